@@ -45,8 +45,8 @@ def children_of_gpu(resolution: int, memory_bytes: int) -> int:
         resolution: of their pictures, in pixels.
         memory_bytes: of the GPU.
     """
-    needed = _CHILD_BYTES + _PIXEL_BYTES * resolution**2
-    return min(_MOST_CHILDREN, max(1, int(_USED * memory_bytes) // needed))
+    child_bytes = _CHILD_BYTES + _PIXEL_BYTES * resolution**2
+    return min(_MOST_CHILDREN, max(1, int(_USED * memory_bytes) // child_bytes))
 
 
 def _affinity() -> int:

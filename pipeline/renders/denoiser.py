@@ -79,7 +79,8 @@ def denoise_arrays(
 
     filtered = _filter(resolution, quality, _device, _threads)
     if (dr.backend_v(pictures[0]) == dr.JitBackend.CUDA) != (_device == "CUDA"):
-        kind, shape = type(pictures[0]), (resolution, resolution, 3)
+        kind = type(pictures[0])
+        shape = (resolution, resolution, 3)
         inputs = [
             [np.array(each).reshape(shape) for each in (p, *g)]
             for p, g in zip(pictures, guides, strict=True)
@@ -166,10 +167,8 @@ class _DLTensor(ctypes.Structure):
 
 
 _capsule_pointer = ctypes.pythonapi.PyCapsule_GetPointer
-_capsule_pointer.restype, _capsule_pointer.argtypes = (
-    ctypes.c_void_p,
-    [ctypes.py_object, ctypes.c_char_p],
-)
+_capsule_pointer.restype = ctypes.c_void_p
+_capsule_pointer.argtypes = [ctypes.py_object, ctypes.c_char_p]
 
 
 def _address(array: Any) -> int:

@@ -76,8 +76,10 @@ class DevicePictures:
             camera: the view.
             settings: how well.
         """
-        self._samples, self._resolution = samples, camera.resolution
-        self._names, self._quality = settings.part_names, settings.denoiser
+        self._samples = samples
+        self._resolution = camera.resolution
+        self._names = settings.part_names
+        self._quality = settings.denoiser
         arrays = tracer.feature_arrays(camera, spp=settings.aux_spp)
         names = self._names or ("",)
         self._guides, masks = _guides(
@@ -86,7 +88,8 @@ class DevicePictures:
         self._logs = [dr.opaque(mi.Color3d, 0, camera.resolution**2) for _ in range(2)]
         self._masks = masks
         bits = read_numbers(masks).reshape(camera.resolution, camera.resolution)
-        self.hits, self.shown = bits & 1 > 0, bits & 2 > 0
+        self.hits = bits & 1 > 0
+        self.shown = bits & 2 > 0
         if not self.shown.any():
             self.shown[:] = True
         hits = TILE * tile_means(self.hits.astype(np.float64)).ravel()
@@ -94,8 +97,9 @@ class DevicePictures:
         self._counts = everywhere, everywhere, hits
 
     def look(self, quality: Filtered) -> MeasuredLook:
-        sums, kind = _sums(self._samples), (self._names, self._resolution, quality != "off")
-        filtered = self._filtered(sums, quality, of_both=False)
+        sums = _sums(self._samples)
+        kind = (self._names, self._resolution, quality != "off")
+        filtered = self._denoise_raws(sums, quality, of_both=False)
         arrays = sums, filtered, self._guides, self._masks, self._logs
         numbers, self._logs = _measure(KernelInputs(), *arrays, *kind)
         rows = read_numbers(numbers).reshape(-1, len(self._counts[0]))
@@ -111,8 +115,9 @@ class DevicePictures:
         )
 
     def finish(self) -> NDArray[np.float32]:
-        sums, kind = _sums(self._samples), (self._names, self._resolution, self._quality != "off")
-        filtered = self._filtered(sums, self._quality, of_both=True)
+        sums = _sums(self._samples)
+        kind = (self._names, self._resolution, self._quality != "off")
+        filtered = self._denoise_raws(sums, self._quality, of_both=True)
         pictures = _finish(KernelInputs(), sums, filtered, self._guides, *kind)
         return read_numbers(pictures).reshape(-1, self._resolution, self._resolution, 3)
 
@@ -127,7 +132,7 @@ class DevicePictures:
         )
         return MeasuredFloor(log_db=log_db, linear_db=linear_db, object_log_db=object_log_db)
 
-    def _filtered(self, sums: Sums, quality: Filtered, *, of_both: bool) -> list[list[Any]]:
+    def _denoise_raws(self, sums: Sums, quality: Filtered, *, of_both: bool) -> list[list[Any]]:
         """Return what the denoiser makes of each half, or of the mean of both."""
         if quality == "off":
             return []
@@ -194,19 +199,20 @@ def _measure(
     and of each part; then what is greatest: surprises of the same, and the brightest raw channel.
     """
     raws = _means(sums, of_both=False)
-    denoised = _denoised(raws, filtered, guides, names, resolution) if is_filtered else raws
+    denoised = _clean_pictures(raws, filtered, guides, names, resolution) if is_filtered else raws
     new_logs = [log10(mi.Color3d(add_up(each))) for each in denoised]
     changes = [channel_mean(dr.square(new - old)) for new, old in zip(new_logs, logs, strict=True)]
-    kept = denoised
+    corrected = denoised
     if is_filtered and len(sums[0]) == 1:
         picture = [[(a + b) / 2 for a, b in zip(*each, strict=True)] for each in (denoised, raws)]
         error = _squared_error_of_means(sums)
         right = converged(picture[0], picture[1], error, resolution)
-        kept = [choose(right, *each) for each in zip(raws, denoised, strict=True)]
+        corrected = [choose(right, *each) for each in zip(raws, denoised, strict=True)]
     hit = (masks & 1) > 0
-    rows, every = [], max(1, len(names))
+    rows = []
+    every = max(1, len(names))
     for first, step in [(0, 1), *((part, every) for part in range(len(names)))]:
-        a, b, da, db = (mi.Color3d(add_up(each[first::step])) for each in (*raws, *kept))
+        a, b, da, db = (mi.Color3d(add_up(each[first::step])) for each in (*raws, *corrected))
         rows.append(estimates(a, b, da, db, hit, is_filtered))
     brightest = functools.reduce(dr.maximum, [dr.max(part) for half in raws for part in half])
     adds = [*changes, _broken(sums), *(row for errors, _ in rows for row in errors)]
@@ -229,7 +235,7 @@ def _finish(
     """Return the pictures of all samples (Float), one after another."""
     raws = _means(sums, of_both=True)
     if is_filtered:
-        (pictures,) = _denoised(raws, filtered, guides, names, resolution)
+        (pictures,) = _clean_pictures(raws, filtered, guides, names, resolution)
         if len(sums[0]) == 1:
             right = converged(pictures, raws[0], _squared_error_of_means(sums), resolution)
             pairs = list(zip(choose(right, raws[0], pictures), raws[0], strict=True))
@@ -266,7 +272,9 @@ def _squared_error_of_means(sums: Sums) -> Any:
     """Return the square (Float64) of HostMeans.standard_error."""
     greys = [channel_mean(add_up(half)) for half in _half_means(sums)]
     mean = (greys[0] + greys[1]) / 2
-    spread, count, shares = mi.Float64(0), mi.Float64(0), mi.Float64(0)
+    spread = mi.Float64(0)
+    count = mi.Float64(0)
+    shares = mi.Float64(0)
     for grey, (tracer,) in zip(greys, sums, strict=True):
         squares, spp, passes = tracer[-3:]
         spread += squares - spp * mean * (2 * grey - mean)
@@ -276,7 +284,7 @@ def _squared_error_of_means(sums: Sums) -> Any:
     return dr.select(count < LEAST_PASSES, dr.inf, error)
 
 
-def _denoised(
+def _clean_pictures(
     raws: list[list[Any]],
     filtered: list[list[Any]],
     guides: dict[str, Any],

@@ -45,7 +45,8 @@ def with_means_of(pairs: Sequence[tuple[Any, Any]], resolution: int) -> list[Any
             dr.gather(mi.Float64, sums, 4 * row + each) for each in range(4)
         )
         factors = [_factor(is_now, was), _factor(rest_is, rest_was)]
-        least, most = dr.minimum(*factors), dr.maximum(*factors)
+        least = dr.minimum(*factors)
+        most = dr.maximum(*factors)
         apart = (least < 1 / MOST_APART) | (most > MOST_APART)
         whole = _factor(is_now + rest_is, was + rest_was)
         factor = dr.select(apart, whole, dr.select(glints, *factors))
@@ -92,11 +93,13 @@ def estimates(
 
     The pictures (Color3d) are those of `Half`.
     """
-    raw, denoised = (a + b) / 2, (denoised_a + denoised_b) / 2
+    raw = (a + b) / 2
+    denoised = (denoised_a + denoised_b) / 2
     estimate = dr.square(denoised_a - b) + dr.square(denoised_b - a) - dr.square(a - b)
     estimate = estimate / 2 - dr.square(denoised_a - denoised_b) / 4
-    errors, surprises = [], []
-    for curve in (log10, _clamped):
+    errors = []
+    surprises = []
+    for curve in (log10, _clamp):
         if is_filtered:
             least = SMALLEST_STEP * (1 + dr.abs(denoised))
             step = raw - denoised
@@ -114,7 +117,7 @@ def log10(radiance: Any) -> Any:
     return dr.log(1 + radiance) * _INV_LN_10
 
 
-def _clamped(radiance: Any) -> Any:
+def _clamp(radiance: Any) -> Any:
     return dr.clip(radiance, 0, 1)
 
 
@@ -148,5 +151,6 @@ def reduce_tiles(values: Sequence[Any], reduction: Any, resolution: int) -> Any:
 
 def totals(values: Sequence[Any], resolution: int) -> Any:
     """Return the sum over all pixels of each of some values (Float64)."""
-    sums, across = reduce_tiles(values, dr.ReduceOp.Add, resolution), resolution // TILE_PX
+    sums = reduce_tiles(values, dr.ReduceOp.Add, resolution)
+    across = resolution // TILE_PX
     return dr.block_sum(dr.block_sum(sums, across), across)

@@ -50,7 +50,8 @@ class _Kind:
     """What tells recordings apart, and the objects of the call at hand."""
 
     def __init__(self, names: tuple[Any, ...], objects: tuple[Any, ...]) -> None:
-        self._names, self.objects = names, objects
+        self._names = names
+        self.objects = objects
 
     def __hash__(self) -> int:
         return hash(self._names)

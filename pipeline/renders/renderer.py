@@ -73,7 +73,9 @@ class SceneRenderer:
             TrilightError: with `per_light`, where an environment lights the scene too.
         """
         require_surfaces(scene)
-        self._settings, self._shows_looks, self._used = settings, shows_looks, UsedTime()
+        self._settings = settings
+        self._shows_looks = shows_looks
+        self._used = UsedTime()
         self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
         if settings.part_names:
             self._tracer = self._tracer.apart(bounces=settings.split, lobes=settings.split_lobes)
@@ -114,7 +116,8 @@ class SceneRenderer:
         self, c2w: ArrayLike, fov_deg: float, seed: int
     ) -> Generator[Sampling, None, RenderedView]:
         """Do what `render_view` does, yielding after each pass of one half."""
-        settings, self._used = self._settings, UsedTime()
+        settings = self._settings
+        self._used = UsedTime()
         pose = np.asarray(c2w, np.float64)
         camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
         settled = settings.first_spp
@@ -154,7 +157,8 @@ class SceneRenderer:
 
     def _stored(self, pictures: NDArray[np.float32]) -> dict[str, Any]:
         """Return the pictures of a view by their fields: the sum of what is apart, as stored."""
-        per_light, names = self._settings.per_light, self._settings.part_names
+        per_light = self._settings.per_light
+        names = self._settings.part_names
         if not (per_light or names):
             return {"radiance_rgb": representable(pictures[0])}
         parts = _by_part(rounded_to_half(representable(pictures)), max(1, len(names)))
@@ -178,7 +182,8 @@ class SceneRenderer:
             raise Rejected("black_view", f"mean radiance {mean:.2g} is below {bound:.2g}")
 
     def _refuse_noisy(self, floor: MeasuredFloor) -> None:
-        targets_db, floors_db = self._settings.targets_db, _by_metric(floor)
+        targets_db = self._settings.targets_db
+        floors_db = _by_metric(floor)
         missed = [
             f"{metric} is {floors_db[metric]:.1f} dB; expected {targets_db[metric]:g}"
             for metric in gaps_db(targets_db, floors_db)
@@ -189,7 +194,8 @@ class SceneRenderer:
     def _sample_to_targets(
         self, samples: HalfSamples, pictures: ViewPictures
     ) -> Generator[Sampling, None, MeasuredLook]:
-        targets_db, max_spp = self._settings.targets_db, self._settings.max_spp
+        targets_db = self._settings.targets_db
+        max_spp = self._settings.max_spp
         measured: list[tuple[int, Floors]] = []
         shown = np.ones_like(pictures.shown) if self._sees_sky else pictures.shown
         tiles = TileChoice(shown)
@@ -202,7 +208,8 @@ class SceneRenderer:
             if not gaps or samples.spp >= max_spp:
                 return look
             goal = Goal(targets_db=targets_db, step=2 * samples.pass_spp, max_spp=max_spp)
-            expected, missing_db = expected_spp(measured, goal), max(gaps.values())
+            expected = expected_spp(measured, goal)
+            missing_db = max(gaps.values())
             if self._shows_looks:
                 yield self._growing(samples, pictures, look.floor, expected, missing_db)
             if expected >= _GUIDED_SPP:

@@ -32,7 +32,8 @@ class HalfSamples:
             max_spp: the most that will be asked for.
         """
         self._seed = seed
-        self._first, self._most = first_spp // 2, max_spp // 2
+        self._first = first_spp // 2
+        self._most = max_spp // 2
         self.sums = [[tracer.pass_sum(camera) for tracer in tracers] for _ in range(2)]
         """Of each half, and in it of each tracer."""
         self._spp, self._count = np.zeros((2, 2, camera.resolution, camera.resolution), np.int64)

@@ -53,7 +53,8 @@ class Splats:
     def add(self, value: Any, pixel: Any, active: Any) -> None:
         """Add colours of at least 0 (Color3f) to pixels (UInt32)."""
         # Atomic. By default each thread would sum a picture of its own, in a separate kernel.
-        add, direct = dr.ReduceOp.Add, dr.ReduceMode.Direct
+        add = dr.ReduceOp.Add
+        direct = dr.ReduceMode.Direct
         units = value * self._unit.per_radiance
         fits = dr.max(units) < _LARGEST
         fits &= dr.all(dr.isfinite(units))  # dr.max passes over NaN

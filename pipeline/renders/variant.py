@@ -106,7 +106,7 @@ def choose_variant(default: Device = "cpu", *, device: Device | None = None) -> 
     chosen = device or named_device() or default
     if chosen == "cpu" or (chosen == "auto" and not visible_gpus()):
         return _on_processor()
-    probed = _probe_gpu(again=chosen == "gpu")
+    probed = _probe_gpu(retry_failed=chosen == "gpu")
     if not probed.problem:
         note = (
             probed.denoiser_problem and f"{probed.denoiser_problem}, so the CPU denoises pictures"
@@ -121,23 +121,23 @@ def choose_variant(default: Device = "cpu", *, device: Device | None = None) -> 
     )
 
 
-def _probe_gpu(*, again: bool) -> "_Probed":
+def _probe_gpu(*, retry_failed: bool) -> "_Probed":
     """Return what a probe of the GPU found, from memory where it may be.
 
     Args:
-        again: whether a remembered problem is probed again, since its cause may be fixed.
+        retry_failed: whether a remembered problem is probed again: its cause may be fixed.
     """
     memory = cache_folder("gpu_probes.json")
     identity = _gpu_identity()
     known = _remembered(memory)
     for text in known:
         name, problem, denoiser_problem = json.loads(text)
-        if name == identity and not (problem and again):
+        if name == identity and not (problem and retry_failed):
             return _Probed(problem=problem, denoiser_problem=denoiser_problem)
     probed = _probe(_GPU)
-    others = [text for text in known if json.loads(text)[0] != identity]
+    other_rows = [text for text in known if json.loads(text)[0] != identity]
     row = json.dumps([identity, probed.problem, probed.denoiser_problem])
-    _remember(memory, [*others, row])
+    _remember(memory, [*other_rows, row])
     return probed
 
 
@@ -186,14 +186,14 @@ def _works(library: Path) -> bool:
     known = _remembered(memory)
     if identity in known:
         return True
-    found = _probe(Variant(name="llvm_ad_rgb", libllvm=str(library), note=""))
-    if found.is_silent:
+    probed = _probe(Variant(name="llvm_ad_rgb", libllvm=str(library), note=""))
+    if probed.is_silent:
         raise EnvironmentFailure(
-            f"{library}: the probe of this LLVM library gave {found.problem}, at {len(_PROBE_S)} "
+            f"{library}: the probe of this LLVM library gave {probed.problem}, at {len(_PROBE_S)} "
             "tries; expected a small picture within seconds. Run again when the machine is less "
             "busy; if the library hangs, name another one by DRJIT_LIBLLVM_PATH."
         )
-    if found.problem:
+    if probed.problem:
         return False
     _remember(memory, [*known, identity])
     return True

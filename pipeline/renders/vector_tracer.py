@@ -59,8 +59,11 @@ class VectorTracer:
         """Load a scene that is `scale` times as large as cameras take it for."""
         surfaces, emitters = split_triangles(scene)
         order = np.concatenate([surfaces, emitters])
-        self._record, self._emitters, self._scale = scene, emitters, scale
-        seen, sky = _load(scene, surfaces), shining_sky(scene)
+        self._record = scene
+        self._emitters = emitters
+        self._scale = scale
+        seen = _load(scene, surfaces)
+        sky = shining_sky(scene)
         self._scene = KernelScene(
             surfaces=seen,
             everything=_load(scene, order, beside=seen),
@@ -105,7 +108,8 @@ class VectorTracer:
     def radiance(
         self, camera: Camera, *, seed: int, spp: int, chosen: Chosen = None
     ) -> NDArray[np.float32]:
-        pixels, picture = _pixels(camera, chosen), dr.zeros(mi.Color3f, camera.resolution**2)
+        pixels = _pixels(camera, chosen)
+        picture = dr.zeros(mi.Color3f, camera.resolution**2)
         means = _means(*self._pass(camera, self._film(camera), pixels, seed, spp))
         dr.scatter(picture, sum(means), pixels)
         return _picture(camera, picture)
@@ -194,7 +198,8 @@ def trace_camera_paths(
     sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
     sampler.set_samples_per_wavefront(spp)
     sampler.seed(numbers.camera_seed, len(pixels) * spp)
-    jitter, (column, row) = sampler.next_2d(), film.corners(pixel)
+    jitter = sampler.next_2d()
+    (column, row) = film.corners(pixel)
     ray = film.rays(column + jitter.x, row + jitter.y)
     traced = trace(scene, film, parts, numbers.light_paths, sampler, ray)
     dr.eval(traced)  # all parts in one kernel
@@ -266,7 +271,8 @@ def _first_hit(scene: Any, film: Film, resolution: int, spp: int) -> Any:
     """Return the hits of camera rays on a regular grid in every pixel."""
     across = math.isqrt(spp)
     lane = dr.arange(mi.UInt32, resolution**2 * spp)
-    sample, (column, row) = lane % spp, film.corners(lane // spp)
+    sample = lane % spp
+    (column, row) = film.corners(lane // spp)
     grid_row = sample // across
     within = mi.Float(sample - grid_row * across), mi.Float(grid_row)
     cell = 1 / across  # a power of two
@@ -278,7 +284,9 @@ class DeviceSum:
     """A `PassSum` in float64 in the memory of the device, so that no pass waits for Python."""
 
     def __init__(self, tracer: VectorTracer, camera: Camera) -> None:
-        self._tracer, self._camera, self._film = tracer, camera, tracer._film(camera)
+        self._tracer = tracer
+        self._camera = camera
+        self._film = tracer._film(camera)
         kinds = [*[mi.Color3d] * tracer._parts.count, *[mi.Float64] * 3]
         self.sums: list[Any] = [dr.opaque(kind, 0, camera.resolution**2) for kind in kinds]
         """Of each part (Color3d); the squares of `read_squares`; samples; passes (Float64)."""
@@ -302,7 +310,8 @@ def _learnt(record: Scene, scene: KernelScene) -> GuideTable | None:
     """Return the guide of a scene: None where no mirror lights a rough surface."""
     order = np.concatenate(split_triangles(record))
     corners = record.vertex_positions[record.faces[order]]
-    cells, records = GuideCells(corners.astype(np.float64)), PhotonRecords(PHOTON_PATHS)
+    cells = GuideCells(corners.astype(np.float64))
+    records = PhotonRecords(PHOTON_PATHS)
     u = even_numbers(PHOTON_PATHS, even_shifts(_PHOTON_SEED))
     emitter = scene.emitters.sample(mi.Point2f(u[0], u[1]), mi.Bool(True))
     sampler = mi.load_dict({"type": "independent"})

@@ -24,12 +24,12 @@ class MeasuredLook:
     """What is measured on the samples of a view at one time."""
 
     floor: MeasuredFloor
-    """Of the picture."""
+    """Stated error of the picture."""
     part_floors: Mapping[str, MeasuredFloor]
-    """Of each part that is kept apart, of all lights together."""
+    """Stated error of each part that is stored, of all lights together."""
     changes: Sequence[NDArray[np.float64]]
-    """Of each half, [T, T] mean squared change of the denoised log radiance of each tile since the
-    look before; nothing is meant by those of the first."""
+    """Mean squared change of the denoised log radiance of each tile since the look before, [T, T]
+    for each half; the first look has none that means anything."""
 
 
 class ViewPictures(Protocol):

@@ -48,7 +48,8 @@ def squared_error(a: Half, b: Half, curve: Curve) -> NDArray[np.float64]:
     It is the mean over the channels. Single pixels may be far below 0; the mean over many pixels
     is what it is for.
     """
-    raw_a, raw_b = a.raw_rgb.astype(np.float64), b.raw_rgb.astype(np.float64)
+    raw_a = a.raw_rgb.astype(np.float64)
+    raw_b = b.raw_rgb.astype(np.float64)
     if np.array_equal(a.denoised_rgb, a.raw_rgb):
         of_half: NDArray[np.float64] = 0.5 * np.square(curve(raw_a) - curve(raw_b)).mean(axis=-1)
         return of_half

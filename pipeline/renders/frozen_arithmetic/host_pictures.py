@@ -36,7 +36,8 @@ class HostPictures:
     def __init__(
         self, samples: HalfSamples, tracer: Tracer, camera: Camera, settings: RenderSettings
     ) -> None:
-        self._samples, self._settings = samples, settings
+        self._samples = samples
+        self._settings = settings
         self._features = tracer.features(camera, spp=settings.aux_spp)
         self.hits = tracer.hits(camera)
         self.shown = _shown(self._features)
@@ -64,7 +65,8 @@ class HostPictures:
         )
 
     def finish(self) -> NDArray[np.float32]:
-        raw, error = self._means.mean(), self._means.standard_error()
+        raw = self._means.mean()
+        error = self._means.standard_error()
         parts = self._denoised(raw, self._settings.denoiser)
         if error is None or self._settings.denoiser == "off":
             return parts
@@ -115,7 +117,8 @@ class HostMeans:
             return None
         greys = np.stack([mean.sum(axis=0).mean(axis=-1) for mean in self._means()])
         spp = np.stack([samples.spp_of(half) for half in range(2)])
-        mean, count = greys.mean(axis=0), samples.count_of(0) + samples.count_of(1)
+        mean = greys.mean(axis=0)
+        count = samples.count_of(0) + samples.count_of(1)
         # Passes of n samples have the variance v / n, and the mean of a half of N has v / N.
         spread = (self._squares - spp * mean * (2 * greys - mean)).sum(axis=0)
         variance = np.maximum(spread, 0) / (count - 1)
