@@ -65,7 +65,7 @@ class RevisitOptions:
     """Number of render processes, which share the cores; by default one, or four for each GPU, or
     as many as its memory holds."""
     device: Device | None = None
-    """Device that renders: cpu, gpu or auto, as for `trilight generate`."""
+    """Device that renders: cpu, gpu or auto; by default as `trilight generate` with its build."""
     failure_budget: Share = 0.1
     """Share of scenes that may fail for good before the run stops."""
     accept_environment: bool = False
