@@ -15,18 +15,17 @@ def visible_gpus() -> tuple[str, ...]:
         return tuple(name.strip() for name in named.split(",") if name.strip() not in ("", "-1"))
     try:
         return tuple(str(number) for number in range(len(list((_DRIVER / "gpus").iterdir()))))
-    except OSError:
-        return ()
+    except OSError:  # a container without that folder
+        return tuple(query_gpus("index"))
 
 
 def gpu_identity() -> tuple[str, ...]:
     """Return texts that change with the driver, the GPUs, or those that are visible."""
-    texts = []
-    for path in (_DRIVER / "version", *sorted((_DRIVER / "gpus").glob("*/information"))):
-        try:
-            texts.append(path.read_text(errors="replace"))
-        except OSError:
-            texts.append("")
+    paths = (_DRIVER / "version", *sorted((_DRIVER / "gpus").glob("*/information")))
+    try:
+        texts = [path.read_text(errors="replace") for path in paths]
+    except OSError:
+        texts = query_gpus("name,driver_version")
     return (*visible_gpus(), *texts)
 
 
