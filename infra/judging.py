@@ -30,7 +30,6 @@ from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.report import markdown, record
 from train.evaluation.same_time import same_time
 from train.evaluation.sheet import draw_sheet, write_picture
-from train.loop.checkpoints import network_of_run
 from train.loop.distributed import choose_device
 from train.loss.lpips import load_lpips
 from train.result import pretty_json
@@ -84,7 +83,7 @@ def judge_network(
     """
     opened = open_training_data(data)
     rivals = opened if train_data is None else open_training_data(train_data)
-    network_file = find_network(checkpoint, network_of_run)
+    network_file = find_network(checkpoint)
     shards = opened.split(split)
     if resolution is None:
         stored = stored_resolution(shards)

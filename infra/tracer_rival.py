@@ -207,7 +207,7 @@ def _middle(seconds: Sequence[float]) -> float:
 def tracing_child(variant: Variant) -> IsolatedChild:
     """Return a child that traces on one thread; the caller closes it."""
     limits = replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
-    return IsolatedChild(limits=limits, setup=set_up_child, setup_args=(variant,))
+    return IsolatedChild(limits=limits, factory=set_up_child, args=(variant,))
 
 
 def set_up_child(variant: Variant) -> None:

@@ -9,7 +9,6 @@ All of the network that is used here is in `_encode` and `_decode`.
 import dataclasses
 import functools
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from torch import Tensor
 
 from model.encoded_scene import EncodedScene
 from model.light_groups import LightGroup, light_groups
-from model.open import Finder, find_network
+from model.open import find_network
 from model.precision import set_precision
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import Cameras, batch_scenes, map_tensors, scene_tensors
@@ -62,7 +61,6 @@ class NeuralRenderer:
         *,
         device: str | None = None,
         precision: str = "float32",
-        finders: Sequence[Finder] = (),
     ) -> "NeuralRenderer":
         """Read a checkpoint.
 
@@ -70,12 +68,11 @@ class NeuralRenderer:
             checkpoint: as `model.open.find_network`.
             device: of torch; by default the graphics card where there is one.
             precision: a name of model.precision.PRECISIONS.
-            finders: as `model.open.find_network`.
 
         Raises:
             TrilightError: no such file, or no network.
         """
-        found = find_network(checkpoint, *finders)
+        found = find_network(checkpoint)
         place = device or ("cuda" if torch.cuda.is_available() else "cpu")
         return cls(set_precision(found.open().to(place), precision), found.trained)
 

@@ -2,11 +2,9 @@
 
 ours, shipped      builtin:hits (builtin: for short), builtin:tokens
 our own            model.safetensors of `trilight train`, or the folder that holds one
+checkpoints        a step of a run, or the folder of an unfinished run
 published, local   a folder with config.json and model.safetensors
 published, hub     microsoft/renderformer-v1-base, microsoft/renderformer-v1.1-swin-large
-
-A caller may add forms: `open_network(place, network_of_run)` also opens the checkpoints of training
-(train.loop.checkpoints).
 """
 
 import json
@@ -17,6 +15,7 @@ from pathlib import Path
 
 from safetensors.torch import save
 
+from model.checkpoint_format import find_checkpoint, read_checkpoint
 from model.published.config import PublishedConfig, decode_published, encode_published
 from model.published.convert import from_published, to_published
 from model.renderformer import RenderFormer
@@ -81,35 +80,28 @@ class NetworkFile:
     is damaged, or its tensors do not match its configuration."""
 
 
-Finder = Callable[[Path], NetworkFile | None]
-"""Finds the network at a path in a format that this package does not know, such as a training
-checkpoint (train.loop.checkpoints); returns None for any other path."""
-
-
-def open_network(source: str | Path, *finders: Finder) -> RenderFormer:
+def open_network(source: str | Path) -> RenderFormer:
     """Return a network, float32, in evaluation mode on the CPU.
 
     Args:
-        place: as in `find_network`.
-        finders: as there.
+        source: as in `find_network`.
 
     Raises:
         TrilightError: no such file, pickled code, a damaged file, or tensors that do not match the
             configuration; the message lists their names.
     """
-    return find_network(source, *finders).open()
+    return find_network(source).open()
 
 
-def find_network(place: str | Path, *finders: Finder) -> NetworkFile:
+def find_network(place: str | Path) -> NetworkFile:
     """Return the file of a network without reading its weights; published names are downloaded.
 
     Args:
         place: one of BUILTIN_NETWORKS, a file, a folder, or the name of a repository on the
             Hugging Face hub.
-        finders: functions that are tried first, such as `train.loop.checkpoints.network_of_run`.
 
     Raises:
-        TrilightError: no such file, or pickled code.
+        TrilightError: no such file, pickled code, or a damaged checkpoint.
     """
     source = str(place)
     if source.startswith(BUILTIN) and source not in BUILTIN_NETWORKS:
@@ -118,9 +110,9 @@ def find_network(place: str | Path, *finders: Finder) -> NetworkFile:
             f"{expected_one_of(source, sorted(BUILTIN_NETWORKS))}."
         )
     path = BUILTIN_NETWORKS.get(source, Path(source))
-    for finder in finders:
-        if network := finder(path):
-            return network
+    is_finished = path.is_dir() and (path / WEIGHTS_NAME).is_file()
+    if not is_finished and (checkpoint := find_checkpoint(path)):
+        return _network_of_checkpoint(checkpoint)
     weights = _weights_file(source, path)
     metadata = read_metadata(weights)
     if CONFIG_KEY in metadata:
@@ -135,6 +127,20 @@ def find_network(place: str | Path, *finders: Finder) -> NetworkFile:
         trained=PUBLISHED_RANGE,
         any_width=False,
         open=lambda: _open_published(weights),
+    )
+
+
+def _network_of_checkpoint(path: Path) -> NetworkFile:
+    """Return the network of a checkpoint, whose bytes are all read: their digest verifies it."""
+    checkpoint = read_checkpoint(path)
+    settings = checkpoint.header.get("settings")
+    resolution = settings.get("resolution") if isinstance(settings, dict) else None
+    return NetworkFile(
+        path=path,
+        trained=TrainedRange(resolution=resolution if isinstance(resolution, int) else None),
+        any_width=decode_config(checkpoint.header["model"], f"checkpoint {path}").view_stage
+        == "hits",
+        open=checkpoint.network,
     )
 
 

@@ -5,6 +5,7 @@ same scene whether it is made first, last, alone, or on another machine. Seed 0 
 """
 
 import hashlib
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -31,3 +32,19 @@ def seed_for(seed: int, purpose: str, *indices: int) -> int:
 def _name_digest(seed: int, purpose: str, indices: tuple[int, ...]) -> bytes:
     name = "/".join([str(int(seed)), purpose, *(str(int(index)) for index in indices)])
     return hashlib.sha256(name.encode()).digest()
+
+
+@dataclass(frozen=True)
+class SceneKey:
+    """The numbers that a composed scene follows from, beside settings and objects."""
+
+    seed: int
+    """Seed of the dataset, from 0."""
+    index: int
+    """Index of the scene in the dataset, from 0."""
+    attempt: int = 0
+    """Number of earlier rejections of this scene."""
+
+    def rng(self, purpose: str, *indices: int) -> np.random.Generator:
+        """Return the generator of this attempt for one purpose; arguments as `rng_for`."""
+        return rng_for(self.seed, purpose, self.index, self.attempt, *indices)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from model.checkpoint_format import FOLDER_NAME
 from storage.claims import describe_holder, hold_claim
 from storage.errors import TrilightError
 
@@ -23,7 +24,7 @@ class RunFolder:
     @property
     def checkpoints(self) -> Path:
         """Folder of the checkpoints (loop.checkpoints), one file per saved step."""
-        return self.root / "checkpoints"
+        return self.root / FOLDER_NAME
 
     @property
     def weights(self) -> Path:

@@ -1,7 +1,6 @@
 """Initial or resumed state of a run, and the settings.json that records it."""
 
 import dataclasses
-import json
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,9 +9,10 @@ from typing import Any
 
 import torch
 
+from model.checkpoint_format import Checkpoint, find_checkpoint, read_header, saved_steps
 from model.open import open_network
 from model.renderformer import RenderFormer
-from model.weights import decode_config, encode_weights, read_metadata
+from model.weights import decode_config, encode_weights
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData
 from storage.digests import sha256_hex
@@ -23,16 +23,10 @@ from storage.typed_json import read_json
 from train.data.mixture import RECORD, plan_mixture
 from train.folder import RunFolder
 from train.loop.checkpoints import (
-    HEADER_KEY,
-    Checkpoint,
-    is_checkpoint,
-    network_of_run,
     newest_checkpoint,
-    path_of_step,
     read_checkpoint,
     restore_state,
     save_checkpoint,
-    saved_steps,
 )
 from train.loop.distributed import DistributedContext
 from train.loop.muon import choose_muon_precision
@@ -89,7 +83,7 @@ def plan_start(
         source = start.begin_with
         if source is None:
             return StartPlan(settings=settings)
-        network = open_network(source, network_of_run)
+        network = open_network(source)
         settings = dataclasses.replace(settings, model=network.config)
         return StartPlan(settings=settings, network=network, network_source=source)
     branch = None if start.resume or start.branch is None else Path(start.branch)
@@ -189,12 +183,8 @@ def _origin(step: int, name: str, header: Mapping[str, Any]) -> Event:
 
 def _header_of(path: Path) -> dict[str, Any]:
     """Return the header of a checkpoint, or an empty one for other weights files."""
-    if path.is_dir() and (steps := saved_steps(RunFolder(path).checkpoints)):
-        path = path_of_step(RunFolder(path).checkpoints, steps[-1])
-    if path.suffix != ".safetensors" or not path.is_file():
-        return {}
-    metadata = read_metadata(path)
-    return dict(json.loads(metadata[HEADER_KEY])) if is_checkpoint(metadata) else {}
+    checkpoint = find_checkpoint(path)
+    return read_header(checkpoint) if checkpoint else {}
 
 
 def _copy_log_of_parent(path: Path, folder: RunFolder, step: int) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from model.checkpoint_format import saved_steps
 from model.renderformer import count_parameters
 from model.sky.known import lit_sky, require_known_sky
 from storage.dataset.mixed_data import open_mixture
@@ -23,7 +24,6 @@ from train.evaluation.baselines import median_picture
 from train.evaluation.judge import Judge
 from train.folder import RunFolder, claim_run
 from train.initial_state import init_or_resume_state, plan_start
-from train.loop.checkpoints import saved_steps
 from train.loop.distributed import DistributedContext
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState

@@ -31,10 +31,6 @@ _SAMPLES = 2
 """Number of rendered scenes for experiments on packing and reading."""
 
 
-def _do_nothing() -> None:
-    """Set up a child whose fork server has imported everything already."""
-
-
 class BenchContext:
     """Shared resources of an experiment's trials, until `close`."""
 
@@ -86,7 +82,7 @@ class BenchContext:
     def mesh_child(self) -> IsolatedChild:
         """A child for mesh libraries, one thread, with a limit on its processor time."""
         limits = ChildLimits(memory_bytes=8 << 30, wall_s=600, cpu_s=240, calls_per_child=10_000)
-        child = IsolatedChild(limits=limits, setup=_do_nothing)
+        child = IsolatedChild(limits=limits)
         return self._stack.enter_context(contextlib.closing(child))
 
     @functools.cached_property
@@ -116,15 +112,14 @@ class BenchContext:
         user_scenes = given_scenes(self.options.scenes)
         if trial in user_scenes:
             return user_scenes[trial](self.child)
-        scene: Scene = self.child.call(sampled_scene, int(trial.split()[-1]))
-        return scene
+        return sampled_scene(self.child, int(trial.split()[-1]))
 
     @functools.cached_property
     def samples(self) -> list[Sample]:
         """Scenes of the preset `smoke` as a dataset has them, at the scale's width."""
         build = changed(smoke(), {"renders.resolution": self.scale.picture_px})
         child = self.render_child(build, "builtin:")
-        return [child.call(first_sample, index) for index in range(_SAMPLES)]
+        return [first_sample(child, index) for index in range(_SAMPLES)]
 
     def members(self) -> list[dict[str, bytes]]:
         """Return the files of those samples in a shard."""

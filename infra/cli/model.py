@@ -67,10 +67,9 @@ def model(options: ModelOptions, files: PublishOptions, output: OutputOptions) -
 def _open(name: str) -> "RenderFormer":
     from model.config import SIZES
     from model.open import open_network
-    from train.loop.checkpoints import network_of_run
 
     try:
-        return open_network(name, network_of_run)
+        return open_network(name)
     except TrilightError as error:
         if Path(name).exists() or "/" in name:
             raise

@@ -47,7 +47,6 @@ from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
 from train.evaluation.evaluate import BASELINE_SCENES, make_baselines, stored_resolution
-from train.loop.checkpoints import network_of_run
 from train.loss.lpips import load_lpips
 
 if TYPE_CHECKING:
@@ -202,7 +201,7 @@ def _networks(order: LeaderboardOptions) -> Iterator[Contestant]:
             "different names."
         )
     for name, place in zip(names, places, strict=True):
-        renderer = NeuralRenderer.load(place, device="cpu", finders=[network_of_run])
+        renderer = NeuralRenderer.load(place, device="cpu")
         yield NetworkContestant(name, renderer, [_about_network(name, renderer)])
 
 

@@ -187,13 +187,10 @@ class NeuralPlan:
         import torch
 
         from model.neural_renderer import NeuralRenderer
-        from train.loop.checkpoints import network_of_run
 
         if self.threads is not None:
             torch.set_num_threads(self.threads)
-        renderer = NeuralRenderer.load(
-            self.checkpoint, precision=self.precision, finders=[network_of_run]
-        )
+        renderer = NeuralRenderer.load(self.checkpoint, precision=self.precision)
         return NeuralEngine(renderer, self)
 
     def caveats(self, pictures: Sequence[Facts]) -> list[str]:

@@ -4,7 +4,6 @@
 Previews and methods are evaluated and timed on these scenes.
 """
 
-import contextlib
 import dataclasses
 import os
 from pathlib import Path
@@ -12,13 +11,12 @@ from pathlib import Path
 from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
 from pipeline.generation.accept_objects import accept_objects
-from pipeline.generation.attempt_scene import MAX_ATTEMPTS, SceneRecipe, assets_of, set_up_child
 from pipeline.generation.begin_dataset import begin
 from pipeline.generation.environment import environment
 from pipeline.generation.object_options import ObjectOptions
+from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.renders.variant import Variant, choose_variant
-from pipeline.scenes.compose import compose_scene
 from scene_templates.settings import SceneSettings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.splits import JUDGED_SPLIT
@@ -63,7 +61,7 @@ def composing_child(
     accepted = accept_objects(objects_order)
     recipe = SceneRecipe(settings=build, variant=variant, threads=workers, pool=accepted.pool)
     limits = dataclasses.replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
-    return IsolatedChild(limits=limits, setup=set_up_child, setup_args=(recipe,))
+    return IsolatedChild(limits=limits, factory=SceneWorker, args=(recipe,))
 
 
 def held_out_build() -> BuildSettings:
@@ -78,27 +76,30 @@ def held_out_build() -> BuildSettings:
     return changed(build, {"scenes.max_triangles": TRIANGLES, "assets.budgets": levels})
 
 
-def held_out_scene(index: int) -> Scene:
-    """Return a scene of `held_out_build` with one camera; runs in a child of that build.
+def held_out_scene(child: IsolatedChild, index: int) -> Scene:
+    """Return a scene of `held_out_build` with one camera, composed in a child of that build.
 
     Raises:
         Rejected: every attempt at it was rejected.
     """
     settings = dataclasses.replace(held_out_build().scenes, num_views=1)
-    scene = first_composed(settings, index, seed=_SEED, split=JUDGED_SPLIT)
-    if scene is None:
-        raise Rejected("no_scene", f"scene {index}: every attempt at it was rejected")
-    return scene
+    return first_composed(child, settings, index, seed=_SEED, split=JUDGED_SPLIT)
 
 
 def first_composed(
-    settings: SceneSettings, scene_index: int, *, seed: int = 0, split: str = "train"
-) -> Scene | None:
-    """Return the first accepted attempt at a scene, or None; runs in a render child."""
-    pool = assets_of(split)
-    for attempt in range(MAX_ATTEMPTS):
-        with contextlib.suppress(Rejected):
-            return compose_scene(
-                settings, pool, seed=seed, scene_index=scene_index, attempt=attempt
-            )
-    return None
+    child: IsolatedChild,
+    settings: SceneSettings,
+    scene_index: int,
+    *,
+    seed: int = 0,
+    split: str = "train",
+) -> Scene:
+    """Return the first accepted attempt at a scene, composed in a render child.
+
+    Raises:
+        Rejected: every attempt at it was rejected.
+    """
+    scene = child.call_method(SceneWorker.compose_first, settings, scene_index, seed, split)
+    if scene is None:
+        raise Rejected("no_scene", f"scene {scene_index}: every attempt at it was rejected")
+    return scene

@@ -48,7 +48,7 @@ def measure_costs(table: WayTable) -> PictureCosts:
     with tempfile.TemporaryDirectory() as name:
         child = composing_child(held_out_build(), BENCHMARK, Path(name), variant=variant)
         with contextlib.closing(child):
-            scenes = [child.call(held_out_scene, index) for index in PROBES]
+            scenes = [held_out_scene(child, index) for index in PROBES]
             timed = [_time_scene(child, scene, cores) for scene in scenes]
     mean: PartSeconds = {
         key: {part: float(np.mean([one[key][part] for one in timed])) for part in timed[0][key]}

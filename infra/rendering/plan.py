@@ -130,12 +130,11 @@ def _network_and_width(options: RenderOptions) -> tuple[str | None, int]:
         return None, options.resolution or _RESOLUTION
     require_torch("--engine neural")
     from model.open import BUILTIN, find_network
-    from train.loop.checkpoints import network_of_run
 
     checkpoint = options.checkpoint or BUILTIN
     if options.resolution is not None:
         return checkpoint, options.resolution
-    network = find_network(checkpoint, network_of_run)
+    network = find_network(checkpoint)
     return (
         checkpoint,
         _RESOLUTION if network.any_width else network.trained.resolution or _RESOLUTION,

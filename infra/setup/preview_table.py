@@ -78,7 +78,7 @@ def main() -> None:
         for index in range(SCENES):
             sys.stdout.write(f"scene {index + 1} of {SCENES}\n")
             try:
-                scene = child.call(held_out_scene, index)
+                scene = held_out_scene(child, index)
             except Rejected:
                 if index in PROBES:
                     raise

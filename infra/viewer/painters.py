@@ -181,9 +181,8 @@ class NetworkPainter:
     def _load(self) -> "NeuralRenderer":
         if self._renderer is None:
             from model.neural_renderer import NeuralRenderer
-            from train.loop.checkpoints import network_of_run
 
-            self._renderer = NeuralRenderer.load(self.checkpoint, finders=[network_of_run])
+            self._renderer = NeuralRenderer.load(self.checkpoint)
         return self._renderer
 
 

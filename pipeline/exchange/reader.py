@@ -120,19 +120,15 @@ def file_child(confined_to: Reach = NO_FILES) -> IsolatedChild:
 
     It may use these files, and what it is let by `may`.
     """
-    return IsolatedChild(limits=_LIMITS, setup=_no_set_up, confined_to=confined_to)
+    return IsolatedChild(limits=_LIMITS, confined_to=confined_to)
 
 
 def unconfined_child() -> IsolatedChild:
     """Return the same for what is read already, such as to render it; close it."""
-    return IsolatedChild(limits=_LIMITS, setup=_no_set_up)
+    return IsolatedChild(limits=_LIMITS)
 
 
 def reach_of(source: SceneSource, *, writes: Iterable[Path] = ()) -> Reach:
     """Return what a child needs to read a source, and to write into folders that exist."""
     folders = [] if source.usd_folder is None else [source.usd_folder]
     return reach(files=[source.path, *folders], writes=writes)
-
-
-def _no_set_up() -> None:
-    pass

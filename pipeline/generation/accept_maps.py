@@ -130,9 +130,7 @@ def _prepare_maps(
     scenes = settings.scenes
     size = scenes.textures.surfaces.size if kind == TEXTURE else scenes.skies.maps.height
     all_files = reach(files=(path for user_map in maps for path in user_map.files.values()))
-    pool = ChildPool(
-        lambda _: IsolatedChild(limits=_LIMITS, setup=_no_setup, confined_to=all_files), workers
-    )
+    pool = ChildPool(lambda _: IsolatedChild(limits=_LIMITS, confined_to=all_files), workers)
 
     def prepare(user_map: FoundMap) -> tuple[LockedObject, Path] | Failure:
         try:
@@ -159,10 +157,6 @@ def _notes(prepared: Path) -> Path:
 def _unread_failure(locked: LockedObject, path: Path) -> Failure:
     message = _notes(path).read_text("utf-8")
     return Failure(stage="objects", item=locked.uid, reason="not_read", message=message)
-
-
-def _no_setup() -> None:
-    """Do nothing: the child needs no setup."""
 
 
 def _prepare_file(map_files: MapFiles, child: IsolatedChild) -> Path:

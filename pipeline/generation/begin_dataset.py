@@ -70,7 +70,8 @@ def _require_same_dataset(
     stored = from_record(BuildSettings, manifest.settings).as_json()  # fields may come later
     _require_same(folder, "setting", stored, settings.as_json(), "choose another --out")
     if not accept_environment:
-        before, now = device_of(manifest.environment), device_of(environment)
+        before = device_of(manifest.environment)
+        now = device_of(environment)
         if before != now:
             raise TrilightError(
                 f"{folder.display_name}: this dataset was begun on a {before.upper()} and would "

@@ -3,7 +3,7 @@
 This process requests one pass of samples after another, so that it can report progress.
 """
 
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from pipeline.generation.environment import environment
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
 from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings
 from pipeline.renders.renderer import SceneRenderer, set_threads
-from pipeline.renders.results import RenderedView, Sampling
+from pipeline.renders.results import RenderedView, Sampling, with_result
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, activate
 from storage.errors import Rejected, TrilightError
@@ -57,15 +57,12 @@ class PathTracer:
         }
         """Everything beside scene and camera that decides a picture, as JSON values."""
         self._is_open = False
-        self._child = IsolatedChild(
-            limits=replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes)),
-            setup=set_up_renderer,
-            setup_args=(variant, threads),
-        )
+        limits = replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
+        self._child = IsolatedChild(limits=limits, factory=_ChildRenderer, args=(variant, threads))
 
     def wake(self, name: str) -> None:
         """Start the child and load the renderer, if needed; raises TrilightError as `open`."""
-        self._call(name, lambda: self._child.call(_no_op))
+        self._call(name, lambda: self._child.call_method(_ChildRenderer.wait))
 
     def open(self, scene: Scene, name: str) -> None:
         """Load the scene that the following calls render.
@@ -107,15 +104,15 @@ class PathTracer:
 
     def _open(self) -> None:
         self._is_open = False
-        self._child.call(_open_scene, self._scene, self._settings)
+        self._child.call_method(_ChildRenderer.open, self._scene, self._settings)
         self._is_open = True
 
     def _picture(self, c2w: NDArray[np.float32], fov_deg: float) -> RenderedView | Preview:
         if not self._is_open:  # a child that died took the scene and the samples with it
             self._open()
         try:
-            self._child.call(_begin_view, c2w, fov_deg, self._seed)
-            while isinstance(step := self._child.call(_advance), Sampling):
+            self._child.call_method(_ChildRenderer.begin_view, c2w, fov_deg, self._seed)
+            while isinstance(step := self._child.call_method(_ChildRenderer.advance), Sampling):
                 self._on_samples(step)
         except ChildFailed:
             self._is_open = False
@@ -138,39 +135,28 @@ class PathTracer:
             ) from failure
 
 
-class _ChildState:
-    """State of the child between two calls."""
+class _ChildRenderer:
+    """Object that the child holds: a scene and the view that is rendered of it."""
 
-    renderer: SceneRenderer | PreviewRenderer
-    steps: Generator[Sampling, None, RenderedView | Preview]
+    def __init__(self, variant: Variant, threads: int) -> None:
+        activate(variant)
+        set_threads(threads)
+        self._renderer: SceneRenderer | PreviewRenderer | None = None
+        self._steps: Iterator[Sampling | RenderedView | Preview] = iter(())
 
+    def wait(self) -> None:
+        """Do nothing: a call forces the child to start."""
 
-_state = _ChildState()
+    def open(self, scene: Scene, settings: RenderSettings | PreviewSettings) -> None:
+        if isinstance(settings, PreviewSettings):
+            self._renderer = PreviewRenderer(scene, settings)
+        else:
+            self._renderer = SceneRenderer(scene, settings)
 
+    def begin_view(self, c2w: NDArray[np.float32], fov_deg: float, seed: int) -> None:
+        assert self._renderer is not None, "`open` comes first"
+        self._steps = with_result(self._renderer.view_steps(c2w, fov_deg, seed))
 
-def set_up_renderer(variant: Variant, threads: int) -> None:
-    activate(variant)
-    set_threads(threads)
-
-
-def _no_op() -> None:
-    """Do nothing: a call forces the child to start."""
-
-
-def _open_scene(scene: Scene, settings: RenderSettings | PreviewSettings) -> None:
-    if isinstance(settings, PreviewSettings):
-        _state.renderer = PreviewRenderer(scene, settings)
-    else:
-        _state.renderer = SceneRenderer(scene, settings)
-
-
-def _begin_view(c2w: NDArray[np.float32], fov_deg: float, seed: int) -> None:
-    _state.steps = _state.renderer.view_steps(c2w, fov_deg, seed)
-
-
-def _advance() -> Sampling | RenderedView | Preview:
-    try:
-        return next(_state.steps)
-    except StopIteration as end:
-        rendered: RenderedView | Preview = end.value
-        return rendered
+    def advance(self) -> Sampling | RenderedView | Preview:
+        """Return the next step, last the picture."""
+        return next(self._steps)

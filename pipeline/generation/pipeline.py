@@ -42,7 +42,6 @@ from pipeline.generation.accept_objects import (
 )
 from pipeline.generation.accept_revisited import accept_revisited
 from pipeline.generation.accept_scene_files import accept_scene_files
-from pipeline.generation.attempt_scene import MAX_ATTEMPTS, attempt_scene
 from pipeline.generation.bucket_dataset_writer import hold_membership
 from pipeline.generation.dataset_order import DatasetOrder, generate_words
 from pipeline.generation.dataset_writer import DatasetWriter
@@ -67,9 +66,10 @@ from pipeline.generation.run import (
     resolve_settings,
 )
 from pipeline.generation.runner import Runner
+from pipeline.generation.scene_worker import MAX_ATTEMPTS, SceneAttempt, SceneWorker
 from pipeline.generation.tasks import Piece, iter_rounds_until_done
 from pipeline.generation.unfinished_shard import UnfinishedShard
-from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
+from pipeline.isolation import ChildFailed, IsolatedChild, with_retries
 from storage.dataset.asked import write_asked
 from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import ShardEntry
@@ -246,8 +246,8 @@ def make_scene(
 ) -> tuple[Sample | None, list[Failure]]:
     """Compose and render a scene: return the sample of the first accepted attempt, and failures.
 
-    In the child, `attempt_scene` composes the scene and renders its views; a scene of a file is
-    read in another child, by `read`. If a child is killed, crashes or takes too long, the same
+    In the child, `SceneWorker.attempt` composes the scene and renders its views; a scene of a file
+    is read in another child, by `read`. If a child is killed, crashes or takes too long, the same
     attempt is repeated in a new one. If the prepared file of an object is missing, `restore` makes
     it again for the same attempt.
     """
@@ -256,10 +256,11 @@ def make_scene(
         key = sample_key(scene_index)
         try:
             from_file = (read(scene_index),) if read else ()
-            tried = call_with_retries(child, attempt_scene, split, scene_index, attempt, *from_file)
+            arguments = (split, scene_index, attempt, *from_file)
+            tried = _attempt_with_retries(child, arguments)
             while tried.missing_asset:
                 restore(*tried.missing_asset)
-                tried = call_with_retries(child, attempt_scene, split, scene_index, attempt)
+                tried = _attempt_with_retries(child, arguments)
         except (ChildFailed, Rejected) as error:
             if isinstance(error, Rejected):
                 stage = "scenes"
@@ -277,6 +278,10 @@ def make_scene(
         if tried.sample:
             return tried.sample, failures
     return None, failures
+
+
+def _attempt_with_retries(child: IsolatedChild, arguments: tuple[object, ...]) -> SceneAttempt:
+    return with_retries(lambda: child.call_method(SceneWorker.attempt, *arguments))
 
 
 def make_documents(writer: DatasetWriter) -> Statistics:

@@ -27,7 +27,7 @@ def asset_store() -> AssetStore:
 def asset_child(confined_to: Reach = NO_FILES) -> IsolatedChild:
     """Return a child for mesh work, confined to these files and those of `allow_files`."""
     preload_mesh_libraries()
-    return IsolatedChild(limits=_LIMITS, setup=require_filters, confined_to=confined_to)
+    return IsolatedChild(limits=_LIMITS, factory=require_filters, confined_to=confined_to)
 
 
 def preload_mesh_libraries() -> None:

@@ -5,18 +5,18 @@ changes scene, camera, width and depth between two pictures.
 """
 
 import threading
-from collections.abc import Callable, Generator, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.generation.path_tracer import set_up_renderer
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, with_retries
 from pipeline.renders.progressive import ProgressiveRenderer
-from pipeline.renders.results import GrowingPicture, Sampling
+from pipeline.renders.renderer import set_threads
+from pipeline.renders.results import GrowingPicture, Sampling, with_result
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.variant import Variant
+from pipeline.renders.variant import Variant, activate
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
 
@@ -31,11 +31,8 @@ class ProgressiveTracer:
 
     def __init__(self, *, variant: Variant, threads: int) -> None:
         """Configure the child: Mitsuba's variant, and the number of CPU threads."""
-        self._child = IsolatedChild(
-            limits=replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes)),
-            setup=set_up_renderer,
-            setup_args=(variant, threads),
-        )
+        limits = replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
+        self._child = IsolatedChild(limits=limits, factory=_ChildRenderer, args=(variant, threads))
         self._one_at_a_time = threading.Lock()
 
     def render(
@@ -80,9 +77,9 @@ class ProgressiveTracer:
         self._child.close()
 
     def _render(self, scene: Scene, begin: "_Begin", on_look: Callable[[Sampling], None]) -> None:
-        if not self._child.call(_begin, None, *begin):
-            self._child.call(_begin, scene, *begin)
-        while (step := self._child.call(_advance)) is not None:
+        if not self._child.call_method(_ChildRenderer.begin, None, *begin):
+            self._child.call_method(_ChildRenderer.begin, scene, *begin)
+        while (step := self._child.call_method(_ChildRenderer.advance)) is not None:
             on_look(step)
 
 
@@ -91,49 +88,37 @@ _Begin = tuple[tuple[Hashable, RenderSettings], _Camera, int | None]
 """Scene key with its settings, camera, and samples of a preview."""
 
 
-class _ChildState:
-    """State of the child between two calls."""
+class _ChildRenderer:
+    """Object that the child holds: the loaded scenes, and the picture that is rendered."""
 
-    steps: Generator[Sampling, None, GrowingPicture]
+    def __init__(self, variant: Variant, threads: int) -> None:
+        activate(variant)
+        set_threads(threads)
+        self._loaded: dict[Hashable, ProgressiveRenderer] = {}
+        self._steps: Iterator[Sampling | GrowingPicture] = iter(())
 
-    def __init__(self) -> None:
-        self.loaded: dict[Hashable, ProgressiveRenderer] = {}
-        self.ended = True
+    def begin(
+        self,
+        scene: Scene | None,
+        key: tuple[Hashable, RenderSettings],
+        camera: _Camera,
+        preview_spp: int | None,
+    ) -> bool:
+        """Begin a picture; return False if no scene is given and it is no longer loaded."""
+        renderer = self._loaded.pop(key, None)
+        if renderer is None:
+            if scene is None:
+                return False
+            while len(self._loaded) >= MOST_SCENES:
+                del self._loaded[next(iter(self._loaded))]
+            renderer = ProgressiveRenderer(scene, key[1])
+        self._loaded[key] = renderer
+        if preview_spp is None:
+            self._steps = with_result(renderer.view_steps(*camera, 0))
+        else:
+            self._steps = with_result(renderer.preview_steps(*camera, 0, preview_spp))
+        return True
 
-
-_state = _ChildState()
-
-
-def _begin(
-    scene: Scene | None,
-    key: tuple[Hashable, RenderSettings],
-    camera: _Camera,
-    preview_spp: int | None,
-) -> bool:
-    """Begin a picture; return False if no scene is given and it is no longer loaded."""
-    renderer = _state.loaded.pop(key, None)
-    if renderer is None:
-        if scene is None:
-            return False
-        while len(_state.loaded) >= MOST_SCENES:
-            del _state.loaded[next(iter(_state.loaded))]
-        renderer = ProgressiveRenderer(scene, key[1])
-    _state.loaded[key] = renderer
-    _state.ended = False
-    if preview_spp is None:
-        _state.steps = renderer.view_steps(*camera, 0)
-    else:
-        _state.steps = renderer.preview_steps(*camera, 0, preview_spp)
-    return True
-
-
-def _advance() -> Sampling | GrowingPicture | None:
-    """Return the next step; None after the last one."""
-    if _state.ended:
-        return None
-    try:
-        return next(_state.steps)
-    except StopIteration as end:
-        _state.ended = True
-        last: GrowingPicture = end.value
-        return last
+    def advance(self) -> Sampling | GrowingPicture | None:
+        """Return the next step; None after the last one."""
+        return next(self._steps, None)

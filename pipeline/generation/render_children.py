@@ -13,12 +13,12 @@ from typing import Any
 from pipeline.assets.settings import AssetSettings
 from pipeline.builds.settings import differences
 from pipeline.exchange.scene_files import SceneFiles
-from pipeline.generation.attempt_scene import SceneRecipe, set_up_child
 from pipeline.generation.child_pool import ChildPool
 from pipeline.generation.environment import environment
 from pipeline.generation.machine import available_cores
 from pipeline.generation.prepare_isolated import asset_child
 from pipeline.generation.run import ShardJob
+from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
 from pipeline.isolation import ChildLimits, IsolatedChild, call_with_retries, reach
 from pipeline.renders.variant import choose_variant
 from pipeline.renders.visible_gpus import visible_gpus
@@ -141,7 +141,7 @@ def _render_pool(job: ShardJob) -> ChildPool:
             folder=job.folder,
         )
         limits = replace(_RENDER_LIMITS, memory_bytes=memory_bytes)
-        return IsolatedChild(limits=limits, setup=set_up_child, setup_args=(recipe,))
+        return IsolatedChild(limits=limits, factory=SceneWorker, args=(recipe,))
 
     return ChildPool(new_child, job.num_at_once)
 

@@ -25,6 +25,7 @@ from storage.dataset.manifest import ShardEntry
 from storage.errors import TrilightError
 from storage.records.sample import Sample, decode_sample
 from storage.records.scene import Scene
+from storage.seeds import SceneKey
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,15 +132,13 @@ def require_digest(dataset: FinishedDataset, digest: str) -> None:
 
 def _redraw(scene: Scene, index: int, attempt: int, settings: BuildSettings) -> Scene:
     revisit = settings.revisit
-    seed = settings.seed
+    scene_key = SceneKey(settings.seed, index, attempt)
     assert revisit is not None
     ranges = settings.scenes.of_scene(scene.provenance["scene_index"])
     if revisit.materials == "new":
-        scene = with_new_materials(scene, ranges.materials, seed=seed, index=index, attempt=attempt)
+        scene = with_new_materials(scene, ranges.materials, scene_key)
     if revisit.lights == "new":
-        scene = with_new_lights(
-            scene, ranges.lights, revisit.num_lights, seed=seed, index=index, attempt=attempt
-        )
+        scene = with_new_lights(scene, ranges.lights, revisit.num_lights, scene_key)
     return scene
 
 

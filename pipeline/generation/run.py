@@ -215,7 +215,8 @@ def choose_dataset_variant(order: DatasetOrder, folder: DatasetFolder) -> Varian
     It is that of the device which the dataset was begun on, unless the options or TRILIGHT_VARIANT
     name another one. A new dataset takes its build's device. Raises as `choose_variant`.
     """
-    default, device = BUILDS[order.build].device, order.device
+    default = BUILDS[order.build].device
+    device = order.device
     if folder.manifest.exists():
         default = device_of(read_head(folder.manifest).environment)
         device = default if device == "auto" else device

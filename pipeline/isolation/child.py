@@ -23,7 +23,7 @@ from typing import Any
 
 from pipeline.isolation.answers import decode_answer
 from pipeline.isolation.call_failures import ChildFailed, Result, with_retries
-from pipeline.isolation.child_main import serve
+from pipeline.isolation.child_main import CallKind, serve
 from pipeline.isolation.confinement import Reach, code_of, confine, should_confine
 from pipeline.isolation.frames import TooLong, receive, send, wait_within
 from pipeline.isolation.waiting import CallTime
@@ -70,16 +70,17 @@ class IsolatedChild:
         self,
         *,
         limits: ChildLimits,
-        setup: Callable[..., None],
-        setup_args: tuple[Any, ...] = (),
+        factory: Callable[..., object] | None = None,
+        args: tuple[Any, ...] = (),
         confined_to: Reach | None = None,
     ) -> None:
         """Configure the child; the first call starts it.
 
         Args:
             limits: resource limits.
-            setup: an importable function that prepares a new child, such as loading a library.
-            setup_args: picklable arguments of `setup`.
+            factory: an importable class or function that makes the object which a new child
+                holds, for `call_method`; it may also load a library.
+            args: picklable arguments of `factory`.
             confined_to: files that the child may use beside libraries, if the machine can confine
                 children; `may` adds to them. None for an unconfined child.
 
@@ -88,7 +89,8 @@ class IsolatedChild:
         """
         self._is_confined = confined_to is not None and should_confine()
         self._limits = limits
-        self._setup = (setup, setup_args)
+        self._factory = factory
+        self._args = args
         self._process: Any = None
         self._connection: Connection | None = None
         self._calls_left = 0
@@ -115,6 +117,15 @@ class IsolatedChild:
             TrilightError: also where a new child cannot be set up.
             ChildClosed: `close` was called, perhaps by another thread.
         """
+        return self._call("function", function, args)
+
+    def call_method(self, method: Callable[..., Result], *args: Any) -> Result:
+        """Run a function whose first argument is the object that the child holds; as `call`."""
+        return self._call("method", method, args)
+
+    def _call(
+        self, kind: CallKind, function: Callable[..., Result], args: tuple[Any, ...]
+    ) -> Result:
         if self._closed:
             raise ChildClosed
         if self._reach is not None and not (code := code_of(function)) <= self._code:
@@ -124,7 +135,7 @@ class IsolatedChild:
             if self._calls_left == 0:
                 self._start()
             self._calls_left -= 1
-            return self._exchange(function, args, self._limits.wall_s)
+            return self._exchange(kind, function, args, self._limits.wall_s)
         except ChildFailed:
             self._stop()
             raise
@@ -160,32 +171,41 @@ class IsolatedChild:
         try:
             files = loaded_files()
             if self._is_confined:  # before it starts threads
-                setup_code = {Path(path).parent for path, _ in files} | code_of(self._setup[0])
-                self._exchange(confine, (self._reach, self._code | setup_code), _START_UP_S)
-            if files:  # first: the setup may use their definitions
-                self._exchange(load_same, (files,), _START_UP_S)
-            self._exchange(_set_up, self._setup, _START_UP_S)
+                code = self._code | {Path(path).parent for path, _ in files}
+                if self._factory is not None:
+                    code |= code_of(self._factory)
+                self._exchange("function", confine, (self._reach, code), _START_UP_S)
+            if files:  # first: the factory may use their definitions
+                self._exchange("function", load_same, (files,), _START_UP_S)
+            if self._factory is not None:
+                self._exchange("factory", self._factory, self._args, _START_UP_S)
         except ChildFailed as failure:
             if self._closed:
                 raise ChildClosed from failure
-            if failure.reason == "exception":  # setup itself failed: no item is to blame
+            if failure.reason == "exception":  # the factory failed: no item is to blame
                 raise _cannot_be_set_up(failure) from failure
             raise
         self._calls_left = self._limits.calls_per_child
 
     def _exchange(
-        self, function: Callable[..., Result], args: tuple[Any, ...], wall_s: float
+        self,
+        kind: CallKind,
+        function: Callable[..., Result],
+        args: tuple[Any, ...],
+        wall_s: float,
     ) -> Result:
         from pipeline.isolation.result_schema import result_reader  # children do without
 
         assert self._connection is not None
-        result_reader(function)  # raises first if the declared result type cannot be checked
+        # a factory's object stays in the child, which answers None
+        declared: Callable[..., Any] = _no_result if kind == "factory" else function
+        result_reader(declared)  # raises first if the declared result type cannot be checked
         file = self._connection.fileno()
         wait = wait_within(CallTime(self._process.pid, wall_s))
         try:
-            send(file, [ForkingPickler.dumps((function, args))], wait)
+            send(file, [ForkingPickler.dumps((kind, function, args))], wait)
             answer = receive(file, wait, min(self._limits.memory_bytes, _MOST_BYTES))
-            result: Result = decode_answer(answer, function)
+            result: Result = decode_answer(answer, declared)
             return result
         except TooLong as error:
             raise ChildFailed("nonsense", f"its answer would have {error}") from error
@@ -208,9 +228,8 @@ class IsolatedChild:
         return ChildFailed("killed", f"ended by {name}{hint}")
 
 
-def _set_up(setup: Callable[..., object], args: tuple[Any, ...]) -> None:
-    """Set up a new child; the result of `setup` is dropped."""
-    setup(*args)
+def _no_result() -> None:
+    """Declare the answer to a factory."""
 
 
 def _cannot_be_set_up(failure: ChildFailed) -> EnvironmentFailure:

@@ -1,14 +1,18 @@
 """What a renderer gives: a finished picture, and on the way to it how far it is."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.noise_floor import MeasuredFloor
 from storage.records.parts import Parts
+
+Step = TypeVar("Step")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,3 +81,9 @@ class UsedTime:
 
     def leave_out(self, core_s: float) -> None:
         self._began_s += core_s
+
+
+def with_result(steps: Generator[Step, None, Result]) -> Iterator[Step | Result]:
+    """Yield the steps of a rendering and, last, its result."""
+    result = yield from steps
+    yield result

@@ -1,10 +1,10 @@
 """Composes scenes: meshes within the triangle budget, in a layout, with cameras that see them.
 
-Scene k is a pure function of (settings, pool, seed, k, attempt).
+A scene is a pure function of (settings, pool, scene key).
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -39,16 +39,14 @@ from storage.errors import TrilightError
 from storage.records.material import EMISSION
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene, SceneObject
-from storage.seeds import rng_for
+from storage.seeds import SceneKey
 
 
 def compose_scene(
     settings: SceneSettings,
     pool: Sequence[PooledAsset],
+    scene_key: SceneKey,
     *,
-    seed: int,
-    scene_index: int,
-    attempt: int,
     user_maps: OwnMaps = NO_OWN_MAPS,
 ) -> Scene:
     """Compose one scene.
@@ -56,9 +54,7 @@ def compose_scene(
     Args:
         settings: the ranges to draw from.
         pool: the objects of the scene's split, sorted by uid.
-        seed: seed of the dataset, from 0.
-        scene_index: index of the scene, from 0.
-        attempt: number of earlier rejections of this scene.
+        scene_key: seed, index and attempt of the scene.
         user_maps: the user's textures and maps of the scene's split.
 
     Returns:
@@ -74,10 +70,10 @@ def compose_scene(
     """
     if not pool:
         raise TrilightError("scenes: the pool holds 0 objects; expected at least 1: add objects.")
-    plan = scene_plan(settings, seed=seed, scene_index=scene_index)
-    provenance = _provenance(settings, plan, seed, scene_index, attempt)
-    settings = settings.of_scene(scene_index)
-    rng = rng_for(seed, "scene", scene_index, attempt)
+    plan = scene_plan(settings, seed=scene_key.seed, scene_index=scene_key.index)
+    provenance = _provenance(settings, plan, scene_key)
+    settings = settings.of_scene(scene_key.index)
+    rng = scene_key.rng("scene")
     chosen = _objects_rand(rng, settings, plan, pool)
     budget = _object_budget(settings, plan)
     levels = levels_within([entry.asset for entry in chosen], budget, settings.enough_error)
@@ -86,26 +82,25 @@ def compose_scene(
         for entry, level in zip(chosen, levels, strict=True)
     ]
     layout = layout_rand(rng, settings, plan, shapes)
-    name = {"seed": seed, "scene_index": scene_index, "attempt": attempt}
-    skins = source_skins(chosen, levels, settings.materials, **name)
+    skins = source_skins(chosen, levels, settings.materials, scene_key)
     pieces = scene_pieces(layout, chosen, shapes, settings, rng, skins)
     pieces = with_drawn_textures(
-        pieces, layout, settings.textures, **name, user_textures=user_maps.textures
+        pieces, layout, settings.textures, scene_key, user_textures=user_maps.textures
     )
-    scene = _scene_of(pieces, provenance, name)
+    scene = _scene_of(pieces, provenance, scene_key)
     uids = {piece.skin.uid for piece in pieces if piece.skin and piece.skin.uid}
-    scene = _with_sky(scene, settings, name, user_maps, uids)
+    scene = _with_sky(scene, settings, scene_key, user_maps, uids)
     scene = with_first_cameras(without_constant_textures(scene), settings)
     require_valid(scene, settings)
     return scene
 
 
 def _scene_of(
-    pieces: Sequence[ScenePiece], provenance: dict[str, Any], name: Mapping[str, int]
+    pieces: Sequence[ScenePiece], provenance: dict[str, Any], scene_key: SceneKey
 ) -> Scene:
     """Return the scene of some pieces, still without cameras."""
     arrays = concatenate_pieces(pieces)
-    arrays["materials"] = with_drawn_columns(arrays["materials"], **name)
+    arrays["materials"] = with_drawn_columns(arrays["materials"], scene_key)
     return Scene(
         **arrays,
         c2w=np.zeros((0, 4, 4), np.float32),
@@ -118,7 +113,7 @@ def _scene_of(
 def _with_sky(
     scene: Scene,
     settings: SceneSettings,
-    name: Mapping[str, int],
+    scene_key: SceneKey,
     user_maps: OwnMaps,
     uids: set[str],
 ) -> Scene:
@@ -128,7 +123,7 @@ def _with_sky(
         settings.skies,
         scene.vertex_positions[scene.faces[emits]].astype(np.float64),
         scene.materials[scene.material_index[emits], EMISSION].astype(np.float64),
-        **name,
+        scene_key,
         user_skies=user_maps.skies,
         licences=scene.licences,
     )
@@ -142,18 +137,16 @@ def _with_sky(
     return scene.with_provenance(provenance)
 
 
-def _provenance(
-    settings: SceneSettings, plan: ScenePlan, seed: int, scene_index: int, attempt: int
-) -> dict[str, Any]:
+def _provenance(settings: SceneSettings, plan: ScenePlan, scene_key: SceneKey) -> dict[str, Any]:
     origin = {
         "template": plan.family.template,
         "family": plan.family.name,
-        "scene_index": scene_index,
-        "attempt": attempt,
-        "seed": seed,
+        "scene_index": scene_key.index,
+        "attempt": scene_key.attempt,
+        "seed": scene_key.seed,
         "camera_attempts": [],
     }
-    excursion = settings.excursion_of(scene_index)
+    excursion = settings.excursion_of(scene_key.index)
     if excursion is not None:
         origin["excursion"] = {"axis": excursion.axis, "value": excursion.value}
     return origin

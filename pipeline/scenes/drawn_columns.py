@@ -5,12 +5,10 @@ from numpy.typing import NDArray
 
 from storage.errors import TrilightError
 from storage.records.material import EMISSION, laid_out
-from storage.seeds import rng_for
+from storage.seeds import SceneKey
 
 
-def with_drawn_columns(
-    materials: NDArray[np.float32], *, seed: int, scene_index: int, attempt: int
-) -> NDArray[np.float32]:
+def with_drawn_columns(materials: NDArray[np.float32], scene_key: SceneKey) -> NDArray[np.float32]:
     """Return the material rows of a scene with values for the columns that have a draw.
 
     Each column has a random stream of its own, so that it changes no other draw of the scene. Rows
@@ -18,9 +16,7 @@ def with_drawn_columns(
 
     Args:
         materials: rows with all declared columns, which stay unchanged.
-        seed: seed of the dataset.
-        scene_index: index of the scene.
-        attempt: number of earlier rejections of this scene.
+        scene_key: seed, index and attempt of the scene.
 
     Raises:
         TrilightError: a draw returns another shape, or a value outside of its column's range.
@@ -30,7 +26,7 @@ def with_drawn_columns(
     for column, part in laid_out():
         if column.draw is None:
             continue
-        rng = rng_for(seed, f"material column {column.name}", scene_index, attempt)
+        rng = scene_key.rng(f"material column {column.name}")
         values = np.asarray(column.draw(rng, int(reflects.sum())), np.float32)
         shape = (int(reflects.sum()), column.width)
         if values.shape != shape or not np.all(column.within.holds(values)):

@@ -19,12 +19,10 @@ from storage.records.material import DIFFUSE, ROUGHNESS, SPECULAR
 from storage.records.retextured import NEW, chosen_maps, without_maps
 from storage.records.scene import Scene
 from storage.records.scene_facts import surfaces
-from storage.seeds import rng_for
+from storage.seeds import SceneKey
 
 
-def with_new_materials(
-    scene: Scene, settings: MaterialSettings, *, seed: int, index: int, attempt: int
-) -> Scene:
+def with_new_materials(scene: Scene, settings: MaterialSettings, scene_key: SceneKey) -> Scene:
     """Return the scene with new materials for each object, floor and wall; emitters stay.
 
     New materials have no textures. Faces that shared a row of materials within an object still
@@ -33,10 +31,10 @@ def with_new_materials(
     Args:
         scene: a valid scene.
         settings: the ranges to draw from.
-        seed, index, attempt: a random stream belongs to each of these.
+        scene_key: seed, index and attempt of the scene.
     """
     scene = without_maps(scene, environment=False)
-    rng = rng_for(seed, "new materials", index, attempt)
+    rng = scene_key.rng("new materials")
     rows = [scene.materials[:0]]
     material_index = scene.material_index.astype(np.int64)
     lit = {row for row, entry in enumerate(scene.objects) if entry.kind == "emitter"}
@@ -60,9 +58,7 @@ def with_new_materials(
             new[:, ROUGHNESS] = look.roughness
         rows.append(new)
         material_index[mine] = start + within.ravel()
-    materials = with_drawn_columns(
-        np.concatenate(rows), seed=seed, scene_index=index, attempt=attempt
-    )
+    materials = with_drawn_columns(np.concatenate(rows), scene_key)
     return dataclasses.replace(
         scene, materials=materials, material_index=material_index.astype(np.uint16)
     )
@@ -72,10 +68,7 @@ def with_new_lights(
     scene: Scene,
     settings: LightSettings,
     num_lights: int | None,
-    *,
-    seed: int,
-    index: int,
-    attempt: int,
+    scene_key: SceneKey,
 ) -> Scene:
     """Return the scene with its lamps replaced by new ones, drawn by its layout.
 
@@ -85,7 +78,7 @@ def with_new_lights(
         scene: a valid scene.
         settings: the ranges to draw from; its count is not used.
         num_lights: number of new lamps; None for as many as there are.
-        seed, index, attempt: a random stream belongs to each of these.
+        scene_key: seed, index and attempt of the scene.
 
     Raises:
         Rejected: "no_layout" if the template of the scene is no known layout.
@@ -96,7 +89,7 @@ def with_new_lights(
     kinds = np.array([entry.kind for entry in scene.objects])
     lit = np.array([entry.is_lamp for entry in scene.objects])
     count = int(lit.sum()) if num_lights is None else num_lights
-    rng = rng_for(seed, "new lights", index, attempt)
+    rng = scene_key.rng("new lights")
     emitters = emitters_rand(rng, settings, TEMPLATES[name].lights, count, _centres(scene, kinds))
     lamps = [emitter_piece(emitter, row) for row, emitter in enumerate(emitters)]
     dark = _without(scene, lit)

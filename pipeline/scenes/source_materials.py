@@ -11,17 +11,14 @@ from storage.records.asset import Level
 from storage.records.objects import LockedObject
 from storage.records.skin import LevelSkin
 from storage.records.texture import TEXTURED, MapSource
-from storage.seeds import rng_for
+from storage.seeds import SceneKey
 
 
 def source_skins(
     chosen: Sequence[PooledAsset],
     levels: Sequence[Level],
     settings: MaterialSettings,
-    *,
-    seed: int,
-    scene_index: int,
-    attempt: int,
+    scene_key: SceneKey,
 ) -> list[Skin | None]:
     """Return the skin of each object, or None if its materials are drawn.
 
@@ -32,9 +29,7 @@ def source_skins(
         chosen: the objects of a scene.
         levels: the level of detail of each.
         settings: source of the materials, and the fraction of objects that keep theirs.
-        seed: seed of the dataset.
-        scene_index: index of the scene.
-        attempt: number of earlier rejections of this scene.
+        scene_key: seed, index and attempt of the scene.
 
     Raises:
         Rejected: law_broken, which names the object.
@@ -43,7 +38,7 @@ def source_skins(
         return [None] * len(chosen)
     skins: list[Skin | None] = []
     for row, (entry, level) in enumerate(zip(chosen, levels, strict=True)):
-        rng = rng_for(seed, "own materials", scene_index, attempt, row)
+        rng = scene_key.rng("own materials", row)
         keeps = rng.random() < settings.own_share and level.skin is not None
         skins.append(_skin(level.skin, entry.locked) if keeps and level.skin else None)
     return skins

@@ -19,7 +19,7 @@ from scene_templates.textures import MOST_TEXTURED, TexturedLook, TextureSetting
 from scene_templates.user_maps import UserMap, UserTexture
 from storage.conventions import linear_from_srgb8, srgb8
 from storage.records.texture import Texture
-from storage.seeds import rng_for
+from storage.seeds import SceneKey
 
 _RIGHT = np.array([[0, 1, 0], [0, -1, 0], [-1, 0, 0], [1, 0, 0], [1, 0, 0], [-1, 0, 0]], np.float64)
 _UP = np.array([[0, 0, 1]] * 4 + [[0, 1, 0]] * 2, np.float64)
@@ -30,10 +30,8 @@ def with_drawn_textures(
     pieces: Sequence[ScenePiece],
     layout: Layout,
     settings: TextureSettings,
+    scene_key: SceneKey,
     *,
-    seed: int,
-    scene_index: int,
-    attempt: int,
     user_textures: Sequence[UserMap[UserTexture]] = (),
 ) -> list[ScenePiece]:
     """Return the pieces, some with drawn textures; emitters have none.
@@ -44,9 +42,7 @@ def with_drawn_textures(
         pieces: floor and walls, objects and emitters, in the order of `layout`.
         layout: poses of the objects.
         settings: fraction of textured pieces, and ranges.
-        seed: seed of the dataset.
-        scene_index: index of the scene.
-        attempt: number of earlier rejections of this scene.
+        scene_key: seed, index and attempt of the scene.
         user_textures: the user's textures.
     """
     if settings.share == 0:
@@ -59,7 +55,7 @@ def with_drawn_textures(
     result = list(pieces)
     textured = 0
     for row, (frame, origin) in enumerate(zip(frames, origins, strict=True)):
-        rng = rng_for(seed, "texture", scene_index, attempt, row)
+        rng = scene_key.rng("texture", row)
         look = (
             draw_look(rng, settings, user_textures, licences) if textured < MOST_TEXTURED else None
         )

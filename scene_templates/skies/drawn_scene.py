@@ -18,7 +18,7 @@ from scene_templates.skies.settings import SkySettings
 from scene_templates.user_maps import UserMap, draw_user_map
 from storage.records.environment import Environment
 from storage.records.texture import MapSource
-from storage.seeds import rng_for
+from storage.seeds import SceneKey, rng_for
 
 LEAST_DISTANCE = 0.5
 """Emitters count as this far from the middle of the room at least, half of its width."""
@@ -39,10 +39,8 @@ def scene_sky(
     settings: SkySettings,
     emitters: NDArray[np.float64],
     radiance_rgb: NDArray[np.float64],
+    scene_key: SceneKey,
     *,
-    seed: int,
-    scene_index: int,
-    attempt: int,
     user_skies: Sequence[UserMap[NDArray[np.float32]]] = (),
     licences: Sequence[str] = (),
 ) -> SceneSky | None:
@@ -52,15 +50,16 @@ def scene_sky(
         settings: the ranges to draw from.
         emitters: [N, 3, 3] corners of the emitting triangles, around the middle of the room.
         radiance_rgb: [N, 3] their radiance.
-        seed, scene_index: whether there is a sky goes by these.
-        attempt: which one goes by this too: how many times the scene was rejected before.
-        own: a user's own maps.
+        scene_key: its attempt decides which sky, not whether there is one.
+        user_skies: the user's own maps.
         licences: of what is in the scene already.
     """
-    if not settings.share or rng_for(seed, "has sky", scene_index).random() >= settings.share:
+    if not settings.share:
         return None
-    rng = rng_for(seed, "sky", scene_index, attempt)
-    place = rng_for(seed, "own sky", scene_index, attempt)
+    if rng_for(scene_key.seed, "has sky", scene_key.index).random() >= settings.share:
+        return None
+    rng = scene_key.rng("sky")
+    place = scene_key.rng("own sky")
     chosen = draw_user_map(place, user_skies, settings.own_share, licences)
     if chosen is None:
         drawn = draw_sky(rng, settings.maps)

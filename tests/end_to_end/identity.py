@@ -24,9 +24,9 @@ from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.usd.write import write_usd
-from pipeline.generation.attempt_scene import MAX_ATTEMPTS
 from pipeline.generation.environment import vector_extension
 from pipeline.generation.prepare_isolated import prepare_isolated
+from pipeline.generation.scene_worker import MAX_ATTEMPTS
 from pipeline.objects.generated import generate_objects
 from pipeline.objects.local.folder import list_folder
 from pipeline.scenes.compose import compose_scene
@@ -40,6 +40,7 @@ from storage.records.objects import LockedObject, ObjectRecord
 from storage.records.sample import sample_key
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_arrays, encode_scene
+from storage.seeds import SceneKey
 from tests.conftest import ROOT
 from tests.scenes_by_hand import tiny_scene
 from trilight.scenes import read_scene
@@ -99,7 +100,7 @@ def _composed(settings: BuildSettings, pool: list[PooledAsset], scene_index: int
     for attempt in range(MAX_ATTEMPTS):
         try:
             return compose_scene(
-                settings.scenes, pool, seed=settings.seed, scene_index=scene_index, attempt=attempt
+                settings.scenes, pool, SceneKey(settings.seed, scene_index, attempt)
             )
         except Rejected:
             continue

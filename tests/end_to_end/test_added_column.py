@@ -41,7 +41,6 @@ from train.data.bad_samples import BadSampleCounter
 from train.data.order import RankSlice
 from train.data.scenes import training_scene
 from train.data.stream import stream_batches
-from train.loop.checkpoints import network_of_run
 from train.loop.state import new_state
 from train.run import stream_settings
 from train.settings import TrainSettings
@@ -146,13 +145,13 @@ def test_a_network_learns_from_it_and_is_opened_again(run: Path) -> None:
     checkpoint = run / "checkpoints" / "step-000000004.safetensors"
     pictures = []
     for place in (run, checkpoint):
-        network = open_network(place, network_of_run)
+        network = open_network(place)
         assert network.config.material_columns == WITH_COAT
         with torch.no_grad():
             pictures.append(network(batch_scenes([scene_tensors(composed(0))]), 16))
     assert torch.equal(*pictures)
     start = new_state(coated_run()).model.encoder.tokens.material.weight
-    learnt = open_network(run, network_of_run).encoder.tokens.material.weight
+    learnt = open_network(run).encoder.tokens.material.weight
     assert learnt.shape == start.shape == (36, 11)
     assert not torch.equal(learnt[:, -1], start[:, -1]), "no gradient reached the column"
     renderer = NeuralRenderer.load(run / "model.safetensors")
@@ -166,7 +165,7 @@ def test_a_checkpoint_whose_column_is_not_declared_says_so(run: Path) -> None:
     with declared():
         for place in (run, run / "checkpoints" / "step-000000004.safetensors"):
             with pytest.raises(TrilightError, match="'coat'.*has to be declared first"):
-                open_network(place, network_of_run)
+                open_network(place)
 
 
 def test_the_published_form_refuses_it(tmp_path: Path) -> None:
@@ -230,7 +229,7 @@ def test_inspect_names_the_columns_in_use(tmp_path: Path) -> None:
 
 def test_a_network_of_four_columns_trains_on_the_same_data(data: Dataset, tmp_path: Path) -> None:
     trained(FOUR, [str(data.folder.root)], tmp_path / "four")
-    assert open_network(tmp_path / "four", network_of_run).encoder.tokens.material.weight.shape == (
+    assert open_network(tmp_path / "four").encoder.tokens.material.weight.shape == (
         36,
         10,
     )

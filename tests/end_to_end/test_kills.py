@@ -113,7 +113,11 @@ def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path, whole: Whole) -
 @pytest.mark.slow("kills")
 @pytest.mark.timeout(3600)
 def test_kills_of_children_end_in_the_same_digest(tmp_path: Path, whole: Whole) -> None:
-    """While meshes are made, with an empty store, and while pictures are; fork servers too."""
+    """While meshes are made, with an empty store, and while pictures are; fork servers too.
+
+    Two kills of meshes: a dataset is begun without an object whose children were killed three times
+    (tests/pipeline/generation/test_poison.py), and all kills may hit the same one.
+    """
     rng, out, cache = np.random.default_rng(0), tmp_path / "killed", tmp_path / "cache"
     mark, environment = marked_environment()
     environment["TRILIGHT_CACHE"] = str(cache)
@@ -122,7 +126,7 @@ def test_kills_of_children_end_in_the_same_digest(tmp_path: Path, whole: Whole) 
         return sum(len(log.read_text().splitlines()) for log in (out / "logs").glob("*.jsonl"))
 
     run, killed = _start(out, 2, environment), Counter[str]()
-    moments = [("meshes", at) for at in (3, 8, 13, 18)] + [("scenes", at) for at in (1, 3, 5, 7)]
+    moments = [("meshes", at) for at in (3, 13)] + [("scenes", at) for at in (1, 3, 5, 7)]
     for what, at in moments:
         while (num_meshes(cache) if what == "meshes" else num_scenes()) < at:
             if run.poll() is not None:  # three kills of one set-up end a run; it goes on
@@ -134,8 +138,8 @@ def test_kills_of_children_end_in_the_same_digest(tmp_path: Path, whole: Whole) 
     run.wait()
     assert _start(out, 2, environment).wait() == 0
     assert min(killed["meshes"], killed["scenes"]) > 0
-    assert open_dataset(str(out)).digest == whole.digest
     assert [row for row in open_dataset(str(out)).failures() if is_transient(row.reason)] == []
+    assert open_dataset(str(out)).digest == whole.digest
     wait_until_nobody_is_left(mark)
 
 

@@ -32,6 +32,7 @@ from storage.conventions import HALF_FLOAT_MAX
 from storage.dataset.settings import MOST_SCENES, SplitSettings
 from storage.dataset.splits import MOST_SHARDS, scenes_of_shard, shard_name, shards_for
 from storage.errors import Rejected, TrilightError
+from storage.seeds import SceneKey
 from storage.settings.changes import changed
 from storage.settings.ranges import Declared
 from tests.extremes.test_ranges import FIELDS, SMOKE, End
@@ -122,7 +123,7 @@ def _require_scene_or_reason(pool: list[PooledAsset], name: str, field: Declared
     wanted = changed(ONE_FAMILY, {**blind, **beside, name: _value(field, end)})
     with case((name, end)):
         try:
-            scene = compose_scene(wanted, pool, seed=0, scene_index=0, attempt=0)
+            scene = compose_scene(wanted, pool, SceneKey(0, 0))
         except Rejected as rejection:
             assert rejection.reason == NO_SCENE.get((name, end)), rejection
         else:
@@ -152,7 +153,7 @@ def test_scenes_at_several_ends_keep_their_laws_or_have_a_reason(
     except TrilightError:
         reject()  # laws between fields
     try:
-        compose_scene(wanted, pool, seed=0, scene_index=0, attempt=0).check()
+        compose_scene(wanted, pool, SceneKey(0, 0)).check()
     except Rejected as rejection:
         assert rejection.reason in SCENE_REASONS, rejection
 

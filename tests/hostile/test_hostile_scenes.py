@@ -77,7 +77,7 @@ def outcome(path: str) -> Outcome:
 
 @pytest.fixture(scope="module")
 def child() -> Iterator[IsolatedChild]:
-    child = IsolatedChild(limits=LIMITS, setup=smaller_limits)
+    child = IsolatedChild(limits=LIMITS, factory=smaller_limits)
     yield child
     child.close()
 

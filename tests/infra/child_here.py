@@ -20,11 +20,13 @@ class ChildHere:
         self,
         *,
         limits: ChildLimits,
-        setup: Callable[..., None],
-        setup_args: tuple[Any, ...] = (),
+        factory: Callable[..., object] | None = None,
+        args: tuple[Any, ...] = (),
         confined_to: Reach | None = None,
     ) -> None:
-        self._setup: tuple[Callable[..., None], tuple[Any, ...]] | None = (setup, setup_args)
+        self._factory = factory
+        self._args = args
+        self._held: object = None
 
     def allow_files(self, more: Reach) -> None:
         """Allow more files: nothing is confined here."""
@@ -32,10 +34,7 @@ class ChildHere:
     def call(self, function: Callable[..., Result], *args: Any) -> Result:
         """Run a function; what it raises ends the call as it would in a child."""
         try:
-            if self._setup is not None:
-                setup, setup_args = self._setup
-                setup(*setup_args)
-                self._setup = None
+            self._make()
             # as between processes: an answer of another type than declared is a failure
             answer = [
                 np.frombuffer(part, np.uint8).copy() for part in encode_result(function(*args))
@@ -45,6 +44,16 @@ class ChildHere:
             raise
         except Exception as error:
             raise ChildFailed("exception", f"{type(error).__name__}: {error}") from error
+
+    def call_method(self, method: Callable[..., Result], *args: Any) -> Result:
+        """Run a function whose first argument is the object that the factory made."""
+        self._make()
+        return self.call(method, self._held, *args)
+
+    def _make(self) -> None:
+        if self._factory is not None:
+            self._held = self._factory(*self._args)
+            self._factory = None
 
     def retire(self) -> None:
         """End nothing."""

@@ -15,7 +15,6 @@ from model.open import (
     CONFIG_NAME,
     PUBLISHED,
     WEIGHTS_NAME,
-    NetworkFile,
     find_network,
     open_network,
     save_published,
@@ -117,21 +116,6 @@ def published(tmp_path: Path) -> Path:
 def same(a: RenderFormer, b: RenderFormer) -> bool:
     pairs = zip(a.state_dict().items(), b.state_dict().items(), strict=True)
     return a.config == b.config and all(n == m and torch.equal(x, y) for (n, x), (m, y) in pairs)
-
-
-def _unopened() -> RenderFormer:
-    raise AssertionError("finding reads no weights")
-
-
-def test_finders_are_asked_before_any_file_is() -> None:
-    mine = NetworkFile(path=Path("mine"), trained=TrainedRange(), any_width=True, open=_unopened)
-    asked: list[Path] = []
-
-    def nothing(path: Path) -> None:
-        asked.append(path)
-
-    assert find_network("nowhere", nothing, lambda path: mine) is mine
-    assert asked == [Path("nowhere")]
 
 
 def test_ours_opens_as_file_and_as_folder(ours: Path) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import torch
 
+from model.checkpoint_format import path_of_step
 from model.config import ModelConfig
 from model.config import smoke as smoke_model
 from model.hits.traced import INPUTS
@@ -53,7 +54,6 @@ from train.evaluation.baselines import MEDIAN, NEAREST
 from train.evaluation.evaluate import EvalConfig, judge_views, make_baselines
 from train.evaluation.judge import predict
 from train.evaluation.judged_view import NETWORK, summarize_views
-from train.loop.checkpoints import network_of_run, path_of_step
 from train.loop.distributed import DistributedContext
 from train.loop.schedule import learning_rate
 from train.loop.state import TrainState, new_state
@@ -140,7 +140,7 @@ def test_unseen_scenes_look_better_than_any_stored_picture(tmp_path: Path) -> No
     trained(settings, [str(folder.root)], tmp_path / "out")
     data = open_training_data([str(folder.root)])
     contest = EvalConfig(
-        network=open_network(tmp_path / "out", network_of_run),
+        network=open_network(tmp_path / "out"),
         shards=data.split("validation"),
         resolution=16,
         baselines=make_baselines(data.split("train"), 16),

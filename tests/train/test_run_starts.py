@@ -16,6 +16,7 @@ import pytest
 import torch
 from safetensors.torch import load
 
+from model.checkpoint_format import path_of_step, saved_steps
 from model.open import open_network
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import NO_MANIFEST
@@ -25,12 +26,7 @@ from tests.for_each import for_each
 from tests.http_server import Fault, Site, serve
 from tests.train.kit import TINY_MODEL, Heard, Killed, flip_a_bit, tiny_run, trained
 from tests.train.toy import write_toy_dataset
-from train.loop.checkpoints import (
-    network_of_run,
-    path_of_step,
-    read_checkpoint,
-    saved_steps,
-)
+from train.loop.checkpoints import read_checkpoint
 from train.progress import TrainProgress
 from train.settings import LossSettings
 from train.start_options import StartOptions
@@ -43,7 +39,7 @@ def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) 
     second = tiny_run(from_weights=True, learning_rate=1e-12, warmup_steps=0, num_steps=4)
     place = str(tmp_path / "first")
     trained(second, dataset, tmp_path / "second", start=StartOptions(begin_with=place))
-    before, after = (open_network(tmp_path / name, network_of_run) for name in ("first", "second"))
+    before, after = (open_network(tmp_path / name) for name in ("first", "second"))
     assert after.config == first
     for name, weight in after.state_dict().items():
         # a learning rate of 1e-12 moves nothing that float32 shows but numbers near 0
@@ -139,12 +135,12 @@ def test_a_run_goes_on_past_a_damaged_checkpoint_to_the_same_weights(
     weights, path = whole.folder.weights.read_bytes(), path_of_step(whole.folder.checkpoints, 8)
     flip_a_bit(path)
     with pytest.raises(TrilightError, match=f"{path} is not readable"):
-        open_network(path, network_of_run)
+        open_network(path)
     notes = Heard()
     again = trained(settings, dataset, tmp_path, resume=True, workers=1, progress=notes)
     assert [str(path) in text for text in notes.notes] == [True]
     assert again.folder.weights.read_bytes() == weights
-    assert open_network(path, network_of_run).config == settings.model, "it was written again"
+    assert open_network(path).config == settings.model, "it was written again"
 
 
 def test_a_network_with_windows_is_trained(dataset: Dataset, tmp_path: Path) -> None:
@@ -171,7 +167,7 @@ def test_muon_goes_on_in_another_precision_on_another_processor(
     have_bfloat16(monkeypatch, True)
     whole = trained(settings, dataset, tmp_path)
     assert json.loads(whole.folder.settings.read_text())["muon_precision"] == "bfloat16"
-    weights = open_network(tmp_path, network_of_run).state_dict()
+    weights = open_network(tmp_path).state_dict()
     checkpoints = whole.folder.checkpoints
     path_of_step(checkpoints, 12).unlink()
     begun_at = read_checkpoint(path_of_step(checkpoints, 8)).network().state_dict()
@@ -180,7 +176,7 @@ def test_muon_goes_on_in_another_precision_on_another_processor(
     trained(settings, dataset, tmp_path, resume=True, workers=1, progress=notes)
     assert ["Muon's products in float32 instead of bfloat16" in text for text in notes.notes] == [1]
     assert read_checkpoint(path_of_step(checkpoints, 12)).header["muon_precision"] == "float32"
-    resumed = open_network(tmp_path, network_of_run).state_dict()
+    resumed = open_network(tmp_path).state_dict()
     apart = sum((resumed[name] - weights[name]).square().sum() for name in weights)
     way = sum((weights[name] - begun_at[name]).square().sum() for name in weights)
     # measured 0.095: the rounding of four steps, and what gradients then differ; without the
@@ -278,7 +274,7 @@ def test_a_second_trainer_is_refused_and_changes_nothing(dataset: Dataset, tmp_p
                     with pytest.raises(TrilightError) as refused:
                         trained(tiny_run(), dataset, out, start=start)
                     said.append(str(refused.value))
-                open_network(out, network_of_run)
+                open_network(out)
                 assert files() == before
                 raise Killed
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from model.checkpoint_format import path_of_step, saved_steps
 from model.open import open_network
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
@@ -22,7 +23,7 @@ from train import run as run_module
 from train.data.buckets import TrainingBatch
 from train.folder import RunFolder
 from train.loop import step as step_module
-from train.loop.checkpoints import network_of_run, path_of_step, read_checkpoint, saved_steps
+from train.loop.checkpoints import read_checkpoint
 from train.loop.recorder import read_rows
 from train.loop.step import PendingStats, Stepper
 from train.progress import TrainProgress
@@ -58,7 +59,7 @@ def wsd(**changes: Any) -> TrainSettings:
 
 
 def weights(place: Path) -> dict[str, Tensor]:
-    return open_network(place, network_of_run).state_dict()
+    return open_network(place).state_dict()
 
 
 def same(one: dict[str, Tensor], other: dict[str, Tensor]) -> bool:
@@ -256,7 +257,7 @@ def test_a_branch_takes_other_data_and_other_pictures(dataset: Dataset, tmp_path
     result = run(wsd(ema_decay=0.0), other, out, **start)
     assert result.num_steps == 6
     assert {event.name for event in result.history} == {*stage, "checkpoint"}
-    assert open_network(out, network_of_run).config == wsd().model
+    assert open_network(out).config == wsd().model
     with pytest.raises(TrilightError, match="holds a run already; add --resume"):
         run(wsd(ema_decay=0.0), other, out, **start)
     again = run(wsd(ema_decay=0.0), other, out, resume=True, **start)

@@ -13,40 +13,32 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors.torch import save
-from torch import Tensor
 
-from model.open import NetworkFile
-from model.renderformer import RenderFormer
-from model.weights import TrainedRange, decode_config, encode_config, load_tensors, read_metadata
+from model import checkpoint_format
+from model.checkpoint_format import (
+    HEADER_KEY,
+    Checkpoint,
+    path_of_step,
+    saved_steps,
+    unreadable_error,
+)
+from model.weights import encode_config, load_tensors
 from storage.atomic import atomic_writer, remove_leftovers
 from storage.digests import seal_of
 from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions
-from storage.records.safe_read import read_plain, read_safetensors
-from storage.settings.described import from_record
 from storage.settings.ranges import Within
 from storage.typed_json import FINITE, Sha256, read_json
 from train.data.mixture import RECORD, Mixture
-from train.folder import RunFolder
 from train.loop.distributed import DistributedContext
 from train.loop.schedule import decay_start_step
 from train.loop.state import TrainState, new_state
 from train.loop.step import StepReport
 from train.resume import Event, ResumePlan, event_records
 from train.settings import Precision, TrainSettings
-from train.stored_settings import known_settings, stored_settings
-
-PREFIX = "step-"
-SUFFIX = ".safetensors"
-"""Suffix of the file names, after the number of the step."""
-
-HEADER_KEY = "trilight_checkpoint"
-"""Metadata entry with counters, damaged samples, settings, digest of the data, the mixture, the
-history, and the execution: number of processes and threads, precision of Muon's products."""
+from train.stored_settings import stored_settings
 
 UNSEALED = "0" * 64
 """Placeholder of the sha256 while it is computed. Old checkpoints have no sha256."""
@@ -122,48 +114,14 @@ def _write_sealed(path: Path, data: bytes) -> None:
             stream.write(part)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Checkpoint:
-    """Header and tensors of a checkpoint file."""
-
-    header: Mapping[str, Any]
-    """Step, settings, digest of the data, history, number of processes."""
-    arrays: Mapping[str, NDArray]
-    """Tensors by part and name."""
-
-    def network(self) -> RenderFormer:
-        """Return the network that was evaluated at that step: the EMA if there is one."""
-        model = RenderFormer(decode_config(self.header["model"]))
-        load_tensors(
-            model, _tensors_under(self.arrays, "mean") or _tensors_under(self.arrays, "model")
-        )
-        return model.eval()
-
-
-def is_checkpoint(metadata: Mapping[str, str]) -> bool:
-    """Return whether the metadata of a safetensors file is that of a checkpoint."""
-    return HEADER_KEY in metadata
-
-
 def read_checkpoint(path: Path) -> Checkpoint:
     """Read and verify a checkpoint; raises TrilightError, with its path, if it is invalid."""
+    checkpoint = checkpoint_format.read_checkpoint(path)
     try:
-        data = read_plain(path)
-        arrays, metadata = read_safetensors(data)
-        if not is_checkpoint(metadata):
-            raise TrilightError("it belongs to no run; expected one that `trilight train` wrote")
-        seal = read_json(metadata[HEADER_KEY], _Header, "its header").sha256
-        if seal and seal_of(data, seal) != seal:
-            raise TrilightError("its bytes are not those that were written")
-        for name, array in arrays.items():
-            is_weight = name.startswith(("model/", "mean/"))
-            if is_weight and not (array.dtype == np.float32 and np.isfinite(array).all()):
-                raise TrilightError(f"{name} is {array.dtype}; expected finite float32 numbers")
-    except (OSError, ValueError) as error:
-        raise TrilightError(
-            f"checkpoint {path} is not readable: {str(error).rstrip('.')}."
-        ) from error
-    return Checkpoint(header=json.loads(metadata[HEADER_KEY]), arrays=arrays)
+        read_json(json.dumps(checkpoint.header), _Header, "its header")
+    except TrilightError as error:
+        raise unreadable_error(path, error) from error
+    return checkpoint
 
 
 def restore_state(
@@ -198,35 +156,14 @@ def restore_state(
         state.skipped_in_a_row = header.get("skipped_in_a_row", 0)
     state.history = plan.history
     state.reports = [StepReport(**fields) for fields in header.get("reports", ())]
-    weights = _tensors_under(checkpoint.arrays, "model")
+    weights = checkpoint.tensors_under("model")
     load_tensors(state.model, weights)
     if state.ema_model is not None:
-        load_tensors(state.ema_model, _tensors_under(checkpoint.arrays, "mean") or weights)
+        load_tensors(state.ema_model, checkpoint.tensors_under("mean") or weights)
     if updates := state.step - state.skipped_steps:
         tensors = {name: torch.from_numpy(array) for name, array in checkpoint.arrays.items()}
         state.updater.load_optimizer_state(tensors, updates)
     return state
-
-
-def _tensors_under(arrays: Mapping[str, NDArray], prefix: str) -> dict[str, Tensor]:
-    start = f"{prefix}/"
-    return {
-        name.removeprefix(start): torch.from_numpy(array)
-        for name, array in arrays.items()
-        if name.startswith(start)
-    }
-
-
-def saved_steps(folder: Path) -> list[int]:
-    """Return the steps of the saved checkpoints, oldest first."""
-    names = [path.name for path in folder.glob(f"{PREFIX}*{SUFFIX}")]
-    digits = [name.removeprefix(PREFIX).removesuffix(SUFFIX) for name in names]
-    return sorted(int(text) for text in digits if text.isdecimal())
-
-
-def path_of_step(folder: Path, step: int) -> Path:
-    """Return the path of the checkpoint of a step."""
-    return folder / f"{PREFIX}{step:09d}{SUFFIX}"
 
 
 def newest_checkpoint(
@@ -315,36 +252,3 @@ def _write_and_prune(folder: Path, newest: int, data: bytes, settings: TrainSett
         milestone = settings.keep_every and step % settings.keep_every == 0
         if not milestone and step != decay_start_step(settings):
             path_of_step(folder, step).unlink(missing_ok=True)
-
-
-def network_of_run(path: Path) -> NetworkFile | None:
-    """Return the network of a checkpoint, or of the folder of an unfinished run; else None.
-
-    A checkpoint is read as a whole, since the digest of all its bytes verifies its header. The
-    finished network of a run is a file of weights, which `model.open` reads.
-
-    Args:
-        path: any file or folder.
-
-    Raises:
-        TrilightError: the checkpoint is damaged.
-    """
-    if path.is_dir():
-        folder = RunFolder(path)
-        steps = saved_steps(folder.checkpoints)
-        if folder.weights.is_file() or not steps:
-            return None
-        path = path_of_step(folder.checkpoints, steps[-1])
-    if path.suffix != ".safetensors" or not path.is_file():
-        return None
-    if not is_checkpoint(read_metadata(path)):
-        return None
-    checkpoint = read_checkpoint(path)
-    stored = known_settings(checkpoint.header["settings"], f"checkpoint {path}")
-    settings = from_record(TrainSettings, stored)
-    return NetworkFile(
-        path=path,
-        trained=TrainedRange(resolution=settings.resolution),
-        any_width=settings.model.view_stage == "hits",
-        open=checkpoint.network,
-    )

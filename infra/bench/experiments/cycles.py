@@ -55,7 +55,7 @@ def _scene(context: BenchContext, kind: str, index: int) -> Scene:
         names = list(given_scenes(context.options.scenes))
         return context.scene(names[index % len(names)])
     name = f"surfaces {index}" if kind == TEXTURED else f"sky {SKIES[index % len(SKIES)]}"
-    scene: Scene = context.child.call(mapped_scene, name)
+    scene = mapped_scene(context.child, name)
     return scene
 
 

@@ -66,7 +66,7 @@ def _measure(
     context: BenchContext, points: Sequence[Point], trial: str
 ) -> Iterator[tuple[str, Figures]]:
     methods, child = context.get_or_make("methods", lambda: _set_up(context))
-    scene = child.call(held_out_scene, int(trial.split()[-1]))
+    scene = held_out_scene(child, int(trial.split()[-1]))
     for px in WIDTHS:
         camera = first_camera(scene, px)
         reference = kept_reference(child, scene, camera, 2 * context.scale.max_spp)
@@ -82,7 +82,6 @@ def _set_up(context: BenchContext) -> tuple[Mapping[int, Mapping[str, Method]], 
     import torch
 
     from model.neural_renderer import NeuralRenderer
-    from train.loop.checkpoints import network_of_run
 
     torch.set_num_threads(1)  # core-seconds of waiting threads are not the network's
     paths = context.options.checkpoint
@@ -91,7 +90,7 @@ def _set_up(context: BenchContext) -> tuple[Mapping[int, Mapping[str, Method]], 
     for label, path in (
         dict(zip(BUILTIN_NETWORKS, BUILTIN_NETWORKS, strict=True)) | paths_by_label
     ).items():
-        renderer = NeuralRenderer.load(path, device="cpu", finders=[network_of_run])
+        renderer = NeuralRenderer.load(path, device="cpu")
         renderers[network_name(label)] = renderer
         context.note(f"{network_name(label)} is {renderer.digest[:8]}")
     context.note(f"differences are to {network_name(network_labels(paths)[0])}")

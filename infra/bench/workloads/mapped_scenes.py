@@ -2,8 +2,8 @@
 
 from infra.rendering.held_out_scenes import first_composed
 from pipeline.builds.training import textured_256
+from pipeline.isolation import IsolatedChild
 from scene_templates.settings import SceneSettings
-from storage.errors import Rejected
 from storage.records.scene import Scene
 from storage.settings.changes import changed
 
@@ -26,10 +26,11 @@ _CALM = {
 """Changes that leave out mirrors, whose caustics would be too noisy for a comparison."""
 
 
-def mapped_scene(name: str) -> Scene:
-    """Return the scene of a name, with one camera; runs in a render child with objects.
+def mapped_scene(child: IsolatedChild, name: str) -> Scene:
+    """Return the scene of a name, with one camera.
 
     Args:
+        child: render child with objects.
         name: `surfaces N`, a scene of `textured-256`, or `sky` and one of SKIES.
 
     Raises:
@@ -47,7 +48,4 @@ def mapped_scene(name: str) -> Scene:
             "skies.maps.height": _SKY_ROWS,
         }
         settings = changed(settings, sky)
-    scene = first_composed(settings, number, seed=_SEED)
-    if scene is None:
-        raise Rejected("no_scene", f"{name}: every attempt was rejected")
-    return scene
+    return first_composed(child, settings, number, seed=_SEED)

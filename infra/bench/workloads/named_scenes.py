@@ -12,10 +12,10 @@ from pipeline.builds.training import smoke
 from pipeline.exchange.gltf.read import SUFFIXES as GLTF_SUFFIXES
 from pipeline.exchange.gltf.read import read_gltf
 from pipeline.exchange.scene_files import build_scene
-from pipeline.generation.attempt_scene import MAX_ATTEMPTS, attempt_scene
+from pipeline.generation.scene_worker import MAX_ATTEMPTS, SceneWorker
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.licences import USER_PROVIDED
-from storage.errors import Rejected, TrilightError
+from storage.errors import TrilightError
 from storage.records.sample import Sample
 from storage.records.scene import Scene
 
@@ -49,28 +49,26 @@ def given_scenes(folder: Path | None) -> Mapping[str, MakeScene]:
     }
 
 
-def sampled_scene(scene_index: int) -> Scene:
-    """Return a scene of the preset `smoke` with one camera; runs in a render child.
+def sampled_scene(child: IsolatedChild, scene_index: int) -> Scene:
+    """Return a scene of the preset `smoke` with one camera, composed in a render child.
 
     Raises:
         Rejected: every attempt at it was rejected.
     """
-    scene = first_composed(dataclasses.replace(smoke().scenes, num_views=1), scene_index)
-    if scene is None:
-        raise Rejected("no_scene", f"scene {scene_index}: every attempt at it was rejected")
-    return scene
+    settings = dataclasses.replace(smoke().scenes, num_views=1)
+    return first_composed(child, settings, scene_index)
 
 
-def first_sample(scene_index: int) -> Sample:
-    """Return the sample of a training scene's first accepted attempt; runs in a render child.
+def first_sample(child: IsolatedChild, scene_index: int) -> Sample:
+    """Return the sample of a training scene's first accepted attempt, made in a render child.
 
     Raises:
         TrilightError: every attempt was rejected.
     """
     for attempt in range(MAX_ATTEMPTS):
-        sample = attempt_scene("train", scene_index, attempt).sample
-        if sample is not None:
-            return sample
+        made = child.call_method(SceneWorker.attempt, "train", scene_index, attempt)
+        if made.sample is not None:
+            return made.sample
     raise TrilightError(f"scene {scene_index}: rejected {MAX_ATTEMPTS} times; choose others.")
 
 

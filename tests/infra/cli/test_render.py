@@ -3,7 +3,6 @@
 import io
 import itertools
 import json
-import operator
 import os
 import re
 from pathlib import Path
@@ -28,7 +27,7 @@ from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene, scene_digest
 from storage.settings.described import option_words
 from tests.command_line import trilight
-from tests.crash import crash
+from tests.crash import CrashingRenderer
 from tests.for_each import case
 from tests.infra.child_here import use_processes
 from tests.infra.rendering.render_kit import SMALL, mistake, render
@@ -313,7 +312,6 @@ def test_a_crash_in_native_code_is_one_line(
 ) -> None:
     """In a real child, which loads no renderer to be quick."""
     use_processes(monkeypatch)
-    monkeypatch.setattr(path_tracer, "set_up_renderer", operator.is_)
-    monkeypatch.setattr(path_tracer, "_open_scene", crash)
+    monkeypatch.setattr(path_tracer, "_ChildRenderer", CrashingRenderer)
     told = mistake(source, "--out", tmp_path / "x.exr", *SMALL)
     assert told.startswith("tiny.safetensors: rendering failed (crashed_signal_11")

@@ -28,7 +28,7 @@ import multiprocessing.forkserver, sys
 from pipeline.isolation import ChildLimits, IsolatedChild
 sys.path.insert(0, "")
 limits = ChildLimits(memory_bytes=2 << 30, wall_s=99, calls_per_child=1)
-IsolatedChild(limits=limits, setup=int).call(print)
+IsolatedChild(limits=limits).call(print)
 """
 """A user's own, whose first import path is the working folder: the child's is not."""
 

@@ -20,6 +20,7 @@ from infra.cli.console import progress_bars
 from infra.cli.dataset_changes import with_base_settings
 from infra.cli.settings_file import read_settings_file
 from infra.cli.train import _BarProgress, _QuietProgress, _validation_rows
+from model.checkpoint_format import saved_steps
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.manifest import read_manifest
@@ -32,7 +33,6 @@ from tests.for_each import case
 from tests.pipeline.generation.test_dataset_writer import begin_tiny
 from tests.train.toy import write_toy_dataset
 from train.evaluation.scores import Lead
-from train.loop.checkpoints import saved_steps
 from train.loop.interrupts import SAVED_STATUS
 from train.monitoring.rows import read_rows
 from train.runs import RUNS, named_run

@@ -112,7 +112,7 @@ class Bench:
             self.set()
         heavy = ("pipeline.assets.prepare", "pipeline.assets.decimation.pymeshlab_filters")
         preload([*heavy, "tests.pipeline.assets.child_kit"])
-        self.child = IsolatedChild(limits=self.limits, setup=nothing)
+        self.child = IsolatedChild(limits=self.limits)
 
     def set(self, **plan: str) -> None:
         """Say what children do: an action by method, such as `die` or `die once`."""

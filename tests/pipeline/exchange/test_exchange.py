@@ -218,7 +218,7 @@ def test_scenes_do_not_pile_up(tmp_path: Path, form: str) -> None:
     One layer of this scene takes 170 kB, so that keeping each of 150 would be 25 MB.
     """
     limits = ChildLimits(memory_bytes=8 << 30, wall_s=1800, calls_per_child=1)
-    child = IsolatedChild(limits=limits, setup=nothing)
+    child = IsolatedChild(limits=limits)
     try:
         assert child.call(grown_bytes, tmp_path, form) < 12e6
     finally:

@@ -11,7 +11,7 @@ from pathlib import Path
 from pipeline.assets.attempt import AssetAttempt
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import attempt_in_child
-from pipeline.generation.attempt_scene import SceneAttempt, attempt_scene
+from pipeline.generation.scene_worker import SceneAttempt, SceneWorker
 
 OBJECT = "poison.obj"
 """Its mesh ends whoever reads it."""
@@ -46,8 +46,10 @@ def prepare_or_die(
     return attempt_in_child(source, settings, method, root)
 
 
-def render_or_abort(split: str, scene_index: int, attempt: int) -> SceneAttempt:
+def render_or_abort(
+    worker: SceneWorker, split: str, scene_index: int, attempt: int
+) -> SceneAttempt:
     """Abort as LLVM does when it cannot go on, or make the attempt."""
     if (scene_index, attempt) == (SCENE, 0) or scene_index == LOST_SCENE:
         os.abort()
-    return attempt_scene(split, scene_index, attempt)
+    return worker.attempt(split, scene_index, attempt)

@@ -18,12 +18,12 @@ from pipeline.generation import frozen_pool, pipeline, restore_object
 from pipeline.generation import object_options as asked_objects
 from pipeline.generation.accept_maps import AcceptedMaps, MapFolders, accept_maps, map_folders
 from pipeline.generation.accept_objects import accept_objects, load_trusted_objects
-from pipeline.generation.attempt_scene import SceneAttempt
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects, require_same
 from pipeline.generation.frozen_pool import AssetMissing, SplitPool
 from pipeline.generation.prepare_isolated import asset_store
+from pipeline.generation.scene_worker import SceneAttempt
 from pipeline.generation.user_maps import user_maps
 from pipeline.objects.maps.prepared import MapFiles, prepare_map
 from pipeline.scenes.compose import compose_scene
@@ -44,7 +44,7 @@ from storage.records.objects import (
     read_objects_lock,
 )
 from storage.records.texture import MapSource
-from storage.seeds import rng_for
+from storage.seeds import SceneKey, rng_for
 from tests.infra.child_here import ChildHere
 from tests.pipeline.documents.dataset_by_hand import locked
 from tests.pipeline.generation.frozen_kit import SOURCE, asked, begun, build, frozen, prepared
@@ -202,7 +202,7 @@ def test_an_object_that_is_away_is_brought_back_for_the_same_attempt(
     calls: list[tuple[object, ...]] = []
     away = [("a", "1"), ("b", "2")]
 
-    def call(child: object, function: object, *args: object) -> SceneAttempt:
+    def attempt(child: object, args: tuple[object, ...]) -> SceneAttempt:
         calls.append(args)
         return SceneAttempt(sample=None, failures=[], missing_asset=away[0] if away else None)
 
@@ -210,7 +210,7 @@ def test_an_object_that_is_away_is_brought_back_for_the_same_attempt(
         calls.append((uid, name))
         away.pop(0)
 
-    monkeypatch.setattr(pipeline, "call_with_retries", call)
+    monkeypatch.setattr(pipeline, "_attempt_with_retries", attempt)
     child: object = None
     pipeline.make_scene("train", 7, 1, child, restore)  # type: ignore[arg-type]
     assert calls == [("train", 7, 0), ("a", "1"), ("train", 7, 0), ("b", "2"), ("train", 7, 0)]
@@ -295,9 +295,7 @@ def test_no_texture_or_map_of_test_is_in_train(
                 scene = compose_scene(
                     settings.scenes,
                     small_pool(),
-                    seed=0,
-                    scene_index=index,
-                    attempt=0,
+                    SceneKey(0, index),
                     user_maps=own,
                 )
             except Rejected:
@@ -327,7 +325,7 @@ def test_without_own_ones_a_scene_is_what_it_was(
     plain = named_build("smoke", changes=SHARES | changes).scenes
     own = user_maps(accepted.rows, "train")
     first, second = (
-        compose_scene(plain, small_pool(), seed=0, scene_index=3, attempt=0, **given)
+        compose_scene(plain, small_pool(), SceneKey(0, 3), **given)
         for given in ({}, {"user_maps": own})
     )
     assert [t.sha256 for t in first.textures] == [t.sha256 for t in second.textures]

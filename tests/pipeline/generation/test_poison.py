@@ -16,6 +16,7 @@ from pipeline.generation import pipeline
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.pipeline import make_dataset, prepare_dataset
 from pipeline.generation.run import Outcome
+from pipeline.generation.scene_worker import SceneWorker
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
 from storage.errors import EnvironmentFailure, TrilightError
@@ -161,7 +162,7 @@ def test_scenes_that_abort_their_child_are_counted(
     workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One is saved by its next attempt; one is given up, within the budget and beyond it."""
-    monkeypatch.setattr(pipeline, "attempt_scene", poison.render_or_abort)
+    monkeypatch.setattr(SceneWorker, "attempt", poison.render_or_abort)
     monkeypatch.setattr(pipeline, "MAX_ATTEMPTS", 2)  # 16 would start a child 48 times
     with pytest.raises(TrilightError, match="1 of 8 scenes could not be made.*budget of 0%"):
         make(workshop, tmp_path / "set", failure_budget=0.0)

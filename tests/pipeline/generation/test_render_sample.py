@@ -31,7 +31,7 @@ from storage.records.objects import Failure
 from storage.records.passes.stored import passes_exr
 from storage.records.sample import decode_sample, encode_sample, sample_key
 from storage.records.scene import Scene
-from storage.seeds import seed_for
+from storage.seeds import SceneKey, seed_for
 from storage.settings.changes import json_or_word
 from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _locked
 from tests.pipeline.scenes.small_pool import small_pool
@@ -45,9 +45,7 @@ KEY = "000000000"
 def scene() -> Scene:
     for attempt in range(16):
         try:
-            return compose_scene(
-                BUILD.scenes, small_pool(), seed=BUILD.seed, scene_index=0, attempt=attempt
-            )
+            return compose_scene(BUILD.scenes, small_pool(), SceneKey(BUILD.seed, 0, attempt))
         except Rejected:
             continue
     raise AssertionError("no scene in sixteen attempts")

@@ -14,12 +14,12 @@ import pytest
 from PIL import Image
 
 from pipeline.generation import pipeline, render_children, tasks, unfinished_shard
-from pipeline.generation.attempt_scene import SceneAttempt
 from pipeline.generation.child_pool import ChildPool
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.freeze_objects import AcceptedObjects
 from pipeline.generation.pipeline import make_dataset, make_piece
 from pipeline.generation.run import Run, ShardJob, TaskResult
+from pipeline.generation.scene_worker import SceneAttempt
 from pipeline.generation.tasks import Piece
 from pipeline.generation.unfinished_shard import UnfinishedShard
 from pipeline.isolation import ChildFailed, IsolatedChild
@@ -54,7 +54,7 @@ class FakeChild:
         self._made = made
         self._broken = broken
 
-    def call(self, function: Any, split: str, scene_index: int, attempt: int) -> SceneAttempt:
+    def call_method(self, method: Any, split: str, scene_index: int, attempt: int) -> SceneAttempt:
         if scene_index == self._broken and attempt == 0:
             raise ChildFailed("crashed_signal_11", "native code ended by SIGSEGV")
         self._made[scene_index] += 1
@@ -344,7 +344,8 @@ def test_only_children_that_nobody_uses_are_closed(monkeypatch: pytest.MonkeyPat
         return ChildPool(lambda number: cast(IsolatedChild, child), 1)
 
     job = cast(Any, SimpleNamespace(
-        folder=DatasetFolder(Path("a")), settings=SimpleNamespace(digest="d"), lock_sha256="l", device="cpu"
+        folder=DatasetFolder(Path("a")), settings=SimpleNamespace(digest="d"), lock_sha256="l",
+        device="cpu",
     ))  # fmt: skip
     monkeypatch.setattr(render_children, "_pools", {("b", "d", "l"): pool("other")})
     monkeypatch.setattr(render_children, "_render_pool", lambda job: pool("ours"))

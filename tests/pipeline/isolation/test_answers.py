@@ -258,7 +258,7 @@ class Hostile:
 
 @pytest.fixture
 def child() -> Iterator[IsolatedChild]:
-    child = IsolatedChild(limits=LIMITS, setup=called.nothing)
+    child = IsolatedChild(limits=LIMITS)
     yield child
     child.close()
 

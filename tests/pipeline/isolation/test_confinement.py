@@ -41,7 +41,7 @@ needs_seccomp = pytest.mark.skipif(not seccomp_works(), reason="no seccomp here"
 
 
 def confined(allowed: Reach) -> IsolatedChild:
-    return IsolatedChild(limits=LIMITS, setup=called.nothing, confined_to=allowed)
+    return IsolatedChild(limits=LIMITS, confined_to=allowed)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def _tried(place: Path, wall: str) -> Mapping[str, bool | None]:
         (place / "probed" / name).write_text(name)
     with (
         subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as victim,
-        closing(IsolatedChild(limits=LIMITS, setup=called.nothing)) as child,
+        closing(IsolatedChild(limits=LIMITS)) as child,
     ):
         refused = child.call(probes.try_all, wall, place, victim.pid)
         victim.kill()
@@ -125,7 +125,7 @@ TERMINAL = """
 from pipeline.isolation import ChildLimits, IsolatedChild, reach
 from tests.pipeline.isolation import called, probes
 limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
-child = IsolatedChild(limits=limits, setup=called.nothing, confined_to=reach())
+child = IsolatedChild(limits=limits, confined_to=reach())
 print("terminals:", child.call(probes.open_terminals))
 """
 
@@ -147,7 +147,7 @@ from tests.pipeline.isolation import called, probes
 path = pathlib.Path(sys.argv[1])
 limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
 files = reach(writes=[path.parent]) if len(sys.argv) > 2 else None
-child = IsolatedChild(limits=limits, setup=called.nothing, confined_to=files)
+child = IsolatedChild(limits=limits, confined_to=files)
 child.call(probes.stay, path, files is not None)
 """
 
@@ -274,7 +274,7 @@ PATIENT = ChildLimits(memory_bytes=2 << 30, wall_s=120, calls_per_child=9)
 
 
 def child_with(setup, *args: object) -> IsolatedChild:  # type: ignore[no-untyped-def]
-    return IsolatedChild(limits=PATIENT, setup=setup, setup_args=args)
+    return IsolatedChild(limits=PATIENT, factory=setup, args=args)
 
 
 @pytest.fixture(autouse=True)

@@ -33,7 +33,7 @@ LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=2, calls_per_child=3)
 
 @pytest.fixture
 def child(tmp_path: Path) -> Iterator[IsolatedChild]:
-    child = IsolatedChild(limits=LIMITS, setup=called.prepare, setup_args=(str(tmp_path),))
+    child = IsolatedChild(limits=LIMITS, factory=called.prepare, args=(str(tmp_path),))
     yield child
     child.close()
 
@@ -113,7 +113,7 @@ def test_closing_frees_a_waiting_caller(child: IsolatedChild) -> None:
 def test_processor_seconds_are_for_one_call_each() -> None:
     """A call that uses them up ends its child; several that stay below do not add up."""
     limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, cpu_s=1, calls_per_child=9)
-    with closing(IsolatedChild(limits=limits, setup=called.nothing)) as child:
+    with closing(IsolatedChild(limits=limits)) as child:
         assert len({child.call(called.burn, 0.6) for _ in range(3)}) == 1
         with pytest.raises(ChildFailed, match="timeout_cpu: used its 1 processor seconds"):
             child.call(called.burn, 30.0)
@@ -123,7 +123,7 @@ def test_processor_seconds_are_for_one_call_each() -> None:
 def test_waiting_uses_no_processor_seconds() -> None:
     """It uses the time of its call, and costs no more than that."""
     limits = ChildLimits(memory_bytes=2 << 30, wall_s=1.5, cpu_s=1, calls_per_child=9)
-    with closing(IsolatedChild(limits=limits, setup=called.nothing)) as child:
+    with closing(IsolatedChild(limits=limits)) as child:
         with pytest.raises(ChildFailed, match="timeout_wall"):
             child.call(called.hang)
         assert child.call(called.double, 4) == 8
@@ -157,7 +157,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[IsolatedChild]:
     monkeypatch.setattr(waiting, "LOOK_S", 0.05)
     monkeypatch.setattr(waiting, "LOOKS_BEFORE_KILL", 15)
     monkeypatch.setattr(call_failures, "_PAUSE_S", 0.0)
-    watched = IsolatedChild(limits=PATIENT, setup=called.nothing)
+    watched = IsolatedChild(limits=PATIENT)
     yield watched
     watched.close()
 
@@ -216,7 +216,7 @@ from called import wait_for
 from pipeline.isolation import ChildLimits, IsolatedChild
 
 limits = ChildLimits(memory_bytes=2 << 30, wall_s=2, calls_per_child=9)
-child = IsolatedChild(limits=limits, setup=int)
+child = IsolatedChild(limits=limits)
 print(child.call(wait_for, __file__), flush=True)
 print(child.call(wait_for, __file__ + ".go"), flush=True)
 """

@@ -219,18 +219,18 @@ def test_the_child_keeps_the_scene_and_ends_where_it_is_told_to() -> None:
         assert psnr_log_db(last.radiance_rgb, expected) > 30
         tracer.render(scene, "a", camera, GROWING, told.append, preview_spp=4)
         assert isinstance(told[-1], GrowingPicture) and told[-1].spp == 4
-        assert tracer._child.call(_num_loaded) == 1, "a preview loads no scene anew"
+        assert tracer._child.call_method(_num_loaded) == 1, "a preview loads no scene anew"
         dark = tiny_scene(faces=tiny_scene().faces[2:], material_index=np.array([1], np.uint16),
                           object_index=np.array([1], np.uint16))  # fmt: skip
         with pytest.raises(TrilightError, match="no_surfaces"):
             tracer.render(dark, "dark", camera, GROWING, told.append)
         for key in ("b", "c", "d"):
             tracer.render(scene, key, camera, GROWING, told.append)
-        kept = tracer._child.call(_num_loaded)
+        kept = tracer._child.call_method(_num_loaded)
         assert kept == module.MOST_SCENES
     finally:
         tracer.close()
 
 
-def _num_loaded() -> int:
-    return len(module._state.loaded)
+def _num_loaded(renderer: module._ChildRenderer) -> int:
+    return len(renderer._loaded)

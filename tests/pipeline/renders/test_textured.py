@@ -27,6 +27,7 @@ from storage.records.lookup import texture_values
 from storage.records.retextured import with_textures, without_constant_textures
 from storage.records.scene import Scene, SceneObject
 from storage.records.texture import MAX_SIDE, Texture
+from storage.seeds import SceneKey
 from tests.oracle.kernel_bsdf import exact_twin
 from tests.oracle.plugin_tracer import PluginTracer
 from tests.pipeline.assets.meshes_by_hand import prepare
@@ -315,9 +316,7 @@ def test_a_traced_picture_has_the_colours_in_their_corners(tmp_path: Path, kind:
     )
     entry = PooledAsset(locked=small_pool()[0].locked, asset=prepare(path, KEEP))
     level = entry.asset.levels[0]
-    (skin,) = source_skins(
-        [entry], [level], MaterialSettings(source="object"), seed=0, scene_index=0, attempt=0
-    )
+    (skin,) = source_skins([entry], [level], MaterialSettings(source="object"), SceneKey(0, 0))
     assert skin is not None
     positions = level.positions
     square = object_piece(

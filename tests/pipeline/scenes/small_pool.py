@@ -15,6 +15,7 @@ from storage.errors import Rejected
 from storage.records.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
 from storage.records.objects import LockedObject
 from storage.records.scene import Scene
+from storage.seeds import SceneKey
 
 QUALITY = LevelQuality(
     error_mean=0.0,
@@ -116,9 +117,7 @@ def first_scene(
     """Return the first attempt at a scene that is not rejected, as a run does."""
     for attempt in range(16):
         try:
-            return compose_scene(
-                settings, pool, seed=seed, scene_index=scene_index, attempt=attempt
-            )
+            return compose_scene(settings, pool, SceneKey(seed, scene_index, attempt))
         except Rejected:
             continue
     raise AssertionError(f"scene {scene_index} of seed {seed} was rejected sixteen times")

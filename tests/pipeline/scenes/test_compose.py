@@ -17,6 +17,7 @@ from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
+from storage.seeds import SceneKey
 from storage.settings.changes import changed
 from tests.pipeline.scenes.scene_facts import counts_of, digest, planes_of, points_of, rows_of
 from tests.pipeline.scenes.small_pool import first_scene
@@ -34,7 +35,7 @@ def test_attempts_differ_but_keep_what_was_planned(pool: list[PooledAsset]) -> N
         tries = []
         for attempt in range(4):
             with contextlib.suppress(Rejected):
-                scene = compose_scene(SETTINGS, pool, seed=0, scene_index=index, attempt=attempt)
+                scene = compose_scene(SETTINGS, pool, SceneKey(0, index, attempt))
                 tries.append(scene)
         assert len({digest(scene) for scene in tries}) == len(tries) >= 2
         for scene in tries:
@@ -50,7 +51,7 @@ def test_the_budget_is_never_exceeded(pool: list[PooledAsset], max_triangles: in
     totals = []
     for index in range(24):
         try:
-            scene = compose_scene(settings, pool, seed=1, scene_index=index, attempt=0)
+            scene = compose_scene(settings, pool, SceneKey(1, index))
         except Rejected as rejected:
             assert rejected.reason in ("over_budget", "no_camera")
             continue
@@ -72,7 +73,7 @@ def _require_within_budget(pool: list[PooledAsset], names: Iterable[str], scenes
         for index in range(scenes):
             most = settings.of_scene(index).max_triangles
             with contextlib.suppress(Rejected):
-                scene = compose_scene(settings, pool, seed=2, scene_index=index, attempt=0)
+                scene = compose_scene(settings, pool, SceneKey(2, index))
                 fullest = max(fullest, scene.num_triangles / most)
                 assert choose_tracing_scale(scene) == 1, "no preset's pictures change by a size"
         # A level of the small pool is a quarter of the next finer one: little is ever left.
@@ -137,7 +138,7 @@ def test_scenes_keep_the_laws_of_the_record_emitters_objects_and_normals(
 def test_rights_travel_and_names_are_unique(pool: list[PooledAsset]) -> None:
     wall = [entry for entry in pool if entry.locked.uid == "made/wall1"]
     settings = template_settings("corner", {"families.num_objects": [3, 3], "num_views": 1})
-    scene = compose_scene(settings, wall, seed=0, scene_index=0, attempt=0)
+    scene = compose_scene(settings, wall, SceneKey(0, 0))
     objects = [entry for entry in scene.objects if entry.kind == "object"]
     assert [entry.name for entry in objects] == ["wall1_2", "wall1_3", "wall1_4"]
     for entry in objects:
@@ -149,13 +150,13 @@ def test_rights_travel_and_names_are_unique(pool: list[PooledAsset]) -> None:
 
 def test_an_empty_pool_is_a_users_mistake() -> None:
     with pytest.raises(TrilightError, match="pool"):
-        compose_scene(SETTINGS, [], seed=0, scene_index=0, attempt=0)
+        compose_scene(SETTINGS, [], SceneKey(0, 0))
 
 
 def test_a_scene_without_objects_is_a_scene(pool: list[PooledAsset]) -> None:
     """The published families have some; a view of one need not show any object."""
     settings = template_settings("open_box", {"families.num_objects": [0, 0]})
-    scene = compose_scene(settings, pool, seed=0, scene_index=0, attempt=0)
+    scene = compose_scene(settings, pool, SceneKey(0, 0))
     scene.check()
     assert rows_of(scene, "object") == []
     assert len(scene.provenance["camera_attempts"]) == scene.num_views == 4

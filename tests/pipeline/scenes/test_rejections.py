@@ -18,6 +18,7 @@ from pipeline.scenes.scene_checks import require_valid
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
 from storage.records.scene import Scene
+from storage.seeds import SceneKey
 from tests.for_each import for_each
 from tests.pipeline.scenes.scene_facts import digest
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
@@ -66,7 +67,7 @@ def test_each_reason_is_given_where_it_holds(
 
 def _rejection(settings: SceneSettings, pool: Sequence[PooledAsset], index: int) -> Rejected:
     with pytest.raises(Rejected) as caught:
-        compose_scene(settings, pool, seed=0, scene_index=index, attempt=0)
+        compose_scene(settings, pool, SceneKey(0, index))
     return caught.value
 
 
@@ -106,7 +107,7 @@ def test_a_mesh_without_usable_triangles_is_rejected(pool: list[PooledAsset], bu
     for damage, each, index in itertools.product(DAMAGES, (settings, overlapping), range(4)):
         damaged = [_damaged(pool[1], DAMAGES[damage])]
         try:
-            scene = compose_scene(each, damaged, seed=0, scene_index=index, attempt=0)
+            scene = compose_scene(each, damaged, SceneKey(0, index))
         except Rejected as rejection:
             assert rejection.reason == "no_faces", (damage, rejection)
             assert "made/box" in rejection.message

@@ -32,6 +32,7 @@ from storage.records.packed_maps import pack_texture
 from storage.records.scene import Scene, SceneObject
 from storage.records.skin import LevelSkin, SkinQuality
 from storage.records.texture import Texture
+from storage.seeds import SceneKey
 from storage.settings.changes import changed
 from tests.pipeline.scenes.small_pool import LOOK, first_scene, pooled, small_pool
 from tests.scene_templates.statistics import require_plausible, share
@@ -119,10 +120,10 @@ def test_as_many_objects_keep_their_own_as_stated() -> None:
     levels = [entry.asset.levels[0] for entry in entries]
     found = []
     for index in range(60):
-        name = {"seed": 0, "scene_index": index, "attempt": 0}
-        skins = source_skins(entries, levels, some.materials, **name)
+        scene_key = SceneKey(0, index)
+        skins = source_skins(entries, levels, some.materials, scene_key)
         found += [skin is not None for skin in skins]
-        everybody = source_skins(entries, levels, OWN.materials, **name)
+        everybody = source_skins(entries, levels, OWN.materials, scene_key)
         assert all(skin is not None for skin in everybody)
     require_plausible({"own": share(found, 0.3)})
 
@@ -134,7 +135,7 @@ def test_an_object_whose_textures_break_a_law_costs_scenes_by_its_name() -> None
     skin = dataclasses.replace(level.skin, packed=(broken, *level.skin.packed[1:]))
     levels = [dataclasses.replace(level, skin=skin)]
     with pytest.raises(Rejected, match=f"^law_broken: object {entries[0].locked.uid}: .*diffuse"):
-        source_skins(entries, levels, OWN.materials, seed=0, scene_index=0, attempt=0)
+        source_skins(entries, levels, OWN.materials, SceneKey(0, 0))
 
 
 def test_subdivision_moves_no_colour() -> None:
@@ -143,8 +144,8 @@ def test_subdivision_moves_no_colour() -> None:
     positions = level.positions
     box, rng = SceneObject(name="box", kind="object"), np.random.default_rng(0)
     piece = object_piece(box, positions, level.faces, LOOK, rng, 30.0)
-    entries, name = [pooled("a", [trimesh.creation.box()])], {"seed": 0, "scene_index": 0}
-    (skin,) = source_skins(entries, [level], OWN.materials, **name, attempt=0)
+    entries = [pooled("a", [trimesh.creation.box()])]
+    (skin,) = source_skins(entries, [level], OWN.materials, SceneKey(0, 0))
     assert skin is not None
     whole = apply_skin(piece, positions, level.faces, skin)
     more = subdivide(whole, 100)
@@ -294,7 +295,7 @@ def test_without_lamps_or_share_all_stays_dark(lamps: bool, share: float) -> Non
 
 def test_new_lights_leave_parts_that_emit() -> None:
     scene = first_scene(GLOWS, glowing_pool(), seed=0, scene_index=1)
-    again = with_new_lights(scene, GLOWS.lights, None, seed=3, index=0, attempt=0)
+    again = with_new_lights(scene, GLOWS.lights, None, SceneKey(3, 0))
     again.check()
     count = sum(entry.is_lamp for entry in scene.objects)
     assert sum(entry.is_lamp for entry in again.objects) == count

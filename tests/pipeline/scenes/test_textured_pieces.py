@@ -22,6 +22,7 @@ from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.textures import TextureSettings
 from storage.records.material import default_rows
 from storage.records.scene import Scene, SceneObject
+from storage.seeds import SceneKey
 from storage.settings.changes import changed
 from tests.for_each import for_each
 from tests.pipeline.scenes.small_pool import LOOK, first_scene, small_pool
@@ -108,9 +109,7 @@ def test_an_objects_texture_turns_with_it() -> None:
         placement = ObjectPlacement(pose=pose, surface=LOOK)
         layout = Layout(shell=(), objects=(placement,), emitters=())
         textures = TextureSettings(share=1.0, surfaces=SMALL)
-        (textured,) = with_drawn_textures(
-            [piece], layout, textures, seed=0, scene_index=0, attempt=0
-        )
+        (textured,) = with_drawn_textures([piece], layout, textures, SceneKey(0, 0))
         assert textured.skin is not None
         found.append(textured.skin.uv)
     assert np.abs(found[0] - found[1]).max() < 1e-5

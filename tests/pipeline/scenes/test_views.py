@@ -27,6 +27,7 @@ from storage.errors import Rejected
 from storage.records.material import DIFFUSE, EMISSION, SPECULAR
 from storage.records.scene import ARRAY_FIELDS, Scene
 from storage.records.scene_facts import lights, surfaces
+from storage.seeds import SceneKey
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import tiny_scene
 from tests.sky_maps import constant, one_sun
@@ -206,7 +207,6 @@ def test_the_cameras_of_a_view_need_nothing_but_the_stored_scene(scenes: list[Sc
 
 
 SMOKE = named_build("smoke").scenes
-SEEDED = {"seed": 7, "index": 3}
 
 
 @pytest.fixture(scope="module", params=range(4))
@@ -225,7 +225,7 @@ def surface_points(scene: Scene) -> list[np.ndarray]:
 
 
 def test_new_materials_leave_shape_light_and_the_pattern_of_colours(scene: Scene) -> None:
-    new = with_new_materials(scene, SMOKE.materials, **SEEDED, attempt=0)
+    new = with_new_materials(scene, SMOKE.materials, SceneKey(7, 3))
     new.check()
     for name in ("vertex_positions", "vertex_normals", "faces", "object_index", "c2w"):
         assert np.array_equal(getattr(new, name), getattr(scene, name)), name
@@ -251,9 +251,7 @@ def test_draws_are_those_of_composition(scene: Scene) -> None:
     drawn = [
         surface
         for attempt in range(40)
-        for surface in surfaces(
-            with_new_materials(scene, SMOKE.materials, **SEEDED, attempt=attempt)
-        )
+        for surface in surfaces(with_new_materials(scene, SMOKE.materials, SceneKey(7, 3, attempt)))
     ]
     share = np.array([one.specular / 0.95 for one in drawn])
     # uniform in [0, 1] times a sum within 5 % of 0.95: mean 0.5, five standard errors
@@ -263,7 +261,7 @@ def test_draws_are_those_of_composition(scene: Scene) -> None:
 
 @pytest.mark.parametrize("count", [None, 1, 5])
 def test_new_lights_leave_surfaces_and_follow_the_ranges(scene: Scene, count: int | None) -> None:
-    new = with_new_lights(scene, SMOKE.lights, count, **SEEDED, attempt=0)
+    new = with_new_lights(scene, SMOKE.lights, count, SceneKey(7, 3))
     new.check()
     for before, after in zip(surface_points(scene), surface_points(new), strict=True):
         assert np.array_equal(before, after)
@@ -280,8 +278,8 @@ def test_new_lights_leave_surfaces_and_follow_the_ranges(scene: Scene, count: in
 
 def test_redrawn_scenes_are_equal_for_equal_arguments_and_keep_the_laws(scene: Scene) -> None:
     def redrawn(attempt: int) -> Scene:
-        lit = with_new_lights(scene, SMOKE.lights, None, **SEEDED, attempt=attempt)
-        return with_new_materials(lit, SMOKE.materials, **SEEDED, attempt=attempt)
+        lit = with_new_lights(scene, SMOKE.lights, None, SceneKey(7, 3, attempt))
+        return with_new_materials(lit, SMOKE.materials, SceneKey(7, 3, attempt))
 
     first, again, other = redrawn(0), redrawn(0), redrawn(1)
     assert np.array_equal(first.materials, again.materials)
@@ -290,7 +288,7 @@ def test_redrawn_scenes_are_equal_for_equal_arguments_and_keep_the_laws(scene: S
     assert not np.array_equal(first.materials[:, DIFFUSE], other.materials[:, DIFFUSE])
     # A light that is drawn into an object's box is refused, as composition refuses it.
     near = dataclasses.replace(SMOKE.lights, distance=(0.01, 0.02), target_jitter=0.0)
-    inside = with_new_lights(scene, near, 8, **SEEDED, attempt=0)
+    inside = with_new_lights(scene, near, 8, SceneKey(7, 3))
     with pytest.raises(Rejected, match="emitter_inside"):
         require_valid(inside, SMOKE)
 
@@ -298,16 +296,16 @@ def test_redrawn_scenes_are_equal_for_equal_arguments_and_keep_the_laws(scene: S
 def test_a_scene_of_a_file_draws_no_lights() -> None:
     scene = tiny_scene(provenance={"template": "renderformer-json"})
     with pytest.raises(Rejected, match="no_layout: 'renderformer-json' is no layout"):
-        with_new_lights(scene, SMOKE.lights, 1, **SEEDED, attempt=0)
+        with_new_lights(scene, SMOKE.lights, 1, SceneKey(7, 3))
 
 
 def test_textures_go_with_the_materials_and_stay_with_the_triangles() -> None:
     """New materials are plain; new lamps stand behind triangles that keep their coordinates."""
     scene = textured_scene(environment=sky())
-    plain = with_new_materials(scene, SMOKE.materials, **SEEDED, attempt=0)
+    plain = with_new_materials(scene, SMOKE.materials, SceneKey(7, 3))
     plain.check()
     assert not plain.textures and plain.uv is None and plain.environment is scene.environment
-    lit = with_new_lights(scene, SMOKE.lights, 3, **SEEDED, attempt=0)
+    lit = with_new_lights(scene, SMOKE.lights, 3, SceneKey(7, 3))
     lit.check()
     assert lit.num_triangles > scene.num_triangles and lit.environment is scene.environment
     assert lit.uv is not None and scene.uv is not None and lit.material_textures is not None
@@ -325,6 +323,6 @@ def test_a_texture_of_lamps_alone_goes_with_them() -> None:
     index = scene.material_textures[::-1].copy()
     on_the_lamp = dataclasses.replace(scene, material_textures=index)
     on_the_lamp.check()
-    lit = with_new_lights(on_the_lamp, SMOKE.lights, 1, **SEEDED, attempt=0)
+    lit = with_new_lights(on_the_lamp, SMOKE.lights, 1, SceneKey(7, 3))
     lit.check()
     assert not lit.textures and lit.uv is None and lit.material_textures is None

@@ -14,7 +14,7 @@ from scene_templates.skies.families import OUR_SKIES, SKIES
 from scene_templates.skies.settings import SkySettings
 from scene_templates.skies.texels import SkyTexels
 from storage.records.scene import Scene
-from storage.seeds import rng_for
+from storage.seeds import SceneKey, rng_for
 from tests.for_each import for_each
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scene_templates.statistics import choices, require_plausible, share, uniform
@@ -207,10 +207,7 @@ RADIANCE = np.array([[300.0, 200.0, 100.0]])
 
 
 def _drawn(settings: SkySettings, count: int = 2000) -> list[SceneSky | None]:
-    return [
-        scene_sky(settings, LAMP, RADIANCE, seed=3, scene_index=index, attempt=0)
-        for index in range(count)
-    ]
+    return [scene_sky(settings, LAMP, RADIANCE, SceneKey(3, index)) for index in range(count)]
 
 
 def test_shares_families_strengths_and_turns_are_as_stated() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 
+from model.checkpoint_format import path_of_step
 from storage.dataset.mixed_data import open_mixture
 from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
@@ -19,7 +20,7 @@ from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.mixture import RECORD, Mixture, plan_mixture
 from train.data.scenes import TrainingScene
 from train.data.stream import StreamSettings
-from train.loop.checkpoints import path_of_step, read_checkpoint
+from train.loop.checkpoints import read_checkpoint
 from train.run import train_run
 from train.start_options import StartOptions
 

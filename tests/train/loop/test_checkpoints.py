@@ -13,6 +13,7 @@ import pytest
 import torch
 from safetensors.torch import save as save_tensors
 
+from model.checkpoint_format import HEADER_KEY, path_of_step, saved_steps
 from model.neural_renderer import NeuralRenderer
 from model.open import find_network, open_network
 from model.weights import encode_weights
@@ -29,15 +30,11 @@ from train.data.buckets import TrainingBatch, make_batch
 from train.data.scenes import training_scene
 from train.folder import RunFolder
 from train.loop.checkpoints import (
-    HEADER_KEY,
     UNSEALED,
-    network_of_run,
     newest_checkpoint,
-    path_of_step,
     read_checkpoint,
     restore_state,
     save_checkpoint,
-    saved_steps,
 )
 from train.loop.distributed import DistributedContext
 from train.loop.recorder import MetricsLog
@@ -232,19 +229,17 @@ def test_a_network_is_found_in_folder_checkpoint_and_file(tmp_path: Path) -> Non
     with torch.no_grad():
         state.ema_model.decoder.token_W.fill_(0.25)
     with pytest.raises(TrilightError, match="no checkpoint here"):
-        open_network(tmp_path, network_of_run)
+        open_network(tmp_path)
     save_checkpoint(folder.checkpoints, state, settings, data_digest="d", world_size=1)
     for place in (tmp_path, path_of_step(folder.checkpoints, 0)):
-        found = find_network(place, network_of_run)
+        found = find_network(place)
         assert found.trained.resolution == settings.resolution
         assert (found.open().decoder.token_W == 0.25).all(), "the mean is what is shown"
-        renderer = NeuralRenderer.load(place, device="cpu", finders=[network_of_run])
+        renderer = NeuralRenderer.load(place, device="cpu")
         assert renderer.trained == found.trained
     folder.weights.write_bytes(encode_weights(state.model))
     for place in (tmp_path, folder.weights):
-        assert torch.equal(
-            open_network(place, network_of_run).decoder.token_W, state.model.decoder.token_W
-        )
+        assert torch.equal(open_network(place).decoder.token_W, state.model.decoder.token_W)
 
 
 DIGEST = "d" * 64

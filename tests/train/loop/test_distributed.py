@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import torch
 
+from model.checkpoint_format import saved_steps
 from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
 from tests.for_each import for_each
@@ -21,7 +22,7 @@ from tests.train.kit import tiny_run, trained
 from train.folder import RunFolder
 from train.loop import checkpoints, interrupts
 from train.loop.background import BackgroundWriter
-from train.loop.checkpoints import read_checkpoint, saved_steps
+from train.loop.checkpoints import read_checkpoint
 from train.loop.distributed import DistributedContext, choose_device, join_processes
 from train.loop.interrupts import deferred_interrupts
 from train.progress import TrainProgress

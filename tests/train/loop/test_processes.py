@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
+from model.checkpoint_format import saved_steps
 from storage.dataset.dataset import Dataset
 from storage.seeds import rng_for
 from tests.conftest import ROOT
 from tests.infra.slurm.fake_slurm import commands_in
 from tests.train.toy import write_toy_dataset
-from train.loop.checkpoints import saved_steps
 from train.monitoring.rows import read_rows
 
 SMALL = {

@@ -15,6 +15,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from model.checkpoint_format import path_of_step, saved_steps
 from model.layers import Norm
 from tests.for_each import for_each
 from tests.model.kit import awake, tiny_config
@@ -26,7 +27,7 @@ from train.data.scenes import training_scene
 from train.folder import RunFolder
 from train.loop import muon, optim
 from train.loop import step as step_module
-from train.loop.checkpoints import path_of_step, read_checkpoint, saved_steps
+from train.loop.checkpoints import read_checkpoint
 from train.loop.decision import Decision, move_along, move_towards
 from train.loop.optim import Updater
 from train.loop.state import TrainState, ema_step, new_state

@@ -60,7 +60,7 @@ def run_blender(process: str, folder: Path, request: dict[str, Any]) -> NDArray[
 def ours(scene: Scene, resolution: int, spp: int) -> NDArray[np.float32]:
     """Return our picture [R, R, 3] of the first view."""
     limits = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1)
-    child = IsolatedChild(limits=limits, setup=activate, setup_args=(choose_variant(),))
+    child = IsolatedChild(limits=limits, factory=activate, args=(choose_variant(),))
     try:
         settings = {"ours": fixed_samples(resolution, spp)}
         return child.call(shots, scene, settings)["ours"].view.radiance_rgb

@@ -263,7 +263,7 @@ LIMITS = ChildLimits(memory_bytes=4 << 30, wall_s=60, calls_per_child=1000)
 
 @pytest.fixture(scope="module")
 def child() -> Iterator[IsolatedChild]:
-    child = IsolatedChild(limits=LIMITS, setup=nothing)
+    child = IsolatedChild(limits=LIMITS)
     yield child
     child.close()
 

@@ -1,0 +1,168 @@
+"""`SceneWorker`: composes scenes and renders their views, inside a render child."""
+
+import contextlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pipeline.assets.store import AssetStore
+from pipeline.builds.settings import BuildSettings
+from pipeline.generation.frozen_pool import AssetMissing, FrozenPool
+from pipeline.generation.prepare_isolated import asset_store
+from pipeline.generation.render_sample import RenderInput, render_sample
+from pipeline.generation.revisited_scenes import RevisitedScenes
+from pipeline.generation.user_maps import user_maps
+from pipeline.generation.view_progress import ViewProgress
+from pipeline.renders.renderer import set_threads
+from pipeline.renders.variant import Variant, activate
+from pipeline.scenes.compose import compose_scene
+from pipeline.scenes.pool import PooledAsset
+from scene_templates.settings import SceneSettings
+from scene_templates.user_maps import OwnMaps
+from storage.dataset.layout import DatasetFolder
+from storage.errors import Rejected
+from storage.records.objects import Failure, LockedObject
+from storage.records.sample import Sample, sample_key
+from storage.records.scene import Scene
+from storage.seeds import SceneKey
+
+MAX_ATTEMPTS = 16
+"""Attempts at a scene before it is given up."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneRecipe:
+    """Configuration of a render child, sent once when it starts."""
+
+    settings: BuildSettings
+    """Settings of the dataset."""
+    variant: Variant
+    """Mitsuba variant and denoiser device."""
+    threads: int
+    """Number of CPU threads of this child."""
+    gpu: str | None = None
+    """GPU of this child, as CUDA_VISIBLE_DEVICES names it; None without one."""
+    pool: FrozenPool | None = None
+    """The frozen objects, if scenes are composed of them."""
+    assets: AssetStore = field(default_factory=asset_store)
+    """Store of the objects' prepared files, as the worker sees it."""
+    maps: tuple[tuple[LockedObject, Path], ...] = ()
+    """The user's textures and skies with their prepared files."""
+    revisited: RevisitedScenes | None = None
+    """Reader of a finished dataset, if scenes are those of one."""
+    folder: DatasetFolder | None = None
+    """Folder that gets the progress of a scene; None reports none."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneAttempt:
+    """The result of one attempt."""
+
+    sample: Sample | None
+    """The finished sample; None if the attempt was rejected."""
+    failures: list[Failure]
+    """Rejections of the attempt, and of cameras on the way to a sample."""
+    missing_asset: tuple[str, str] | None = None
+    """uid and file name of an object that must be prepared again before this attempt."""
+
+
+class SceneWorker:
+    """Object that a render child holds: makes attempts at scenes, and opens each split once."""
+
+    def __init__(self, recipe: SceneRecipe) -> None:
+        """Prepare this process: its GPU, Mitsuba's variant, and its threads."""
+        if recipe.gpu is not None:
+            os.environ["CUDA_VISIBLE_DEVICES"] = recipe.gpu
+        activate(recipe.variant)
+        set_threads(recipe.threads)
+        self._recipe = recipe
+        self._pools: dict[str, Sequence[PooledAsset]] = {}
+        self._maps: dict[str, OwnMaps] = {}
+
+    def attempt(
+        self, split: str, scene_index: int, attempt: int, from_file: Scene | None = None
+    ) -> SceneAttempt:
+        """Make one attempt at a scene; equal arguments give equal results in every child.
+
+        Args:
+            split: split of the scene.
+            scene_index: index of the scene, from 0.
+            attempt: number of the attempt, from 0.
+            from_file: the scene if it comes from a file, which a confined child has read.
+        """
+        key = sample_key(scene_index)
+        settings = self._recipe.settings
+        failures: list[Failure] = []
+        progress = ViewProgress(self._recipe.folder, scene_index)
+        stage = "scenes"
+        try:
+            render_input = self._render_input(split, scene_index, attempt, from_file)
+            stage = "renders"
+            sample = render_sample(key, render_input, settings, failures, progress)
+        except Rejected as rejection:
+            failures.append(
+                Failure(
+                    stage=stage,
+                    item=key,
+                    reason=rejection.reason,
+                    message=rejection.message,
+                    attempt=attempt,
+                )
+            )
+            return SceneAttempt(sample=None, failures=failures)
+        except AssetMissing as missing:
+            return SceneAttempt(
+                sample=None, failures=[], missing_asset=(missing.uid, missing.asset_name)
+            )
+        finally:
+            progress.end()
+        return SceneAttempt(sample=sample, failures=failures)
+
+    def compose_first(
+        self, settings: SceneSettings, scene_index: int, seed: int, split: str
+    ) -> Scene | None:
+        """Compose the first accepted attempt at a scene without the user's maps; None if none is.
+
+        Args:
+            settings: the ranges to draw from, which may differ from the dataset's.
+            scene_index: index of the scene, from 0.
+            seed: seed of the draws.
+            split: split of the objects.
+        """
+        for attempt in range(MAX_ATTEMPTS):
+            with contextlib.suppress(Rejected):
+                return compose_scene(
+                    settings, self._pool(split), SceneKey(seed, scene_index, attempt)
+                )
+        return None
+
+    def _render_input(
+        self, split: str, scene_index: int, attempt: int, from_file: Scene | None
+    ) -> RenderInput:
+        recipe = self._recipe
+        if recipe.revisited is not None:
+            return recipe.revisited.scene(scene_index, attempt, recipe.settings)
+        if from_file is not None:
+            return RenderInput(scene=from_file, kept_cameras=recipe.settings.scenes.num_views)
+        scene = compose_scene(
+            recipe.settings.scenes,
+            self._pool(split),
+            SceneKey(recipe.settings.seed, scene_index, attempt),
+            user_maps=self._maps_of(split),
+        )
+        return RenderInput(scene=scene)
+
+    def _pool(self, split: str) -> Sequence[PooledAsset]:
+        """Return the objects of a split, sorted by uid; each is opened on first access."""
+        if split not in self._pools:
+            frozen = self._recipe.pool
+            assert frozen is not None, "only composed scenes draw objects"
+            self._pools[split] = frozen.open_split(split, self._recipe.assets)
+        return self._pools[split]
+
+    def _maps_of(self, split: str) -> OwnMaps:
+        """Return the user's textures and maps of a split; each is read when a scene takes it."""
+        if split not in self._maps:
+            self._maps[split] = user_maps(self._recipe.maps, split)
+        return self._maps[split]
