@@ -14,11 +14,14 @@ import numpy as np
 import pytest
 
 from pipeline.generation.environment import environment
+from pipeline.generation.path_tracer import PathTracer
+from pipeline.generation.progressive_tracer import ProgressiveTracer
 from pipeline.renders import denoiser, variant_probe, vector_tracer
 from pipeline.renders import variant as variant_module
 from pipeline.renders.facts import render_facts
 from pipeline.renders.llvm_libraries import llvm_libraries
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
+from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Device, Variant, _Probed, activate, choose_variant
 from pipeline.renders.variant_probe import BLOCK, probe_scene, wrong_picture
 from storage.errors import EnvironmentFailure, TrilightError
@@ -148,6 +151,7 @@ def test_a_gpu_is_used_only_after_a_probe(own_cache: Path, monkeypatch: pytest.M
 
 
 CPU, GPU = "llvm_ad_rgb", "cuda_ad_rgb"
+ON_CPU = Variant(name="llvm_ad_rgb", libllvm="libLLVM.so", note="")
 
 
 @for_each(
@@ -175,11 +179,10 @@ def test_an_option_names_the_device_before_the_variable_and_the_default(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    on_cpu = Variant(name="llvm_ad_rgb", libllvm="libLLVM.so", note="")
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path))
     monkeypatch.setenv("TRILIGHT_VARIANT", named)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-    monkeypatch.setattr(variant_module, "_on_processor", lambda: on_cpu)
+    monkeypatch.setattr(variant_module, "_on_processor", lambda: ON_CPU)
     monkeypatch.setattr(variant_module, "_probe", lambda variant: _Probed(problem=problem))
     if chosen not in (CPU, GPU):
         with pytest.raises(TrilightError, match=chosen):
@@ -189,6 +192,18 @@ def test_an_option_names_the_device_before_the_variable_and_the_default(
     assert variant.name == chosen
     assert bool(variant.note) == (problem == "no OptiX")
     assert (variant.address_space(1) == 1) == (chosen == CPU)
+
+
+def test_children_on_a_gpu_may_map_what_cuda_reserves() -> None:
+    """CUDA maps the memory of GPU and machine: with 16 GiB of addresses it does not start."""
+    settings = RenderSettings(resolution=8, noise_floor_db=30, min_spp=8, max_spp=8)
+    for variant in (variant_module._GPU, ON_CPU):
+        path_tracer = PathTracer(
+            settings, seed=0, variant=variant, threads=1, on_samples=lambda now: None
+        )
+        for tracer in (path_tracer, ProgressiveTracer(variant=variant, threads=1)):
+            is_wide = tracer._child._limits.memory_bytes > 16 << 30
+            assert is_wide == (variant.device == "gpu")
 
 
 def test_a_probe_of_a_gpu_is_remembered_for_its_driver(
@@ -204,9 +219,7 @@ def test_a_probe_of_a_gpu_is_remembered_for_its_driver(
 
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
     monkeypatch.setattr(variant_module, "_probe", probe)
-    monkeypatch.setattr(
-        variant_module, "_on_processor", lambda: Variant(name="llvm_ad_rgb", libllvm="", note="")
-    )
+    monkeypatch.setattr(variant_module, "_on_processor", lambda: ON_CPU)
     assert [choose_variant("auto").device for _ in range(2)] == ["cpu", "cpu"]
     assert len(probes) == 1
     assert [choose_variant(device="gpu").device for _ in range(2)] == ["gpu", "gpu"]
