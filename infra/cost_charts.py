@@ -18,7 +18,7 @@ class SeriesPoint:
     """Point with several costs."""
 
     name: str
-    """Label beside the point."""
+    """Text label beside the marker of the point."""
     kind: str
     """Group of the point, which decides its color."""
     costs: Sequence[float]

@@ -130,7 +130,7 @@ def _renderer() -> Finding:
     finding = _probe(
         "renderer",
         "import mitsuba; mitsuba.set_variant('scalar_rgb')",
-        found=text,
+        summary=text,
         consequence="nothing can be rendered",
         mend=f"{_APT} libatomic1",
     )
@@ -182,7 +182,7 @@ def _mesh_decimation() -> Finding:
     return _probe(
         "mesh decimation",
         "import meshoptimizer",
-        found=f"meshoptimizer {metadata.version('meshoptimizer')}",
+        summary=f"meshoptimizer {metadata.version('meshoptimizer')}",
         consequence="meshes cannot be decimated where pymeshlab fails",
         mend="make setup",
     )
@@ -205,7 +205,7 @@ def _mesh_filters() -> Finding:
     return _probe(
         "mesh filters",
         code,
-        found=f"pymeshlab {metadata.version('pymeshlab')}",
+        summary=f"pymeshlab {metadata.version('pymeshlab')}",
         consequence="every object is rejected, or decimated by meshoptimizer with twice the error",
         mend=f"{_APT} libgl1 libopengl0",
     )
@@ -237,7 +237,7 @@ def _orchestrator() -> Finding:
     return _probe(
         "orchestrator",
         "import prefect.server.api.server",
-        found=f"prefect {metadata.version('prefect')}, fastapi {metadata.version('fastapi')}",
+        summary=f"prefect {metadata.version('prefect')}, fastapi {metadata.version('fastapi')}",
         consequence="no flow can run",
         mend="make setup" if _has_home() else "export HOME=/a/folder/of/your/own",
     )
@@ -302,7 +302,7 @@ def _has_home() -> bool:
     return True
 
 
-def _probe(name: str, code: str, *, found: str, consequence: str, mend: str) -> Finding:
+def _probe(name: str, code: str, *, summary: str, consequence: str, mend: str) -> Finding:
     """Run code in a child process; a non-zero status, a crash or a hang is `missing`."""
     try:
         result = subprocess.run(
@@ -320,9 +320,9 @@ def _probe(name: str, code: str, *, found: str, consequence: str, mend: str) -> 
     except OSError as error:
         problem = f"{sys.executable} cannot be started ({error.strerror})"
     if not problem:
-        return Finding(name=name, state="ok", found=found)
-    found = f"{found}: {problem}"
-    return Finding(name=name, state="missing", found=found, consequence=consequence, mend=mend)
+        return Finding(name=name, state="ok", found=summary)
+    summary = f"{summary}: {problem}"
+    return Finding(name=name, state="missing", found=summary, consequence=consequence, mend=mend)
 
 
 def _last_line(text: str, status: int) -> str:

@@ -6,11 +6,11 @@
     picture = trilight.render(scene, noise_floor_db=35)
     print(picture.radiance_rgb.shape, picture.noise_floor_db)
 
-Everything here stands for something of the packages, and works the same there. Nothing is loaded
-before it is used: `import trilight` takes milliseconds, and no torch, Mitsuba, USD or Prefect.
-Mistakes are `TrilightError`s, which say what was found, what was expected, and what to do.
+Every name here is one of the packages' names. Modules load on first use: `import trilight` takes
+milliseconds, and no torch, Mitsuba, USD or Prefect. Mistakes raise `TrilightError`, whose message
+names the value, the expectation and a remedy.
 
-World: metres, +Z up, right-handed; networks were trained on scenes within [-0.5, 0.5]^3. Colours
+World: meters, +Z up, right-handed; networks were trained on scenes within [-0.5, 0.5]^3. Colors
 are linear with Rec.709 primaries. `trilight.extend` serves extensions: templates, builds, runs.
 """
 
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from trilight.scenes import write_scene as write_scene
 
 _HOME = offered_names(__file__)
-"""The module of this package that has each name. No name is one of a package of ours: an installed
+"""Module of this package for each name. No name equals a package of the checkout: an installed
 wheel has `trilight.train` and the other packages as subpackages."""
 
 __all__ = sorted(["__version__", *_HOME])  # noqa: PLE0605

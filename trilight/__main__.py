@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 
-# while libraries are loaded nothing is begun; `main` has words of its own
+# Ctrl-C during imports ends at once without a traceback; `main` installs its own handler
 signal.signal(signal.SIGINT, lambda *_: os._exit(130))
 
 from storage.installation import order_installed_first  # noqa: E402

@@ -1,7 +1,7 @@
-"""A scene from Python: meshes with materials, a floor, lamps and cameras, put together.
+"""Scenes from Python: meshes with materials, a floor, lamps and cameras.
 
-The builder writes down what a RenderFormer scene file would say, and what gives such files their
-meaning (pipeline.exchange.from_description) makes the scene.
+The builder collects the content of a RenderFormer scene file, and the reader of such files
+(pipeline.exchange.from_description) turns it into a scene.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ from trilight.parts import Material, described_material, mesh_of_arrays, vector
 _CC0 = "CC0-1.0"
 _TEMPLATE = "python"
 _TRIANGLE = np.array([[0.0, 1.0, 0.0], [-(0.75**0.5), -0.5, 0.0], [0.75**0.5, -0.5, 0.0]]) / 3**0.5
-"""Equilateral, edge 1, its middle at the origin."""
+"""Corners of an equilateral triangle of edge 1 around the origin."""
 
 
 _STAYS = DescribedTransform(
@@ -46,17 +46,17 @@ _STAYS = DescribedTransform(
 
 @dataclass(frozen=True, kw_only=True)
 class _MeshFile:
-    """A file that is read when the scene is made."""
+    """A mesh file that `SceneBuilder.scene` reads."""
 
     path: Path
     licence: str
 
 
 class SceneBuilder:
-    """Gathers what a scene is made of; `scene` makes it. Every method returns the builder."""
+    """Collects the contents of a scene; `scene` builds it. The other methods return the builder."""
 
     def __init__(self, name: str = "scene") -> None:
-        """Begin an empty scene; `name` stands in messages and in its provenance."""
+        """Begin an empty scene; messages and its provenance hold `name`."""
         self._name = name
         self._objects: list[DescribedObject] = []
         self._meshes: list[LoadedMesh | _MeshFile] = []
@@ -78,29 +78,28 @@ class SceneBuilder:
         Args:
             mesh: a file `.glb .gltf .obj .ply .stl .off`, which `scene` reads; or vertices [V, 3]
                 and triangles [F, 3] of their rows, counter-clockwise seen from outside.
-            material: of the whole object; grey by default.
+            material: material of the whole object; gray by default.
             name: unique in the scene; after the file, or `objectN`, by default.
-            at: where the origin of the mesh comes to lie, metres; with `size` the mean of its
-                vertices.
-            size: diameter in metres of the sphere around that mean that holds it; by default the
-                mesh keeps the units of its file.
+            at: position of the mesh's origin, meters; with `size` of the mean of its vertices.
+            size: diameter in meters of the sphere around that mean that holds the mesh; by default
+                the mesh keeps the units of its file.
             rotation_deg: angles about the world's X, then Y, then Z.
             licence: SPDX identifier, or `LicenseRef-...`.
 
         Raises:
-            TrilightError: no such file, arrays that are no mesh, or invalid numbers.
+            TrilightError: no such file, arrays that are not a mesh, or invalid numbers.
         """
         if isinstance(mesh, tuple):
             name = name or f"object{len(self._objects)}"
-            found: LoadedMesh | _MeshFile = mesh_of_arrays(*mesh, uid=name, licence=licence)
+            loaded: LoadedMesh | _MeshFile = mesh_of_arrays(*mesh, uid=name, licence=licence)
         else:
-            found = _MeshFile(path=Path(mesh), licence=licence)
-            if not found.path.is_file():
-                raise TrilightError(f"{found.path}: no such file; expected a mesh.")
-            name = name or self._unused(found.path.stem)
+            loaded = _MeshFile(path=Path(mesh), licence=licence)
+            if not loaded.path.is_file():
+                raise TrilightError(f"{loaded.path}: no such file; expected a mesh.")
+            name = name or self._unique_name(loaded.path.stem)
         if size is not None and not 0 < size < np.inf:
             raise TrilightError(f"{name}: size is {size}; expected metres above 0.")
-        if size is not None and isinstance(found, LoadedMesh) and found.reach == 0:
+        if size is not None and isinstance(loaded, LoadedMesh) and loaded.reach == 0:
             raise TrilightError(f"{name}: all vertices are one point; expected a mesh.")
         scale = 1.0 if size is None else float(size)
         transform = DescribedTransform(
@@ -109,7 +108,7 @@ class SceneBuilder:
             scale=(scale, scale, scale),
             normalize=size is not None,
         )
-        return self._add(name, found, transform, material or Material())
+        return self._add(name, loaded, transform, material or Material())
 
     def add_builtin(
         self,
@@ -122,11 +121,11 @@ class SceneBuilder:
         size: float = 0.6,
         rotation_deg: Vector = (0.0, 0.0, 0.0),
     ) -> Self:
-        """Add a procedural object, such as the 3rd `rock` or `torus_knot` of `builtin:`.
+        """Add a procedural object, such as the third `rock` or `torus_knot` of `builtin:`.
 
         Args:
-            family: a name of pipeline.objects.generated.
-            number: which of the family, from 0.
+            family: name of a family in pipeline.objects.generated.
+            number: index within the family, from 0.
             material, name, at, size, rotation_deg: as `add_mesh`.
 
         Raises:
@@ -135,7 +134,7 @@ class SceneBuilder:
         return self.add_mesh(
             builtin_mesh(family, number),
             material,
-            name=name or self._unused(family),
+            name=name or self._unique_name(family),
             at=at,
             size=size,
             rotation_deg=rotation_deg,
@@ -145,12 +144,12 @@ class SceneBuilder:
     def add_floor(
         self, material: Material | None = None, *, size: float = 2.0, height: float = -0.5
     ) -> Self:
-        """Add a level square of 128 triangles, as the rooms of our datasets have.
+        """Add a level square of 128 triangles, as in the rooms of Trilight's datasets.
 
         Args:
-            material: of the floor; grey by default.
-            size: side in metres; its middle is above the origin.
-            height: where it lies, metres; the floor of the nominal room is at -0.5.
+            material: material of the floor; gray by default.
+            size: side in meters; the square is centered at x = y = 0.
+            height: z of the floor in meters; the floor of the nominal room is at -0.5.
         """
         placement = PatchPlacement(
             rotation_deg=(0, 0, 0),
@@ -158,7 +157,7 @@ class SceneBuilder:
             scale=(size, size, 1),
             translation=(0, 0, 1 + 2 * height),
         )
-        name = self._unused("floor")
+        name = self._unique_name("floor")
         square = (patch(SIDES["floor"], placement), PATCH_FACES)
         mesh = mesh_of_arrays(*square, uid=f"{SHELL_FOLDER}{name}", licence=_CC0)
         flat = dataclasses.replace(material or Material(), smooth=False)
@@ -172,18 +171,18 @@ class SceneBuilder:
         size: float = 0.15,
         towards: Vector = (0.0, 0.0, 0.0),
     ) -> Self:
-        """Add an emitter: one triangle with equal sides, hidden from the camera, bright on both.
+        """Add an emitter: an equilateral triangle that emits from both sides, hidden from cameras.
 
         Args:
-            at: its middle, metres.
+            at: center of the triangle, meters.
             radiance: linear red, green, blue, or one number for white.
-            size: its side in metres; the power grows with its square.
-            towards: the point that it faces.
+            size: edge length in meters; the power grows with its square.
+            towards: point that the triangle faces.
 
         Raises:
             TrilightError: invalid numbers.
         """
-        name = self._unused("lamp")
+        name = self._unique_name("lamp")
         middle, target = (
             vector(f"{name}: {what}", value) for what, value in (("at", at), ("towards", towards))
         )
@@ -208,11 +207,11 @@ class SceneBuilder:
         fov_deg: float = 40.0,
         up: Vector = (0.0, 0.0, 1.0),
     ) -> Self:
-        """Add a view.
+        """Add a camera.
 
         Args:
-            at: where the camera is, metres.
-            look_at: the point in the middle of the picture.
+            at: position of the camera, meters.
+            look_at: point in the center of the picture.
             fov_deg: full angle of view, equal in width and height.
             up: roughly upwards in the picture; not along the view.
         """
@@ -227,7 +226,7 @@ class SceneBuilder:
         return self
 
     def scene(self) -> Scene:
-        """Return the scene; it passes `Scene.check`. Files are read here, by a child process.
+        """Build the scene, which passes `Scene.check`. A child process reads the mesh files.
 
         Raises:
             TrilightError: a file is unusable, two objects have one name, albedos add up to more
@@ -254,7 +253,7 @@ class SceneBuilder:
         )
 
     def _read(self) -> list[LoadedMesh]:
-        with SceneReader() as reader:  # starts no child where no mesh is a file
+        with SceneReader() as reader:  # starts a child process only for mesh files
             return [
                 reader.mesh(mesh.path, mesh.licence) if isinstance(mesh, _MeshFile) else mesh
                 for mesh in self._meshes
@@ -279,8 +278,8 @@ class SceneBuilder:
         self._meshes.append(mesh)
         return self
 
-    def _unused(self, name: str) -> str:
-        """Return a name that no object has yet: `name`, `name1`, `name2`."""
+    def _unique_name(self, name: str) -> str:
+        """Return a name that no object has yet: `name`, `name1` or `name2`, and so on."""
         taken = {described.name for described in self._objects}
         tries = (f"{name}{number or ''}" for number in range(len(taken) + 1))
         return next(text for text in tries if text not in taken)

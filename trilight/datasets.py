@@ -1,4 +1,4 @@
-"""Datasets: made, opened, walked through and counted."""
+"""Datasets: generate, open, read and count them."""
 
 from typing import TYPE_CHECKING
 
@@ -23,15 +23,15 @@ __all__ = [
 
 
 def generate(order: DatasetOrder) -> "Outcome":
-    """Make a dataset, or what is missing of it, as `trilight generate` does.
+    """Generate a dataset, or its missing scenes, as `trilight generate` does.
 
-    It may be stopped at any time; the same order goes on, and ends in the same dataset digest.
+    The call may be stopped at any time; the same order resumes and gives the same dataset digest.
 
     Args:
-        order: which build, where, how many scenes: what the command line takes as options.
+        order: build, folder, number of scenes: the options of the command line.
 
     Raises:
-        TrilightError: what the user can mend; what is finished is safe.
+        TrilightError: an error that the user can fix; finished scenes are safe.
     """
     from pipeline.executors.threads import ThreadRunner
     from pipeline.generation.pipeline import make_dataset

@@ -1,4 +1,4 @@
-"""What goes wrong for a reason that the user can mend."""
+"""The exception for errors that the user can fix."""
 
 from storage.errors import TrilightError
 

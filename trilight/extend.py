@@ -1,4 +1,4 @@
-"""Building blocks for extensions: your own templates, builds, sources, metrics and runs.
+"""Building blocks of extensions: templates, builds, sources, metrics and runs.
 
 An extension imports from `trilight` alone, because the packages behind it have other names in a
 checkout than in an installed wheel. Entries of a table (TEMPLATES, BUILDS, METRICS ...) are added

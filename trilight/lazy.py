@@ -1,14 +1,14 @@
-"""Names that a module offers and imports on first use, so that importing it loads nothing slow."""
+"""Lazy exports of a module, so that importing it loads nothing slow."""
 
 import ast
 from pathlib import Path
 
 
 def offered_names(file: str) -> dict[str, str]:
-    """Return each name that a module offers, with the module to import it from.
+    """Return each exported name of a module, with the module to import it from.
 
-    They are the imports under `if TYPE_CHECKING:`, so that type checkers and `import` read one
-    list. A wheel's build rewrites them together with all other imports (infra/setup/wheel_tree.py).
+    The exports are the imports under `if TYPE_CHECKING:`, so that type checkers and `import` read
+    one list. The wheel's build rewrites them with all other imports (infra/setup/wheel_tree.py).
 
     Args:
         file: the module's `__file__`.

@@ -1,4 +1,4 @@
-"""Networks trained and judged; torch is loaded when a function is called."""
+"""Networks: train and evaluate them; torch is loaded when a function is called."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -45,33 +45,31 @@ def train_network(
     watched: WatchSettings | None = None,
     progress: "TrainProgress | None" = None,
 ) -> "TrainResult":
-    """Train a network on a dataset and judge it, as `trilight train` does, in this process.
+    """Train a network on a dataset and evaluate it, as `trilight train` does, in this process.
 
-    Several processes or machines train by the command: `torchrun -m trilight train`.
+    The command trains on several processes or machines: `torchrun -m trilight train`.
 
     Args:
         run: named run, such as `smoke` or `pretrain`.
-        data: root of a dataset, with a train split, or several roots, whose scenes are mixed as the
-            change `data_weights` says.
+        data: root of a dataset with a train split, or several roots, mixed by `data_weights`.
         out: folder of the run.
-        steps: replaces the run's number of steps.
+        steps: number of steps instead of the run's.
         changes: other settings by dotted name, such as `{"model.width": 64}`.
-        resume: go on from the folder's newest checkpoint.
-        branch: checkpoint, or folder of a run, to go on from in the new folder `out`.
-        decisions: settings by dotted name that change where the run goes on, which it records.
-        begin_with: network that a finetune run begins with.
+        resume: resume from the folder's newest checkpoint.
+        branch: checkpoint or folder of a run to resume from in the new folder `out`.
+        decisions: settings by dotted name that change on resuming; the run records them.
+        begin_with: initial network of a finetune run.
         lpips: folder of LPIPS' weights, or `hub`.
-        workers: threads that decode samples; as many as the machine has to spare unless said.
+        workers: threads that decode samples; by default as many as the machine can spare.
         device: cpu or cuda; by default cuda where there is one.
-        watched: how the run is watched, such as WatchSettings(profile=5).
-        progress: receives the progress of the run; by default nothing does.
+        watched: monitoring settings, such as WatchSettings(profile=5).
+        progress: receiver of the run's progress; none by default.
 
     Raises:
         TrilightError: PyTorch is not installed, a setting or the data is refused, or the folder
             already holds a run.
     """
     require_torch("train_network")
-    places = [data] if isinstance(data, str | os.PathLike) else data
     settings = changed_run(run, changes or {}, steps=steps)
     start = StartOptions(
         resume=resume,
@@ -81,20 +79,44 @@ def train_network(
         lpips=lpips,
     )
     start.check(settings)
+    return _train_alone(
+        settings,
+        start,
+        roots=[data] if isinstance(data, str | os.PathLike) else data,
+        out=Path(out),
+        device=device,
+        workers=workers,
+        watched=watched,
+        progress=progress,
+    )
+
+
+def _train_alone(
+    settings: TrainSettings,
+    start: StartOptions,
+    *,
+    roots: Sequence[str | os.PathLike[str]],
+    out: Path,
+    device: str | None,
+    workers: int | None,
+    watched: WatchSettings | None,
+    progress: "TrainProgress | None",
+) -> "TrainResult":
+    """Train in this process as the only rank."""
     from train.loop.distributed import DistributedContext, choose_device
     from train.run import train_run
 
     result = train_run(
         settings,
-        data=[os.fspath(place) for place in places],
-        out=Path(out),
+        data=[os.fspath(root) for root in roots],
+        out=out,
         start=start,
         dist_context=DistributedContext(device=choose_device(device)),
         workers=workers,
         watched=watched,
         progress=progress,
     )
-    assert result is not None  # the first process of a crew of one
+    assert result is not None  # rank 0 returns a result
     return result
 
 
@@ -110,9 +132,9 @@ def judge_network(
     device: str | None = None,
     done: Callable[[int, int], None] = lambda now, total: None,
 ) -> "Judgement":
-    """Judge a network on a split of a dataset, as `trilight evaluate` does.
+    """Evaluate a network on a split of a dataset, as `trilight evaluate` does.
 
-    Arguments, result and errors are those of infra.judging.judge_network; `data` is one dataset.
+    Arguments, result and errors are as in infra.judging.judge_network; `data` is one dataset.
 
     Raises:
         TrilightError: also where PyTorch is not installed.
@@ -136,7 +158,7 @@ def judge_network(
 def write_judgement(judgement: "Judgement", out: str | os.PathLike[str]) -> Path:
     """Write evaluation.json, evaluation.md and sheets of pictures into a folder; return it.
 
-    It is `out`, or where another network's report is there, out-2, out-3 ...
+    The folder is `out`, or `out-2`, `out-3` ... where `out` holds another network's report.
     """
     from infra import judging
 

@@ -1,4 +1,4 @@
-"""What a scene is put together from: a material, and arrays that are a mesh."""
+"""Components of a scene from Python: materials, and meshes from arrays."""
 
 from typing import Annotated
 
@@ -14,18 +14,18 @@ from storage.settings.ranges import FLOAT32_MAX, Within
 
 @checked("material")
 class Material:
-    """How a surface reflects or shines: Lambert and GGX, as storage.conventions says."""
+    """Reflection and emission of a surface: Lambert and GGX, as in storage.conventions."""
 
     diffuse: Annotated[tuple[float, ...], Within(0, 1)] = (0.5, 0.5, 0.5)
     """Diffuse albedo, linear red, green, blue; with `specular` at most 1 in each."""
     specular: Annotated[tuple[float, ...], Within(0, 1)] = (0.0, 0.0, 0.0)
-    """Specular albedo."""
+    """Specular albedo, linear red, green, blue."""
     roughness: Annotated[float, Within(0, 1)] = 0.5
-    """The GGX width is its square."""
+    """Roughness; its square is the GGX width."""
     emission: Annotated[tuple[float, ...], Within(0, FLOAT32_MAX)] = (0.0, 0.0, 0.0)
-    """Radiance of both sides; every triangle of a mesh that shines is an emitter of its own."""
+    """Radiance of both sides; each triangle of an emitting mesh is a separate emitter."""
     smooth: bool = True
-    """Whether normals are interpolated across edges of up to 30 degrees; flat otherwise."""
+    """Interpolate normals across edges of up to 30 degrees; otherwise flat."""
 
     def __post_init__(self) -> None:
         for name in ("diffuse", "specular", "emission"):
@@ -33,7 +33,7 @@ class Material:
 
 
 def described_material(material: Material) -> DescribedMaterial:
-    """Return a material as a scene file would state it."""
+    """Return a material in the form of a scene file."""
     return DescribedMaterial(
         diffuse=vector("diffuse", material.diffuse),
         specular=vector("specular", material.specular),
@@ -47,7 +47,7 @@ def described_material(material: Material) -> DescribedMaterial:
 
 
 def vector(name: str, values: ArrayLike) -> Vector:
-    """Return three finite numbers; raises TrilightError, with `name`, where they are none."""
+    """Return three finite numbers; raises TrilightError with `name` for other values."""
     array = np.asarray(values, np.float64)
     if array.shape != (3,) or not np.isfinite(array).all():
         raise TrilightError(f"{name} is {values!r}; expected three finite numbers.")
@@ -59,7 +59,7 @@ def mesh_of_arrays(positions: ArrayLike, faces: ArrayLike, *, uid: str, licence:
     """Return vertices [V, 3] and triangles [F, 3] as a mesh.
 
     Raises:
-        TrilightError: they are none, named by `uid`.
+        TrilightError: the arrays are not a mesh; the message names `uid`.
     """
     points: NDArray[np.float64] = np.asarray(positions, np.float64)
     rows = np.asarray(faces)
@@ -67,8 +67,8 @@ def mesh_of_arrays(positions: ArrayLike, faces: ArrayLike, *, uid: str, licence:
         raise TrilightError(
             f"{uid}: vertices have shape {points.shape}; expected [V, 3] finite metres."
         )
-    whole = np.issubdtype(rows.dtype, np.integer)
-    if rows.ndim != 2 or rows.shape[1:] != (3,) or len(rows) == 0 or not whole:
+    is_integer = np.issubdtype(rows.dtype, np.integer)
+    if rows.ndim != 2 or rows.shape[1:] != (3,) or len(rows) == 0 or not is_integer:
         raise TrilightError(
             f"{uid}: triangles have shape {rows.shape} and dtype {rows.dtype}; expected [F, 3] "
             "whole numbers."

@@ -1,4 +1,4 @@
-"""Pictures of a scene: what its pixels see, path traced, or by a trained network."""
+"""Pictures of a scene: visible surfaces, path traced light, or a trained network's render."""
 
 import os
 from collections.abc import Sequence
@@ -53,32 +53,32 @@ def render(
     seed: int = 0,
     threads: int | None = None,
 ) -> RenderedView:
-    """Return the path traced picture of one camera, with its measured error.
+    """Render one camera by path tracing, with the picture's measured error.
 
-    Equal arguments give equal pictures. A child process with limits renders; each call pays for
-    its start, so several cameras are cheaper by `render_views`.
+    Equal arguments give equal pictures. A child process with limits renders; each call starts one,
+    so `render_views` is cheaper for several cameras.
 
     Args:
-        scene: passes `Scene.check`.
-        view: row of `scene.c2w`.
+        scene: a scene that passes `Scene.check`.
+        view: camera, a row of `scene.c2w`.
         resolution: width and height in pixels, a multiple of 8.
         noise_floor_db: sampling stops when the measured error (psnr_log_db) reaches this; by
             default 40, or none where another floor is given.
-        noise_floor_linear_db: the same as psnr_linear_db; of several, all are reached.
-        noise_floor_objects_db: the same as object_psnr_log_db: where geometry is seen.
+        noise_floor_linear_db: the same for psnr_linear_db; all given floors are reached.
+        noise_floor_objects_db: the same for object_psnr_log_db: pixels that show geometry.
         max_spp: sampling also stops at this many samples per pixel.
         split: also return direct and indirect light, whose sum is the picture.
         split_lobes: also return the light of the diffuse and of the specular lobe of the visible
-            surface; with `split` there are four parts.
-        seed: of the samples.
-        threads: of the processor; all cores by default.
+            surface; with `split` there are four layers.
+        seed: seed of the samples.
+        threads: CPU threads; all cores by default.
 
     Returns:
-        `radiance_rgb` [R, R, 3] float32 linear radiance, its three floors, `spp` and more; where
-        parts are asked for, `parts_rgb` and `part_floors` by their names.
+        `radiance_rgb` [R, R, 3] float32 linear radiance, its three floors, `spp` and more; with a
+        split also `parts_rgb` and `part_floors` by name.
 
     Raises:
-        TrilightError: a number that is refused, or a scene that cannot be rendered.
+        TrilightError: an invalid number, or a scene that cannot be rendered.
     """
     (picture,) = render_views(
         scene,
@@ -110,13 +110,13 @@ def render_views(
     seed: int = 0,
     threads: int | None = None,
 ) -> list[RenderedView]:
-    """Return the path traced pictures of several cameras of a scene, which is loaded once.
+    """Render several cameras of a scene by path tracing; the scene is loaded once.
 
     Args:
-        scene: passes `Scene.check`.
-        views: rows of `scene.c2w`; all by default.
+        scene: a scene that passes `Scene.check`.
+        views: cameras, as rows of `scene.c2w`; all by default.
         resolution, noise_floor_db, noise_floor_linear_db, noise_floor_objects_db, max_spp, split,
-            split_lobes, seed, threads: as `render`, which says what comes back and what is refused.
+            split_lobes, seed, threads: as in `render`, which documents results and errors.
     """
     from pipeline.generation.path_tracer import PathTracer
     from pipeline.renders.variant import choose_variant
@@ -155,16 +155,16 @@ def open_network(
     device: str | None = None,
     precision: str = "float32",
 ) -> "NeuralRenderer":
-    """Return a trained network; its `render(scene)` gives pictures [V, R, R, 3] of all cameras.
+    """Load a trained network; its `render(scene)` gives pictures [V, R, R, 3] of all cameras.
 
     Args:
-        checkpoint: `builtin:`, the model.safetensors of a run, or the published network's folder
-            or name on the Hugging Face hub.
-        device: of torch; by default the graphics card where there is one.
+        checkpoint: `builtin:`, the model.safetensors of a run, or RenderFormer's folder or name on
+            the Hugging Face hub.
+        device: PyTorch device; by default the GPU where there is one.
         precision: a name of model.precision.PRECISIONS.
 
     Raises:
-        TrilightError: no such file, no network, or PyTorch is not installed.
+        TrilightError: no such file, not a network, or PyTorch is not installed.
     """
     require_torch("open_network")
     from model.neural_renderer import NeuralRenderer
@@ -176,11 +176,11 @@ def write_picture(path: str | os.PathLike[str], radiance_rgb: NDArray[np.float32
     """Write a picture as OpenEXR (radiance in half floats) or as PNG (for looking).
 
     Args:
-        path: ends in `.exr` or `.png`.
+        path: file that ends in `.exr` or `.png`.
         radiance_rgb: [R, R, 3] linear radiance of at least 0; beyond 65504 it is clipped.
 
     Raises:
-        TrilightError: another suffix, a value that is no radiance, or a place that cannot be
+        TrilightError: another suffix, a value that is not a radiance, or a path that cannot be
             written.
     """
     from pipeline.documents.png import encode_png

@@ -1,4 +1,4 @@
-"""Scenes of files: read, written, and brought to the size that a network knows."""
+"""Scene files: read, write, and reduce them to a network's number of triangles."""
 
 import os
 import warnings
@@ -18,33 +18,33 @@ __all__ = ["Scene", "SceneObject", "read_scene", "read_scenes", "within_budget",
 
 
 def read_scene(source: str | os.PathLike[str]) -> Scene:
-    """Return one scene with all of its cameras; it passes `Scene.check`.
+    """Read one scene with all of its cameras; it passes `Scene.check`.
 
-    Warns of unknown parts of the file, and of what could not be carried over. A child process with
-    limits reads it, so that no file can crash or fill this one.
+    Warns of unknown parts of the file, and of parts that a scene cannot hold. A child process with
+    limits reads it, so that no file can crash this process or fill its memory.
 
     Args:
         source: `.usda .usdc .usdz .usd`, RenderFormer's `.json` or `.h5`, `.safetensors`, or
             `SHARD.tar::KEY`.
 
     Raises:
-        TrilightError: anything in the file is unusable, or breaks a law of scenes.
+        TrilightError: a part of the file is unusable, or breaks a rule of scenes.
     """
     with SceneReader() as reader:
-        return _noted(reader.load(scene_source(os.fspath(source))))
+        return _warn_notes(reader.load(scene_source(os.fspath(source))))
 
 
 def read_scenes(source: str | os.PathLike[str]) -> Iterator[Scene]:
     """Yield every scene of a shard, a moving USD stage, a folder of scene files, or numbered files.
 
-    Warns and raises as `read_scene`, which says what a scene file may be.
+    Warns and raises as `read_scene`, which lists the forms of scene files.
 
     Args:
         source: such as `train-000000.tar`, `stage.usdc`, `scenes/` or `scenes/{000..119}.json`.
     """
     with SceneReader() as reader:
-        for found in scene_sources(os.fspath(source), reader):
-            yield _noted(reader.load(found))
+        for entry in scene_sources(os.fspath(source), reader):
+            yield _warn_notes(reader.load(entry))
 
 
 def write_scene(
@@ -53,36 +53,36 @@ def write_scene(
     *,
     radiance_rgb: NDArray[np.float32] | None = None,
 ) -> tuple[str, ...]:
-    """Write a scene in the form that the path's suffix says; return what that form cannot hold.
+    """Write a scene in the format of the path's suffix; return notes on lost parts.
 
     Args:
-        scene: passes `Scene.check`.
-        path: ends in `.usda .usdc .usdz .glb .json .h5` or `.safetensors`. Meshes of a `.json` are
-            written beside it.
-        radiance_rgb: [V, R, R, 3] linear radiance of its views, which `.h5` alone holds.
+        scene: a scene that passes `Scene.check`.
+        path: file that ends in `.usda .usdc .usdz .glb .json .h5` or `.safetensors`. Meshes of a
+            `.json` are written next to it.
+        radiance_rgb: [V, R, R, 3] linear radiance of the views, which only `.h5` holds.
 
     Raises:
-        TrilightError: the scene breaks a law, there is no such form, or it cannot be written.
+        TrilightError: the scene breaks a rule, the suffix is unknown, or writing fails.
     """
     scene.check()
     return write_in_form(Path(path), scene, radiance_rgb)
 
 
 def within_budget(scene: Scene, max_triangles: int) -> Scene:
-    """Return the scene with fewer triangles; emitters stay whole. Warns of what it cost.
+    """Return the scene with fewer triangles; emitters stay whole. Warns of the loss.
 
     Args:
-        scene: passes `Scene.check`.
-        max_triangles: the limit, such as the 768 of the network that comes with Trilight.
+        scene: a scene that passes `Scene.check`.
+        max_triangles: limit, such as the 768 of the built-in network.
 
     Raises:
-        TrilightError: emitters alone are more, or an object cannot be reduced that far.
+        TrilightError: the emitters alone exceed it, or an object cannot be reduced that far.
     """
     with SceneReader() as reader:
-        return _noted(reader.within_budget(scene, max_triangles))
+        return _warn_notes(reader.within_budget(scene, max_triangles))
 
 
-def _noted(loaded: LoadedScene) -> Scene:
+def _warn_notes(loaded: LoadedScene) -> Scene:
     for note in loaded.notes:
         warnings.warn(note, stacklevel=3)
     return loaded.scene

@@ -45,7 +45,7 @@ class AssetOptions:
     source: str
     """Source of 3D objects: a folder or a URL, builtin:, or objaverse:."""
     out: Path
-    """Folder for the meshes."""
+    """Folder that receives the meshes."""
     budget: Annotated[int | None, _LEVELS] = None
     """Maximum number of triangles of an object; by default 1400, or 4096 with --epsilon."""
     epsilon: str | None = None

@@ -49,7 +49,7 @@ class InspectOptions:
     out: Path | None = None
     """Folder for the report and the sheet; by default the dataset's own."""
     turntable: Path | None = None
-    """For one scene: picture X.png with views from all sides; by default none."""
+    """Picture file X.png for views of one scene from all sides; by default none."""
 
 
 @command("source")

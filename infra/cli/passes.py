@@ -36,9 +36,9 @@ class PassOptions:
 def passes(options: PassOptions, output: OutputOptions) -> None:
     names = pass_names(name for words in options.passes for name in words.split(","))
     first_words(f"Writing {', '.join(names)} to {options.out}", silent=output.json)
-    from pipeline.exchange.pass_files import WantedPasses, write_passes
+    from pipeline.exchange.pass_files import PassFileOptions, write_passes
 
-    selection = WantedPasses(
+    selection = PassFileOptions(
         names=names,
         scene=options.scene,
         view=options.view,

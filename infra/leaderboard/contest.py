@@ -36,7 +36,7 @@ class BoardContest:
     """Scenes, widths and contestants of a leaderboard."""
 
     shards: ShardSet
-    """Shards of the split."""
+    """Dataset shards of the evaluated split."""
     keys: Sequence[str]
     """Keys of the evaluated scenes, the first ones of the split."""
     num_views: int

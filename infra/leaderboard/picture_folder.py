@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from infra.leaderboard.contestants import ELSEWHERE, ShownViews
 from pipeline.exchange.exports.scenes import picture_name
-from pipeline.exchange.pictures import MAX_BYTES, decoded_pixels
+from pipeline.exchange.pictures import MAX_BYTES, decode_pixels
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.safe_read import read_plain
@@ -96,7 +96,7 @@ def _bytes_of(path: Path) -> bytes:
 
 def _picture(data: bytes, path: Path, widths: Sequence[int]) -> NDArray[np.float32]:
     """Return the radiance [R, R, 3] of a file whose width is one of `widths`."""
-    pixels = decoded_pixels(data, path.name)
+    pixels = decode_pixels(data, path.name)
     if pixels is None or pixels.dtype != np.float32 or pixels.shape[2] < 3:
         raise TrilightError(
             f"{path.name}: no readable OpenEXR picture of channels R, G and B; expected linear "

@@ -16,7 +16,7 @@ class OutputPaths:
     stem: Path | None
     """Path of the only picture without its suffix; None for many pictures."""
     folder: Path
-    """Folder of the pictures."""
+    """Folder that receives the pictures."""
     video: Path | None
     """Path of the video; None without one."""
 

@@ -36,7 +36,7 @@ class PictureKey:
     source: str
     """Name of the scene's file, without its folders."""
     scene_sha256: str
-    """storage.records.scene_file.scene_digest."""
+    """Digest of the scene by storage.records.scene_file.scene_digest."""
     camera: ShotCamera
     view: int | None
     """Row of the camera in the scene; None for a camera from elsewhere."""

@@ -40,7 +40,7 @@ class SceneIdentity:
     """Digest and size of a scene."""
 
     digest: str
-    """SHA-256 by storage.records.scene_file.scene_digest."""
+    """SHA-256 of the scene by storage.records.scene_file.scene_digest."""
     num_triangles: int
     """Number of triangles, emitting ones included."""
     num_lights: int

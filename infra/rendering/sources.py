@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from pipeline.exchange.formats import SceneSource, readable
+from pipeline.exchange.formats import SceneSource, readable_suffixes
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
 from storage.dataset.shard_places import expand_pattern
@@ -30,10 +30,11 @@ def scene_sources(text: str, reader: SceneReader) -> list[SceneSource]:
 
 
 def _scene_files(folder: Path) -> list[Path]:
-    paths = [path for path in folder.iterdir() if path.suffix.lower() in readable()]
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in readable_suffixes()]
     if not paths:
         raise TrilightError(
-            f"{folder}: holds no scene file; expected files that end in {' '.join(readable())}."
+            f"{folder}: holds no scene file; expected files that end in "
+            f"{' '.join(readable_suffixes())}."
         )
     return sorted(paths, key=lambda path: _by_number(path.name))
 

@@ -66,12 +66,12 @@ def _deploy_flow(row: dict[str, Any]) -> None:
     file, function = row["entrypoint"].split(":")
     flow = getattr(importlib.import_module(file.removesuffix(".py").replace("/", ".")), function)
     ((_, folder),) = apply_values(row["pull"], dict(os.environ))[0].items()
-    given = {key: row.get(key) for key in ("description", "tags", "parameters")}
+    options = {key: row.get(key) for key in ("description", "tags", "parameters")}
     deployment: RunnerDeployment = flow.to_deployment(
         row["name"],
         work_pool_name=row["work_pool"]["name"],
         concurrency_limit=row.get("concurrency_limit"),
-        **given,
+        **options,
     )
     deployment.storage = LocalStorage(folder["directory"])
     deployment.entrypoint = row["entrypoint"]

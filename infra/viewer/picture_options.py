@@ -23,7 +23,7 @@ class PictureOptions:
     """Options of one picture."""
 
     engine: str
-    """Name of the renderer."""
+    """Name of the renderer that makes the picture."""
     camera: ShotCamera
     view: int | None
     """Row of `camera` in the scene; None for another camera."""

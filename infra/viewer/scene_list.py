@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.exchange.formats import readable
+from pipeline.exchange.formats import readable_suffixes
 from storage.errors import TrilightError
 
 MOST_FILES = 5000
@@ -31,7 +31,7 @@ def scene_list(root: Path) -> SceneList:
     Raises:
         TrilightError: there is no such file.
     """
-    suffixes = frozenset(readable())
+    suffixes = frozenset(readable_suffixes())
     names = list[str]()
     for name in _files(root):
         if Path(name).suffix.lower() in suffixes:
@@ -41,7 +41,7 @@ def scene_list(root: Path) -> SceneList:
     if not names:
         raise TrilightError(
             f"{root}: no dataset, and holds no scene; expected a folder that `trilight generate` "
-            f"wrote, or files {' '.join(readable())} in it."
+            f"wrote, or files {' '.join(readable_suffixes())} in it."
         )
     return SceneList(root=root, names=tuple(names[:MOST_FILES]), is_cut=len(names) > MOST_FILES)
 

@@ -1,4 +1,4 @@
-"""What one method makes of an object: the answer of a child, read without any mesh library."""
+"""The result of one decimation method: a child process's answer, free of mesh libraries."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,13 +8,13 @@ from storage.records.asset import Asset
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AssetAttempt:
-    """What one method made of an object."""
+    """The result of one decimation method for one object."""
 
     method: str
-    """The one that was used: another than asked for where that one is not safe for the mesh."""
+    """Method that ran: `meshoptimizer` where the requested one is unsafe for this mesh."""
     asset: Asset
-    """With the levels that passed the gate, possibly none."""
+    """The asset, with the levels that passed the quality checks; possibly none."""
     missed: Mapping[int, tuple[str, str]]
-    """Reason and message by budget, for the levels that did not."""
+    """Reason code and message by budget, for the levels that failed."""
     unread: tuple[str, ...] = ()
-    """What of the file no code has read, in short sentences."""
+    """Short sentences, one for each part of the file that no reader handled."""

@@ -1,4 +1,4 @@
-"""Whether this machine's pymeshlab can do what we ask of it.
+"""Checks that the installed pymeshlab has the filters that the mesh stage calls.
 
 Without the system library libOpenGL.so.0, pymeshlab imports with a warning and lacks 46 of its
 filters. That is a fault of the environment, which stops a run; it must not reject every object.
@@ -8,11 +8,11 @@ from importlib.util import find_spec
 
 
 def missing_filters() -> list[str]:
-    """Return the filters that this stage calls and pymeshlab does not have; empty when all is well.
+    """Return the filters that this stage calls and the installed pymeshlab lacks.
 
-    All is well, too, without pymeshlab: `recipe.methods_of` then leaves its methods out.
+    The list is empty without pymeshlab too: `recipe.methods_of` then leaves its methods out.
 
-    It loads the native libraries (about one second), so ask in a child process.
+    The call loads the native libraries (about one second), so run it in a child process.
     """
     if find_spec("pymeshlab") is None:
         return []

@@ -1,4 +1,4 @@
-"""Parallel rays from around the unit box, and what they meet first."""
+"""Parallel rays from around the unit box, and the faces that they hit first."""
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh as EmbreeMesh
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pipeline.foreign.mesh import TriangleMesh
 
 RADIUS = 0.9
-"""Of a sphere around the unit box, whose corners are sqrt(3)/2 away from its centre."""
+"""Radius of a sphere around the unit box, whose corners are sqrt(3)/2 from its center."""
 
 
 def outside_rays(
@@ -36,7 +36,7 @@ def outside_rays(
 def first_faces(
     mesh: TriangleMesh, origins: NDArray[np.float32], directions: NDArray[np.float32]
 ) -> NDArray[np.int64]:
-    """Return the face [R] that each ray meets first, from either side; -1 where it meets none.
+    """Return the face [R] that each ray hits first, from either side; -1 where it hits none.
 
     Computed in single precision: a ray may slip through the seam between two faces.
     """

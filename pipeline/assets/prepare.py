@@ -1,4 +1,4 @@
-"""One object: from a file to an `Asset`. It runs in a child process: native code may end it."""
+"""Prepares one object: from a file to an `Asset`, in a child process that may crash."""
 
 from pathlib import Path
 
@@ -6,17 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.attempt import AssetAttempt
-from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalise
+from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalize
 from pipeline.assets.cleaning.guards import check_clean, check_raw
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.decimation.by_name import decimate, safe_method
 from pipeline.assets.decimation.smallest import smallest_passing
-from pipeline.assets.own.levels import with_own_materials
-from pipeline.assets.quality.gate import check_level
+from pipeline.assets.quality.level_checks import check_level
 from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.assets.quality.triangles import count_edges
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
+from pipeline.assets.source_materials.levels import add_source_materials
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
@@ -27,31 +27,31 @@ from storage.records.asset import Asset, Level, LevelQuality, LevelRecord, Sourc
 def prepare_asset(
     path: Path, settings: AssetSettings, method: str, root: Path | None = None
 ) -> AssetAttempt:
-    """Return the clean, outward oriented object at all budgets at which it passes the gate.
+    """Return the clean, outward oriented object at every budget that passes the quality checks.
 
     Args:
         path: the only file that is opened, with the buffers that a glTF names below its folder.
         settings: profile, budgets and limits.
-        method: a name of `recipe.methods_of`, for the levels that are not the source as it is.
-        root: folder of its pictures, as of `read_source`.
+        method: a name of `recipe.methods_of`, for levels other than the unchanged source.
+        root: folder of its pictures, as in `read_source`.
 
     Raises:
-        Rejected: the object is unusable by any method; the reason codes are those of the steps.
+        Rejected: the object is unusable by any method; each step has its reason codes.
 
-    What it does not do: close holes, or remove inner parts.
+    Holes stay open and inner components stay in.
     """
     source = read_source(path, settings.read_limits, root)
     raw = load_mesh(source)
     check_raw(raw, settings, is_single=source.is_single)
-    cleaned = clean(normalise(raw))
+    cleaned = clean(normalize(raw))
     check_clean(cleaned)
     mesh, front_share = orient_outward(cleaned)
     measured = MeasuredSource(mesh)
-    used = safe_method(mesh, method)
-    levels, missed = _levels(measured, settings, used)
-    levels, missed, materials = with_own_materials(levels, missed, source, mesh, settings)
+    safe = safe_method(mesh, method)
+    levels, missed = _levels(measured, settings, safe)
+    levels, missed, materials = add_source_materials(levels, missed, source, mesh, settings)
     return AssetAttempt(
-        method=used,
+        method=safe,
         asset=Asset(
             geometry_sha256=geometry_sha256(cleaned),
             source_sha256=source.sha256,
@@ -72,19 +72,20 @@ def _facts(
     return SourceFacts(
         num_faces_read=len(raw.faces),
         num_faces=len(source.mesh.faces),
-        num_faces_turned=_count_turned(cleaned, source.mesh),
-        num_parts=source.parts.count,
+        num_faces_turned=_count_flipped(cleaned, source.mesh),
+        num_parts=source.components.count,
         open_edges=edges.open,
         nonmanifold_edges=edges.nonmanifold,
         front_share=round(front_share, 6),
     )
 
 
-def _count_turned(before: TriangleMesh, after: TriangleMesh) -> int:
-    """Count the faces that changed their winding: canonical rows differ in their last two."""
+def _count_flipped(before: TriangleMesh, after: TriangleMesh) -> int:
+    """Count the faces whose winding changed: their canonical rows differ in the last two."""
 
     def second_corners(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-        low, high = faces[:, 1:].min(axis=1), faces[:, 1:].max(axis=1)
+        low = faces[:, 1:].min(axis=1)
+        high = faces[:, 1:].max(axis=1)
         return faces[np.lexsort((high, low, faces[:, 0])), 1]
 
     return int((second_corners(before.faces) != second_corners(after.faces)).sum())
@@ -93,11 +94,11 @@ def _count_turned(before: TriangleMesh, after: TriangleMesh) -> int:
 def _levels(
     source: MeasuredSource, settings: AssetSettings, method: str
 ) -> tuple[tuple[Level, ...], dict[int, tuple[str, str]]]:
-    """Return the levels from the largest budget, and why others are missing.
+    """Return the levels from the largest budget, and the reasons of the missing ones.
 
-    A budget that the level before it meets as well gets no level of its own.
+    A budget that the level before it meets as well gets no level.
     """
-    maker = _LevelMaker(source, settings, method)
+    builder = _LevelBuilder(source, settings, method)
     levels: list[Level] = []
     missed: dict[int, tuple[str, str]] = {}
     for budget in settings.budgets:
@@ -105,14 +106,14 @@ def _levels(
             continue
         try:
             finest = budget == settings.budgets[0]
-            levels.append(maker.smallest(budget) if finest else maker.level(budget))
+            levels.append(builder.smallest(budget) if finest else builder.level(budget))
         except Rejected as failure:
             missed[budget] = (failure.reason, failure.message)
     return tuple(levels), missed
 
 
-class _LevelMaker:
-    """Makes levels of one source by one method."""
+class _LevelBuilder:
+    """Builds the levels of one source by one method."""
 
     def __init__(self, source: MeasuredSource, settings: AssetSettings, method: str) -> None:
         self._mesh = source.mesh
@@ -121,29 +122,29 @@ class _LevelMaker:
         self._method = method
 
     def smallest(self, budget: int) -> Level:
-        """Return the smallest level within epsilon up to `budget`, or the level of that budget."""
+        """Return the smallest level within the mesh tolerance, or else that of `budget`."""
         epsilon = self._settings.epsilon
         if epsilon is None:
             return self.level(budget)
         largest = min(budget, len(self._mesh.faces)) if self._keeps_source else budget
         try:
-            found = smallest_passing(lambda faces: self._make(faces, epsilon), largest)
+            best = smallest_passing(lambda faces: self._make(faces, epsilon), largest)
         except Rejected:
             return self.level(budget)
-        return _level(budget, *found)
+        return _level(budget, *best)
 
     def level(self, budget: int) -> Level:
-        """Return the level of a budget; raises Rejected where it fails the gate."""
+        """Return the level of a budget; raises Rejected where it fails the quality checks."""
         return _level(budget, *self._make(budget, self._settings.gate.max_error_p99))
 
     @property
     def _keeps_source(self) -> bool:
-        """Whether a source within budget is its own level: its triangles need not be even."""
+        """True where a source within budget is used unchanged: its triangles need not be even."""
         return self._settings.profile == "faithful"
 
     def _make(self, faces: int, max_error_p99: float) -> tuple[str, TriangleMesh, LevelQuality]:
         if self._keeps_source and len(self._mesh.faces) <= faces:
-            return "source", self._mesh, self._source.own_quality()
+            return "source", self._mesh, self._source.source_quality()
         result = decimate(self._mesh, faces, self._method)
         gate = self._settings.gate
         mesh, quality = check_level(result, self._source, faces, gate, max_error_p99)
@@ -151,7 +152,7 @@ class _LevelMaker:
 
 
 def _level(budget: int, method: str, mesh: TriangleMesh, quality: LevelQuality) -> Level:
-    """Clean positions lie on a grid that float32 holds exactly."""
+    """Return a level; clean positions lie on a grid that float32 holds exactly."""
     return Level(
         record=LevelRecord(budget=budget, method=method, quality=quality),
         positions=mesh.positions.astype(np.float32),

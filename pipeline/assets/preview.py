@@ -1,15 +1,15 @@
-"""A quick picture of a mesh, for people who compare it with another: grey, lit from the camera."""
+"""Quick previews of meshes for side-by-side comparison: gray, lit from the camera."""
 
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.cleaning.clean import clean, normalise
+from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.outside_rays import first_faces
-from pipeline.assets.own.nearest import barycentric
 from pipeline.assets.settings import AssetSettings
+from pipeline.assets.source_materials.nearest import barycentric
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
@@ -22,55 +22,56 @@ _TOWARDS_CAMERA = np.array([0.62, -0.62, 0.48])
 _BACKGROUND = 1.0
 _LINE_PX = 0.7
 _LINED_PX = (3.0, 9.0)
-"""Sizes of triangles in pixels: no lines below the first, which would only blacken the picture, and
-full ones above the second."""
+"""Triangle sizes in pixels: no edge lines below the first, where they would only blacken the
+picture, and full lines above the second."""
 _SUPERSAMPLE = 2
 
 
-def preview_both(
+def preview_source_and_level(
     path: str, settings: AssetSettings, level: Level, width_px: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return a grey picture [W, W] of a source file as the stage cleans it, and one of its level.
+    """Return gray pictures [W, W] of a cleaned source file and of one of its levels.
 
     Raises Rejected as `prepare_asset`.
     """
     data = read_source(Path(path), settings.read_limits)
-    mesh, _ = orient_outward(clean(normalise(load_mesh(data))))
+    mesh, _ = orient_outward(clean(normalize(load_mesh(data))))
     return preview(mesh, width_px), preview_level(level, width_px)
 
 
 def preview_level(level: Level, width_px: int) -> NDArray[np.uint8]:
-    """Return a picture of a level of an asset: grey [W, W], or [W, W, 3] where it has colours."""
+    """Return a picture of a level: gray [W, W], or [W, W, 3] where the level has colors."""
     mesh = TriangleMesh(
         positions=level.positions.astype(np.float64), faces=level.faces.astype(np.int64)
     )
     grey = preview(mesh, width_px)
-    return grey if level.skin is None else _coloured(mesh, level.skin, width_px)
+    return grey if level.skin is None else _preview_colors(mesh, level.skin, width_px)
 
 
-def _coloured(mesh: TriangleMesh, skin: LevelSkin, width_px: int) -> NDArray[np.uint8]:
-    """Return a picture [W, W, 3] of a mesh in its own colours, without lines."""
+def _preview_colors(mesh: TriangleMesh, skin: LevelSkin, width_px: int) -> NDArray[np.uint8]:
+    """Return a picture [W, W, 3] of a mesh with its textures, without edge lines."""
     wide = width_px * _SUPERSAMPLE
     origins, directions, _ = _camera_rays(wide)
     face = first_faces(mesh, origins.astype(np.float32), directions.astype(np.float32))
     hit = face >= 0
-    colour = np.full((len(face), 3), _BACKGROUND)
-    corners, normals = mesh.corners[face[hit]], mesh.double_area_vectors[face[hit]]
+    color = np.full((len(face), 3), _BACKGROUND)
+    corners = mesh.corners[face[hit]]
+    normals = mesh.double_area_vectors[face[hit]]
     facing = np.einsum("ij,ij->i", normals, -directions[hit])
     facing /= np.linalg.norm(normals, axis=1)
-    away = np.einsum("ij,ij->i", normals, origins[hit] - corners[:, 0])
+    offset = np.einsum("ij,ij->i", normals, origins[hit] - corners[:, 0])
     steep = np.einsum("ij,ij->i", normals, -directions[hit])
-    distance = away / np.where(np.abs(steep) > 1e-12, steep, 1e-12)
+    distance = offset / np.where(np.abs(steep) > 1e-12, steep, 1e-12)
     points = origins[hit] + distance[:, None] * directions[hit]
     uv = np.einsum("nc,ncd->nd", barycentric(corners, points), skin.uv[face[hit]])
     diffuse, specular = (texture_values(texture, uv) for texture in skin.textures[:2])
-    colour[hit] = (diffuse + specular) * (0.25 + 0.75 * np.abs(facing))[:, None]
-    blocks = colour.reshape(width_px, _SUPERSAMPLE, width_px, _SUPERSAMPLE, 3).mean(axis=(1, 3))
+    color[hit] = (diffuse + specular) * (0.25 + 0.75 * np.abs(facing))[:, None]
+    blocks = color.reshape(width_px, _SUPERSAMPLE, width_px, _SUPERSAMPLE, 3).mean(axis=(1, 3))
     return srgb8(blocks)
 
 
 def preview(mesh: TriangleMesh, width_px: int) -> NDArray[np.uint8]:
-    """Return a grey picture [W, W] of a mesh in the unit box, +Z up, with its triangles drawn.
+    """Return a gray picture [W, W] of a mesh in the unit box, +Z up, with its edges drawn.
 
     Parallel projection from the front right and above; back faces are darker.
     """
@@ -104,7 +105,7 @@ def _shade(
     directions: NDArray[np.float64],
     pixel: float,
 ) -> NDArray[np.float64]:
-    """Return the grey of each hit: brighter towards the camera, dark along the edges."""
+    """Return the gray value of each hit: brighter towards the camera, dark along the edges."""
     normal = mesh.double_area_vectors[face]
     unit = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     corner = mesh.corners[face]

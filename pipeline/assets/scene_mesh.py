@@ -1,7 +1,7 @@
-"""The mesh of a scene file: as it is, or with even triangles. It runs in a child process.
+"""Loads the mesh of a scene file: unchanged, or remeshed. It runs in a child process.
 
-A scene file says where each vertex goes, so nothing is centred, joined, repaired or turned around
-here: other than objects for random scenes, a mesh that is named by a scene stays what it is.
+A scene file states where each vertex lies, so nothing is centered, welded, repaired or flipped
+here: unlike objects for random scenes, a mesh that a scene names stays unchanged.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.cleaning.clean import clean, normalise
+from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.guards import check_raw
 from pipeline.assets.decimation.by_name import decimate, safe_method
 from pipeline.assets.recipe import methods_of
@@ -23,18 +23,18 @@ from storage.errors import Rejected
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneMesh:
-    """A mesh in the units of its file, +Z up (a glTF is turned)."""
+    """A mesh in the units of its file, +Z up (a glTF is rotated)."""
 
     mesh: TriangleMesh
-    """Its triangles; the vertices unwelded, possibly some without a triangle."""
+    """Triangles with unwelded vertices; some vertices may belong to no triangle."""
     centre: NDArray[np.float64]
     """[3] mean of all vertices of the file."""
     reach: float
-    """Distance of the farthest of them from the centre."""
+    """Distance of the farthest vertex from the center."""
     sha256: str
-    """Digest of the file."""
+    """SHA-256 digest of the file, in hex."""
     unread: tuple[str, ...]
-    """What of the file no code has read, in short sentences."""
+    """Short sentences, one for each part of the file that no reader handled."""
 
 
 def load_scene_mesh(path: Path, settings: AssetSettings, remesh_faces: int | None) -> SceneMesh:
@@ -44,11 +44,11 @@ def load_scene_mesh(path: Path, settings: AssetSettings, remesh_faces: int | Non
         path: the only file that is opened, with the buffers that a glTF names below its folder.
         settings: limits on bytes and faces.
         remesh_faces: most triangles of a remeshed mesh, or None for the mesh as it is. Remeshing
-            is the profile `uniform` of the mesh stage without its gate; the published one gives
-            other triangles.
+            is the profile `uniform` of the mesh stage without its quality checks; RenderFormer's
+            own remeshing gives other triangles.
 
     Raises:
-        Rejected: the reason codes of reading, of `check_raw`, and `remesh_failed`.
+        Rejected: reading or `check_raw` failed, or `remesh_failed`.
         TrilightError: remeshing without pymeshlab.
     """
     source = read_source(path, settings.read_limits)
@@ -58,7 +58,7 @@ def load_scene_mesh(path: Path, settings: AssetSettings, remesh_faces: int | Non
         raise Rejected("nonfinite_vertices", "a vertex without a triangle is not finite")
     centre = raw.positions.mean(axis=0)
     reach = float(np.sqrt(np.sum(np.square(raw.positions - centre), axis=1).max()))
-    mesh = raw if remesh_faces is None else remeshed(raw, remesh_faces)
+    mesh = raw if remesh_faces is None else remesh(raw, remesh_faces)
     return SceneMesh(
         mesh=mesh,
         centre=centre,
@@ -68,16 +68,17 @@ def load_scene_mesh(path: Path, settings: AssetSettings, remesh_faces: int | Non
     )
 
 
-def remeshed(raw: TriangleMesh, num_faces: int) -> TriangleMesh:
-    """Return the surface with at most `num_faces` triangles of even size, where the file has it.
+def remesh(raw: TriangleMesh, num_faces: int) -> TriangleMesh:
+    """Return the surface with at most `num_faces` even triangles, in the units of the file.
 
     Raises:
-        Rejected: "remesh_failed" where no method gives that.
+        Rejected: "remesh_failed" where no method gives that many.
         TrilightError: pymeshlab is not installed.
     """
     used = raw.positions[np.unique(raw.faces)]
-    low, high = used.min(axis=0), used.max(axis=0)
-    unit = clean(normalise(raw))
+    low = used.min(axis=0)
+    high = used.max(axis=0)
+    unit = clean(normalize(raw))
     if len(unit.faces):
         for method in methods_of("uniform"):
             try:

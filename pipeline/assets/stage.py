@@ -1,4 +1,4 @@
-"""Stage "assets": every object becomes a prepared asset or a rejection, each made only once."""
+"""Stage "assets": every object becomes a prepared asset or a rejection, each computed once."""
 
 import dataclasses
 import logging
@@ -26,20 +26,20 @@ BorrowChild = Callable[[], AbstractContextManager[IsolatedChild]]
 
 @dataclass(frozen=True, kw_only=True)
 class PreparedAsset:
-    """An accepted object."""
+    """An accepted object with its asset file."""
 
     record: ObjectRecord
-    """Identity and rights."""
+    """Identity and rights of the object."""
     path: Path
-    """Its asset file in the store."""
+    """Path of the asset file in the store."""
     asset_sha256: str
-    """Digest of that file."""
+    """SHA-256 digest of the asset file, in hex."""
     geometry_sha256: str
-    """Digest of its cleaned geometry."""
-    without_own: str = ""
-    """Reason code of why it goes without materials of its own, where they were asked for."""
+    """Digest of the cleaned geometry, in hex."""
+    missing_materials_reason: str = ""
+    """Reason code of missing source materials, where settings keep them; otherwise empty."""
     unread: tuple[str, ...] = ()
-    """What of its file no code has read, in short sentences."""
+    """Short sentences, one for each part of the file that no reader handled."""
 
 
 def prepare_assets(
@@ -56,9 +56,9 @@ def prepare_assets(
     Args:
         records: the objects.
         settings: profile, budgets and limits.
-        store: where outcomes are kept, and found again.
+        store: the cache of outcomes.
         borrow_child: lends a child with the limits of this stage.
-        workers: objects at a time.
+        workers: objects that are prepared at a time.
         done: called after each object, from any thread.
 
     Raises:
@@ -88,21 +88,22 @@ def _prepare_once(
     methods: tuple[str, ...],
     borrow_child: BorrowChild,
 ) -> PreparedAsset:
-    """Find or make the outcome of an object; raises Rejected where there is no asset."""
-    source, root = Path(record.path), Path(record.root) if record.root else None
+    """Load or compute the outcome of an object; raises Rejected where there is no asset."""
+    source = Path(record.path)
+    root = Path(record.root) if record.root else None
     key = _key(source, root, settings, store, borrow_child)
     path = store.asset_path(key)
-    with store.making(key):
+    with store.lock(key):
         if refusal := store.refusal(key):
             raise refusal
         if not path.exists():
-            outcome = _outcome(source, root, settings, methods, borrow_child)
+            outcome = _prepare_in_child(source, root, settings, methods, borrow_child)
             if _key(source, root, settings, store, borrow_child) != key:
                 raise Rejected("unreadable_file", "it changed while it was being prepared")
             if isinstance(outcome, Rejected):
-                store.refuse(key, outcome.reason, outcome.message)
+                store.save_refusal(key, outcome.reason, outcome.message)
                 raise outcome
-            store.keep(key, *outcome)
+            store.save_asset(key, *outcome)
     data = path.read_bytes()
     asset = decode_asset(data)
     return PreparedAsset(
@@ -110,7 +111,7 @@ def _prepare_once(
         path=path,
         asset_sha256=sha256_hex(data),
         geometry_sha256=asset.geometry_sha256,
-        without_own="" if asset.materials is None else asset.materials.reason,
+        missing_materials_reason="" if asset.materials is None else asset.materials.reason,
         unread=store.unread(key),
     )
 
@@ -122,7 +123,7 @@ def _key(
     store: AssetStore,
     borrow_child: BorrowChild,
 ) -> str:
-    """Return the name of the outcome of a source, which its pre-flight may refuse (Rejected)."""
+    """Return the store's key of a source; raises Rejected where the pre-flight refuses it."""
     try:
         if not needs_child(source):
             kind, digest = source_digest(source, settings, root)
@@ -140,32 +141,32 @@ def _key(
 def source_digest(
     source: Path, settings: AssetSettings, root: Path | None = None
 ) -> tuple[str, str]:
-    """Return kind and digest of a source after the checks that come before any mesh library.
+    """Return kind and digest of a source, after the checks that need no mesh library.
 
     Raises:
         Rejected: as `read_source`.
         OSError: it cannot be read.
     """
-    found = read_source(source, settings.read_limits, root)
-    return found.kind, found.sha256
+    source_file = read_source(source, settings.read_limits, root)
+    return source_file.kind, source_file.sha256
 
 
-def _outcome(
+def _prepare_in_child(
     source: Path,
     root: Path | None,
     settings: AssetSettings,
     methods: tuple[str, ...],
     borrow_child: BorrowChild,
 ) -> tuple[Asset, tuple[str, ...]] | Rejected:
-    """Return what is to be kept of an object: its asset and what is unread, or the verdict on it.
+    """Return what the store keeps: an asset with its unread parts, or a rejection.
 
     Raises:
-        Rejected: the environment failed; nothing is to be kept, and the next run tries again.
+        Rejected: the environment failed; the store keeps nothing, and the next run tries again.
     """
     try:
         with borrow_child() as child:
             child.allow_files(reach(files=[source, root or source]))
-            return _by_any_method(child, source, root, settings, methods)
+            return _try_methods(child, source, root, settings, methods)
     except Rejected as rejection:
         return rejection
     except ChildFailed as failure:
@@ -175,7 +176,7 @@ def _outcome(
         raise refusal from failure
 
 
-def _by_any_method(
+def _try_methods(
     child: IsolatedChild,
     source: Path,
     root: Path | None,
@@ -185,8 +186,8 @@ def _by_any_method(
     """Try the methods in turn, each in a fresh child, for the levels that are still missing.
 
     Raises:
-        Rejected: the object is unusable, or no level passed the gate: then as the first method
-            failed at the largest budget.
+        Rejected: the object is unusable; or no level passed the quality checks, then with the
+            first method's reason at the largest budget.
         ChildFailed: every method crashed its child or used up its processor time; or a child was
             ended by something else, which says nothing about the method and leads to no other.
     """
@@ -195,22 +196,26 @@ def _by_any_method(
     levels: list[Level] = []
     first_miss: tuple[str, str] | None = None
     death: ChildFailed | None = None
-    missing, waiting = settings.budgets, list(methods)
+    missing = settings.budgets
+    waiting = list(methods)
     while waiting:
         method = waiting.pop(0)
         finest = missing[0] == settings.budgets[0]  # epsilon is about this level
-        wanted = dataclasses.replace(
+        attempt_settings = dataclasses.replace(
             settings, budgets=missing, epsilon=settings.epsilon if finest else None
         )
         try:
-            attempt = call_with_retries(child, attempt_in_child, source, wanted, method, root)
+            attempt = call_with_retries(
+                child, attempt_in_child, source, attempt_settings, method, root
+            )
         except ChildFailed as failure:
             if not failure.is_verdict:
                 raise
             death = failure
             continue
-        asset, unread = _remembering(asset, attempt.asset), attempt.unread
-        if attempt.method in waiting:  # it stood in for what is not safe for this mesh
+        asset = _carry_materials_reason(asset, attempt.asset)
+        unread = attempt.unread
+        if attempt.method in waiting:  # it replaced a method that is not safe for this mesh
             waiting = waiting[waiting.index(attempt.method) + 1 :]
         levels += asset.levels
         missing = tuple(budget for budget in missing if budget in attempt.missed)
@@ -224,32 +229,32 @@ def _by_any_method(
     if not levels:
         assert first_miss is not None
         raise Rejected(*first_miss)
-    return dataclasses.replace(asset, levels=_rising(levels)), unread
+    return dataclasses.replace(asset, levels=_drop_wasteful_levels(levels)), unread
 
 
-def _remembering(before: Asset | None, now: Asset) -> Asset:
-    """Return what an attempt found, and why an earlier one kept no materials of its own."""
+def _carry_materials_reason(before: Asset | None, now: Asset) -> Asset:
+    """Return an attempt's asset, with the reason of an earlier one for missing materials."""
     if before is None or before.materials is None or not before.materials.reason:
         return now
     return dataclasses.replace(now, materials=before.materials)
 
 
-def _rising(levels: list[Level]) -> tuple[Level, ...]:
-    """Return the levels from the largest budget, without those that waste theirs.
+def _drop_wasteful_levels(levels: list[Level]) -> tuple[Level, ...]:
+    """Return the levels from the largest budget, without those that waste their budget.
 
     Another method may leave fewer faces at a budget than the first one at a smaller budget.
     """
-    kept: list[Level] = []
+    useful: list[Level] = []
     for level in sorted(levels, key=lambda level: level.record.budget):
-        if not kept or len(level.faces) > len(kept[-1].faces):
-            kept.append(level)
-    return tuple(reversed(kept))
+        if not useful or len(level.faces) > len(useful[-1].faces):
+            useful.append(level)
+    return tuple(reversed(useful))
 
 
 def attempt_in_child(
     source: Path, settings: AssetSettings, method: str, root: Path | None = None
 ) -> AssetAttempt:
-    """Run the recipe; only here are the mesh libraries imported, and only children come here."""
+    """Run the recipe in a child process, the only place that imports the mesh libraries."""
     from pipeline.assets.prepare import prepare_asset
 
     try:

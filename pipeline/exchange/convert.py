@@ -1,6 +1,6 @@
-"""One scene, or all that a file holds, from one form to another; in a child process with limits.
+"""Converts the scenes of a file to another format, in a child process with limits.
 
-USD holds many scenes in one file. Forms that hold one: many become `NAME.KEY.SUFFIX`.
+A USD file holds many scenes. In formats that hold one, each scene becomes `NAME.KEY.SUFFIX`.
 """
 
 import dataclasses
@@ -16,9 +16,9 @@ from pipeline.exchange.formats import (
     LoadedScene,
     SceneFormat,
     SceneSource,
-    carried_scene,
-    lost_members,
-    writable,
+    drop_uncarried_maps,
+    list_lost_members,
+    writable_suffixes,
 )
 from pipeline.exchange.open_scene import load_source, source_keys
 from pipeline.exchange.reader import file_child, reach_of
@@ -29,18 +29,18 @@ from storage.records.scene import Scene
 
 
 @dataclass(frozen=True, kw_only=True)
-class Converted:
-    """What came of a conversion."""
+class ConvertResult:
+    """Result of a conversion."""
 
-    files: tuple[Path, ...]  # what was written, without the meshes beside a scene JSON
-    triangles: int  # triangles of all scenes
-    notes: tuple[str, ...]  # what could not be carried over, for people
+    files: tuple[Path, ...]  # written files, without the meshes of a scene JSON
+    triangles: int  # sum over all scenes
+    notes: tuple[str, ...]  # sentences about what was lost
 
 
 def convert_scene(
     source: SceneSource, target: Path, *, budget: int | None, done: Callable[[int, int], None]
-) -> Converted:
-    """Read a source and write it in the form that the target's name says.
+) -> ConvertResult:
+    """Read a source and write it in the format of the target's suffix.
 
     Args:
         source: one scene, or a file of many.
@@ -49,57 +49,57 @@ def convert_scene(
         done: called with (finished, all) files.
 
     Raises:
-        TrilightError: the source is unusable, the target's form cannot hold it, or it cannot be
-            written.
+        TrilightError: the source is unusable, the target's format cannot hold it, or it cannot
+            be written.
     """
     form = _form_of(target)
-    child = file_child(reach_of(source, writes=[_made_folder(target)]))
+    child = file_child(reach_of(source, writes=[_make_folder(target)]))
     try:
         keys = call_with_retries(child, source_keys, source)
         if not keys:
             raise TrilightError(f"{source.name}: holds no scene.")
         if form.write_many and len(keys) > 1:
-            found = [call_with_retries(child, _many, source, keys, target, budget)]
+            results = [call_with_retries(child, _convert_many, source, keys, target, budget)]
             done(1, 1)
         else:
-            found = []
+            results = []
             for key in keys:
-                wanted = source if key is None else dataclasses.replace(source, key=key)
+                one_source = source if key is None else dataclasses.replace(source, key=key)
                 out = target if len(keys) == 1 else target.with_suffix(f".{key}{target.suffix}")
-                found.append(call_with_retries(child, _one, wanted, out, budget))
-                done(len(found), len(keys))
+                results.append(call_with_retries(child, _convert_one, one_source, out, budget))
+                done(len(results), len(keys))
     except ChildFailed as failure:
         raise TrilightError(f"{source.name}: could not be converted ({failure}).") from failure
     finally:
         child.close()
-    return Converted(
-        files=tuple(path for each in found for path in each.files),
-        triangles=sum(each.triangles for each in found),
-        notes=tuple(dict.fromkeys(note for each in found for note in each.notes)),
+    return ConvertResult(
+        files=tuple(path for each in results for path in each.files),
+        triangles=sum(each.triangles for each in results),
+        notes=tuple(dict.fromkeys(note for each in results for note in each.notes)),
     )
 
 
 def write_scene(
     target: Path, scene: Scene, radiance_rgb: NDArray[np.float32] | None = None
 ) -> tuple[str, ...]:
-    """Write a scene in the form that the target's name says; return what that cannot hold.
+    """Write a scene in the format of the target's suffix; return what that cannot hold.
 
     Args:
         target: the file to write.
-        scene: that passes `Scene.check`.
+        scene: passes `Scene.check`.
         radiance_rgb: [V, R, R, 3] pictures of its views, which HDF5 alone holds.
 
     Raises:
-        TrilightError: the form cannot hold it, or it cannot be written.
+        TrilightError: the format cannot hold it, or it cannot be written.
     """
     form = _form_of(target)
     assert form.write is not None
-    shown = carried_scene(scene, form.carried)
-    return (*lost_members(scene, form.carried), *form.write(target, shown, radiance_rgb))
+    carried = drop_uncarried_maps(scene, form.carried)
+    return (*list_lost_members(scene, form.carried), *form.write(target, carried, radiance_rgb))
 
 
-def _made_folder(target: Path) -> Path:
-    """Make the folder of a file, for a child that may write there and nowhere else."""
+def _make_folder(target: Path) -> Path:
+    """Make the folder of a file; the child may write there and nowhere else."""
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -112,40 +112,43 @@ def _form_of(target: Path) -> SceneFormat:
     if form is None or form.write is None or target.is_dir():
         raise TrilightError(
             f"{target}: cannot be written as a scene; expected the name of a file: "
-            f"{' '.join(writable())}."
+            f"{' '.join(writable_suffixes())}."
         )
     return form
 
 
-def _one(source: SceneSource, target: Path, budget: int | None) -> Converted:
-    loaded = _loaded(source, budget, pictures=_form_of(target).holds_pictures)
+def _convert_one(source: SceneSource, target: Path, budget: int | None) -> ConvertResult:
+    loaded = _load_within_budget(source, budget, pictures=_form_of(target).holds_pictures)
     lost = write_scene(target, loaded.scene, loaded.radiance_rgb)
-    notes = (*loaded.notes, *_said(target, lost))
-    return Converted(files=_list_files(target), triangles=loaded.scene.num_triangles, notes=notes)
+    notes = (*loaded.notes, *_format_losses(target, lost))
+    return ConvertResult(
+        files=_list_files(target), triangles=loaded.scene.num_triangles, notes=notes
+    )
 
 
-def _said(target: Path, lost: Iterable[str]) -> Iterator[str]:
+def _format_losses(target: Path, lost: Iterable[str]) -> Iterator[str]:
     return (f"{target.name}: cannot hold {text}" for text in lost)
 
 
-def _many(
+def _convert_many(
     source: SceneSource, keys: Sequence[str | None], target: Path, budget: int | None
-) -> Converted:
+) -> ConvertResult:
     form = _form_of(target)
     assert form.write_many is not None
-    triangles, notes = 0, list[str]()
+    triangles = 0
+    notes = list[str]()
 
     def scenes() -> Iterator[tuple[str, Scene]]:
         nonlocal triangles
         for key in keys:
-            loaded = _loaded(dataclasses.replace(source, key=key), budget)
+            loaded = _load_within_budget(dataclasses.replace(source, key=key), budget)
             triangles += loaded.scene.num_triangles
-            lost = lost_members(loaded.scene, form.carried)
-            notes.extend((*loaded.notes, *_said(target, lost)))
-            yield str(key), carried_scene(loaded.scene, form.carried)
+            lost = list_lost_members(loaded.scene, form.carried)
+            notes.extend((*loaded.notes, *_format_losses(target, lost)))
+            yield str(key), drop_uncarried_maps(loaded.scene, form.carried)
 
     form.write_many(target, scenes())
-    return Converted(files=_list_files(target), triangles=triangles, notes=tuple(notes))
+    return ConvertResult(files=_list_files(target), triangles=triangles, notes=tuple(notes))
 
 
 def _list_files(target: Path) -> tuple[Path, ...]:
@@ -153,7 +156,9 @@ def _list_files(target: Path) -> tuple[Path, ...]:
     return (target, *(() if named is None else named(target)))
 
 
-def _loaded(source: SceneSource, budget: int | None, *, pictures: bool = False) -> LoadedScene:
+def _load_within_budget(
+    source: SceneSource, budget: int | None, *, pictures: bool = False
+) -> LoadedScene:
     loaded = load_source(source, pictures=pictures)
     if budget is None or loaded.scene.num_triangles <= budget:
         return loaded

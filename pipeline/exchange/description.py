@@ -1,6 +1,6 @@
-"""What a scene file describes: objects by the paths of their meshes, materials, and cameras.
+"""Records of a scene file: objects with mesh paths and materials, and cameras.
 
-Values are as the file states them; `pipeline.exchange.from_description` says what they mean.
+Values are as the file states them; `pipeline.exchange.from_description` interprets them.
 """
 
 from dataclasses import dataclass
@@ -8,39 +8,39 @@ from typing import Literal
 
 Vector = tuple[float, float, float]
 
-ColourGroups = Literal["per-triangle", "per-shading-group"]
+ColorGroups = Literal["per-triangle", "per-shading-group"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class DescribedTransform:
-    """How a mesh comes to its place."""
+    """Transform of a mesh into world space."""
 
     translation: Vector  # world units, the last step
     rotation_deg: Vector  # angles about the world's X, then Y, then Z
     scale: Vector  # factors along the world's axes, after the rotation; a negative one mirrors
     normalize: bool
-    """Whether the mesh is first brought into a sphere of diameter 1 around the origin."""
+    """True brings the mesh into a sphere of diameter 1 around the origin first."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DescribedMaterial:
-    """How an object reflects or emits; colours are linear."""
+    """Reflectance and emission of an object; colors are linear."""
 
-    diffuse: Vector  # diffuse albedo, unless the object has random colours
+    diffuse: Vector  # diffuse albedo, unless the object has random colors
     specular: Vector  # specular albedo
     roughness: float  # in [0, 1]; the GGX width is its square
     emissive: Vector
     """Radiance of every triangle, to both sides; the object is an emitter where one is above 0."""
     smooth_shading: bool
-    """Whether normals are interpolated across edges of up to 30 degrees; flat otherwise."""
-    random_diffuse_max: float  # bound of the random colours
-    random_diffuse_type: ColourGroups  # what shares one random colour
+    """True interpolates normals across edges of up to 30 degrees; False shades flat."""
+    random_diffuse_max: float  # upper bound of the random colors
+    random_diffuse_type: ColorGroups  # triangles that share one random color
     rand_tri_diffuse_seed: int | None
-    """Seed of random colours that replace `diffuse`; None for none."""
+    """Seed of random colors that replace `diffuse`; None keeps `diffuse`."""
 
     @property
     def emits(self) -> bool:
-        """Whether the object is an emitter."""
+        """True where the object is an emitter."""
         return max(self.emissive) > 0
 
 
@@ -48,11 +48,11 @@ class DescribedMaterial:
 class DescribedObject:
     """One entry of `objects`."""
 
-    name: str  # its key
+    name: str  # key of the entry
     mesh_path: str  # relative to the scene file
-    transform: DescribedTransform  # how its mesh comes to its place
-    material: DescribedMaterial  # what it is made of
-    remesh: bool  # whether the mesh is replaced by one of even triangles
+    transform: DescribedTransform  # from mesh to world space
+    material: DescribedMaterial  # reflectance and emission
+    remesh: bool  # True replaces the mesh by one of even triangles
     remesh_target_face_num: int  # maximum number of triangles of the remeshed mesh
 
     @property

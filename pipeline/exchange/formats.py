@@ -1,10 +1,10 @@
-"""The formats of scene files, by the suffix that chooses each: one table for all.
+"""Table of the scene formats, by file suffix.
 
-A file may be hostile, so it is read in child processes only (pipeline.exchange.reader); a child
-loads the extensions that have added a format.
+A file may be hostile, so only child processes read it (pipeline.exchange.reader); a child loads the
+extensions that have added a format.
 
 Each format states the members of a scene that it carries. Every other member that is not at its
-default is reported as lost, so that no writer drops one without a word. A member is a field of
+default is reported as lost, so that no writer drops one silently. A member is a field of
 `Scene`, or a part of one: `materials.diffuse` (storage.records.material) and `objects.uid`
 (SceneObject). A format that carries `materials` carries all columns, added ones too.
 """
@@ -24,12 +24,12 @@ from pipeline.exchange.gltf import write as gltf
 from pipeline.exchange.gltf.read import read_gltf
 from pipeline.exchange.renderformer_cells import textured_triangles
 from pipeline.exchange.renderformer_h5 import (
+    note_reflecting_emitters,
     read_renderformer_h5,
-    reflecting_emitters,
     write_renderformer_h5,
 )
-from pipeline.exchange.renderformer_json import described_files
-from pipeline.exchange.scene_files import build_scene, cameras_by, described_by
+from pipeline.exchange.renderformer_json import describe_scene
+from pipeline.exchange.scene_files import build_scene, read_scene_cameras, read_scene_description
 from pipeline.exchange.usd import write as usd
 from pipeline.exchange.usd.read import read_usd, usd_keys
 from pipeline.exchange.usd.write import write_usd, write_usd_shard
@@ -58,31 +58,31 @@ Pictures = NDArray[np.float32] | None
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSource:
-    """The place of one scene."""
+    """Path and key of one scene."""
 
     path: Path
-    """The file."""
+    """Local path of the scene file."""
     key: str | None
-    """Which scene of it, where it holds many."""
+    """Key of the scene in a file of many; None for a file of one scene."""
     usd_folder: Path | None = None
-    """A USD file may name files below it; below its own folder by default."""
+    """Folder whose files a USD file may name; None stands for the folder of the file."""
     albedo_over_one: AlbedoOverOne = "scale"
-    """What to do in RenderFormer's JSON where albedos add up to more than 1."""
+    """Treatment of albedos that add up to more than 1 in RenderFormer's JSON."""
 
     @property
     def name(self) -> str:
-        """What may be published: the file without its folders, and the key."""
+        """Name for messages and notes: the file without its folders, and the key."""
         return self.path.name if self.key is None else f"{self.path.name}{SEPARATOR}{self.key}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LoadedScene:
-    """A scene as it was read."""
+    """A scene that was read, with notes on what it lacks."""
 
     scene: Scene
-    """It passes `Scene.check`."""
+    """The scene, which passes `Scene.check`."""
     notes: tuple[str, ...]
-    """Notes for people: unknown parts of the file, and what could not be carried over."""
+    """Sentences about unknown fields of the file and what could not be read."""
     radiance_rgb: Pictures = None
     """Pictures of all views, where they were requested and the source has them."""
 
@@ -93,43 +93,42 @@ Cameras = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFormat:
-    """One form; what it leaves out it cannot do."""
+    """Functions of one scene format; None where the format cannot do it."""
 
     read: Callable[[SceneSource, bool], LoadedScene] | None = None
     """Reads a scene, and its pictures where the second argument says so; raises TrilightError."""
     keys: Callable[[SceneSource], Sequence[str | None]] | None = None
     """Returns the key of each scene in a file; None stands for the only scene of a file."""
     always_many: bool = False
-    """Whether a file is no scene without a key."""
+    """True where a file always holds many scenes, so that a source needs a key."""
     cameras: Callable[[SceneSource], Cameras] | None = None
-    """Reads the cameras alone, where that asks for less than a whole scene."""
+    """Reads the cameras alone, where that needs less than the whole scene."""
     write: Callable[[Path, Scene, Pictures], Iterable[str]] | None = None
-    """Writes a scene that passes `Scene.check`, and returns what of `carried` got lost."""
+    """Writes a scene that passes `Scene.check`, and returns what of `carried` was lost."""
     write_many: Callable[[Path, Iterable[tuple[str, Scene]]], None] | None = None
     """Writes scenes with their keys into one file."""
     named_files: Callable[[Path], Sequence[Path]] | None = None
-    """Returns the files beside a written one that it names."""
+    """Returns the further files that a written file names."""
     carried: Collection[str] = frozenset()
-    """Members of a scene that it holds (pipeline.exchange.formats); of others in use the loss is
-    noted."""
+    """Members of a scene that the format holds; other members in use are noted as lost."""
     holds_pictures: bool = False
-    """Whether `write` makes use of pictures."""
+    """True where `write` stores the pictures of the views."""
 
 
-def readable() -> list[str]:
-    """Return the suffixes of files that are scenes."""
+def readable_suffixes() -> list[str]:
+    """Return the suffixes of files that hold one scene and can be read."""
     return [suffix for suffix, form in FORMATS.items() if form.read and not form.always_many]
 
 
-def writable() -> list[str]:
+def writable_suffixes() -> list[str]:
     """Return the suffixes of files that can be written."""
     return [suffix for suffix, form in FORMATS.items() if form.write]
 
 
 def _read_usd(source: SceneSource, pictures: bool) -> LoadedScene:
-    found = read_usd(source.path, source.key, source.usd_folder, USER_PROVIDED)
+    loaded = read_usd(source.path, source.key, source.usd_folder, USER_PROVIDED)
     return LoadedScene(
-        scene=found.scene, notes=tuple(f"{source.name}: {text}" for text in found.lost)
+        scene=loaded.scene, notes=tuple(f"{source.name}: {text}" for text in loaded.lost)
     )
 
 
@@ -152,16 +151,16 @@ def _list_usd_pictures(target: Path) -> Sequence[Path]:
 
 
 def _write_many_usd(target: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
-    # a variant of USD may not be called what a time code is: it has a point, or a minus
+    # names of USD variants must not contain the point or the minus of a time code
     write_usd_shard(
         target, ((key.replace(".", "_").replace("-", "m"), scene) for key, scene in scenes)
     )
 
 
 def _read_gltf(source: SceneSource, pictures: bool) -> LoadedScene:
-    found = read_gltf(source.path, USER_PROVIDED)
+    loaded = read_gltf(source.path, USER_PROVIDED)
     return LoadedScene(
-        scene=found.scene, notes=tuple(f"{source.name}: {text}" for text in found.lost)
+        scene=loaded.scene, notes=tuple(f"{source.name}: {text}" for text in loaded.lost)
     )
 
 
@@ -170,8 +169,9 @@ def _write_glb(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...
 
 
 def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
-    root, name = source.path.parent.resolve(), source.path.name
-    unknown = described_by(root, name).unknown_fields
+    root = source.path.parent.resolve()
+    name = source.path.name
+    unknown = read_scene_description(root, name).unknown_fields
     unread: list[str] = []
     scene, _ = build_scene(
         root,
@@ -189,23 +189,23 @@ def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
 
 
 def _json_cameras(source: SceneSource) -> Cameras:
-    return cameras_by(source.path.parent.resolve(), source.path.name)
+    return read_scene_cameras(source.path.parent.resolve(), source.path.name)
 
 
 def _write_json(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
-    described = described_files(scene, target.stem)
+    described = describe_scene(scene, target.stem)
     for path, data in described.meshes.items():
         write_atomically(target.parent / path, data)
-    write_atomically(target, described.json)  # last: what it names is there
+    write_atomically(target, described.json)  # last, so that the files that it names exist
     return described.lost
 
 
 def _read_h5(source: SceneSource, pictures: bool) -> LoadedScene:
-    found = read_renderformer_h5(source.path)
+    loaded = read_renderformer_h5(source.path)
     return LoadedScene(
-        scene=found.scene,
-        notes=tuple(f"{source.path.name}: {text}" for text in found.lost),
-        radiance_rgb=found.radiance_rgb if pictures else None,
+        scene=loaded.scene,
+        notes=tuple(f"{source.path.name}: {text}" for text in loaded.lost),
+        radiance_rgb=loaded.radiance_rgb if pictures else None,
     )
 
 
@@ -213,7 +213,7 @@ def _write_h5(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]
     write_renderformer_h5(target, scene, pictures)
     count = int(textured_triangles(scene).sum())
     cells = (f"more of {count} textured triangles than the means of 32 x 32 cells each",)
-    return (*reflecting_emitters(scene), *(cells if count else ()))
+    return (*note_reflecting_emitters(scene), *(cells if count else ()))
 
 
 def _read_scene_file(source: SceneSource, pictures: bool) -> LoadedScene:
@@ -230,7 +230,8 @@ def _shard_keys(source: SceneSource) -> list[str | None]:
 
 
 def _read_sample(source: SceneSource, pictures: bool) -> LoadedScene:
-    path, key = source.path, str(source.key)
+    path = source.path
+    key = str(source.key)
     record = decode_scene(key, read_members(path, key, _MEMBERS))
     try:
         record.scene.check()
@@ -281,8 +282,8 @@ FORMATS: Registry[SceneFormat] = Registry(
 """Formats by suffix, in lower case with the point."""
 
 
-def lost_members(scene: Scene, carried: Collection[str]) -> tuple[str, ...]:
-    """Return what a form that carries these members loses of a scene: one text, or none."""
+def list_lost_members(scene: Scene, carried: Collection[str]) -> tuple[str, ...]:
+    """Return one text that lists the members which a format loses; empty without losses."""
     lost = [
         member
         for member in _members_in_use(scene)
@@ -292,25 +293,27 @@ def lost_members(scene: Scene, carried: Collection[str]) -> tuple[str, ...]:
 
 
 def _members_in_use(scene: Scene) -> Iterator[str]:
-    """Yield the members that are not at their defaults."""
+    """Yield the members of a scene that are not at their defaults."""
     for field in dataclasses.fields(Scene):
         if field.name == "materials":
             yield from (f"materials.{name}" for name in columns_in_use(scene.materials))
         elif field.name == "objects":
-            for part in dataclasses.fields(SceneObject):
-                if any(getattr(entry, part.name) != part.default for entry in scene.objects):
-                    yield f"objects.{part.name}"
+            for part_field in dataclasses.fields(SceneObject):
+                if any(
+                    getattr(entry, part_field.name) != part_field.default for entry in scene.objects
+                ):
+                    yield f"objects.{part_field.name}"
         elif field.name == "environment":
             yield from ("environment",) if scene.environment is not None else ()
         elif field.name not in MAP_ARRAYS and len(getattr(scene, field.name)):
-            yield field.name  # texture coordinates and the like come and go with `textures`
+            yield field.name  # MAP_ARRAYS belong to `textures`
 
 
-def carried_scene(scene: Scene, carried: Collection[str]) -> Scene:
-    """Return what a form that carries these members shows of a scene: it, or it without its maps.
+def drop_uncarried_maps(scene: Scene, carried: Collection[str]) -> Scene:
+    """Return the scene without the textures or environment that a format does not carry.
 
     Raises:
-        TrilightError: nothing but its environment lights the scene, which the form cannot hold.
+        TrilightError: the environment is the only light, and the format cannot hold it.
     """
     loses_sky = scene.environment is not None and "environment" not in carried
     if not loses_sky and (not scene.textures or "textures" in carried):

@@ -1,15 +1,15 @@
-"""From a description and its meshes to a `Scene`: what the values of a scene file mean.
+"""Builds a `Scene` from a scene description and its meshes.
 
-A mesh is brought into a sphere of diameter 1 where the file says `normalize` (the mean of the
-vertices as the file has them becomes the origin, the farthest lies at 0.5), turned about the
-world's X, then Y, then Z, scaled along the world's axes, and moved: the order of the published
-converter. Vertices are not joined first, so that smooth shading stops where the mesh file splits
-its vertices. Template files, whose scales and translations are meant to be halved, are not known.
+The transform of a mesh follows the order of the published converter: with `normalize`, the mesh is
+brought into a sphere of diameter 1 (the mean of the file's vertices becomes the origin, the
+farthest vertex lies at 0.5); then it is rotated about the world's X, Y and Z, scaled along the
+world's axes, and translated. Vertices are not joined first, so that smooth shading stops where the
+mesh file splits its vertices. Template files, whose scales and translations would have to be
+halved, are not supported.
 
-An emitter's triangles become emitters each. They reflect by the albedos that the file gives them,
-since the published renderer's emitters have a white surface, as its files say. Materials whose
-albedos add up to more than 1 are scaled or refused (`lawful_albedos`); the provenance names the
-scaled ones by object.
+Each triangle of an emitter becomes an emitter. It reflects by the albedos that the file states,
+since the published renderer's emitters have a white surface. Materials whose albedos add up to more
+than 1 are scaled or refused (`limit_albedos`); the provenance names the scaled ones by object.
 """
 
 import math
@@ -36,10 +36,10 @@ from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, def
 from storage.records.scene import ALBEDO_SUM_TOLERANCE, ObjectKind, Scene, SceneObject
 
 AlbedoOverOne = Literal["scale", "refuse"]
-"""What to do with materials whose diffuse and specular albedos add up to more than 1."""
+"""Treatment of materials whose diffuse and specular albedos add up to more than 1."""
 
 SHELL_FOLDER = "templates/backgrounds/"
-"""Meshes below it are floors and walls; the published scene files keep them there."""
+"""Folder of floors and walls in the published scene files."""
 
 SMOOTH_ANGLE_DEG = 30.0
 """Smoothing angle of the published converter."""
@@ -52,15 +52,15 @@ MAX_MATERIALS = 1 << 16
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LoadedMesh:
-    """The mesh of an object, as its file has it or remeshed."""
+    """The mesh of an object, from its file or remeshed."""
 
     uid: str  # path of the file below the folder of the scenes, with slashes
     licence: str  # SPDX identifier, or `LicenseRef-...`
     positions: NDArray[np.float64]  # [V, 3] in the units of the file
     faces: NDArray[np.int64]  # [F, 3]
-    centre: NDArray[np.float64]  # [3] mean of the vertices of the file
-    reach: float  # distance of the farthest of them from the centre
-    unread: tuple[str, ...] = ()  # what of the file no code has read
+    centre: NDArray[np.float64]  # [3] mean of the vertices in the file
+    reach: float  # distance of the farthest vertex from `centre`
+    unread: tuple[str, ...] = ()  # parts of the file that were ignored
 
 
 def scene_from_description(
@@ -71,35 +71,35 @@ def scene_from_description(
     provenance: Mapping[str, Any],
     albedo_over_one: AlbedoOverOne = "scale",
 ) -> Scene:
-    """Return the scene that a file describes.
+    """Build the scene that a file describes.
 
     Args:
         description: the file.
         meshes: one per object, in its order.
-        num_views: how many of the file's cameras to take, from the first.
-        provenance: of the scene; `albedo_scale` is added where materials were scaled.
-        albedo_over_one: what to do where albedos add up to more than 1.
+        num_views: number of the file's cameras to take, from the first.
+        provenance: provenance of the scene; `albedo_scale` is added where materials were scaled.
+        albedo_over_one: treatment of albedos that add up to more than 1.
 
     Returns:
         A checked scene; objects in the order of the file, an emitting object as one object per
         triangle.
 
     Raises:
-        TrilightError: an unusable object or camera, by its name; or a count above its maximum.
+        TrilightError: an object or camera, which is named, is unusable; or a count is too large.
     """
     pieces: list[ScenePiece] = []
     scales: dict[str, float] = {}
     for described, mesh in zip(description.objects, meshes, strict=True):
         try:
-            found, scale = _pieces(described, mesh, albedo_over_one)
-            pieces += found
+            object_pieces, scale = _pieces(described, mesh, albedo_over_one)
+            pieces += object_pieces
             if scale < 1:
                 scales[described.name] = round(scale, 6)
         except TrilightError as error:
             raise TrilightError(f"{description.file}: objects.{described.name}: {error}") from error
     try:
         _check_counts(pieces)
-        c2w, fov_deg = described_cameras(description.cameras[:num_views])
+        c2w, fov_deg = build_cameras(description.cameras[:num_views])
         scene = Scene(
             **concatenate_pieces(pieces),
             c2w=c2w,
@@ -113,19 +113,19 @@ def scene_from_description(
     return scene
 
 
-def placed(mesh: LoadedMesh, described: DescribedObject) -> NDArray[np.float32]:
+def place_mesh(mesh: LoadedMesh, described: DescribedObject) -> NDArray[np.float32]:
     """Return the vertices [V, 3] of a mesh in world space."""
     transform = described.transform
     points = mesh.positions
     if transform.normalize:
         points = (points - mesh.centre) / (2 * mesh.reach)
-    turned = rotate_points(points, rotation_xyz(transform.rotation_deg))
-    world = turned * np.array(transform.scale) + np.array(transform.translation)
+    rotated = rotate_points(points, rotation_xyz(transform.rotation_deg))
+    world = rotated * np.array(transform.scale) + np.array(transform.translation)
     return world.astype(np.float32)
 
 
 def scaled_albedo_notes(scene: Scene) -> tuple[str, ...]:
-    """Return, for people, which objects of a described scene are darker than their file says."""
+    """Return a sentence for each object that became darker than its file states."""
     return tuple(
         f"objects.{name}: diffuse + specular is {1 / scale:.4f}, which is more than 1; both were "
         f"multiplied by {scale:.4f}"
@@ -136,8 +136,8 @@ def scaled_albedo_notes(scene: Scene) -> tuple[str, ...]:
 def _pieces(
     described: DescribedObject, mesh: LoadedMesh, over_one: AlbedoOverOne
 ) -> tuple[list[ScenePiece], float]:
-    """Return the pieces of an object, and by what the darkest of its materials was multiplied."""
-    positions = placed(mesh, described)
+    """Return the pieces of an object, and the least factor of its materials."""
+    positions = place_mesh(mesh, described)
     mirrored = np.prod(described.transform.scale) < 0
     faces = (mesh.faces[:, ::-1] if mirrored else mesh.faces).astype(np.uint32)
     faces = without_slivers(positions, faces)
@@ -164,20 +164,20 @@ def _surface(
     rows = np.zeros(len(shaded.faces), np.int64)
     diffuse = np.array([material.diffuse])
     if material.rand_tri_diffuse_seed is not None:
-        rows = colour_groups(shaded, material)
+        rows = color_groups(shaded, material)
         count = int(rows.max()) + 1
         diffuse = random_diffuse(material.rand_tri_diffuse_seed, material.random_diffuse_max, count)
-    materials, scale = _reflecting(diffuse, material, over_one)
+    materials, scale = _build_materials(diffuse, material, over_one)
     kind: ObjectKind = "shell" if mesh.uid.startswith(SHELL_FOLDER) else "object"
     entry = _entry(described.name, kind, mesh)
     return ScenePiece(entry=entry, mesh=shaded, materials=materials, material_index=rows), scale
 
 
-def _reflecting(
+def _build_materials(
     diffuse: NDArray[np.float64], material: DescribedMaterial, over_one: AlbedoOverOne
 ) -> tuple[NDArray[np.float32], float]:
-    """Return rows that do not emit, for diffuse albedos [M, 3], and the least factor."""
-    diffuse, specular, scale = lawful_albedos(diffuse, np.array(material.specular), over_one)
+    """Return non-emitting rows for diffuse albedos [M, 3], and the least albedo factor."""
+    diffuse, specular, scale = limit_albedos(diffuse, np.array(material.specular), over_one)
     materials = default_rows(len(diffuse))
     materials[:, DIFFUSE] = diffuse
     materials[:, SPECULAR] = specular
@@ -193,9 +193,9 @@ def _emitters(
     over_one: AlbedoOverOne,
 ) -> tuple[list[ScenePiece], float]:
     if len(faces) > MAX_EMITTERS:
-        _too_many("emitting triangles", len(faces), MAX_EMITTERS)
+        _refuse_count("emitting triangles", len(faces), MAX_EMITTERS)
     diffuse = np.array([described.material.diffuse])
-    materials, scale = _reflecting(diffuse, described.material, over_one)
+    materials, scale = _build_materials(diffuse, described.material, over_one)
     materials[:, EMISSION] = described.material.emissive
     single = len(faces) == 1
     pieces = [
@@ -215,7 +215,7 @@ def _entry(name: str, kind: ObjectKind, mesh: LoadedMesh) -> SceneObject:
     return SceneObject(name=name, kind=kind, uid=uid, licence=mesh.licence)
 
 
-def described_cameras(
+def build_cameras(
     cameras: Sequence[DescribedCamera],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return poses [C, 4, 4] and full angles [C] in degrees; raises TrilightError."""
@@ -243,34 +243,34 @@ def _check_counts(pieces: Sequence[ScenePiece]) -> None:
         ("materials", sum(len(piece.materials) for piece in pieces), MAX_MATERIALS),
     ):
         if count > most:
-            _too_many(what, count, most)
+            _refuse_count(what, count, most)
 
 
-def _too_many(what: str, count: int, most: int) -> NoReturn:
+def _refuse_count(what: str, count: int, most: int) -> NoReturn:
     raise TrilightError(f"{count} {what}; expected at most {most} in a scene.")
 
 
-def lawful_albedos(
+def limit_albedos(
     diffuse: NDArray[np.float64], specular: NDArray[np.float64], over_one: AlbedoOverOne
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return albedos that add up to at most 1, and by what the darkened ones were multiplied.
+    """Return albedos that add up to at most 1, and the least factor that this took.
 
-    A surface beyond 1 gives off more light than it gets; published scene files have some (1.1).
+    A surface beyond 1 reflects more light than it receives; published scene files have some (1.1).
     Both albedos of such a material are multiplied by 1 / their largest sum over the channels. One
-    number for all channels keeps the hue of both, and one for both keeps how glossy the surface is
-    against how coloured; a number for each channel would bleach a red of 1.1 towards white.
+    factor for all channels keeps both hues, and one for both albedos keeps their ratio; a factor
+    for each channel would bleach a red of 1.1 towards white.
 
     Args:
-        diffuse: [M, 3] of M materials.
-        specular: [3] of all of them.
-        over_one: whether to scale materials beyond 1.
+        diffuse: [M, 3] albedos of M materials.
+        specular: [3] albedo of all of them.
+        over_one: "scale" or "refuse" for materials beyond 1.
 
     Returns:
         Diffuse and specular albedos [M, 3], and the smallest factor of a material; 1.0 where none
-        was beyond 1, and then both are what was given.
+        was beyond 1, and then both are unchanged.
 
     Raises:
-        TrilightError: a material is beyond 1, and that is to be refused.
+        TrilightError: a material is beyond 1, and `over_one` is "refuse".
     """
     both = np.broadcast_to(specular, diffuse.shape)
     sums = (diffuse + both).max(axis=1)
@@ -286,11 +286,11 @@ def lawful_albedos(
     return diffuse * factors[:, None], both * factors[:, None], float(factors.min())
 
 
-def colour_groups(mesh: ShadedMesh, material: DescribedMaterial) -> NDArray[np.int64]:
-    """Return the number of the draw that colours each triangle, [T].
+def color_groups(mesh: ShadedMesh, material: DescribedMaterial) -> NDArray[np.int64]:
+    """Return the random color's number of each triangle, [T].
 
-    As published, a flat mesh shares no vertices, so that each of its triangles is a group of its
-    own, whatever the type says.
+    In the published converter a flat mesh shares no vertices, so that each of its triangles is a
+    group, whatever the type says.
     """
     if material.smooth_shading and material.random_diffuse_type == "per-shading-group":
         return mesh.groups
@@ -298,22 +298,22 @@ def colour_groups(mesh: ShadedMesh, material: DescribedMaterial) -> NDArray[np.i
 
 
 def random_diffuse(seed: int, bound: float, count: int) -> NDArray[np.float64]:
-    """Return `count` diffuse albedos [count, 3]: whole numbers below ceil(256 bound), over 255.
+    """Return `count` diffuse albedos [count, 3]: integers below ceil(256 bound), over 255.
 
     The published converter seeds numpy's legacy Mersenne Twister and draws one triple per group, in
     the order in which trimesh splits the shaded mesh. On flat meshes that is the order of faces,
-    and colours are exactly the published ones. On smooth meshes trimesh has its own order, and its
-    own groups where an object has large flat parts; our groups come in the order of their first
-    faces, and the same numbers may fall on other groups than published.
+    and colors are exactly the published ones. On smooth meshes trimesh has another order, and other
+    groups where an object has large flat regions; our groups are in the order of their first faces,
+    so that the same numbers may fall on other groups than published.
 
-    The numbers stand in the published tokens as linear albedos, and so they do here. Published
-    renders took them through vertex colours that Blender decodes as sRGB, so the same numbers meant
-    darker surfaces there, which we do not imitate.
+    The published tokens hold the numbers as linear albedos, and so does Trilight. Published renders
+    passed them through vertex colors that Blender decodes as sRGB, so the same numbers meant darker
+    surfaces there, which Trilight does not imitate.
 
     Args:
-        seed: of the legacy generator, 0 to 2^32 - 1. Seed 0 is an ordinary seed.
+        seed: seed of the legacy generator, 0 to 2^32 - 1; 0 is an ordinary seed.
         bound: `random_diffuse_max`; a channel may exceed it by at most 1/255.
-        count: how many colours.
+        count: number of colors.
     """
     generator = np.random.RandomState(seed)
     return generator.randint(0, max(1, math.ceil(256 * bound)), (count, 3)) / 255

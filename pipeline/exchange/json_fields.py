@@ -1,7 +1,7 @@
-"""Strict access to the fields of a JSON object: every complaint names file, field, got, expected.
+"""Strict access to the fields of a JSON object.
 
-What was never asked for is an unknown field; those are collected, so that a misspelt option is
-named instead of silently having no effect.
+Every error names the file, the field, its value and what was expected. Fields that the reader never
+asks for are collected as unknown, so that a misspelt option is reported instead of ignored.
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,38 +11,40 @@ from pipeline.foreign.numbers import Malformed, read_number
 from storage.errors import TrilightError
 from storage.settings.ranges import Within
 
-_SHOWN = 120
-"""Most characters of a value in a message."""
+_MAX_SHOWN = 120
+"""Maximum number of characters of a value in a message."""
 
 _MAX_TEXT = 200
-"""Longest text that a field may hold."""
+"""Maximum number of characters of a text field."""
 
 
 class Fields:
     """One JSON object of a file, read field by field."""
 
     def __init__(self, value: Any, *, file: str, where: str, unknown: list[str]) -> None:
-        """Begin to read.
+        """Wrap a value of the JSON tree.
 
         Args:
-            value: what the JSON holds there.
+            value: the parsed value.
             file: name of the file, for messages.
-            where: dotted name of this object inside of the file; empty for the whole.
-            unknown: collects the names of fields that nobody asks for (`end`).
+            where: dotted name of this object inside the file; empty for the root.
+            unknown: receives the names of fields that are never read (`end`).
 
         Raises:
-            TrilightError: `value` is no JSON object.
+            TrilightError: `value` is not a JSON object.
         """
-        self._file, self._where, self._unknown = file, where, unknown
+        self._file = file
+        self._where = where
+        self._unknown = unknown
         if not isinstance(value, dict):
             self._refuse(where or "the file", value, "a JSON object")
         self._values: dict[str, Any] = value
-        self._asked: set[str] = set()
+        self._read_keys: set[str] = set()
 
     def end(self) -> None:
-        """Collect the fields that were not asked for."""
-        unasked = [key for key in self._values if key not in self._asked]
-        self._unknown += [shown(self._name(key)) for key in unasked]
+        """Add the names of fields that were not read to `unknown`."""
+        unread = [key for key in self._values if key not in self._read_keys]
+        self._unknown += [to_text(self._name(key)) for key in unread]
 
     def keys(self) -> Iterator[str]:
         """Yield the names of all fields, which must be short printable text."""
@@ -83,17 +85,17 @@ class Fields:
             self._refuse(self._name(key), value, "true or false")
         return value
 
-    def whole(self, key: str, low: int, high: int, default: int) -> int:
-        """Return a field that is a whole number from `low` to `high`."""
+    def integer(self, key: str, low: int, high: int, default: int) -> int:
+        """Return a field that is an integer from `low` to `high`."""
         value = self._get(key, default)
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
             self._refuse(self._name(key), value, f"a whole number from {low} to {high}")
         return value
 
-    def optional_whole(self, key: str, low: int, high: int) -> int | None:
-        """Return the same, or None where the field is missing or null."""
-        self._asked.add(key)
-        return None if self._values.get(key) is None else self.whole(key, low, high, low)
+    def optional_integer(self, key: str, low: int, high: int) -> int | None:
+        """Return an integer field, or None where it is missing or null."""
+        self._read_keys.add(key)
+        return None if self._values.get(key) is None else self.integer(key, low, high, low)
 
     def number(self, key: str, low: float, high: float, default: float | None = None) -> float:
         """Return a field that is a finite number from `low` to `high`."""
@@ -101,7 +103,8 @@ class Fields:
 
     def vector(self, key: str, low: float, high: float) -> tuple[float, float, float]:
         """Return a field that is a list of three finite numbers from `low` to `high`."""
-        values, name = self._get(key), self._name(key)
+        values = self._get(key)
+        name = self._name(key)
         if not isinstance(values, list) or len(values) != 3:
             self._refuse(name, values, "a list of three numbers")
         x, y, z = (self._number(f"{name}[{at}]", v, low, high) for at, v in enumerate(values))
@@ -112,13 +115,13 @@ class Fields:
 
     def _number(self, name: str, value: Any, low: float, high: float) -> float:
         try:
-            return read_number(value, shown(name), Within(low, high))
+            return read_number(value, to_text(name), Within(low, high))
         except Malformed as error:
             raise TrilightError(f"{self._file}: {error}.") from error
 
     def _get(self, key: str, default: Any = None) -> Any:
-        """Return a value; a field without default must be there."""
-        self._asked.add(key)
+        """Return a value, or its default; a field without a default must exist."""
+        self._read_keys.add(key)
         if key in self._values:
             return self._values[key]
         if default is None:
@@ -129,10 +132,12 @@ class Fields:
         return f"{self._where}.{key}" if self._where else key
 
     def _refuse(self, name: str, value: Any, expected: str) -> NoReturn:
-        raise TrilightError(f"{self._file}: {shown(name)} is {shown(value)}; expected {expected}.")
+        raise TrilightError(
+            f"{self._file}: {to_text(name)} is {to_text(value)}; expected {expected}."
+        )
 
 
-def shown(value: Any) -> str:
-    """Return a value for a message: short, in one line, without control characters."""
+def to_text(value: Any) -> str:
+    """Return a value as short text for a message, on one line without control characters."""
     text = value if isinstance(value, str) and value.isprintable() else repr(value)
-    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
+    return text if len(text) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN - 3]}..."

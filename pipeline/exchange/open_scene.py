@@ -1,14 +1,14 @@
-"""What `SRC` means where a command wants one scene: a file of its own, or a sample of a shard.
+"""Resolves the `SRC` of a command to one scene: a file, or a sample of a shard.
 
     scene.json                 RenderFormer scene; its meshes lie in the folder of the file
     scene.safetensors          storage.records.scene_file
     scene.h5                   the published layout (pipeline.exchange.renderformer_h5)
     scene.glb .gltf            glTF 2.0 (pipeline.exchange.gltf)
-    scene.usda .usdc .usdz .usd   a USD stage (pipeline.scenes.usd)
+    scene.usda .usdc .usdz .usd   a USD stage (pipeline.exchange.usd)
     train-000000.tar::KEY      the sample KEY of a shard
-    scenes.usdc::KEY           a scene of a shard in USD, or a time code of a stage that moves
+    scenes.usdc::KEY           a scene of a USD shard, or a time code of an animated stage
 
-The last form is taken apart here and nowhere else: no library that knows URLs ever sees it.
+Only this module splits `FILE::KEY`, so that no library that parses URLs ever sees it.
 """
 
 import re
@@ -22,7 +22,7 @@ from pipeline.exchange.formats import (
     LoadedScene,
     SceneFormat,
     SceneSource,
-    readable,
+    readable_suffixes,
 )
 from pipeline.exchange.from_description import AlbedoOverOne
 from storage.errors import TrilightError
@@ -38,17 +38,17 @@ def scene_source(
     usd_folder: Path | None = None,
     albedo_over_one: AlbedoOverOne = "scale",
 ) -> SceneSource:
-    """Return what the user's `SRC` names; the file is not opened yet.
+    """Return the source that `SRC` names, without opening the file.
 
     Args:
-        text: what the user typed.
-        many: whether a shard without a key will do.
+        text: the text of `SRC`.
+        many: True accepts a shard without a key.
         usd_folder, albedo_over_one: see `SceneSource`.
 
     Raises:
-        TrilightError: a URL, no such file, or a name that is none of the forms.
+        TrilightError: a URL, a missing file, or a name in none of these forms.
     """
-    expected = f"expected a scene {' '.join(readable())}, or SHARD.tar{SEPARATOR}KEY"
+    expected = f"expected a scene {' '.join(readable_suffixes())}, or SHARD.tar{SEPARATOR}KEY"
     if "://" in text:
         raise TrilightError(f"{safe_url(text)}: only files of this machine are read; {expected}.")
     name, separator, key = text.rpartition(SEPARATOR)
@@ -73,21 +73,21 @@ def scene_source(
 
 
 def source_keys(source: SceneSource) -> Sequence[str | None]:
-    """Return the key of every scene that a source names; [None] where it is one scene.
+    """Return the key of every scene of a source; [None] for a single scene.
 
-    Only children come here, since a stage may be read.
+    Only child processes call this, since a stage may be read.
     """
     keys = _form_of(source).keys
     return [source.key] if source.key is not None or keys is None else keys(source)
 
 
 def load_cameras(source: SceneSource) -> Cameras:
-    """Read the cameras alone, poses [C, 4, 4] and angles [C]; only children come here.
+    """Read the cameras alone: poses [C, 4, 4] and angles [C] in degrees.
 
-    A JSON file needs nothing but its list `cameras`.
+    Only child processes call this. A JSON file needs nothing but its list `cameras`.
 
     Raises:
-        TrilightError: as `load_source`.
+        TrilightError: the file is unusable.
     """
     form = _form_of(source)
     if form.cameras:
@@ -97,14 +97,16 @@ def load_cameras(source: SceneSource) -> Cameras:
 
 
 def load_source(source: SceneSource, *, pictures: bool = False) -> LoadedScene:
-    """Read a scene, with all of its cameras; only children come here, since meshes may be read.
+    """Read a scene with all of its cameras.
+
+    Only child processes call this, since meshes may be read.
 
     Args:
-        source: which.
-        pictures: whether to read those of a shard's sample or an HDF5 file too.
+        source: the scene.
+        pictures: True also reads the pictures of a shard's sample or an HDF5 file.
 
     Raises:
-        TrilightError: anything in the file is unusable, or breaks a law of scenes.
+        TrilightError: anything in the file is unusable, or the scene breaks a law (`Scene.check`).
     """
     read = _form_of(source).read
     assert read is not None, source

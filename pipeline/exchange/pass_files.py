@@ -1,12 +1,12 @@
-"""Passes of stored scenes as OpenEXR files, one a view, as datasets that store them hold them."""
+"""Writes passes of scenes as OpenEXR files, one for each view, as datasets store them."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.exchange.chosen import chosen_samples, is_dataset
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
+from pipeline.exchange.select_samples import is_dataset, select_samples
 from storage.atomic import write_atomically
 from storage.dataset.dataset import open_dataset
 from storage.records.first_hits import require_row
@@ -14,15 +14,15 @@ from storage.records.passes.stored import passes_exr
 from storage.records.scene import Scene
 
 _RESOLUTION = 256
-"""Of scenes that have no pictures."""
+"""Width and height in pixels for scenes without pictures."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class WantedPasses:
-    """Which pictures to write."""
+class PassFileOptions:
+    """Options of `write_passes`: the passes and views to write."""
 
     names: Sequence[str]
-    """Passes by name."""
+    """Names of the passes to write."""
     scene: str | None
     """Key of the only scene, with or without zeros before it; None for all."""
     view: int | None
@@ -30,12 +30,12 @@ class WantedPasses:
     resolution: int | None
     """Width and height in pixels; None for that of the dataset's pictures, or 256."""
     rays_a_side: int
-    """As `view_passes`."""
+    """Rays along each side of a pixel."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Found:
-    """One scene of a source."""
+class _NamedScene:
+    """A scene of a source with its file name."""
 
     name: str
     scene: Scene
@@ -44,51 +44,53 @@ class _Found:
 
 
 def write_passes(
-    source: str, out: Path, wanted: WantedPasses, *, done: Callable[[Path], None]
+    source: str, out: Path, options: PassFileOptions, *, done: Callable[[Path], None]
 ) -> tuple[str, ...]:
-    """Write `SCENE.VIEW.passes.exr` into a folder for each wanted view; return notes for people.
+    """Write `SCENE.VIEW.passes.exr` into a folder for each chosen view; return notes.
 
-    With the resolution and the single ray of a dataset that stores the same passes, the files are
-    the same to the last byte.
+    With the resolution and the single ray of a dataset that stores the same passes, the files equal
+    the stored ones byte for byte.
 
     Args:
         source: a dataset (folder or URL), or a scene in any form that `trilight convert` reads.
-        out: the folder; it is made.
-        wanted: which.
-        done: called with each file.
+        out: the folder, which is created.
+        options: the passes and views.
+        done: called with each written file.
 
     Raises:
         TrilightError: the source is unusable, there is no such scene, view or pass, or the folder
             cannot be written.
     """
     notes: list[str] = []
-    for found in _scenes(source, wanted.scene):
-        notes += found.notes
-        views = range(found.scene.num_views) if wanted.view is None else [wanted.view]
+    for named in _scenes(source, options.scene):
+        notes += named.notes
+        views = range(named.scene.num_views) if options.view is None else [options.view]
         for view in views:
-            require_row("view", view, found.scene.num_views)
-            path = out / f"{found.name}.{view}.passes.exr"
+            require_row("view", view, named.scene.num_views)
+            path = out / f"{named.name}.{view}.passes.exr"
             data = passes_exr(
-                found.scene,
-                wanted.names,
+                named.scene,
+                options.names,
                 view=view,
-                resolution=wanted.resolution or found.resolution,
-                rays_a_side=wanted.rays_a_side,
+                resolution=options.resolution or named.resolution,
+                rays_a_side=options.rays_a_side,
             )
             write_atomically(path, data)
             done(path)
     return tuple(dict.fromkeys(notes))
 
 
-def _scenes(source: str, key: str | None) -> Iterator[_Found]:
+def _scenes(source: str, key: str | None) -> Iterator[_NamedScene]:
     if is_dataset(source):
-        for _, sample in chosen_samples(open_dataset(source), scene=key):
+        for _, sample in select_samples(open_dataset(source), scene=key):
             resolution = sample.radiance_rgb.shape[2]
-            yield _Found(name=sample.key, scene=sample.scene, resolution=resolution)
+            yield _NamedScene(name=sample.key, scene=sample.scene, resolution=resolution)
         return
     with SceneReader() as reader:
-        wanted = scene_source(source if key is None else f"{source}::{key}", many=True)
-        for each in reader.scenes_of(wanted):
+        whole_source = scene_source(source if key is None else f"{source}::{key}", many=True)
+        for each in reader.scenes_of(whole_source):
             loaded = reader.load(each)
             name = each.path.stem if each.key is None else each.key
-            yield _Found(name=name, scene=loaded.scene, resolution=_RESOLUTION, notes=loaded.notes)
+            yield _NamedScene(
+                name=name, scene=loaded.scene, resolution=_RESOLUTION, notes=loaded.notes
+            )

@@ -1,6 +1,6 @@
-"""Pictures of strangers as arrays: decoded by name of few formats, and bounded before any memory.
+"""Decodes untrusted pictures to arrays; few formats, and sizes checked before any allocation.
 
-Bytes stay bytes, so that what is read is what is stored.
+8-bit values stay 8-bit values, so that textures hold exactly what their files hold.
 """
 
 import io
@@ -20,21 +20,21 @@ Pixels = NDArray[np.uint8] | NDArray[np.float32]
 """[H, W, C] encoded as the file has them, the top row first; uint8 and C of 1 to 4, or float32."""
 
 
-def decoded_pixels(
+def decode_pixels(
     data: bytes, name: str, lost: list[str] | None = None, *, is_color: bool = True
 ) -> Pixels | None:
-    """Return a picture, or None where the bytes are none.
+    """Decode a picture; return None where the bytes are not one.
 
     16-bit pictures become float32 from 0 to 1; OpenEXR and Radiance are linear float32.
 
     Args:
         data: the file.
-        name: what messages call it.
-        lost: gets a sentence for what is not read of it.
-        is_color: whether its numbers are colors, so that its primaries count.
+        name: name for messages.
+        lost: receives a sentence for each unsupported feature.
+        is_color: True where the values are colors, so that primaries apply.
 
     Raises:
-        TrilightError: it has more pixels than MAX_PIXELS.
+        TrilightError: the picture has more pixels than MAX_PIXELS.
     """
     try:
         picture = read_linear_picture(data, MAX_PIXELS, is_color=is_color)
@@ -45,7 +45,7 @@ def decoded_pixels(
             lost.append(f"{name!r:.100}: {error.message}")
         return None
     if picture is None:
-        return _plain(data, name)
+        return _decode_with_pillow(data, name)
     if lost is not None:
         lost += [f"{name!r:.100}: {sentence}" for sentence in picture.unread]
     return picture.values
@@ -61,11 +61,11 @@ def linear_rgb(pixels: Pixels) -> NDArray[np.float32]:
 
 
 def is_encoded(pixels: Pixels) -> bool:
-    """Return whether pixels of an unstated colour space are taken as sRGB: colours in 8 bits."""
+    """Return whether pixels of an unstated color space count as sRGB: colors in 8 bits."""
     return bool(pixels.dtype == np.uint8 and pixels.shape[2] >= 3)
 
 
-def _plain(data: bytes, name: str) -> Pixels | None:
+def _decode_with_pillow(data: bytes, name: str) -> Pixels | None:
     from PIL import Image
 
     try:
@@ -82,7 +82,7 @@ def _plain(data: bytes, name: str) -> Pixels | None:
     except Image.DecompressionBombError as error:
         raise TrilightError(f"{name}: expected at most {MAX_PIXELS} pixels.") from error
     except (OSError, SyntaxError, ValueError, LookupError):
-        return None  # PIL says so in all of these ways
+        return None  # errors that Pillow raises for a damaged file
     return values if values.ndim == 3 else values[..., None]
 
 

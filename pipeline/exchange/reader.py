@@ -1,4 +1,4 @@
-"""Reads scenes of a user's files in a child process with limits; only checked scenes come out."""
+"""Reads scenes of untrusted files in a child process with limits; returns checked scenes only."""
 
 import dataclasses
 import logging
@@ -29,19 +29,19 @@ log = logging.getLogger("trilight.exchange")
 
 
 class SceneReader:
-    """One child for any number of sources; close it, or use it in a `with` block."""
+    """A child process that reads any number of sources; close it, or use a `with` block."""
 
     def __init__(self, albedo_over_one: AlbedoOverOne = "scale") -> None:
-        """Start nothing yet.
+        """Create the reader; the child starts with the first call.
 
         Args:
-            albedo_over_one: of RenderFormer's JSON, where albedos add up to more than 1.
+            albedo_over_one: treatment of albedos over 1 in RenderFormer's JSON.
         """
         self._child = file_child()
         self._over_one = albedo_over_one
 
     def scenes_of(self, source: SceneSource) -> list[SceneSource]:
-        """Return each scene that a file holds as a source of its own, in the order of the file.
+        """Return a source for each scene of a file, in the order of the file.
 
         Raises:
             TrilightError: the file is unusable, or holds no scene.
@@ -53,30 +53,31 @@ class SceneReader:
         return [dataclasses.replace(source, key=key) for key in keys]
 
     def load(self, source: SceneSource, *, pictures: bool = False) -> LoadedScene:
-        """Read one scene; arguments and TrilightError as of `scene_source.load_source`."""
+        """Read one scene; see `pipeline.exchange.open_scene.load_source`."""
         source = dataclasses.replace(source, albedo_over_one=self._over_one)
         self._child.allow_files(reach_of(source))
         return self._call(source.name, _load_with_pictures if pictures else load_source, source)
 
     def cameras(self, source: SceneSource) -> Cameras:
-        """Return poses and angles; raises TrilightError as `scene_source.load_cameras`."""
+        """Read poses and angles; see `pipeline.exchange.open_scene.load_cameras`."""
         self._child.allow_files(reach_of(source))
         return self._call(source.name, load_cameras, source)
 
     def mesh(self, path: Path, licence: str) -> LoadedMesh:
-        """Read a file of an object, as it is; raises TrilightError as `load_mesh_file`.
+        """Read the mesh of an object file; log the parts of the file that are ignored.
 
-        What of the file nothing reads is logged.
+        Raises:
+            TrilightError: the file is not a usable mesh, or cannot be read.
         """
         self._child.allow_files(reach(files=[path]))
-        wanted = (path, path.name, path.name, AssetSettings(), licence)
-        mesh, _ = self._call(path.name, load_mesh_file, *wanted)
+        arguments = (path, path.name, path.name, AssetSettings(), licence)
+        mesh, _ = self._call(path.name, load_mesh_file, *arguments)
         if mesh.unread:
             log.warning("%s: not read: %s", path.name, "; ".join(mesh.unread))
         return mesh
 
     def within_budget(self, scene: Scene, max_triangles: int) -> LoadedScene:
-        """Return a scene of fewer triangles; raises TrilightError as `within_budget`."""
+        """Reduce a scene in the child; see `pipeline.exchange.scene_budget.within_budget`."""
         return self._call("scene", _within_budget, scene, max_triangles)
 
     def close(self) -> None:
@@ -116,19 +117,19 @@ _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)
 
 
 def file_child(confined_to: Reach = NO_FILES) -> IsolatedChild:
-    """Return a child with limits that nothing was set up in; close it.
+    """Return a confined child with limits; close it.
 
-    It may use these files, and what it is let by `may`.
+    The child may use these files, and those that `allow_files` adds.
     """
     return IsolatedChild(limits=_LIMITS, confined_to=confined_to)
 
 
 def unconfined_child() -> IsolatedChild:
-    """Return the same for what is read already, such as to render it; close it."""
+    """Return an unconfined child with limits, for scenes that are already read; close it."""
     return IsolatedChild(limits=_LIMITS)
 
 
 def reach_of(source: SceneSource, *, writes: Iterable[Path] = ()) -> Reach:
-    """Return what a child needs to read a source, and to write into folders that exist."""
+    """Return the files that a child needs to read a source and to write into folders."""
     folders = [] if source.usd_folder is None else [source.usd_folder]
     return reach(files=[source.path, *folders], writes=writes)

@@ -1,4 +1,4 @@
-"""RenderFormer's published HDF5 file of one scene, written and read: every array with its quirks.
+"""Reads and writes the published RenderFormer HDF5 file of one scene.
 
 | array | dtype, shape | meaning |
 |---|---|---|
@@ -11,19 +11,19 @@
 | `mvp` | f32 [V, 4, 4] | world to clip space, near 0.05, far 5; where there are pictures |
 
 - A texture fills its cells (x, y) with x + y <= 32, which are 559 of 1024; the others are zero.
-  Published files hold one value in all of them: 1024 times the bytes of what it says. Textures of
-  a scene become cells, and cells that vary textures (pipeline.exchange.renderformer_cells).
-- Normals of a texture are (.5, .5, 1): no bump, in the file's tangent space.
-- An emitter's texture says diffuse (1, 1, 1) and roughness 1, as published, though our emitters
-  reflect nothing (as do the published ones when rendered).
-- Half floats end at 65504 and keep 11 bits: albedos move by up to 2^-11, and brighter lights are
+  Published files hold one value in all of them. Textures of a scene become cells, and varying cells
+  become textures (pipeline.exchange.renderformer_cells).
+- The normal channels are (.5, .5, 1): no bump, in the file's tangent space.
+- The texture of an emitter states diffuse (1, 1, 1) and roughness 1, as published, though emitters
+  reflect nothing here (nor do the published ones when rendered).
+- Half floats end at 65504 and keep 11 bits: albedos change by up to 2^-11, and brighter lights are
   refused.
-- Every array is packed by gzip at level 9, in chunks of h5py's choosing.
-- Our pictures have no alpha: it is written as 1, and the empty background is radiance zero.
+- Every array is compressed by gzip at level 9, in chunks that h5py chooses.
+- Pictures have no alpha here: it is written as 1, and the empty background is radiance zero.
 - `mvp` is OpenGL's, for column vectors; the published training multiplies it by zero.
 
-What a file cannot say: which triangles are one object, names and rights, provenance, shared
-vertices. The reader does not trust the file (pipeline.exchange.safe_h5).
+The file has no place for objects (which triangles belong together), names and rights, provenance,
+or shared vertices. The reader does not trust the file (pipeline.exchange.safe_h5).
 """
 
 import io
@@ -36,8 +36,8 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.renderformer_cells import (
     CELLS,
-    cells_of,
-    filled_cells,
+    compute_cells,
+    filled_cell_mask,
     textured_triangles,
 )
 from pipeline.exchange.renderformer_stored import (
@@ -46,13 +46,13 @@ from pipeline.exchange.renderformer_stored import (
     MAX_TRIANGLES,
     TEXTURE_EMISSION,
     TEXTURE_NORMAL,
-    stored_textures,
+    read_textures,
     with_cells,
 )
-from pipeline.exchange.renderformer_v2 import KNOWN, grey_textures, is_second_version, sky_of
+from pipeline.exchange.renderformer_v2 import KNOWN, is_second_version, read_grey_textures, read_sky
 from pipeline.exchange.safe_h5 import (
-    names_in,
-    opened_h5,
+    list_names,
+    open_h5,
     plain_array,
     read_whole,
 )
@@ -77,8 +77,9 @@ CARRIED = frozenset(
 )
 """Members of a scene that the file holds (pipeline.exchange.formats)."""
 
-NEAR, FAR = 0.05, 5.0
-"""Clip distances of `mvp`, in metres."""
+NEAR = 0.05
+FAR = 5.0
+"""Clip distances of `mvp`, in meters."""
 GZIP_LEVEL = 9
 
 TextureType = Literal["float16", "float32"]
@@ -93,11 +94,11 @@ def write_renderformer_h5(
 ) -> None:
     """Write a scene, and its pictures [V, R, R, 3] if given; equal scenes give equal bytes.
 
-    `float16` is what the public converter writes, `float32` what the authors' later tools do. The
-    file appears whole or not at all; in memory it takes its packed size and one block of textures.
+    The public converter writes `float16`, the authors' later tools `float32`. The file appears
+    whole or not at all; memory is its compressed size and one block of textures.
 
     Raises:
-        TrilightError: a value that half floats do not hold, or the file cannot be written.
+        TrilightError: a value exceeds half floats, or the file cannot be written.
     """
     import h5py
 
@@ -122,7 +123,7 @@ def texture_rows(scene: Scene, texture_type: TextureType) -> NDArray[np.floating
     Where rounding to half floats would make albedos add up to more than 1, they are rounded down.
 
     Raises:
-        TrilightError: an emission that half floats turn into infinity or nothing.
+        TrilightError: an emission becomes infinite or zero as half floats.
     """
     emits = np.any(scene.materials[:, EMISSION] > 0, axis=1)
     rows = np.zeros((len(scene.materials), CHANNELS), np.float32)
@@ -150,11 +151,11 @@ def texture_rows(scene: Scene, texture_type: TextureType) -> NDArray[np.floating
     return half[scene.material_index]
 
 
-def reflecting_emitters(scene: Scene) -> tuple[str, ...]:
-    """Return what a file says otherwise, for people: what emitters reflect, where they do."""
+def note_reflecting_emitters(scene: Scene) -> tuple[str, ...]:
+    """Return a note that a written file changes the albedos of emitters, where they reflect."""
     emits = (scene.materials[:, EMISSION] > 0).any(axis=1)
     reflects = (scene.materials[emits][:, : SPECULAR.stop] > 0).any(axis=1)
-    return (f"what {int(reflects.sum())} emitting materials reflect",) if reflects.any() else ()
+    return (f"albedos of {int(reflects.sum())} emitting materials",) if reflects.any() else ()
 
 
 def _write(file: Any, name: str, values: NDArray) -> None:
@@ -162,18 +163,19 @@ def _write(file: Any, name: str, values: NDArray) -> None:
 
 
 def _write_texture(file: Any, rows: NDArray[np.floating], scene: Scene) -> None:
-    """Write textures a block of triangles at a time: whole, they take 53 kB a triangle."""
+    """Write textures in blocks of triangles; in memory each triangle takes 53 kB."""
     textured = textured_triangles(scene)
     shape = (len(rows), CHANNELS, CELLS, CELLS)
     texture = file.create_dataset(
         "texture", shape, rows.dtype, compression="gzip", compression_opts=GZIP_LEVEL
     )
-    filled, step = filled_cells(), texture.chunks[0]
+    filled = filled_cell_mask()
+    step = texture.chunks[0]
     for start in range(0, len(rows), step):
         block = rows[start : start + step, :, None, None]
         cells = np.where(filled, block, rows.dtype.type(0))
         for triangle in start + np.flatnonzero(textured[start : start + step]):
-            for part, values in cells_of(scene, int(triangle)):
+            for part, values in compute_cells(scene, int(triangle)):
                 cells[triangle - start, part] = values
         texture[start : start + step] = cells
 
@@ -187,7 +189,8 @@ def _mvp(scene: Scene) -> NDArray[np.float32]:
     focal = 1 / np.tan(np.radians(scene.fov_deg.astype(np.float64)) / 2)
     clip = np.zeros((len(focal), 4, 4))
     clip[:, 0, 0] = clip[:, 1, 1] = focal
-    clip[:, 2, 2], clip[:, 2, 3] = (FAR + NEAR) / (NEAR - FAR), 2 * FAR * NEAR / (NEAR - FAR)
+    clip[:, 2, 2] = (FAR + NEAR) / (NEAR - FAR)
+    clip[:, 2, 3] = 2 * FAR * NEAR / (NEAR - FAR)
     clip[:, 3, 2] = -1
     view = np.linalg.inv(scene.c2w.astype(np.float64))
     return np.einsum("vij,vjk->vik", clip, view).astype(np.float32)
@@ -195,54 +198,54 @@ def _mvp(scene: Scene) -> NDArray[np.float32]:
 
 MAX_VIEWS = 1000
 MAX_PICTURE_BYTES = 1 << 30
-"""Maximum size of all pictures of a file as float32."""
+"""Maximum bytes of all pictures of a file as float32."""
 MAX_PALETTE = 1 << 16
 """Maximum number of material rows and of objects: `Scene` counts them in 16 bits."""
 
 UNKNOWN_LICENCE = "LicenseRef-unknown"
-"""A file names no rights."""
+"""Licence of everything that is read, since the file states no rights."""
 
 _KNOWN = ("c2w", "fov", "img", "mvp", "texture", "triangles", "vn")
 _ROUNDING = 2.0**-10
-"""Albedos that are meant to add up to 1 may exceed it by this as half floats."""
+"""Tolerance for the half-float rounding of albedos that add up to 1."""
 _PUBLISHED_EMITTER = np.array([1, 1, 1, 0, 0, 0, 1], np.float32)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RenderFormerFile:
-    """What a file says."""
+    """A scene that was read, with its pictures and losses."""
 
     scene: Scene
     """A checked scene: one object of everything that reflects, one for each emitting triangle."""
     radiance_rgb: NDArray[np.float32] | None
     """[V, H, W, 3] linear radiance; None where the file has no pictures."""
     lost: tuple[str, ...]
-    """What could not be carried over, for people."""
+    """Sentences about parts of the file that were lost."""
 
 
 def read_renderformer_h5(path: Path) -> RenderFormerFile:
     """Read a file of the published layout.
 
     Corners with equal position and normal become one vertex, so that flat and smooth shading stay
-    as they are; equal materials become one row, but each emitting triangle has its own.
+    as they are. Equal materials become one row, but each emitting triangle has a separate row.
 
     Raises:
-        TrilightError: not such a file; behind links, outside of the file, larger than it may be,
-            not finite (pipeline.exchange.safe_h5); or a scene that breaks a law (`Scene.check`).
+        TrilightError: the file has another layout; an array is a link, outside the file, too large
+            or not finite (pipeline.exchange.safe_h5); or the scene breaks a law (`Scene.check`).
     """
     lost: list[str] = []
-    with opened_h5(path) as file:
-        lost += _unknown(file)
+    with open_h5(path) as file:
+        lost += _list_unknown(file)
         triangles = read_whole(plain_array(file, "triangles", (None, 3, 3), MAX_TRIANGLES))
         count = len(triangles)
         normals = read_whole(plain_array(file, "vn", (count, 3, 3), MAX_TRIANGLES))
         second = is_second_version(file)
-        stored = (grey_textures if second else stored_textures)(file, count, lost)
-        sky = sky_of(file, UNKNOWN_LICENCE, lost) if second else None
+        stored = (read_grey_textures if second else read_textures)(file, count, lost)
+        sky = read_sky(file, UNKNOWN_LICENCE, lost) if second else None
         c2w = read_whole(plain_array(file, "c2w", (None, 4, 4), MAX_VIEWS))
         fov_deg = read_whole(plain_array(file, "fov", (len(c2w),), MAX_VIEWS))
-        pictures = _pictures(file, len(c2w), lost) if "img" in names_in(file) else None
-        positions, normals, faces = _indexed(triangles, _unit(triangles, normals, lost))
+        pictures = _pictures(file, len(c2w), lost) if "img" in list_names(file) else None
+        positions, normals, faces = _index_vertices(triangles, _normalize(triangles, normals, lost))
         scene = Scene(
             vertex_positions=positions,
             vertex_normals=normals,
@@ -258,9 +261,9 @@ def read_renderformer_h5(path: Path) -> RenderFormerFile:
     return RenderFormerFile(scene=scene, radiance_rgb=pictures, lost=tuple(lost))
 
 
-def _unknown(file: Any) -> list[str]:
+def _list_unknown(file: Any) -> list[str]:
     known = (*_KNOWN, *KNOWN) if is_second_version(file) else _KNOWN
-    names = [f"array or group {name!r:.60}" for name in names_in(file) if name not in known]
+    names = [f"array or group {name!r:.60}" for name in list_names(file) if name not in known]
     names += [f"attribute {name!r:.60}" for name in sorted(file.attrs)]
     return names if len(names) <= 10 else [*names[:10], f"and {len(names) - 10} more"]
 
@@ -269,14 +272,14 @@ def _pictures(file: Any, num_views: int, lost: list[str]) -> NDArray[np.float32]
     array = plain_array(file, "img", (num_views, None, None, 4), MAX_RESOLUTION)
     rgba = read_whole(array, MAX_PICTURE_BYTES)
     if (rgba[..., 3] != 1).any():
-        lost.append("alpha of pictures: they stand before black")
+        lost.append("alpha of pictures: composited over black")
     return rgba[..., :3].copy()
 
 
-def _unit(
+def _normalize(
     triangles: NDArray[np.float32], normals: NDArray[np.float32], lost: list[str]
 ) -> NDArray[np.float32]:
-    """Return normals [T, 3, 3] of unit length; the face's own where there is none."""
+    """Return unit normals [T, 3, 3]; the normal of the face replaces zero normals."""
     length = np.linalg.norm(normals.astype(np.float64), axis=2, keepdims=True)
     off = np.abs(length - 1) > UNIT_NORMAL_TOLERANCE
     if not off.any():
@@ -292,15 +295,15 @@ def _unit(
     return np.where(off, chosen / size, normals).astype(np.float32)
 
 
-def _indexed(
+def _index_vertices(
     triangles: NDArray[np.float32], normals: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
-    """Return vertices and faces; vertices are in the order in which they are first used."""
+    """Return positions, normals and faces, with vertices in the order of first use."""
     corners = np.concatenate([triangles, normals], axis=2).reshape(-1, 6)
     first, rows = distinct_rows(corners)
-    kept = corners[first]
+    vertices = corners[first]
     faces = rows.astype(np.uint32).reshape(-1, 3)
-    return kept[:, :3].copy(), kept[:, 3:].copy(), faces
+    return vertices[:, :3].copy(), vertices[:, 3:].copy(), faces
 
 
 def _palette(
@@ -311,11 +314,11 @@ def _palette(
     materials[:, REFLECTING] = rows[:, REFLECTING]
     materials[:, EMISSION] = rows[:, TEXTURE_EMISSION]
     if (materials[emits, REFLECTING] != _PUBLISHED_EMITTER).any():
-        lost.append("what emitters reflect: ours reflect nothing")
+        lost.append("albedos of emitters: emitters of a scene reflect nothing")
     materials[emits, REFLECTING] = [0, 0, 0, 0, 0, 0, 1]
-    materials[varies, REFLECTING] = 0  # one row for all of them: their cells say the rest
-    _within_one(materials, lost)
-    order = np.where(emits, np.cumsum(emits), -1.0 * varies)  # emitters stay apart, even if equal
+    materials[varies, REFLECTING] = 0  # one row for all of them, since their cells hold the values
+    _limit_rounded_albedos(materials, lost)
+    order = np.where(emits, np.cumsum(emits), -1.0 * varies)  # equal emitters keep separate rows
     first, index = distinct_rows(np.column_stack([materials, order.astype(np.float32)]))
     if len(first) > MAX_PALETTE or emits.sum() >= MAX_PALETTE:
         raise TrilightError(
@@ -324,7 +327,7 @@ def _palette(
         )
     surface = () if emits.all() else (SceneObject(name="surfaces", kind="object"),)
     emitters = tuple(SceneObject(name=f"emitter{i}", kind="emitter") for i in range(emits.sum()))
-    entries = [_of_unknown_rights(entry) for entry in (*surface, *emitters)]
+    entries = [_with_unknown_licence(entry) for entry in (*surface, *emitters)]
     return {
         "materials": materials[first],
         "material_index": index.astype(np.uint16),
@@ -333,12 +336,12 @@ def _palette(
     }
 
 
-def _of_unknown_rights(entry: SceneObject) -> SceneObject:
+def _with_unknown_licence(entry: SceneObject) -> SceneObject:
     return SceneObject(name=entry.name, kind=entry.kind, licence=UNKNOWN_LICENCE)
 
 
-def _within_one(materials: NDArray[np.float32], lost: list[str]) -> None:
-    """Lower specular albedos where rounding took the sum over 1; `Scene.check` refuses more."""
+def _limit_rounded_albedos(materials: NDArray[np.float32], lost: list[str]) -> None:
+    """Lower specular albedos whose sum rounding raised above 1, as `Scene.check` demands."""
     excess = materials[:, DIFFUSE] + materials[:, SPECULAR] - 1
     rounded = (excess > ALBEDO_SUM_TOLERANCE) & (excess <= _ROUNDING)
     if rounded.any():

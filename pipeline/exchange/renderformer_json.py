@@ -1,14 +1,14 @@
-"""RenderFormer's scene JSON (version 1.0), read as a `SceneDescription`, written from a `Scene`.
+"""Reads RenderFormer's scene JSON (version 1.0) as a `SceneDescription`; writes it from a `Scene`.
 
-Which fields may be missing, and their defaults, follow the published reader. Unlike it, unknown
-fields are named and left out. Only the fields of the published example scenes are known: no
-templates, whose values would have to be halved, no textures, no environment.
+Optional fields and their defaults follow the published reader. Unlike it, this reader reports and
+ignores unknown fields. It knows the fields of the published example scenes only: no templates
+(whose values would have to be halved), no textures, no environment.
 
-A written file names one OBJ file per mesh, in world space and not normalised. An object of the file
-has one material, so an object of ours becomes one for each of its materials. `CARRIED` lists what
-the format holds; of that, `DescribedFiles.lost` lists what does not come back whole: which
-triangles of several colours were one object; shading normals other than flat ones and those that
-its readers make (smooth across edges of up to 30 degrees).
+A written file names one OBJ file per mesh, in world space and not normalized. An object of the file
+has one material, so an object of a scene becomes one object for each of its materials. `CARRIED`
+lists the members that the format holds. `DescribedFiles.lost` lists what of these a reader cannot
+restore: objects of several materials; shading normals other than flat ones and those that readers
+compute (smooth across edges of up to 30 degrees).
 """
 
 import json
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.description import (
-    ColourGroups,
+    ColorGroups,
     DescribedCamera,
     DescribedMaterial,
     DescribedObject,
@@ -39,17 +39,17 @@ from storage.records.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, ROUGH
 from storage.records.scene import ARRAY_FIELDS, Scene
 
 MAX_BYTES = 4 << 20
-"""Largest accepted file; an object takes about 1 KiB."""
+"""Maximum size of a file; an object takes about 1 KiB."""
 
 MAX_OBJECTS = 8192
-"""Maximum number of objects in a file; a triangle with its own colour counts as an object."""
+"""Maximum number of objects in a file; a triangle with a separate color counts as an object."""
 
 MAX_CAMERAS = 1000
 """Maximum number of cameras in a file."""
 
 _VERSION = "1.0"
 _MAX_LENGTH = 1e6
-"""Greatest coordinate or factor: beyond it float32 positions are off by centimetres."""
+"""Maximum coordinate or factor; beyond it float32 positions are off by centimeters."""
 _MAX_ANGLE_DEG = 1e6
 _MAX_EMISSION = 1e9
 _MAX_SEED = 2**32 - 1
@@ -58,36 +58,38 @@ _COLOUR_GROUPS = ("per-triangle", "per-shading-group")
 
 
 def read_description(data: bytes, name: str) -> SceneDescription:
-    """Return what a scene file describes.
+    """Parse a scene file.
 
     Args:
         data: the bytes of the file.
-        name: of the file, for messages.
+        name: name of the file, for messages.
 
     Raises:
-        TrilightError: larger than MAX_BYTES, not JSON, a name twice in one JSON object, or a field
-            that is missing, of the wrong type, not finite or out of range; the message names file,
-            field (with the object's name), value got and value expected.
+        TrilightError: the file exceeds MAX_BYTES or is not JSON; a JSON object repeats a name; or a
+            field is missing, of the wrong type, not finite or out of range. The message names file,
+            field (with the object's name), value and expected value.
     """
     if len(data) > MAX_BYTES:
         raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_BYTES}.")
     unknown: list[str] = []
-    fields = Fields(_parsed(data, name), file=name, where="", unknown=unknown)
-    scene_name, version = fields.text("scene_name"), fields.text("version")
+    fields = Fields(_parse_json(data, name), file=name, where="", unknown=unknown)
+    scene_name = fields.text("scene_name")
+    version = fields.text("version")
     if version != _VERSION:
         raise TrilightError(f"{name}: version is {version!r}; expected {_VERSION!r}.")
-    objects, cameras = fields.group("objects"), fields.groups("cameras", MAX_CAMERAS)
+    objects = fields.group("objects")
+    cameras = fields.groups("cameras", MAX_CAMERAS)
     names = list(objects.keys())
     if not 1 <= len(names) <= MAX_OBJECTS:
         raise TrilightError(f"{name}: {len(names)} objects; expected 1 to {MAX_OBJECTS}.")
     described = tuple(_object(key, objects.group(key)) for key in names)
-    seen = tuple(_camera(camera) for camera in cameras)
+    described_cameras = tuple(_camera(camera) for camera in cameras)
     fields.end()
     return SceneDescription(
         file=name,
         scene_name=scene_name,
         objects=described,
-        cameras=seen,
+        cameras=described_cameras,
         unknown_fields=tuple(unknown),
     )
 
@@ -96,20 +98,20 @@ def read_cameras(data: bytes, name: str) -> tuple[DescribedCamera, ...]:
     """Return the cameras of a scene file, or of a JSON file that has nothing but `cameras`.
 
     Raises:
-        TrilightError: as `read_description`, for what of it is read.
+        TrilightError: as `read_description`, for the cameras alone.
     """
     if len(data) > MAX_BYTES:
         raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_BYTES}.")
-    fields = Fields(_parsed(data, name), file=name, where="", unknown=[])
+    fields = Fields(_parse_json(data, name), file=name, where="", unknown=[])
     return tuple(_camera(camera) for camera in fields.groups("cameras", MAX_CAMERAS))
 
 
-def _parsed(data: bytes, name: str) -> Any:
+def _parse_json(data: bytes, name: str) -> Any:
     try:
         return json.loads(
             data.decode("utf-8-sig"),
-            object_pairs_hook=_without_repeats,
-            parse_constant=_refused_constant,
+            object_pairs_hook=_refuse_repeats,
+            parse_constant=_refuse_constant,
         )
     except RecursionError as error:
         raise TrilightError(f"{name}: nested too deeply for a scene; expected JSON.") from error
@@ -122,15 +124,15 @@ def _parsed(data: bytes, name: str) -> Any:
         raise TrilightError(f"{name}: not readable as JSON in UTF-8.") from error
 
 
-def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+def _refuse_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    members = dict(pairs)
+    if len(members) < len(pairs):
         (repeated, _), *_ = Counter(key for key, _ in pairs).most_common(1)
         raise Malformed(f"the name {repeated!r:.60} stands twice in one object")
-    return found
+    return members
 
 
-def _refused_constant(text: str) -> float:
+def _refuse_constant(text: str) -> float:
     raise Malformed(f"{text} is no JSON number")
 
 
@@ -141,7 +143,7 @@ def _object(name: str, fields: Fields) -> DescribedObject:
         transform=_transform(fields.group("transform")),
         material=_material(fields.group("material")),
         remesh=fields.flag("remesh", default=False),
-        remesh_target_face_num=fields.whole("remesh_target_face_num", 4, _MAX_REMESH_FACES, 2048),
+        remesh_target_face_num=fields.integer("remesh_target_face_num", 4, _MAX_REMESH_FACES, 2048),
     )
     fields.end()
     return described
@@ -167,8 +169,8 @@ def _material(fields: Fields) -> DescribedMaterial:
         emissive=fields.vector("emissive", 0, _MAX_EMISSION),
         smooth_shading=fields.flag("smooth_shading"),
         random_diffuse_max=fields.number("random_diffuse_max", 0, 1, default=1.0),
-        random_diffuse_type=cast(ColourGroups, groups),
-        rand_tri_diffuse_seed=fields.optional_whole("rand_tri_diffuse_seed", 0, _MAX_SEED),
+        random_diffuse_type=cast(ColorGroups, groups),
+        rand_tri_diffuse_seed=fields.optional_integer("rand_tri_diffuse_seed", 0, _MAX_SEED),
     )
     fields.end()
     return material
@@ -194,49 +196,49 @@ CARRIED = frozenset(
 _FLAT = 1e-5
 """Largest difference between a flat face's float32 normal and its geometric normal."""
 _CLOSE = 1e-2
-"""How far a normal may lie from the one that a reader makes before it counts as lost: 0.6 deg."""
+"""Maximum difference between a normal and the one that a reader computes: 0.6 degrees."""
 _NAME_LETTERS = 48
-"""Length limit of object names; the published converter makes files of them (255 bytes)."""
+"""Maximum length of object names; the published converter uses them as file names (255 bytes)."""
 _NO_FILE_LETTERS = '/\\:*?"<>|'
-"""Letters that a name of a file must not have, on some system."""
+"""Characters that some operating system forbids in file names."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DescribedFiles:
-    """The files of one scene."""
+    """The scene file and mesh files of one scene."""
 
     json: bytes  # the scene file
-    meshes: dict[str, bytes]  # OBJ files by path relative to it
-    lost: tuple[str, ...]  # what of the members in CARRIED does not come back, for people
+    meshes: dict[str, bytes]  # OBJ files by path relative to the scene file
+    lost: tuple[str, ...]  # sentences about members in CARRIED that readers cannot restore
 
 
-def described_files(scene: Scene, stem: str) -> DescribedFiles:
+def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
     """Return a scene as the files that the published tools read.
 
     Args:
-        scene: that passes `Scene.check`.
-        stem: of the scene file; its meshes stand in folders of that name.
+        scene: passes `Scene.check`.
+        stem: stem of the scene file and name of its mesh folders.
 
     Raises:
-        TrilightError: more objects or cameras than a file may have, a number beyond its range, or
-            no emitter with an area.
+        TrilightError: more objects or cameras than a file may have, a number out of range, or no
+            emitter with an area.
     """
     scene.check()
     lost: list[str] = []
     meshes: dict[str, bytes] = {}
     objects: dict[str, Any] = {}
     taken: set[str] = set()
-    for row, material, faces in _parts(scene):
+    for row, material, faces in _group_triangles(scene):
         if len(without_slivers(scene.vertex_positions, scene.faces[faces])) == 0:
-            continue  # readers refuse a mesh of which nothing is left
+            continue  # readers refuse a mesh without an area
         name = _unique(_name(scene, row, material), taken)
         normals = scene.vertex_normals[scene.faces[faces]]
         path = _mesh_path(scene, row, material, stem)
         meshes[path] = _obj(scene, faces)
         smooth = _is_smooth(scene, faces, normals)
         objects[name] = _object_entry(path, scene.materials[material], smooth)
-        if smooth and not _comes_back(scene, faces, normals):
-            lost.append(f"{name}: shading normals; readers make their own")
+        if smooth and not _is_reproduced(scene, faces, normals):
+            lost.append(f"{name}: shading normals, which readers compute again")
     if not any(max(entry["material"]["emissive"]) > 0 for entry in objects.values()):
         raise TrilightError("scene: no emitter has an area; a scene file needs at least one.")
     data = json.dumps(
@@ -248,25 +250,25 @@ def described_files(scene: Scene, stem: str) -> DescribedFiles:
         }
     ).encode()
     _require_size(scene, data, len(objects))
-    read_description(data, f"{stem}.json")  # nothing is written that its readers would refuse
+    read_description(data, f"{stem}.json")  # raises for anything that readers would refuse
     return DescribedFiles(json=data, meshes=meshes, lost=(*_losses(scene), *lost))
 
 
-def _parts(scene: Scene) -> list[tuple[int, int, NDArray[np.intp]]]:
-    """Return (object, material, its triangles) in the order of objects and then of materials."""
+def _group_triangles(scene: Scene) -> list[tuple[int, int, NDArray[np.intp]]]:
+    """Return (object, material, triangles), sorted by object and then by material."""
     keys = scene.object_index.astype(np.int64) * len(scene.materials) + scene.material_index
     order = np.argsort(keys, kind="stable")
-    found, starts = np.unique(keys[order], return_index=True)
+    distinct, starts = np.unique(keys[order], return_index=True)
     return [
         (*divmod(int(key), len(scene.materials)), faces)
-        for key, faces in zip(found, np.split(order, starts[1:]), strict=True)
+        for key, faces in zip(distinct, np.split(order, starts[1:]), strict=True)
     ]
 
 
 def _name(scene: Scene, row: int, material: int) -> str:
-    own = scene.material_index[scene.object_index == row]
+    materials = scene.material_index[scene.object_index == row]
     name = _printable(scene.objects[row].name).lstrip(".") or f"object{row}"
-    return name if (own == material).all() else f"{name}.material{material}"
+    return name if (materials == material).all() else f"{name}.material{material}"
 
 
 def _printable(text: str) -> str:
@@ -275,13 +277,14 @@ def _printable(text: str) -> str:
 
 
 def _unique(name: str, taken: set[str]) -> str:
-    """Return a name that no other has, capitals or not, since it becomes that of a file."""
-    chosen, count = name, 1
-    while chosen.casefold() in taken:
+    """Return an unused name, ignoring case, since it becomes the name of a file."""
+    candidate = name
+    count = 1
+    while candidate.casefold() in taken:
         count += 1
-        chosen = f"{name}.{count}"
-    taken.add(chosen.casefold())
-    return chosen
+        candidate = f"{name}.{count}"
+    taken.add(candidate.casefold())
+    return candidate
 
 
 def _mesh_path(scene: Scene, row: int, material: int, stem: str) -> str:
@@ -292,7 +295,7 @@ def _mesh_path(scene: Scene, row: int, material: int, stem: str) -> str:
 
 
 def _obj(scene: Scene, faces: NDArray[np.intp]) -> bytes:
-    """Return triangles as an OBJ file whose numbers come back as the same single floats."""
+    """Return triangles as an OBJ file whose numbers round-trip to the same float32."""
     rows, corners = np.unique(scene.faces[faces], return_inverse=True)
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in scene.vertex_positions[rows].tolist()]
     lines += [f"vn {x:.9g} {y:.9g} {z:.9g}" for x, y, z in scene.vertex_normals[rows].tolist()]
@@ -334,15 +337,16 @@ def camera_entry(c2w: NDArray[np.float32], fov_deg: float) -> dict[str, Any]:
 
 def _is_smooth(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.float32]) -> bool:
     with np.errstate(invalid="ignore", divide="ignore"):
-        own = face_normals(scene.vertex_positions, scene.faces[faces])
-    off = np.abs(normals - own[:, None])
+        flat = face_normals(scene.vertex_positions, scene.faces[faces])
+    off = np.abs(normals - flat[:, None])
     return bool((off[np.isfinite(off)] > _FLAT).any())
 
 
-def _comes_back(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.float32]) -> bool:
-    """Return whether a reader that smooths makes the same normals."""
+def _is_reproduced(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.float32]) -> bool:
+    """Return whether the smoothing of a reader computes the same normals."""
     rows, corners = np.unique(scene.faces[faces], return_inverse=True)
-    positions, triangles = scene.vertex_positions[rows], corners.reshape(-1, 3).astype(np.uint32)
+    positions = scene.vertex_positions[rows]
+    triangles = corners.reshape(-1, 3).astype(np.uint32)
     if len(without_slivers(positions, triangles)) < len(triangles):
         return False
     made = smooth_shaded(positions, triangles, SMOOTH_ANGLE_DEG)
@@ -350,17 +354,22 @@ def _comes_back(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.float
 
 
 def _losses(scene: Scene) -> list[str]:
-    found: list[str] = []
-    parts = np.bincount([row for row, _, _ in _parts(scene)])
-    whole, split = int((parts > 1).sum()), int(parts[parts > 1].sum())
-    if whole:
-        found.append(f"that {split} of its objects were {whole}, of several materials")
+    losses: list[str] = []
+    parts = np.bincount([row for row, _, _ in _group_triangles(scene)])
+    num_objects = int((parts > 1).sum())
+    num_parts = int(parts[parts > 1].sum())
+    if num_objects:
+        losses.append(
+            f"the grouping of {num_parts} objects that were {num_objects}, of several materials"
+        )
     solid = len(without_slivers(scene.vertex_positions, scene.faces))
     if solid < scene.num_triangles:
-        found.append(f"{scene.num_triangles - solid} triangles without an area, which readers drop")
+        losses.append(
+            f"{scene.num_triangles - solid} triangles without an area, which readers drop"
+        )
     if (scene.materials[:, EMISSION] > HALF_FLOAT_MAX).any():
-        found.append(f"emission over {HALF_FLOAT_MAX:.0f}, which the published converter cuts off")
-    return found
+        losses.append(f"emission over {HALF_FLOAT_MAX:.0f}, which the published converter cuts off")
+    return losses
 
 
 def _require_size(scene: Scene, data: bytes, objects: int) -> None:

@@ -1,4 +1,4 @@
-"""The textures of a RenderFormer file: their means, and the cells of those that vary."""
+"""Reads the textures of a RenderFormer file: their means, and the cells of varying ones."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.renderformer_cells import CELLS, MAX_VARYING, atlas_of, filled_cells
+from pipeline.exchange.renderformer_cells import CELLS, MAX_VARYING, build_atlas, filled_cell_mask
 from pipeline.exchange.safe_h5 import iterate_blocks, plain_array, require_finite
 from storage.records.material import REFLECTING
 from storage.records.retextured import with_textures, without_constant_textures
@@ -25,26 +25,26 @@ FLAT_NORMAL = (0.5, 0.5, 1.0)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StoredTextures:
-    """What the textures of all triangles say."""
+    """Means and varying cells of the textures of all triangles."""
 
     rows: NDArray[np.float32]
-    """[T, 13] their means."""
+    """[T, 13] mean of each texture."""
     varies: NDArray[np.bool_]
-    """[T] whether a texture is more than its mean."""
+    """[T] True where the cells of a texture differ."""
     cells: NDArray[np.float32] | None
-    """[N, 7, 32, 32] what those reflect, cell by cell; None where none varies."""
+    """[N, 7, 32, 32] reflectance cells of the varying textures; None where none varies."""
 
 
-def stored_textures(file: Any, count: int, lost: list[str]) -> StoredTextures:
-    """Return the textures of an open file.
+def read_textures(file: Any, count: int, lost: list[str]) -> StoredTextures:
+    """Read the textures of an open file.
 
     Args:
         file: its root group.
-        count: of its triangles.
-        lost: receives what cannot be carried over.
+        count: number of its triangles.
+        lost: receives a sentence for each loss.
 
     Raises:
-        TrilightError: as `plain_array` and `iterate_blocks`, or a value is not finite.
+        TrilightError: the array is unusable (`plain_array`, `iterate_blocks`), or not finite.
     """
     rows, varies = _texture_rows(file, count, lost)
     cells = _varying_cells(file, count, varies) if varies.any() else None
@@ -52,11 +52,11 @@ def stored_textures(file: Any, count: int, lost: list[str]) -> StoredTextures:
 
 
 def with_cells(scene: Scene, stored: StoredTextures, licence: str) -> Scene:
-    """Return a scene with the textures that cells are; its varying triangles share a material."""
+    """Return a scene with the textures of its cells; varying triangles share a material."""
     varies = stored.varies
     if stored.cells is None:
         return scene
-    atlas = atlas_of(stored.cells, MapSource(name="cells of triangles", licence=licence))
+    atlas = build_atlas(stored.cells, MapSource(name="cells of triangles", licence=licence))
     uv = np.zeros((scene.num_triangles, 3, 2), np.float32)
     uv[varies] = atlas.uv
     index = np.full((len(scene.materials), len(TEXTURED)), CONSTANT, np.int32)
@@ -65,23 +65,25 @@ def with_cells(scene: Scene, stored: StoredTextures, licence: str) -> Scene:
     index[np.unique(scene.material_index[varies])] = [
         order.index(texture.sha256) for texture in atlas.textures
     ]
-    kept = tuple(next(t for t in atlas.textures if t.sha256 == key) for key in order)
-    return without_constant_textures(with_textures(scene, uv.reshape(-1, 2), kept, index))
+    textures = tuple(next(t for t in atlas.textures if t.sha256 == key) for key in order)
+    return without_constant_textures(with_textures(scene, uv.reshape(-1, 2), textures, index))
 
 
 def _texture_rows(
     file: Any, count: int, lost: list[str]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return the mean [T, 13] of each texture, and whether it is to be read cell by cell.
+    """Return the mean [T, 13] of each texture, and a mask [T] of those to read by cell.
 
-    One block of cells is held at a time.
+    One block of cells is in memory at a time.
     """
     texture = plain_array(file, "texture", (count, CHANNELS, CELLS, CELLS), MAX_TRIANGLES)
-    filled = filled_cells()
+    filled = filled_cell_mask()
     low = np.full((count, CHANNELS), np.inf, np.float32)
-    high, total = -low, np.zeros((count, CHANNELS))
+    high = -low
+    total = np.zeros((count, CHANNELS))
     for where, block in iterate_blocks(texture):
-        rows, cells = where[:2], filled[where[2:]]
+        rows = where[:2]
+        cells = filled[where[2:]]
         if cells.any():
             require_finite(texture, block[:, :, cells])
             values = block[:, :, cells].astype(np.float32)
@@ -93,10 +95,10 @@ def _texture_rows(
     varies = differs[:, REFLECTING].any(axis=1) & ~emits
     glows = differs[:, TEXTURE_EMISSION].any(axis=1)
     if varies.sum() > MAX_VARYING:
-        lost.append(f"textures that vary, of {varies.sum()} triangles: their mean was taken")
+        lost.append(f"varying textures of {varies.sum()} triangles: replaced by their means")
         varies[:] = False
     if glows.any():
-        lost.append(f"emission that varies, of {glows.sum()} triangles: its mean was taken")
+        lost.append(f"varying emission of {glows.sum()} triangles: replaced by its mean")
     bumpy = (low[:, TEXTURE_NORMAL] != np.array(FLAT_NORMAL, np.float32)).any(axis=1)
     if bumpy.any():
         lost.append(f"normal textures of {bumpy.sum()} triangles")
@@ -105,7 +107,7 @@ def _texture_rows(
 
 
 def _varying_cells(file: Any, count: int, varies: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return the cells [N, 7, 32, 32] of what triangles reflect whose textures vary."""
+    """Return the reflectance cells [N, 7, 32, 32] of the triangles with varying textures."""
     texture = plain_array(file, "texture", (count, CHANNELS, CELLS, CELLS), MAX_TRIANGLES)
     cells = np.zeros((int(varies.sum()), CHANNELS, CELLS, CELLS), np.float32)
     rank = np.cumsum(varies) - 1

@@ -1,8 +1,8 @@
-"""Reading HDF5 arrays from outside: what a file claims is checked before memory is taken.
+"""Reads HDF5 arrays of untrusted files; every claim is checked before memory is allocated.
 
-An HDF5 file can point out of itself (external links, external storage, virtual datasets), have a
-filter loaded as a plug-in, claim shapes that nothing backs, and hold chunks that inflate without
-end. So only plain arrays are read, and chunks are unpacked here and not by the library's filters.
+An HDF5 file can refer to other files (external links, external storage, virtual datasets), load a
+filter as a plug-in, claim shapes without the data, and hold chunks that inflate without end. So
+only plain arrays are read, and this module unpacks chunks instead of the library's filters.
 The library still parses the structure of the file, so untrusted files are opened in a child process
 with limits (pipeline.isolation).
 """
@@ -23,14 +23,15 @@ from storage.errors import TrilightError
 from storage.records.safe_read import open_plain
 
 MAX_BLOCK_BYTES = 64 << 20
-"""Maximum memory of one block of an array."""
+"""Maximum bytes of one block of an array."""
 
 MAX_CHUNKS = 1 << 22
 """Maximum number of chunks in an array; 4096 triangles with published textures take 22528."""
 
 _FLOATS = ("<f2", "<f4", "<f8")
-_DEFLATE, _SHUFFLE = 1, 2
-"""Numbers of the only filters that are undone here."""
+_DEFLATE = 1
+_SHUFFLE = 2
+"""Numbers of the only supported filters."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,20 +39,19 @@ class H5Array:
     """A plain array of a file, not yet read."""
 
     name: str  # for messages
-    shape: tuple[int, ...]  # what it claims; its blocks are counted against it
+    shape: tuple[int, ...]  # claimed by the file; checked against the blocks
     dtype: np.dtype  # type of its elements in the file
     dataset: Any  # the h5py dataset
 
 
 @contextlib.contextmanager
-def opened_h5(path: Path) -> Iterator[Any]:
+def open_h5(path: Path) -> Iterator[Any]:
     """Open a file for reading and yield its root group.
 
     Raises:
-        TrilightError: not an HDF5 file, or damaged where it is read; errors of the block get the
-            name of the file.
+        TrilightError: the file is not HDF5, or damaged. Errors of the `with` block get its name.
     """
-    import h5py  # not at the top: few need it
+    import h5py  # slow to import, and rarely needed
 
     try:
         open_plain(path).close()
@@ -66,52 +66,52 @@ def opened_h5(path: Path) -> Iterator[Any]:
         raise TrilightError(f"{path.name}: not a readable HDF5 file.") from error
 
 
-def names_in(group: Any) -> list[str]:
-    """Return what a group holds, by name; no link is followed."""
+def list_names(group: Any) -> list[str]:
+    """Return the sorted names of a group; no link is followed."""
     return sorted(group)
 
 
 def plain_array(group: Any, name: str, shape: Sequence[int | None], longest: int) -> H5Array:
-    """Return an array of little-endian floats that the file itself holds.
+    """Return an unread array of little-endian floats that the file itself holds.
 
     Args:
-        group: of an open file.
-        name: of the array.
-        shape: what it must have; None is any length from 1 to `longest`.
-        longest: the greatest length.
+        group: a group of an open file.
+        name: name of the array.
+        shape: required shape; None is any length from 1 to `longest`.
+        longest: maximum length of an axis.
 
     Raises:
-        TrilightError: missing, behind a link, outside of the file, of another type or shape.
+        TrilightError: the array is missing, a link, or of another type or shape.
     """
     import h5py
 
-    if name not in names_in(group):
-        raise TrilightError(f"{name}: missing; expected an array {_shown(shape)}.")
+    if name not in list_names(group):
+        raise TrilightError(f"{name}: missing; expected an array {_format_shape(shape)}.")
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
         raise TrilightError(f"{name}: is a link; expected an array in the file itself.")
     dataset = group[name]
     if not isinstance(dataset, h5py.Dataset):
-        raise TrilightError(f"{name}: is no array; expected one {_shown(shape)}.")
+        raise TrilightError(f"{name}: is no array; expected one {_format_shape(shape)}.")
     claimed = dataset.shape or ()
     fits = len(claimed) == len(shape) and all(
-        1 <= got <= longest if wanted is None else got == wanted
-        for got, wanted in zip(claimed, shape, strict=True)
+        1 <= got <= longest if expected is None else got == expected
+        for got, expected in zip(claimed, shape, strict=True)
     )
     if not fits:
         raise TrilightError(
-            f"{name}: has shape {list(claimed)}; expected {_shown(shape)} with lengths of at most "
-            f"{longest}."
+            f"{name}: has shape {list(claimed)}; expected {_format_shape(shape)} with lengths of "
+            f"at most {longest}."
         )
     dtype = _float_type(dataset, name)
     return H5Array(name=name, shape=claimed, dtype=dtype, dataset=dataset)
 
 
 def iterate_blocks(array: H5Array) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
-    """Yield (where, values) for blocks that cover the array once; memory is that of one block.
+    """Yield (slices, values) of blocks that cover the array once; one block is in memory.
 
     Raises:
-        TrilightError: bytes are missing, stored outside of the file, packed in another way than
-            deflate and shuffle, or other than they must be.
+        TrilightError: bytes are missing, damaged, outside the file, or packed by filters other than
+            deflate and shuffle.
     """
     from h5py import h5d
 
@@ -119,7 +119,7 @@ def iterate_blocks(array: H5Array) -> Iterator[tuple[tuple[slice, ...], NDArray]
     if plan.get_external_count() or plan.get_layout() == h5d.VIRTUAL:
         raise TrilightError(f"{array.name}: its bytes are elsewhere; expected them in the file.")
     if plan.get_layout() == h5d.CHUNKED:
-        yield from _chunks(array, plan)
+        yield from _iterate_chunks(array, plan)
         return
     num_bytes = math.prod(array.shape) * array.dtype.itemsize
     if array.dataset.id.get_storage_size() != num_bytes:
@@ -136,10 +136,11 @@ def iterate_blocks(array: H5Array) -> Iterator[tuple[tuple[slice, ...], NDArray]
 
 
 def read_whole(array: H5Array, most_bytes: int = MAX_BLOCK_BYTES) -> NDArray[np.float32]:
-    """Return an array whole, as float32.
+    """Read a whole array as float32.
 
     Raises:
-        TrilightError: as `iterate_blocks`, or it would take more than `most_bytes`, or not finite.
+        TrilightError: a block is unusable (`iterate_blocks`), the array takes more than
+            `most_bytes`, or a value is not finite.
     """
     _require_memory(array, math.prod(array.shape) * 4, most_bytes)
     values = np.zeros(array.shape, np.float32)
@@ -150,14 +151,14 @@ def read_whole(array: H5Array, most_bytes: int = MAX_BLOCK_BYTES) -> NDArray[np.
 
 
 def require_finite(array: H5Array, values: NDArray) -> None:
-    """Raise TrilightError where a value is NaN or infinite, or is so as float32."""
+    """Raise TrilightError where a value is NaN or infinite, or becomes so as float32."""
     with np.errstate(over="ignore"):
         finite = np.isfinite(values.astype(np.float32))
     if not finite.all():
         raise TrilightError(f"{array.name}: holds {values[~finite][0]}; expected finite values.")
 
 
-def _chunks(array: H5Array, plan: Any) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
+def _iterate_chunks(array: H5Array, plan: Any) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
     size = array.dataset.chunks
     filters = [plan.get_filter(at)[0] for at in range(plan.get_nfilters())]
     if filters not in ([], [_DEFLATE], [_SHUFFLE], [_SHUFFLE, _DEFLATE]):
@@ -170,13 +171,13 @@ def _chunks(array: H5Array, plan: Any) -> Iterator[tuple[tuple[slice, ...], NDAr
         raise TrilightError(
             f"{array.name}: has {math.prod(counts)} chunks; expected up to {MAX_CHUNKS}."
         )
-    stored = _stored(array)
+    stored_offsets = _list_chunk_offsets(array)
     for at in itertools.product(*(range(count) for count in counts)):
         offset = tuple(i * chunk for i, chunk in zip(at, size, strict=True))
-        if offset not in stored:
+        if offset not in stored_offsets:
             raise TrilightError(f"{array.name}: the chunk at {list(offset)} is missing.")
         _, packed = array.dataset.id.read_direct_chunk(offset)
-        values = np.frombuffer(_unpacked(array, packed, filters), array.dtype).reshape(size)
+        values = np.frombuffer(_unpack(array, packed, filters), array.dtype).reshape(size)
         where = tuple(
             slice(start, min(start + chunk, length))
             for start, chunk, length in zip(offset, size, array.shape, strict=True)
@@ -184,27 +185,29 @@ def _chunks(array: H5Array, plan: Any) -> Iterator[tuple[tuple[slice, ...], NDAr
         yield where, values[tuple(slice(0, part.stop - part.start) for part in where)]
 
 
-def _stored(array: H5Array) -> set[tuple[int, ...]]:
-    """Return the offsets of the chunks that the file has, none larger than a block or the file."""
+def _list_chunk_offsets(array: H5Array) -> set[tuple[int, ...]]:
+    """Return the offsets of the stored chunks; none is larger than a block or the file."""
     most = min(MAX_BLOCK_BYTES, array.dataset.file.id.get_filesize())
-    found: set[tuple[int, ...]] = set()
+    offsets: set[tuple[int, ...]] = set()
 
-    def look(chunk: Any) -> bool | None:
-        if chunk.filter_mask or chunk.size > most or len(found) >= MAX_CHUNKS:
-            return True  # ends the walk; the chunk then counts as missing
-        found.add(chunk.chunk_offset)
+    def add_offset(chunk: Any) -> bool | None:
+        if chunk.filter_mask or chunk.size > most or len(offsets) >= MAX_CHUNKS:
+            return True  # ends the iteration; the chunk then counts as missing
+        offsets.add(chunk.chunk_offset)
         return None
 
-    array.dataset.id.chunk_iter(look)
-    return found
+    array.dataset.id.chunk_iter(add_offset)
+    return offsets
 
 
-def _unpacked(array: H5Array, packed: bytes, filters: list[int]) -> bytes:
+def _unpack(array: H5Array, packed: bytes, filters: list[int]) -> bytes:
     num_bytes = math.prod(array.dataset.chunks) * array.dtype.itemsize
     if _DEFLATE in filters:
         inflater = zlib.decompressobj()
         try:
-            packed = inflater.decompress(packed, num_bytes + 1)  # never more, whatever it claims
+            packed = inflater.decompress(
+                packed, num_bytes + 1
+            )  # one byte more than expected, whatever the data claims
         except zlib.error as error:
             raise TrilightError(f"{array.name}: a chunk is damaged.") from error
         if not inflater.eof:
@@ -237,5 +240,5 @@ def _require_memory(array: H5Array, num_bytes: int, most: int) -> None:
         )
 
 
-def _shown(shape: Sequence[int | None]) -> str:
+def _format_shape(shape: Sequence[int | None]) -> str:
     return "[" + ", ".join("any" if length is None else str(length) for length in shape) + "]"

@@ -1,8 +1,8 @@
-"""Scenes of files, each built in a child process from one folder and nothing outside of it.
+"""Builds scenes of files in child processes, from one folder and nothing outside it.
 
-Everything that a scene is made of lies in that folder: a path that leads out of it, by dots or by a
-link, is refused. What a scene is made of is known by its digests, so that none is ever built from
-other bytes than the ones that were locked.
+All files of a scene are in that folder: a path that leads out of it, by dots or by a link, is
+refused. The digest of every file is compared with the locked one, so that no scene is built from
+changed bytes.
 """
 
 import stat
@@ -18,7 +18,7 @@ from pipeline.exchange.description import DescribedObject, SceneDescription
 from pipeline.exchange.from_description import (
     AlbedoOverOne,
     LoadedMesh,
-    described_cameras,
+    build_cameras,
     scene_from_description,
 )
 from pipeline.exchange.renderformer_json import MAX_BYTES, read_cameras, read_description
@@ -28,34 +28,34 @@ from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
 
 TEMPLATE = "renderformer-json"
-"""What stands as the template of such scenes in their provenance."""
+"""Value of `template` in the provenance of such scenes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFiles:
-    """What a render child needs to build any scene of the folder."""
+    """Files and options from which a render child builds any scene of the folder."""
 
-    root: Path  # the folder, without links
-    names: tuple[str, ...]  # the scene files; the position is the index of the scene
+    root: Path  # the folder, with links resolved
+    names: tuple[str, ...]  # scene files; the position is the scene index
     sha256: Mapping[str, str]  # digest of every locked file by its path below `root`
     unusable: Mapping[str, str]
-    """What is wrong with each file of which no scene can be made, by its name."""
+    """Reason why no scene can be made of a file, by the name of each such file."""
     licence: str  # licence of every object
-    albedo_over_one: AlbedoOverOne = "scale"  # what to do where albedos add up to more than 1
-    notes: tuple[str, ...] = ()  # what a person should know of the scenes that were built
+    albedo_over_one: AlbedoOverOne = "scale"  # treatment of albedos over 1
+    notes: tuple[str, ...] = ()  # sentences about the built scenes
 
     def scene(self, scene_index: int, assets: AssetSettings, *, num_views: int, seed: int) -> Scene:
-        """Build a scene; only children come here, since it reads meshes.
+        """Build a scene; only child processes call this, since it reads meshes.
 
         Args:
-            scene_index: which.
+            scene_index: index of the scene file in `names`.
             assets: limits on meshes.
-            num_views: cameras to take from its file.
-            seed: of the dataset; stands in the provenance, and decides nothing here.
+            num_views: number of cameras to take from the file.
+            seed: seed of the dataset; recorded in the provenance only.
 
         Raises:
-            Rejected: "unusable_scene_file", for a file of which none can be made.
-            TrilightError: a file is not the one that was locked.
+            Rejected: "unusable_scene_file", for a file of which no scene can be made.
+            TrilightError: a file differs from the one that was locked.
         """
         name = self.names[scene_index]
         if (why := self.unusable.get(name)) is not None:
@@ -79,20 +79,20 @@ class SceneFiles:
         return scene
 
 
-def described_by(root: Path, name: str) -> SceneDescription:
-    """Return what a scene file in the folder `root` describes; raises TrilightError."""
+def read_scene_description(root: Path, name: str) -> SceneDescription:
+    """Read and parse a scene file of the folder `root`; raises TrilightError."""
     return read_description(_read_scene_file(root, name), name)
 
 
-def cameras_by(root: Path, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the poses [C, 4, 4] and angles [C] of a scene file or a list of cameras.
+def read_scene_cameras(root: Path, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Read the poses [C, 4, 4] and angles [C] in degrees of a scene file or a list of cameras.
 
     Raises:
-        TrilightError: the file or a camera in it is unusable, named.
+        TrilightError: the file or a camera in it is unusable; the message names it.
     """
     cameras = read_cameras(_read_scene_file(root, name), name)
     try:
-        return described_cameras(cameras)
+        return build_cameras(cameras)
     except TrilightError as error:
         raise TrilightError(f"{name}: {error}") from error
 
@@ -109,24 +109,24 @@ def build_scene(
     albedo_over_one: AlbedoOverOne = "scale",
     notes: list[str] | None = None,
 ) -> tuple[Scene, Mapping[str, str]]:
-    """Build the scene of one file; only children come here, since it reads meshes.
+    """Build the scene of one file; only child processes call this, since it reads meshes.
 
     Args:
-        root: the folder, without links.
-        name: of the scene file in it.
+        root: the folder, with links resolved.
+        name: name of the scene file in it.
         settings: limits on meshes.
-        licence: of the objects.
-        num_views: cameras to take from the file, or None for all.
-        scene_index: which scene of the dataset this is; stands in its provenance.
-        seed: of the dataset; stands in the provenance, and decides nothing here.
-        albedo_over_one: what to do where albedos add up to more than 1.
-        notes: receives what of the meshes no code has read.
+        licence: licence of the objects.
+        num_views: number of cameras to take from the file; None for all.
+        scene_index: index of the scene in the dataset; recorded in the provenance only.
+        seed: seed of the dataset; recorded in the provenance only.
+        albedo_over_one: treatment of albedos that add up to more than 1.
+        notes: receives a sentence for each ignored part of a mesh file.
 
     Returns:
-        The scene, and the sha256 of every file that it was made of by path below `root`.
+        The scene, and the sha256 of each of its files by path below `root`.
 
     Raises:
-        TrilightError: anything in the file or its meshes is unusable, named.
+        TrilightError: the file or a mesh is unusable; the message names it.
     """
     data = _read_scene_file(root, name)
     description = read_description(data, name)
@@ -136,7 +136,7 @@ def build_scene(
     for described in description.objects:
         key = (described.mesh_path, described.remesh_faces)
         if key not in meshes:
-            meshes[key], digest = _load(root, described, name, settings, licence)
+            meshes[key], digest = _load_mesh(root, described, name, settings, licence)
             digests[meshes[key].uid] = digest
             if notes is not None:
                 notes += (f"{meshes[key].uid}: {text}" for text in meshes[key].unread)
@@ -151,60 +151,66 @@ def build_scene(
             "attempt": 0,
             "seed": seed,
             "camera_attempts": [0] * num_views,
-            "scene_file": {
-                "name": name,
-                "sha256": digests[name],
-                "scene_name": description.scene_name,
-                "cameras": list(range(num_views)),
-            },
+            "scene_file": _file_provenance(description, digests[name], num_views),
         },
     )
     return scene, digests
 
 
-def _load(
+def _file_provenance(
+    description: SceneDescription, sha256: str, num_views: int
+) -> Mapping[str, str | list[int]]:
+    return {
+        "name": description.file,
+        "sha256": sha256,
+        "scene_name": description.scene_name,
+        "cameras": list(range(num_views)),
+    }
+
+
+def _load_mesh(
     root: Path, described: DescribedObject, name: str, settings: AssetSettings, licence: str
 ) -> tuple[LoadedMesh, str]:
     """Return the mesh of an object, and the digest of its file."""
     where = f"{name}: objects.{described.name}.mesh_path"
     path = _below(root, described.mesh_path, where)
     uid = path.relative_to(root).as_posix()
-    shown = f"{where} is {described.mesh_path}"
-    return load_mesh_file(path, uid, shown, settings, licence, described.remesh_faces)
+    display_name = f"{where} is {described.mesh_path}"
+    return load_mesh_file(path, uid, display_name, settings, licence, described.remesh_faces)
 
 
 def load_mesh_file(
     path: Path,
     uid: str,
-    shown: str,
+    display_name: str,
     settings: AssetSettings,
     licence: str,
     remesh_faces: int | None = None,
 ) -> tuple[LoadedMesh, str]:
-    """Read the mesh of a scene; only children come here.
+    """Read the mesh of a scene; only child processes call this.
 
     Args:
         path: the file.
-        uid: what the scene calls it.
-        shown: what the user named, for messages.
+        uid: identifier of the mesh in the scene.
+        display_name: name of the mesh for messages.
         settings: limits on meshes.
-        licence: of the object.
-        remesh_faces: most triangles of a remeshed mesh, or None for the mesh as it is.
+        licence: licence of the object.
+        remesh_faces: maximum number of triangles after remeshing; None keeps the mesh.
 
     Returns:
         The mesh, and the sha256 of its file.
 
     Raises:
-        TrilightError: the file is no usable mesh, or cannot be read.
+        TrilightError: the file is not a usable mesh, or cannot be read.
     """
     from pipeline.assets.scene_mesh import load_scene_mesh  # mesh libraries: in children only
 
     try:
         loaded = load_scene_mesh(path, settings, remesh_faces)
     except Rejected as rejection:
-        raise TrilightError(f"{shown}: {rejection}; expected a usable mesh.") from rejection
+        raise TrilightError(f"{display_name}: {rejection}; expected a usable mesh.") from rejection
     except OSError as error:
-        raise TrilightError(f"{shown}: cannot be read ({error.strerror}).") from error
+        raise TrilightError(f"{display_name}: cannot be read ({error.strerror}).") from error
     mesh = LoadedMesh(
         uid=uid,
         licence=licence,
@@ -229,10 +235,10 @@ def _read_scene_file(root: Path, name: str) -> bytes:
 
 
 def _below(root: Path, relative: str, where: str) -> Path:
-    """Return the file that a path means, links followed, if it is below `root`."""
+    """Resolve a path, links followed; raises TrilightError where it leads out of `root`."""
     try:
         path = (root / relative).resolve()
-        if not path.exists():  # as a program on Windows writes it
+        if not path.exists():  # perhaps a path of Windows: backslashes, other letter case
             path = find_in_any_case(root, relative.replace("\\", "/"), root)
     except (OSError, RuntimeError) as error:  # links in a circle
         raise TrilightError(

@@ -1,7 +1,7 @@
-"""A folder of scene files: which there are, in which order, and what each of them describes.
+"""Lists and parses the scene files of a folder.
 
-Scene k is the k-th `*.json` of the folder by name. A file of which no scene can be made keeps its
-number: that scene is given up, and a row of failures.jsonl says why.
+Scene k is the k-th `*.json` of the folder by name. An unusable file keeps its number: that scene is
+rejected, and a row of failures.jsonl states the reason.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pipeline.exchange.description import SceneDescription
 from pipeline.exchange.from_description import AlbedoOverOne
-from pipeline.exchange.scene_files import described_by
+from pipeline.exchange.scene_files import read_scene_description
 from storage.errors import EnvironmentFailure, TrilightError
 
 MAX_SCENES = 100_000
@@ -21,51 +21,51 @@ MAX_SCENES = 100_000
 class SceneFolder:
     """The scene files of one folder."""
 
-    root: Path  # the folder, without links; nothing outside of it is read
+    root: Path  # the folder, with links resolved; nothing outside it is read
     names: tuple[str, ...]
-    """Every scene file, sorted; the position is the index of the scene, usable or not."""
-    descriptions: tuple[SceneDescription, ...]  # what each usable file describes, in the same order
-    unusable: Mapping[str, str]  # what is wrong with each of the others, by its name
-    albedo_over_one: AlbedoOverOne  # what to do where albedos add up to more than 1
+    """Names of all scene files, sorted; the position is the scene index, usable or not."""
+    descriptions: tuple[SceneDescription, ...]  # of the usable files, in the same order
+    unusable: Mapping[str, str]  # reason for each other file, by its name
+    albedo_over_one: AlbedoOverOne  # treatment of albedos over 1
 
-    def views(self, wanted: int | None) -> int:
-        """Return how many views every scene gets: `wanted`, or the fewest cameras of any file.
+    def views(self, num_views: int | None) -> int:
+        """Return the number of views of each scene: `num_views`, or the fewest cameras of a file.
 
-        No camera is ever invented: the pictures show what the files say.
+        Cameras come from the files alone; none is added.
 
         Raises:
-            TrilightError: a file has fewer cameras than wanted.
+            TrilightError: a file has fewer cameras than `num_views`.
         """
         fewest = min(self.descriptions, key=lambda description: len(description.cameras))
-        if wanted is None:
+        if num_views is None:
             return len(fewest.cameras)
-        if not 1 <= wanted <= len(fewest.cameras):
+        if not 1 <= num_views <= len(fewest.cameras):
             raise TrilightError(
-                f"--views is {wanted}; expected 1 to {len(fewest.cameras)}, the number of cameras "
-                f"in {fewest.file}: choose fewer views, or add cameras to the file."
+                f"--views is {num_views}; expected 1 to {len(fewest.cameras)}, the number of "
+                f"cameras in {fewest.file}: choose fewer views, or add cameras to the file."
             )
-        return wanted
+        return num_views
 
     def notes(self, num_views: int) -> tuple[str, ...]:
-        """Return what a person should know: fields without meaning, and cameras not used."""
-        found = []
+        """Return a sentence for each unknown field and each file with unused cameras."""
+        notes = []
         for description in self.descriptions:
-            found += [
+            notes += [
                 f"{description.file}: unknown field {name}" for name in description.unknown_fields
             ]
             if (unused := len(description.cameras) - num_views) > 0:
-                found.append(
+                notes.append(
                     f"{description.file}: {unused} of {len(description.cameras)} cameras not used, "
                     f"from cameras[{num_views}] on"
                 )
-        return tuple(found)
+        return tuple(notes)
 
 
 def find_scene_files(folder: str, albedo_over_one: AlbedoOverOne = "scale") -> SceneFolder:
-    """Read every `*.json` of a local folder, not of those below it.
+    """Read every `*.json` of a local folder, without its subfolders.
 
     Raises:
-        TrilightError: no such folder, no scene file in it or too many, or none that is usable.
+        TrilightError: the folder is missing, or has no scene files, too many, or no usable one.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -81,10 +81,11 @@ def find_scene_files(folder: str, albedo_over_one: AlbedoOverOne = "scale") -> S
             raise TrilightError(
                 f"--scenes-from {folder}: rename {name!r}; expected printable text."
             )
-    descriptions, unusable = [], {}
+    descriptions = []
+    unusable = {}
     for name in names:
         try:
-            descriptions.append(described_by(root, name))
+            descriptions.append(read_scene_description(root, name))
         except EnvironmentFailure:
             raise
         except TrilightError as mistake:
@@ -100,7 +101,7 @@ def find_scene_files(folder: str, albedo_over_one: AlbedoOverOne = "scale") -> S
 
 
 def require_usable(names: Sequence[str], unusable: Mapping[str, str]) -> None:
-    """Raise TrilightError where no scene can be made of any file; the first says why."""
+    """Raise TrilightError where no file is usable; the message gives the first reason."""
     if len(unusable) == len(names):
         raise TrilightError(
             f"--scenes-from: none of the {len(names)} scene files is usable; the first: "

@@ -1,8 +1,8 @@
-"""Textures that do not repeat as textures that do, over the coordinates that a mesh has.
+"""Converts mirrored, clamped and black-bordered textures to textures that repeat.
 
-Ours repeat along u and v. Others are mirrored in every second tile, or end in their border or in
-black. Over finitely many tiles all of these are one picture: the tiles side by side, which is then
-looked up at coordinates that are moved and shrunk to [0, 1].
+Textures of a scene repeat along u and v; those of other formats may be mirrored in every second
+tile, or continue as their border or as black. Over the finitely many tiles that a mesh uses, each
+equals one picture: the tiles side by side, looked up at coordinates shifted and scaled to [0, 1].
 """
 
 from collections.abc import Sequence
@@ -18,64 +18,65 @@ from storage.records.scene_maps import MAX_UV
 Wrap = Literal["repeat", "mirror", "clamp", "black"]
 
 MAX_TILES = 8
-"""Most tiles along a side."""
+"""Maximum number of tiles along a side."""
 
 _INSIDE = 1e-4
-"""How far coordinates may leave [0, 1] by rounding."""
+"""Tolerance for coordinates that leave [0, 1] by rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tiles:
-    """Which tiles along u or v a picture takes."""
+    """Range of tiles along u or v that a picture covers."""
 
     first: int
-    """Number of the first tile; 0 is that of [0, 1]."""
+    """Number of the first tile; tile 0 is [0, 1]."""
     count: int
-    """How many there are."""
+    """Number of tiles from the first on."""
 
 
-def tiles_of(
+def choose_tiles(
     wraps: Sequence[Wrap], at: NDArray[np.floating], most_texels: int
 ) -> tuple[Tiles, bool]:
-    """Return the tiles that textures of one material need along an axis, and whether they suffice.
+    """Return the tiles of one material's textures along an axis, and whether they suffice.
 
-    One tile where all repeat, where no coordinate leaves [0, 1], or where it would be too many.
+    One tile where all textures repeat, no coordinate leaves [0, 1], or too many would be needed.
 
     Args:
-        wraps: how each of them wraps.
+        wraps: wrap mode of each texture.
         at: coordinates of all corners along the axis.
-        most_texels: of any of them along the axis.
+        most_texels: maximum number of texels of a texture along the axis.
     """
-    wanted = _wanted(wraps, at)
-    if wanted.count <= MAX_TILES and wanted.count * most_texels <= MAX_RESOLUTION:
-        return wanted, True
-    return Tiles(first=0, count=1), wanted.count == 1
+    needed_tiles = _needed_tiles(wraps, at)
+    if needed_tiles.count <= MAX_TILES and needed_tiles.count * most_texels <= MAX_RESOLUTION:
+        return needed_tiles, True
+    return Tiles(first=0, count=1), needed_tiles.count == 1
 
 
-def _wanted(wraps: Sequence[Wrap], at: NDArray[np.floating]) -> Tiles:
+def _needed_tiles(wraps: Sequence[Wrap], at: NDArray[np.floating]) -> Tiles:
     low, high = (float(at.min()), float(at.max())) if at.size else (0.0, 1.0)
-    others = {wrap for wrap in wraps if wrap != "repeat"}
-    if not others or (low >= -_INSIDE and high <= 1 + _INSIDE):
+    modes = {wrap for wrap in wraps if wrap != "repeat"}
+    if not modes or (low >= -_INSIDE and high <= 1 + _INSIDE):
         return Tiles(first=0, count=1)
-    if others == {"mirror"}:
+    if modes == {"mirror"}:
         return Tiles(first=0, count=2)
-    first, last = int(np.floor(low)), int(np.ceil(high))
+    first = int(np.floor(low))
+    last = int(np.ceil(high))
     return Tiles(first=first, count=last - first)
 
 
-def tiled(values: NDArray, wrap: Wrap, tiles: Tiles, axis: int) -> NDArray:
-    """Return a picture [H, W, C] side by side along an axis, 0 for v and 1 for u."""
-    parts = [
+def expand_tiles(values: NDArray, wrap: Wrap, tiles: Tiles, axis: int) -> NDArray:
+    """Return the tiles of a picture [H, W, C] side by side along axis 0 (v) or 1 (u)."""
+    tile_values = [
         _tile(values, wrap, number, axis)
         for number in range(tiles.first, tiles.first + tiles.count)
     ]
-    return np.concatenate(parts, axis=axis) if len(parts) > 1 else parts[0]
+    return np.concatenate(tile_values, axis=axis) if len(tile_values) > 1 else tile_values[0]
 
 
-def repeated_near_zero(uv: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
-    """Return coordinates [T, 3, 2] within the law of scenes, and whether they show the same.
+def shift_near_zero(uv: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+    """Return coordinates [T, 3, 2] within MAX_UV, and whether they look up the same texels.
 
-    A triangle far out is moved by whole pictures, which repeat.
+    A triangle far out is shifted by whole periods of the texture.
     """
     if not uv.size or np.abs(uv).max() <= MAX_UV:
         return uv, True

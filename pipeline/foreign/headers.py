@@ -1,4 +1,4 @@
-"""What the first bytes of a file give away: archives, and counts that its size cannot hold."""
+"""Checks of the first bytes of a file: archives, and counts that its size cannot hold."""
 
 from storage.errors import Rejected
 
@@ -38,7 +38,7 @@ def _check_stl(data: bytes, max_faces: int) -> None:
 
 
 def _check_ply(data: bytes, max_faces: int) -> None:
-    """Every element of a PLY takes at least one byte of the file."""
+    """Refuse a header that counts more elements than the file has bytes: each takes one or more."""
     header = data[:_MAX_HEADER_BYTES].partition(b"end_header")[0]
     total = 0
     for line in header.splitlines():

@@ -1,4 +1,4 @@
-"""Pictures of floats, OpenEXR or Radiance, told by their first bytes."""
+"""Pictures of floats, OpenEXR or Radiance, recognized by their first bytes."""
 
 from pipeline.foreign import openexr, radiance_hdr
 from pipeline.foreign.linear_picture import LinearPicture
@@ -13,8 +13,8 @@ def read_linear_picture(
 
     Args:
         data: the file.
-        max_pixels: most pixels; known before memory is taken.
-        is_color: whether its numbers are colors, so that its primaries count.
+        max_pixels: maximum number of pixels, checked before memory is allocated.
+        is_color: whether its numbers are colors, which its primaries apply to.
 
     Raises:
         Rejected: not_hdr, load_error or too_many_pixels.
@@ -24,6 +24,6 @@ def read_linear_picture(
             return openexr.read_openexr(data, max_pixels, is_color=is_color)
         if data.startswith(radiance_hdr.MAGIC):
             return radiance_hdr.read_radiance_hdr(data, max_pixels, is_color=is_color)
-    except (ValueError, LookupError, ArithmeticError) as error:  # names that are no UTF-8, ...
+    except (ValueError, LookupError, ArithmeticError) as error:  # such as names that are not UTF-8
         raise Rejected("load_error", "it is damaged; write it again") from error
     return None

@@ -1,17 +1,17 @@
-"""How much of a stranger's file is read."""
+"""`ReadLimits`: bounds of what is read of an untrusted file."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReadLimits:
-    """What is refused of a file as too much; the defaults are those of the mesh stage."""
+    """Bounds beyond which a file is refused; the defaults are those of the mesh stage."""
 
     max_bytes: int = 200_000_000
-    """Largest file, with those that it names."""
+    """Maximum bytes of a file and of those that it names together."""
     max_faces: int = 1_500_000
-    """Most triangles, instances counted."""
+    """Maximum number of triangles, those of all instances counted."""
     max_instances: int = 10_000
-    """Most nodes that place a mesh."""
+    """Maximum number of nodes that place a mesh."""
     with_materials: bool = False
-    """Whether the files that materials name are read too."""
+    """True to read the files that materials name, too."""

@@ -1,4 +1,4 @@
-"""From a file to triangles, by its format's own reader."""
+"""`load_mesh`: the triangles of a file, by the reader of its format."""
 
 from pipeline.foreign.gltf.objects import gltf_mesh
 from pipeline.foreign.mesh import TriangleMesh
@@ -9,9 +9,9 @@ from storage.errors import Rejected
 def load_mesh(source: SourceFile) -> TriangleMesh:
     """Return all triangles of a source in its own units, node transforms applied, +Z up.
 
-    glTF defines +Y as up and is turned; USD says which axis is up, and its units, and comes in
-    metres; the other formats define nothing and stay as they are. The
-    vertices are as the file has them: unwelded, some unused, possibly not finite.
+    glTF defines +Y as up and is rotated. USD states its up axis and its units, and is converted to
+    meters. The other formats define neither and stay as they are. The vertices are as the file has
+    them: unwelded, some unused, possibly not finite.
 
     Raises:
         Rejected: load_error, index_range, point_cloud, no_faces, header_size_mismatch, cut_off; of
@@ -21,7 +21,8 @@ def load_mesh(source: SourceFile) -> TriangleMesh:
         return source.usd.mesh
     if source.gltf is not None:
         return gltf_mesh(source.gltf)
-    mesh, unread = source.contents.mesh, "; ".join(source.contents.unread)
+    mesh = source.contents.mesh
+    unread = "; ".join(source.contents.unread)
     if len(mesh.faces) == 0:
         reason = "point_cloud" if len(mesh.positions) and not unread else "no_faces"
         raise Rejected(

@@ -1,6 +1,6 @@
-"""What a file says of a surface, and what that is in Trilight's columns.
+"""`SourceMaterial`: a material as its file states it, and its conversion to Trilight's columns.
 
-Its Fresnel term becomes albedos that are the same at every angle (storage.records.fresnel).
+The Fresnel term becomes albedos that are the same at every angle (storage.records.fresnel).
 """
 
 from dataclasses import dataclass, field
@@ -16,26 +16,25 @@ RGB = tuple[float, float, float]
 WHITE: RGB = (1.0, 1.0, 1.0)
 
 MOST_UV_SETS = 4
-"""Sets of texture coordinates of a mesh that are looked at."""
+"""Maximum number of texture coordinate sets of a mesh that are read."""
 
 LEAST_ROUGHNESS = 0.01
-"""As of drawn materials (scene_templates.materials)."""
+"""Least roughness, the same as that of sampled materials (scene_templates.materials)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Slot:
-    """A picture where a material has it."""
+    """A picture with its placement on texture coordinates."""
 
     picture: Picture
-    """What is shown."""
     uv_set: int = 0
-    """Which of the mesh's coordinates it lies on."""
-    turn: NDArray[np.float64] = field(default_factory=lambda: np.eye(2))
-    """[2, 2] applied to those coordinates first,"""
-    shift: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
-    """[2] and then added; both with v up."""
+    """Index of the mesh's texture coordinate set."""
+    uv_matrix: NDArray[np.float64] = field(default_factory=lambda: np.eye(2))
+    """[2, 2] matrix that those coordinates, v up, are multiplied with first."""
+    uv_offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    """[2] offset added after the matrix, v up."""
     channel: int = 0
-    """Which channel of the picture a number is in."""
+    """Index of the channel that holds a single number."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,37 +43,37 @@ class SourceMaterial:
 
     base_rgb: RGB = WHITE
     base: Slot | None = None
-    """sRGB-encoded; times `base_rgb`."""
+    """Base color picture, sRGB-encoded, multiplied with `base_rgb`."""
     metallic: float = 0.0
     roughness: float = 1.0
     metallic_map: Slot | None = None
     roughness_map: Slot | None = None
-    """Linear: each in its channel, times its factor."""
+    """Roughness picture, as `metallic_map` linear, in one channel, multiplied with its factor."""
     f0: float = 0.04
-    """What a dielectric reflects head-on, before the two below."""
+    """Reflectance at normal incidence, before `specular_rgb` and `specular_strength`."""
     specular_rgb: RGB = WHITE
     specular_colour: Slot | None = None
-    """sRGB-encoded; times `specular_rgb`."""
+    """Specular color picture, sRGB-encoded, multiplied with `specular_rgb`."""
     specular_strength: float = 1.0
     specular_strength_map: Slot | None = None
-    """Linear, in alpha; times `specular_strength`."""
+    """Linear picture, in alpha, multiplied with `specular_strength`."""
     glossiness: Slot | None = None
-    """Linear, in alpha: roughness is 1 - (1 - roughness) x alpha. Of the specular workflow."""
+    """Linear picture of the specular workflow: roughness is 1 - (1 - roughness) x alpha."""
     emission_rgb: RGB = (0.0, 0.0, 0.0)
     emission: Slot | None = None
-    """sRGB-encoded; times `emission_rgb`. No column: it becomes light where that is asked for."""
+    """Emission picture, sRGB-encoded, multiplied with `emission_rgb`; it has no column."""
     lost: tuple[str, ...] = ()
-    """What else it says."""
+    """Names of stated features that have no place here, such as transparency."""
 
     @property
     def emits(self) -> bool:
-        """Whether it says that it does."""
+        """Return whether the emission factor is not zero."""
         return any(self.emission_rgb)
 
     @property
     def slots(self) -> tuple[Slot, ...]:
-        """The pictures that it has."""
-        found = (
+        """The slots that have a picture."""
+        slots = (
             self.base,
             self.metallic_map,
             self.roughness_map,
@@ -83,12 +82,12 @@ class SourceMaterial:
             self.glossiness,
             self.emission,
         )
-        return tuple(slot for slot in found if slot is not None)
+        return tuple(slot for slot in slots if slot is not None)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Seen:
-    """What the pictures of a material show at N places; None where it has no such picture."""
+class MaterialSamples:
+    """Values [N, 4] of the pictures of a material at N places; None without such a picture."""
 
     base: NDArray[np.float32] | None
     metallic: NDArray[np.float32] | None
@@ -98,28 +97,36 @@ class Seen:
     glossiness: NDArray[np.float32] | None
 
 
-def columns(
-    material: SourceMaterial, seen: Seen, count: int, *, least_roughness: float = LEAST_ROUGHNESS
+def source_columns(
+    material: SourceMaterial,
+    samples: MaterialSamples,
+    count: int,
+    *,
+    least_roughness: float = LEAST_ROUGHNESS,
 ) -> NDArray[np.float64]:
-    """Return diffuse rgb, specular rgb and roughness [N, 7] of `count` places."""
+    """Return diffuse rgb, specular rgb and roughness [N, 7] at `count` places."""
 
-    def times(factor: object, found: NDArray[np.float32] | None, part: slice) -> NDArray:
-        whole = np.broadcast_to(np.asarray(factor, np.float64), (count, part.stop - part.start))
-        return whole if found is None else whole * found[:, part]
+    def scale(factor: object, values: NDArray[np.float32] | None, channels: slice) -> NDArray:
+        factors = np.broadcast_to(
+            np.asarray(factor, np.float64), (count, channels.stop - channels.start)
+        )
+        return factors if values is None else factors * values[:, channels]
 
-    def number(factor: float, found: NDArray[np.float32] | None, slot: Slot | None) -> NDArray:
+    def scale_channel(
+        factor: float, values: NDArray[np.float32] | None, slot: Slot | None
+    ) -> NDArray:
         channel = 0 if slot is None else slot.channel
-        return times(factor, found, slice(channel, channel + 1))
+        return scale(factor, values, slice(channel, channel + 1))
 
-    base = np.clip(times(material.base_rgb, seen.base, slice(0, 3)), 0, 1)
-    rough = number(material.roughness, seen.roughness, material.roughness_map)
-    metal = np.clip(number(material.metallic, seen.metallic, material.metallic_map), 0, 1)
-    if seen.glossiness is not None:
-        rough = 1 - (1 - material.roughness) * seen.glossiness[:, 3:4]
-    colour = times(material.specular_rgb, seen.specular_colour, slice(0, 3))
-    strength = times(material.specular_strength, seen.specular_strength, slice(3, 4))
-    dielectric = np.minimum(material.f0 * colour, 1) * strength
-    # what reflects nothing head-on is meant to have no lobe at all
+    base = np.clip(scale(material.base_rgb, samples.base, slice(0, 3)), 0, 1)
+    rough = scale_channel(material.roughness, samples.roughness, material.roughness_map)
+    metal = np.clip(scale_channel(material.metallic, samples.metallic, material.metallic_map), 0, 1)
+    if samples.glossiness is not None:
+        rough = 1 - (1 - material.roughness) * samples.glossiness[:, 3:4]
+    tint = scale(material.specular_rgb, samples.specular_colour, slice(0, 3))
+    strength = scale(material.specular_strength, samples.specular_strength, slice(3, 4))
+    dielectric = np.minimum(material.f0 * tint, 1) * strength
+    # a surface without reflectance at normal incidence is meant to have no specular lobe at all
     grazing = np.where(dielectric.max(axis=1, keepdims=True) > 0, np.clip(strength, 0, 1), 0)
     diffuse, specular = constant_albedos(base, metal, dielectric, grazing)
     return np.concatenate([diffuse, specular, np.clip(rough, least_roughness, 1)], axis=1)

@@ -1,7 +1,7 @@
 """The files that the materials of an object name: pictures, and the MTL of an OBJ.
 
-They are read as buffers are: only regular files below the folder that the user gave, within its
-bound of bytes, and never from a server. A picture that is missing ends no object, as a buffer does.
+Only regular files below the folder that the user gave are read, within its bound of bytes, and
+never from a server. A missing picture does not refuse the object; a missing buffer does.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ from storage.errors import Rejected
 READ_MAPS = {"map_kd", "map_ks", "map_pr", "map_pm", "map_ke"}
 """Maps of an MTL whose pictures are read."""
 _ENCODINGS = ("cp1252", "cp932", "gbk", "cp1251", "cp437")
-"""Those of old programs, in which a name that is not UTF-8 may be meant."""
+"""Encodings of old programs, tried for names that are not UTF-8."""
 _LAYOUTS = ("textures", "images", "../textures", "../images", "../materials/textures")
 """Folders where large collections keep pictures that their MTL files name without a folder."""
 _WINDOWS_ROOT = re.compile(r"[A-Za-z]:/|/")
@@ -34,16 +34,16 @@ ReadFile = Callable[[Path, int], bytes]
 
 @dataclass(frozen=True, kw_only=True)
 class MaterialFiles:
-    """What is beside an object."""
+    """Contents of the files that the materials of an object name."""
 
     data: Mapping[str, bytes] = field(default_factory=dict)
-    """Files by the name under which they are asked for."""
+    """Contents of files by the names that materials use."""
     refused: Mapping[str, Rejected] = field(default_factory=dict)
-    """Why others are not there, likewise."""
+    """Reason of each file that could not be read, by the same names."""
     libraries: tuple[str, ...] = ()
-    """Which of both are the MTL files of an OBJ, the first one that has a material deciding."""
+    """Names of the MTL files of an OBJ, read or refused; the first that has a material counts."""
 
-    def of(self, name: str) -> bytes:
+    def require(self, name: str) -> bytes:
         """Return a file; raises Rejected where it is not there."""
         if name in self.data:
             return self.data[name]
@@ -51,25 +51,25 @@ class MaterialFiles:
             name, Rejected("texture_missing", f"{name!r:.80} is not beside the object")
         )
 
-    def join(self, others: "MaterialFiles") -> "MaterialFiles":
-        """Return these files and others."""
+    def join(self, other: "MaterialFiles") -> "MaterialFiles":
+        """Return the union of both; libraries stay those of the first."""
         return MaterialFiles(
-            data={**self.data, **others.data},
-            refused={**self.refused, **others.refused},
+            data={**self.data, **other.data},
+            refused={**self.refused, **other.refused},
             libraries=self.libraries,
         )
 
 
 class SourceFolder:
-    """Reads the files that one object names, none of them outside of a root."""
+    """Reads the files that an object names, none of them outside of a root folder."""
 
     def __init__(self, folder: Path, root: Path, read: ReadFile) -> None:
-        """Remember where to look.
+        """Resolve both folders.
 
         Args:
-            folder: names count from here.
-            root: nothing outside of it is touched; `folder` itself where that is elsewhere.
-            read: reads a file.
+            folder: relative names start here.
+            root: no file outside of it is read; `folder` itself where that lies elsewhere.
+            read: function that reads a regular file of at most so many bytes.
         """
         self._folder = folder.resolve()
         root = root.resolve()
@@ -77,22 +77,28 @@ class SourceFolder:
         self._read = read
 
     def read_all(
-        self, names: Iterable[str], left: int, *, is_uri: bool = False, beside: Iterable[str] = ()
+        self,
+        names: Iterable[str],
+        bytes_left: int,
+        *,
+        is_uri: bool = False,
+        extra_folders: Iterable[str] = (),
     ) -> MaterialFiles:
-        """Return files by name, within `left` bytes; they may lie in folders `beside`, too."""
-        data, refused = dict[str, bytes](), dict[str, Rejected]()
+        """Return files by name, at most `bytes_left` in all; `extra_folders` are searched, too."""
+        data: dict[str, bytes] = {}
+        refused: dict[str, Rejected] = {}
         for name in dict.fromkeys(names):
             try:
-                data[name] = self._read(self._find(name, beside, is_uri=is_uri), left)
-                left -= len(data[name])
-            except Rejected as why:
+                data[name] = self._read(self._find(name, extra_folders, is_uri=is_uri), bytes_left)
+                bytes_left -= len(data[name])
+            except Rejected as error:
                 code = {"too_large_bytes": "texture_too_large", "missing_file": "texture_missing"}
-                message = f"{name!r:.80}: {why.message}"
-                refused[name] = Rejected(code.get(why.reason, why.reason), message)
+                message = f"{name!r:.80}: {error.message}"
+                refused[name] = Rejected(code.get(error.reason, error.reason), message)
         return MaterialFiles(data=data, refused=refused)
 
-    def _find(self, name: str, beside: Iterable[str], *, is_uri: bool) -> Path:
-        """Return the file that a name means, links followed.
+    def _find(self, name: str, extra_folders: Iterable[str], *, is_uri: bool) -> Path:
+        """Return the file that a name denotes, links followed.
 
         Raises:
             Rejected: texture_outside or missing_file.
@@ -102,8 +108,8 @@ class SourceFolder:
         if "\x00" in plain or (parts and (parts.scheme or parts.netloc)):
             raise Rejected("texture_outside", "it lies elsewhere, and is never fetched")
         is_outside = False
-        others = (f"{folder}/{plain}" for folder in beside)
-        for spelling in (plain, *others, *_list_spellings(plain)):
+        extra_spellings = (f"{folder}/{plain}" for folder in extra_folders)
+        for spelling in (plain, *extra_spellings, *_list_spellings(plain)):
             with contextlib.suppress(OSError):  # such as a name that is too long
                 target = find_in_any_case(self._folder, spelling, self._root)
                 is_inside = target.is_relative_to(self._root)
@@ -116,7 +122,7 @@ class SourceFolder:
 
 
 def _list_spellings(name: str) -> Iterator[str]:
-    """Yield what else a name may mean: in another encoding, or on another machine."""
+    """Yield other readings of a name: in another encoding, or as a path of another machine."""
     with contextlib.suppress(UnicodeEncodeError):
         code = name.encode("latin-1")
         yield os.fsdecode(code)
@@ -136,44 +142,44 @@ def find_in_any_case(folder: Path, name: str, root: Path) -> Path:
     target = Path(os.path.realpath(folder / name))
     if not target.is_relative_to(root) or target.exists() or name.startswith("/"):
         return target
-    place = folder
+    path = folder
     for part in Path(name).parts:
-        following = place / part
-        if part != ".." and place.is_relative_to(root) and not following.exists():
+        next_path = path / part
+        if part != ".." and path.is_relative_to(root) and not next_path.exists():
             with contextlib.suppress(OSError):
-                alike = [one for one in os.listdir(place) if _fold_name(one) == _fold_name(part)]
-                following = place / min(alike, default=part)
-        place = Path(os.path.realpath(following))
-    return place
+                alike = [one for one in os.listdir(path) if _fold_name(one) == _fold_name(part)]
+                next_path = path / min(alike, default=part)
+        path = Path(os.path.realpath(next_path))
+    return path
 
 
 def _fold_name(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
 
 
-def gltf_files(tree: Mapping[str, Any], folder: SourceFolder, left: int) -> MaterialFiles:
-    """Return the pictures that a glTF names; `left` is the bound of bytes for all together."""
+def gltf_files(tree: Mapping[str, Any], folder: SourceFolder, bytes_left: int) -> MaterialFiles:
+    """Return the pictures that a glTF names, at most `bytes_left` together."""
     images = tree.get("images", ())
     uris = [entry.get("uri") for entry in images if isinstance(entry, dict)]
     named = [uri for uri in uris if isinstance(uri, str) and not uri.startswith("data:")]
-    return folder.read_all(named, left, is_uri=True)
+    return folder.read_all(named, bytes_left, is_uri=True)
 
 
-def obj_files(data: bytes, folder: SourceFolder, left: int) -> MaterialFiles:
+def obj_files(data: bytes, folder: SourceFolder, bytes_left: int) -> MaterialFiles:
     """Return the MTL files of an OBJ and the pictures that those name."""
     libraries = MaterialFiles()
     for name, *several in list_libraries(data):
-        files = folder.read_all([name], left)
+        files = folder.read_all([name], bytes_left)
         if not files.data and several != [name]:
-            files = folder.read_all(several, left)
-        left -= sum(map(len, files.data.values()))
+            files = folder.read_all(several, bytes_left)
+        bytes_left -= sum(map(len, files.data.values()))
         libraries = libraries.join(files)
     libraries = dataclasses.replace(libraries, libraries=(*libraries.data, *libraries.refused))
     named = [name for text in libraries.data.values() for name in list_pictures(text, READ_MAPS)]
-    beside = {name.replace("\\", "/").rpartition("/")[0] for name in libraries.data} - {""}
-    return libraries.join(folder.read_all(named, left, beside=sorted(beside)))
+    extra_folders = {name.replace("\\", "/").rpartition("/")[0] for name in libraries.data} - {""}
+    return libraries.join(folder.read_all(named, bytes_left, extra_folders=sorted(extra_folders)))
 
 
-def ply_files(data: bytes, folder: SourceFolder, left: int) -> MaterialFiles:
+def ply_files(data: bytes, folder: SourceFolder, bytes_left: int) -> MaterialFiles:
     """Return the pictures that a PLY names."""
-    return folder.read_all(list_ply_pictures(data), left)
+    return folder.read_all(list_ply_pictures(data), bytes_left)

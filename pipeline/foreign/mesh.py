@@ -1,4 +1,4 @@
-"""`TriangleMesh` and `FileMesh`: the arrays of a mesh, and what its file says of them."""
+"""`TriangleMesh` and `FileMesh`: the arrays of a mesh, and the attributes that its file states."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,10 @@ from storage.conventions import linear_from_srgb, linear_from_srgb8
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TriangleMesh:
-    """Triangles as they are worked on: double precision, signed indices."""
+    """Triangles in double precision with signed indices."""
 
     positions: NDArray[np.float64]
-    """[V, 3]; the units of the source before `normalise`, the unit box after it."""
+    """[V, 3] in the units of the source before `normalise`, in the unit box after it."""
     faces: NDArray[np.int64]
     """[F, 3] rows of `positions`."""
 
@@ -36,22 +36,22 @@ class TriangleMesh:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FileMesh:
-    """What a file of one mesh holds, in its own units."""
+    """The contents of a file of one mesh, in its own units."""
 
     mesh: TriangleMesh
-    """Its triangles, unwelded; without any, its points."""
+    """Unwelded triangles; the points alone where there are none."""
     material: NDArray[np.int64] | None = None
     """[F] row of `material_names`, or -1; None where the file knows no materials."""
     material_names: tuple[str, ...] = ()
-    """Names of materials, or of the pictures that stand for them."""
+    """Names of materials, or of the pictures used as such."""
     uv: NDArray[np.float64] | None = None
     """[F, 3, 2] texture coordinates of corners, v up; not a number where a corner has none."""
     color: NDArray[np.float64] | None = None
     """[F, 3, 3] linear color of corners."""
     is_single: bool = False
-    """Whether the file stores its positions in single precision."""
+    """True where the file stores positions in single precision."""
     unread: tuple[str, ...] = ()
-    """What of the file no code reads, in short sentences."""
+    """Short sentences on contents of the file that are not read."""
 
 
 def decode_colors(codes: NDArray) -> NDArray[np.float64]:

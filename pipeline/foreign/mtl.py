@@ -1,4 +1,4 @@
-"""The text of an MTL: materials as statements, and the options of a map."""
+"""Parser of MTL files: materials as statements, and the options of a map."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pipeline.foreign.text import decode_name, join_continued, plain_text, unquote_name
 
 Fields = dict[str, str]
-"""What a material states, by key words in lower case."""
+"""Statements of a material, by key words in lower case."""
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?=\s)"
 _OPTION = re.compile(
@@ -16,17 +16,18 @@ _OPTION = re.compile(
 
 
 def read_mtl(data: bytes) -> dict[str, Fields]:
-    """Return the materials of a library by name; what stands before the first one is left out."""
+    """Return the materials of a library by name; statements before the first one are ignored."""
     materials: dict[str, Fields] = {}
     fields: Fields = {}
     for line in join_continued(plain_text(data)).split(b"\n"):
         words = line.split(maxsplit=1)
         if not words or words[0].startswith(b"#"):
             continue
-        key, value = decode_name(words[0]).lower(), decode_name(b"".join(words[1:]))
+        key = decode_name(words[0]).lower()
+        value = decode_name(b"".join(words[1:]))
         if key == "newmtl":
             fields = materials[unquote_name(value)] = {}
-        elif value or not key.startswith("map_"):  # exporters name maps that are not there
+        elif value or not key.startswith("map_"):  # exporters write maps without a file
             fields[key] = value
     return materials
 

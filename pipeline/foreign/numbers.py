@@ -1,6 +1,6 @@
-"""Numbers that stand alone in strangers' files: finite, in range, or refused by their fields.
+"""Single numbers of untrusted files: finite and in range, or refused by the name of their field.
 
-Arrays of numbers are checked where they are read.
+Arrays are checked by their readers.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ _COUNTS = Within(0, 2**53)
 
 
 class Malformed(TrilightError):
-    """A law of its format that a file breaks, in words of ours; the caller names the file."""
+    """A file breaks a rule of its format; the message is ours, and the caller names the file."""
 
 
 def read_number(stated: Any, field: str, within: Within = FINITE) -> float:
@@ -24,14 +24,14 @@ def read_number(stated: Any, field: str, within: Within = FINITE) -> float:
     is_number = isinstance(stated, int | float | np.number) and not isinstance(stated, bool)
     if not is_number or not within.holds(stated):
         is_plain = is_number or isinstance(stated, str | int | list | dict | None)
-        shown = f"{stated!r:.60}" if is_plain else f"a {type(stated).__name__}"
+        value_text = f"{stated!r:.60}" if is_plain else f"a {type(stated).__name__}"
         range_text = "that is finite" if within is FINITE else str(within)
-        raise Malformed(f"{field} is {shown}; expected a number {range_text}")
+        raise Malformed(f"{field} is {value_text}; expected a number {range_text}")
     return float(stated)
 
 
 def read_numbers(stated: Any, count: int, field: str) -> tuple[float, ...]:
-    """Return so many numbers; raises Malformed as `read_number`, or where there are not so many."""
+    """Return `count` numbers; raises Malformed for another count, or as `read_number`."""
     rows = list(stated) if hasattr(stated, "__len__") else []
     if len(rows) != count:
         raise Malformed(f"{field} has {len(rows)} values; expected {count} numbers")
@@ -40,7 +40,7 @@ def read_numbers(stated: Any, count: int, field: str) -> tuple[float, ...]:
 
 
 def parse_number(word: str, field: str) -> float:
-    """Return the number that a word of a text is; raises Malformed as `read_number`."""
+    """Return the number that a word spells; raises Malformed as `read_number`."""
     try:
         stated: Any = float(word)
     except ValueError:
@@ -49,5 +49,5 @@ def parse_number(word: str, field: str) -> float:
 
 
 def read_count(row: Mapping[str, Any], name: str, default: int | None = None) -> int:
-    """Return a field that counts something; raises Malformed as `read_number`."""
+    """Return a field as a count, 0 to 2^53; raises Malformed as `read_number`."""
     return int(read_number(row.get(name, default), name, _COUNTS))

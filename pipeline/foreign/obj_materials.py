@@ -1,8 +1,8 @@
 """Materials of an OBJ: its MTL, with the extension for metal and roughness (Pm, Pr, their maps).
 
-A map stands in the first channel of its picture, times the number, which is 1 where only the map is
-there.
-Without those, `Ks` and `Ns` are taken as today's exporters write them: Ks is half of white for an
+A map is read from the first channel of its picture and multiplied with its number, which is 1 where
+only the map is stated.
+Without those, `Ks` and `Ns` are read as today's exporters write them: Ks is half of white for an
 ordinary dielectric, F0 = 0.08 Ks, and Ns is 1000 (1 - roughness)^2. `illum` 0 and 1 mean that there
 is no highlight.
 """
@@ -23,7 +23,7 @@ from storage.errors import Rejected
 _F0_OF_KS = 0.08
 _MOST_NS = 1000.0
 _PHYSICAL = {"pm", "pr", "map_pm", "map_pr"}
-"""What makes a material one of metal and roughness."""
+"""Statements of which one makes a material a metallic-roughness one."""
 _READ = {*_PHYSICAL, "kd", "ks", "ns", "ke", "illum", "map_kd", "map_ks", "map_ke"}
 _LOST = {"norm", "bump", "map_bump", "disp", "d", "tr", "map_d"}
 """Statements that `SourceMaterial.lost` names in words."""
@@ -35,61 +35,63 @@ _RGB_OF_XYZ = np.array(
     [[3.2404542, -1.5371385, -0.4985314], [-0.969266, 1.8760108, 0.041556],
      [0.0556434, -0.2040259, 1.0572252]]
 )  # fmt: skip
-"""Of linear Rec.709."""
+"""Matrix from XYZ to linear Rec.709."""
 
 Decode = Callable[[bytes, str], NDArray]
 
 
 def obj_materials(
-    used: Sequence[str], files: MaterialFiles, decode: Decode, *, emission: bool = False
+    names: Sequence[str], files: MaterialFiles, decode: Decode, *, emission: bool = False
 ) -> tuple[list[SourceMaterial], list[str]]:
-    """Return the materials of some names, and what of them is not read.
+    """Return materials by name, and sentences on statements that are not read.
 
     Args:
-        used: names, in the order of the result.
-        files: the libraries and pictures beside the OBJ.
-        decode: what makes values of the bytes of a picture.
-        emission: whether what emits is read too.
+        names: material names, in the order of the result.
+        files: contents of the libraries and pictures that the OBJ names.
+        decode: returns the values of a picture's bytes.
+        emission: whether emission is read, too.
 
     Raises:
         Rejected: no_materials where it has none, materials_unreadable, or as reading a picture.
     """
-    if not used or not files.libraries:
+    if not names or not files.libraries:
         # records hold these words, and digests hold records
-        why = "names no file of its materials (mtllib)" if used else "names no materials"
+        why = "names no file of its materials (mtllib)" if names else "names no materials"
         raise Rejected("no_materials", f"the OBJ {why}")
     known: dict[str, Fields] = {}
     for library in files.libraries:
         if library in files.data:
             known = {**read_mtl(files.data[library]), **known}
     absent = [name for name in files.libraries if name not in files.data]
-    if missing := [name for name in used if name not in known]:
+    if missing := [name for name in names if name not in known]:
         if absent:
-            files.of(absent[0])
+            files.require(absent[0])
         raise Rejected("materials_unreadable", f"no library has the material {missing[0]!r:.80}")
     reader = _Reader(files, decode)
     try:
-        materials = [reader.material(known[name]) for name in used]
+        materials = [reader.material(known[name]) for name in names]
         if emission:
             materials = [
-                reader.emitting(one, known[name]) for one, name in zip(materials, used, strict=True)
+                reader.add_emission(one, known[name])
+                for one, name in zip(materials, names, strict=True)
             ]
     except Malformed as error:
         raise Rejected("materials_unreadable", f"the MTL is malformed ({error!s:.200})") from error
     unread = [f"library {name[:60]!r}: it is not there" for name in absent]
-    unread += [text for name in used for text in _list_unread(known[name])]
+    unread += [text for name in names for text in _list_unread(known[name])]
     return materials, list(dict.fromkeys(unread))
 
 
 class _Reader:
-    """Makes materials of one MTL, each picture once."""
+    """Converts the materials of one MTL, decoding each picture once."""
 
     def __init__(self, files: MaterialFiles, decode: Decode) -> None:
-        self._files, self._decode = files, decode
+        self._files = files
+        self._decode = decode
         self._values: dict[str, NDArray] = {}
 
     def material(self, fields: Fields) -> SourceMaterial:
-        lost = _lost(fields)
+        lost = _list_unsupported(fields)
         base = self._slot(fields.get("map_kd"), is_srgb=True)
         base_rgb = WHITE if base is not None and "kd" not in fields else _rgb(fields, "kd", 0.8)
         if _PHYSICAL & set(fields):
@@ -116,21 +118,21 @@ class _Reader:
             lost=lost,
         )
 
-    def emitting(self, found: SourceMaterial, fields: Fields) -> SourceMaterial:
-        """Return a material with what it emits; a map alone is as it is."""
+    def add_emission(self, material: SourceMaterial, fields: Fields) -> SourceMaterial:
+        """Return a material with its emission; a map without `Ke` has the factor 1."""
         picture = self._slot(fields.get("map_ke"), is_srgb=True)
         factor = _rgb(fields, "ke", 0.0 if picture is None else 1.0)
         red, green, blue = (max(value, 0.0) for value in factor)
-        if picture is not None and not any(factor):  # as exporters write it that know maps alone
+        if picture is not None and not any(factor):  # some exporters write it so
             red, green, blue = WHITE
-        return dataclasses.replace(found, emission_rgb=(red, green, blue), emission=picture)
+        return dataclasses.replace(material, emission_rgb=(red, green, blue), emission=picture)
 
     def _slot(self, text: str | None, *, is_srgb: bool = False) -> Slot | None:
         if text is None:
             return None
         options, name = split_map(text)
         if name not in self._values:
-            self._values[name] = self._decode(self._files.of(name), name)
+            self._values[name] = self._decode(self._files.require(name), name)
         clamp = options.get("-clamp") == ["on"]
         picture = Picture(
             values=self._values[name],
@@ -139,25 +141,25 @@ class _Reader:
         )
         return Slot(
             picture=picture,
-            turn=np.diag(_pair(options, "-s", 1.0)),
-            shift=np.array(_pair(options, "-o", 0.0)),
+            uv_matrix=np.diag(_pair(options, "-s", 1.0)),
+            uv_offset=np.array(_pair(options, "-o", 0.0)),
             channel=_CHANNELS.get("".join(options.get("-imfchan", ["r"])), 0),
         )
 
 
-def _lost(fields: Fields) -> tuple[str, ...]:
-    found = {
+def _list_unsupported(fields: Fields) -> tuple[str, ...]:
+    unsupported = {
         "emission": _is_over(fields.get("ke", "0"), 0) or "map_ke" in fields,
         "normal map": bool({"norm", "bump", "map_bump", "disp"} & set(fields)),
         "transparency": not _is_over(fields.get("d", "1"), 1 - 1e-9)
         or _is_over(fields.get("tr", "0"), 0)
         or "map_d" in fields,
     }
-    return tuple(word for word, is_there in found.items() if is_there)
+    return tuple(word for word, is_there in unsupported.items() if is_there)
 
 
 def _is_over(text: str, bound: float) -> bool:
-    """Return whether a number of a statement is over a bound; unknown words count for nothing."""
+    """Return whether any number of a statement exceeds a bound; words that are none are ignored."""
     try:
         return any(value > bound for value in _numbers(text.removeprefix("-halo"), ""))
     except ValueError:
@@ -165,7 +167,7 @@ def _is_over(text: str, bound: float) -> bool:
 
 
 def _list_unread(fields: Fields) -> Iterator[str]:
-    """Yield what no code reads of a material."""
+    """Yield names of statements of a material that no code reads."""
     for key, value in fields.items():
         if key not in _READ | _LOST | _MEANINGLESS:
             yield f"statement {key[:24]!r}"

@@ -1,4 +1,4 @@
-"""The mesh of an OFF, by the text of Geomview: OFF with any of ST, C, N, 4 and n before it."""
+"""Reader of OFF meshes in the text form of Geomview: any of ST, C, N, 4 and n before OFF."""
 
 import re
 from collections import Counter
@@ -48,44 +48,47 @@ def read_off(data: bytes) -> FileMesh:
         raise Rejected("load_error", "a face of the OFF names no whole number")
     unread = Counter[str]()
     cut = cut_polygons(points, rows.sizes, np.clip(indices, -1, 2**62).astype(np.int64), unread)
-    color = cut.spread(*_read_colors(numbers, rows, flags, unread))
+    color = cut.spread_colors(*_read_colors(numbers, rows, flags, unread))
     mesh = TriangleMesh(positions=points, faces=cut.vertices)
     return FileMesh(mesh=mesh, color=color, unread=list_some(unread))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Rows:
-    """Where the rows of an OFF stand among its numbers."""
+    """Positions of the rows of an OFF among its numbers."""
 
     points: NDArray[np.int64]
-    """[V] first number of each vertex."""
+    """[V] position of the first number of each vertex."""
     widths: NDArray[np.int64]
-    """[V] numbers of each vertex."""
+    """[V] count of numbers of each vertex."""
     faces: NDArray[np.int64]
-    """[F] the number that says the size of each face."""
+    """[F] position of the number that states the size of each face."""
     sizes: NDArray[np.int64]
-    """[F] corners of each face."""
+    """[F] count of corners of each face."""
     more: NDArray[np.int64]
-    """[F] numbers that follow the corners of each face."""
+    """[F] count of numbers after the corners of each face."""
     dims: int
     """Coordinates of a vertex: 3, or 4 with a divisor."""
 
 
 def _find_rows(lines: TextLines, numbers: NDArray[np.float64], flags: bytes) -> _Rows:
-    """Find the rows, each on a line of its own or between any white space."""
-    starts, widths = lines.first[lines.counts > 0], lines.counts[lines.counts > 0]
+    """Find the rows, one a line or separated by any white space."""
+    starts = lines.first[lines.counts > 0]
+    widths = lines.counts[lines.counts > 0]
     before = int(b"n" in flags)  # the number of dimensions
     row = int(np.searchsorted(starts, before, side="right")) - 1
     stated = int(starts[row] + widths[row]) - before if len(starts) else 0
     head = numbers[before : before + (2 if stated == 2 else 3)]
-    whole = (head >= 0) & (head < 1e15) & (head == np.floor(head))
-    if len(head) < 2 or not whole.all() or (before and numbers[0] != 3):
+    is_count = (head >= 0) & (head < 1e15) & (head == np.floor(head))
+    if len(head) < 2 or not is_count.all() or (before and numbers[0] != 3):
         raise Rejected("load_error", f"the OFF has the counts {numbers[:4].tolist()}")
-    num_points, num_faces = int(head[0]), int(head[1])
+    num_points = int(head[0])
+    num_faces = int(head[1])
     if num_points + num_faces > len(numbers):
-        raise _cut_off(num_points + num_faces, len(widths) - 1)
+        raise _cut_off_error(num_points + num_faces, len(widths) - 1)
     rows = slice(row + 1, row + 1 + num_points + num_faces)
-    starts, widths = starts[rows], widths[rows]
+    starts = starts[rows]
+    widths = widths[rows]
     dims = 3 + (b"4" in flags)
     by_line = stated == len(head) and len(widths) == num_points + num_faces
     if by_line and (widths[:num_points] >= dims).all():
@@ -93,11 +96,12 @@ def _find_rows(lines: TextLines, numbers: NDArray[np.float64], flags: bytes) -> 
         more = widths[num_points:] - 1 - sizes
         is_open = not lines.text.removesuffix(PADDING).rstrip(b" ").endswith(b"\n")
         if (more < 0).any() or (is_open and len(more) > 1 and more[-1] < more[-2]):
-            raise _cut_off(num_faces, int((more >= 0).sum()))
+            raise _cut_off_error(num_faces, int((more >= 0).sum()))
     else:
         width = _count_numbers(flags)
         starts, sizes = _find_words(numbers, before + len(head), width, num_points, num_faces)
-        widths, more = np.full(num_points, width), np.zeros(num_faces)
+        widths = np.full(num_points, width)
+        more = np.zeros(num_faces)
     if not ((sizes >= 0) & (sizes == np.floor(sizes))).all():
         raise Rejected("load_error", "a face of the OFF does not begin with its size")
     return _Rows(
@@ -111,8 +115,10 @@ def _find_rows(lines: TextLines, numbers: NDArray[np.float64], flags: bytes) -> 
 
 
 def _count_numbers(flags: bytes) -> int:
-    """Return the numbers of a vertex as the header says."""
-    normal, color, uv = (3 * (b"N" in flags), 4 * (b"C" in flags), 2 * (b"ST" in flags))
+    """Return the count of numbers of a vertex as the header states it."""
+    normal = 3 * (b"N" in flags)
+    color = 4 * (b"C" in flags)
+    uv = 2 * (b"ST" in flags)
     return 3 + (b"4" in flags) + normal + color + uv
 
 
@@ -120,14 +126,14 @@ def _read_colors(
     numbers: NDArray[np.float64], rows: _Rows, flags: bytes, unread: Counter[str]
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
     """Return the linear colors of vertices [V, 3], or else of faces [F, 3]."""
-    others = int(((rows.more > 0) & (rows.more != 3) & (rows.more != 4)).sum())
-    if others:  # such as rows of a map of colors
-        unread["more numbers of faces"] = others
+    num_unread = int(((rows.more > 0) & (rows.more != 3) & (rows.more != 4)).sum())
+    if num_unread:  # such as rows of a map of colors
+        unread["more numbers of faces"] = num_unread
     if b"C" in flags and len(rows.widths) and (rows.widths >= _count_numbers(flags) - 1).all():
         first = rows.points + rows.dims + 3 * (b"N" in flags)
         return decode_colors(numbers[first[:, None] + np.arange(3)]), None
-    if others := int((rows.widths != _count_numbers(flags)).sum()):
-        unread["more numbers of vertices"] = others
+    if num_unread := int((rows.widths != _count_numbers(flags)).sum()):
+        unread["more numbers of vertices"] = num_unread
     has = (rows.more == 3) | (rows.more == 4)
     if not has.any():
         return None, None
@@ -140,22 +146,24 @@ def _read_colors(
 def _find_words(
     numbers: NDArray[np.float64], at: int, width: int, num_points: int, num_faces: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return where rows begin whose lines end anywhere, and the sizes of the faces."""
+    """Return where rows begin, regardless of line breaks, and the sizes of the faces."""
     starts = at + width * np.arange(num_points)
     at += width * num_points
-    begin, sizes = np.zeros(num_faces, np.int64), np.zeros(num_faces)
+    begin = np.zeros(num_faces, np.int64)
+    sizes = np.zeros(num_faces)
     for row in range(num_faces):
         size = float(numbers[at]) if at < len(numbers) else 0.0
         if not (1 <= size <= len(numbers) and size.is_integer()):
-            raise _cut_off(num_faces, row)
-        begin[row], sizes[row] = at, size
+            raise _cut_off_error(num_faces, row)
+        begin[row] = at
+        sizes[row] = size
         at += 1 + int(size)
     if at != len(numbers):
-        raise _cut_off(num_points + num_faces, num_points)
+        raise _cut_off_error(num_points + num_faces, num_points)
     return np.concatenate([starts, begin]), sizes
 
 
-def _cut_off(expected: int, present: int) -> Rejected:
+def _cut_off_error(expected: int, present: int) -> Rejected:
     return Rejected(
         "header_size_mismatch", f"the OFF counts {expected} rows; the file holds {present}"
     )

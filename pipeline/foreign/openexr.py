@@ -1,10 +1,10 @@
-"""OpenEXR pictures of strangers: what of a file is its picture, in linear Rec.709.
+"""Reader of untrusted OpenEXR files: the picture of a file, in linear Rec.709.
 
-- The display window is the picture: what lies outside is cropped, and what is not stored is black.
-  An environment map (attribute `envmap`) fills its data window, as its text says.
-- Its colors are R, G and B, or luminance and chroma, or one channel alone: of the whole file, or
-  of its one layer or part that has some. Everything else is named.
-- Chromaticities, or the id of a color space, say what its colors are.
+- The display window is the picture: pixels outside are cropped, and missing pixels are black.
+  An environment map (attribute `envmap`) fills its data window, as its definition demands.
+- The colors are R, G and B, or luminance and chroma, or a single channel: of the whole file, or
+  of its one layer or part that has some. Notes name all other channels.
+- Chromaticities, or the id of a color space, define the primaries.
 """
 
 import io
@@ -29,21 +29,23 @@ from storage.errors import Rejected, TrilightError
 from storage.records.exr import MANY_PARTS, find_header_end
 
 _MAX_BYTES = 3 << 30
-"""Maximum bytes of the pixels of all parts: the library reads them all."""
+"""Maximum bytes of the pixels of all parts, since the library reads them all."""
 
 _TILED = 0x200
 
-_GREY, _CHROMA, _COLOR = ("Y",), ("BY", "RY", "Y"), ("R", "G", "B")
+_GREY = ("Y",)
+_CHROMA = ("BY", "RY", "Y")
+_COLOR = ("R", "G", "B")
 _LETTERS = {"RED": "R", "GREEN": "G", "BLUE": "B", "ALPHA": "A"}
 _MAIN_LAYERS = ("combined", "beauty", "rgba", "rgb", "color", "colour", "c")
-"""Last words of the names of layers that are the picture itself."""
+"""Last words in the names of layers that hold the picture itself."""
 
 _SPACES = {"acescg": "lin_ap1_scene", "lin_ap1": "lin_ap1_scene"} | {
     "aces2065-1": "lin_ap0_scene",
     "lin_ap0": "lin_ap0_scene",
 }
 _LINEAR = ("", "unknown", "data", "linear", "scene_linear", "lin_srgb", "lin_rec709", "raw")
-"""Names of OpenImageIO for color spaces, in lower case, beside the ids of OpenEXR."""
+"""Names of linear color spaces in OpenImageIO, in lower case, and ids of OpenEXR."""
 
 _USED = frozenset(
     "channels compression dataWindow displayWindow lineOrder tiles type name view multiView "
@@ -55,7 +57,7 @@ _SAYS_NOTHING = frozenset(
     "latitude altitude focus expTime aperture isoSpeed keyCode timeCode framesPerSecond xDensity "
     "wrapmodes software Software worldToCamera worldToNDC dwaCompressionLevel DateTime".split()
 )
-"""Attributes that say nothing of the values of pixels."""
+"""Attributes that do not affect the values of pixels."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +66,9 @@ class _Choice:
 
     part: int
     letters: tuple[str, ...]
-    """What they are: R, G and B; Y; BY, RY and Y; perhaps A behind them."""
+    """R, G and B; Y; or BY, RY and Y; A may follow."""
     names: tuple[str, ...]
-    """What they are called."""
+    """Names of the channels in the file, one for each letter."""
 
 
 def read_openexr(data: bytes, max_pixels: int, *, is_color: bool = True) -> LinearPicture:
@@ -74,8 +76,8 @@ def read_openexr(data: bytes, max_pixels: int, *, is_color: bool = True) -> Line
 
     Args:
         data: the file.
-        max_pixels: most pixels of the picture; known before memory is taken.
-        is_color: whether its numbers are colors, so that its primaries count.
+        max_pixels: maximum number of pixels, checked before memory is allocated.
+        is_color: whether its numbers are colors, which its primaries apply to.
 
     Raises:
         Rejected: load_error or too_many_pixels.
@@ -84,41 +86,41 @@ def read_openexr(data: bytes, max_pixels: int, *, is_color: bool = True) -> Line
         end = find_header_end(data)
     except TrilightError as error:
         raise Rejected("load_error", str(error)) from error
-    headers = _headers(data)
+    headers = _read_headers(data)
     _require_whole(data, end)
-    choice = _chosen(headers)
+    choice = _choose_channels(headers)
     header = headers[choice.part]
     window = _picture_window(header)
     _require_size(headers, window, max_pixels)
-    planes = _planes(data, headers, choice)
+    planes = _read_planes(data, headers, choice)
     values = np.stack(
-        [_in_window(planes[letter], header, window) for letter in choice.letters], axis=-1
+        [_crop_to_window(planes[letter], header, window) for letter in choice.letters], axis=-1
     )
-    primaries = _primaries(header)
+    primaries = _read_primaries(header)
     if set(_CHROMA) <= set(choice.letters):
         values = _from_chroma(values, primaries)
     if is_color and values.shape[-1] >= 3 and not are_rec709(primaries):
         values[..., :3] = as_rec709(values[..., :3], primaries)
-    return LinearPicture(values=values, unread=tuple(_unread(headers, choice)))
+    return LinearPicture(values=values, unread=tuple(_list_unread(headers, choice)))
 
 
-def _headers(data: bytes) -> list[Mapping[str, Any]]:
-    headers = [part.header for part in _parts(data, header_only=True)]
+def _read_headers(data: bytes) -> list[Mapping[str, Any]]:
+    headers = [part.header for part in _read_parts(data, header_only=True)]
     for header in headers:
         if header.get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile):
             raise Rejected("load_error", "it is deep (many samples a pixel); flatten it")
     if not headers:
-        raise _cut_off()
+        raise _cut_off_error()
     return headers
 
 
-def _parts(data: bytes, *, header_only: bool) -> Sequence[Any]:
+def _read_parts(data: bytes, *, header_only: bool) -> Sequence[Any]:
     try:
         file = OpenEXR.File(
             io.BytesIO(data), separate_channels=True, header_only=header_only, num_threads=0
         )
     except Exception as error:  # the library fails in many ways
-        raise _cut_off() from error
+        raise _cut_off_error() from error
     parts: Sequence[Any] = file.parts
     return parts
 
@@ -126,27 +128,31 @@ def _parts(data: bytes, *, header_only: bool) -> Sequence[Any]:
 def _require_whole(data: bytes, at: int) -> None:
     """Raise Rejected where chunks of a file of one part are missing or lie beyond its end.
 
-    The library prints much about such files. The headers end at `at`.
+    The library would print many lines about such a file. The headers end at `at`.
     """
-    flags, first, last = int.from_bytes(data[4:8], "little"), len(data), 0
+    flags = int.from_bytes(data[4:8], "little")
+    first = len(data)
+    last = 0
     if flags & MANY_PARTS:
         return
     while at < first:  # the table ends where the first chunk begins
         offset = int.from_bytes(data[at : at + 8], "little")
-        at, first, last = at + 8, min(first, offset), max(last, offset)
+        at += 8
+        first = min(first, offset)
+        last = max(last, offset)
     head = 20 if flags & _TILED else 8  # ends in the size of what follows
     size = int.from_bytes(data[last + head - 4 : last + head], "little")
     if first < at or last + head + size > len(data):
-        raise _cut_off()
+        raise _cut_off_error()
 
 
-def _cut_off() -> Rejected:
+def _cut_off_error() -> Rejected:
     return Rejected("load_error", "it is cut off or damaged; write it again")
 
 
-def _chosen(headers: Sequence[Mapping[str, Any]]) -> _Choice:
-    """Return which channels are the picture; layers and further views give way to bare names."""
-    choices = list(_choices(headers))
+def _choose_channels(headers: Sequence[Mapping[str, Any]]) -> _Choice:
+    """Return the channels of the picture, those without a layer or further view first."""
+    choices = list(_list_choices(headers))
     bare = [choice for choice in choices if _layer(headers, choice) == ""]
     if bare:
         return bare[0]
@@ -155,7 +161,7 @@ def _chosen(headers: Sequence[Mapping[str, Any]]) -> _Choice:
     for among in (main, colors, choices):
         if len(among) == 1:
             return among[0]
-    layers = _listed(_layer(headers, choice) for choice in choices)
+    layers = _list_names(_layer(headers, choice) for choice in choices)
     names = [str(channel.name) for header in headers for channel in header["channels"]]
     raise Rejected(
         "load_error",
@@ -165,29 +171,30 @@ def _chosen(headers: Sequence[Mapping[str, Any]]) -> _Choice:
     )
 
 
-def _choices(headers: Sequence[Mapping[str, Any]]) -> Iterator[_Choice]:
-    """Yield all that may be a picture, colors before greys."""
+def _list_choices(headers: Sequence[Mapping[str, Any]]) -> Iterator[_Choice]:
+    """Yield all candidates for the picture, colors before grays."""
     layers: dict[tuple[int, str], dict[str, str]] = defaultdict(dict)
     for part, header in enumerate(headers):
         for channel in header["channels"]:
             layer, _, letter = str(channel.name).rpartition(".")
             letter = _LETTERS.get(letter.upper(), letter.upper())
             layers[part, layer][letter] = str(channel.name)
-    for wanted in (_COLOR, _CHROMA, _GREY, None):
+    for color_letters in (_COLOR, _CHROMA, _GREY, None):
         for (part, layer), names in layers.items():
-            letters = wanted or tuple(set(names) - {"A"})  # one channel of any name is grey
+            letters = color_letters or tuple(set(names) - {"A"})  # one channel of any name is gray
             is_depth = letters == ("Z",) or layer.lower().endswith(("depth", "mist"))
             if is_depth or (letters == _GREY and "X" in names):
                 continue  # or CIE XYZ
-            if set(letters) <= set(names) and len(letters) == len(wanted or _GREY):
+            if set(letters) <= set(names) and len(letters) == len(color_letters or _GREY):
                 alpha = ("A",) if "A" in names else ()
-                called = tuple(names[letter] for letter in (*letters, *alpha))
-                yield _Choice(part, (*(wanted or _GREY), *alpha), called)
+                channel_names = tuple(names[letter] for letter in (*letters, *alpha))
+                yield _Choice(part, (*(color_letters or _GREY), *alpha), channel_names)
 
 
 def _layer(headers: Sequence[Mapping[str, Any]], choice: _Choice) -> str:
-    """Return the layer of channels, or the view that they are of, or "" where there is none."""
-    layer, header = choice.names[0].rpartition(".")[0], headers[choice.part]
+    """Return the layer of channels, else their view, else ""."""
+    layer = choice.names[0].rpartition(".")[0]
+    header = headers[choice.part]
     first_view = next((h["view"] for h in headers if "view" in h), "")
     return layer or (header.get("view", "") if header.get("view") != first_view else "")
 
@@ -200,8 +207,8 @@ def _is_main(headers: Sequence[Mapping[str, Any]], choice: _Choice) -> bool:
 
 def _box(header: Mapping[str, Any], name: str) -> tuple[int, int, int, int]:
     """Return left, top, width and height of a window."""
-    (left, top), (right, bottom) = np.asarray(header[name]).tolist()
-    return left, top, right - left + 1, bottom - top + 1
+    (x_min, y_min), (x_max, y_max) = np.asarray(header[name]).tolist()
+    return x_min, y_min, x_max - x_min + 1, y_max - y_min + 1
 
 
 def _picture_window(header: Mapping[str, Any]) -> tuple[int, int, int, int]:
@@ -230,30 +237,30 @@ def _require_size(
         )
 
 
-def _planes(
+def _read_planes(
     data: bytes, headers: Sequence[Mapping[str, Any]], choice: _Choice
 ) -> dict[str, NDArray[np.float32]]:
     """Return the channels of a choice over its data window [H, W], by their letters."""
-    parts = _parts(data, header_only=False)
+    parts = _read_parts(data, header_only=False)
     if len(parts) != len(headers):  # the library leaves parts out that it cannot read
-        raise _cut_off()
+        raise _cut_off_error()
     channels = parts[choice.part].channels
     planes = {}
     for letter, name in zip(choice.letters, choice.names, strict=True):
         channel = channels[name]
         if not isinstance(channel.pixels, np.ndarray):
-            raise _cut_off()
+            raise _cut_off_error()
         plane = channel.pixels.astype(np.float32)
-        left, top, width, height = _box(headers[choice.part], "dataWindow")
-        across = _stretch(plane.T, left, width, channel.xSampling)
-        planes[letter] = _stretch(across.T, top, height, channel.ySampling)
+        x_min, y_min, width, height = _box(headers[choice.part], "dataWindow")
+        across = _stretch(plane.T, x_min, width, channel.xSampling)
+        planes[letter] = _stretch(across.T, y_min, height, channel.ySampling)
     return planes
 
 
 def _stretch(
     plane: NDArray[np.float32], first: int, count: int, sampling: int
 ) -> NDArray[np.float32]:
-    """Return rows for `count` coordinates from `first` on, of rows for multiples of `sampling`."""
+    """Return rows at `count` coordinates from `first`, interpolated between stored rows."""
     if sampling == 1:
         return plane
     at = np.arange(first, first + count) / sampling - math.ceil(first / sampling)
@@ -263,14 +270,15 @@ def _stretch(
     return (1 - weight) * plane[low] + weight * plane[high]
 
 
-def _in_window(
+def _crop_to_window(
     plane: NDArray[np.float32], header: Mapping[str, Any], window: tuple[int, int, int, int]
 ) -> NDArray[np.float32]:
-    """Return a plane of the data window over a window, 0 where nothing is stored."""
-    left, top, width, height = window
+    """Return a plane of the data window over another window, 0 where no pixel is stored."""
+    x_min, y_min, width, height = window
     if (at := _box(header, "dataWindow")) == window:
         return plane
-    right, down = at[0] - left, at[1] - top
+    right = at[0] - x_min
+    down = at[1] - y_min
     rows = slice(max(0, down), min(height, down + at[3]))
     columns = slice(max(0, right), min(width, right + at[2]))
     result = np.zeros((height, width), np.float32)
@@ -281,19 +289,20 @@ def _in_window(
 
 
 def _from_chroma(values: NDArray[np.float32], primaries: Sequence[float]) -> NDArray[np.float32]:
-    """Return RGB, and alpha where it is there, of BY, RY and Y."""
+    """Convert BY, RY and Y to RGB; alpha stays."""
     by, ry, y = np.moveaxis(values[..., :3], -1, 0)
     weights = luminance_weights(primaries).astype(np.float32)
-    red, blue = (ry + 1) * y, (by + 1) * y
+    red = (ry + 1) * y
+    blue = (by + 1) * y
     green = (y - weights[0] * red - weights[2] * blue) / weights[1]
     return np.concatenate([np.stack([red, green, blue], axis=-1), values[..., 3:]], axis=-1)
 
 
-def _primaries(header: Mapping[str, Any]) -> Sequence[float]:
-    """Return what primaries [8] a header says its colors have.
+def _read_primaries(header: Mapping[str, Any]) -> Sequence[float]:
+    """Return the primaries [8] that a header states.
 
     Raises:
-        Rejected: load_error: the color space that it names is not linear.
+        Rejected: load_error: it names a color space that is not linear.
     """
     if "chromaticities" in header:
         return tuple(float(value) for value in header["chromaticities"])
@@ -309,27 +318,27 @@ def _primaries(header: Mapping[str, Any]) -> Sequence[float]:
     return REC709 if known is None else tuple(float(value) for value in known)
 
 
-def _unread(headers: Sequence[Mapping[str, Any]], choice: _Choice) -> Iterator[str]:
-    others = [
+def _list_unread(headers: Sequence[Mapping[str, Any]], choice: _Choice) -> Iterator[str]:
+    unread_channels = [
         name
         for part, header in enumerate(headers)
         for name in (str(channel.name) for channel in header["channels"])
         if part != choice.part or name not in choice.names
     ]
-    if others:
-        yield f"channels {_listed(others)}"
+    if unread_channels:
+        yield f"channels {_list_names(unread_channels)}"
     header = headers[choice.part]
     space = str(header.get("oiio:ColorSpace", "")).lower()
     if space not in (*_LINEAR, *_SPACES) and "lin_rec709" not in space:
         yield f"color space {header['oiio:ColorSpace']!r:.40} of OpenImageIO"
-    odd = {name for name in header if name not in _USED | _SAYS_NOTHING}
+    unread_attributes = {name for name in header if name not in _USED | _SAYS_NOTHING}
     if header.get("pixelAspectRatio", 1.0) == 1.0:
-        odd -= {"pixelAspectRatio"}
-    if odd:
-        yield f"header attributes {_listed(sorted(odd))}"
+        unread_attributes -= {"pixelAspectRatio"}
+    if unread_attributes:
+        yield f"header attributes {_list_names(sorted(unread_attributes))}"
 
 
-def _listed(names: Iterable[str]) -> str:
-    shown = [f"{name!r:.40}" for name in names]
-    more = f" and {len(shown) - 6} more" if len(shown) > 6 else ""
-    return ", ".join(shown[:6]) + more
+def _list_names(names: Iterable[str]) -> str:
+    quoted = [f"{name!r:.40}" for name in names]
+    more = f" and {len(quoted) - 6} more" if len(quoted) > 6 else ""
+    return ", ".join(quoted[:6]) + more

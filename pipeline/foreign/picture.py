@@ -1,7 +1,7 @@
-"""Pictures from outside: decoded within limits, and looked up with the wrap of their format.
+"""Untrusted pictures: decoded within limits, and sampled with the wrap mode of their format.
 
-What a slot says of a picture counts, not what the picture says of itself: base colours are
-sRGB-encoded and roughness is linear, whatever profile or gamma the file names.
+The slot of a picture decides on its encoding, not the picture itself: base colors are sRGB-encoded
+and roughness is linear, whatever profile or gamma the file names.
 """
 
 import io
@@ -19,39 +19,38 @@ from storage.conventions import linear_from_srgb, linear_from_srgb8
 from storage.errors import Rejected
 
 Wrap = Literal["repeat", "clamp", "mirror", "black"]
-"""`black` is nothing beyond the picture, alpha included."""
+"""Wrap modes; `black` is 0 beyond the picture, alpha included."""
 
 FORMATS = ("PNG", "JPEG", "WEBP", "TGA", "BMP", "TIFF")
-"""What is decoded; a file of another format is refused by its content."""
+"""Formats that are decoded; a file of another one is refused by its content."""
 
 UNREADABLE_PICTURE = (
     "it is cut off or damaged, or no PNG, JPEG, WebP, TGA, BMP, TIFF, OpenEXR or Radiance picture; "
     "write it again"
 )
-"""What records say of it, since they hold no word of a library."""
+"""Text that records hold for such a picture, since they never quote a library."""
 
-_STRIP = 256  # rows, an even number
+_STRIP = 256  # rows; an even number, since pairs of rows are averaged
 
 
 class Decoder:
-    """Decodes the pictures of one object, all together within a number of pixels."""
+    """Decodes the pictures of one object within a common bound of pixels."""
 
     def __init__(self, max_pixels: int) -> None:
-        """Begin with that many."""
-        self._left = max_pixels
+        self._pixels_left = max_pixels
 
     def __call__(self, data: bytes, name: str) -> NDArray:
-        """Return `decoded`, within what is left."""
-        values = decoded(data, name, self._left)
-        self._left -= values.shape[0] * values.shape[1]
+        """Return `decode_image` within the pixels that are left."""
+        values = decode_image(data, name, self._pixels_left)
+        self._pixels_left -= values.shape[0] * values.shape[1]
         return values
 
 
-def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
-    """Return a picture [H, W, 4], row 0 at the bottom: uint8, or uint16 of greys of 16 bits.
+def decode_image(data: bytes, name: str, max_pixels: int) -> NDArray:
+    """Return a picture [H, W, 4], row 0 at the bottom: uint8, or uint16 for grays of 16 bits.
 
-    Palettes, greys, transparency and CMYK become RGBA; colours of 16 bits are read to 8. OpenEXR
-    and Radiance are float16, cut to [0, 1].
+    Palettes, grays, transparency and CMYK become RGBA; colors of 16 bits are reduced to 8. OpenEXR
+    and Radiance are float16, clipped to [0, 1].
 
     Raises:
         Rejected: texture_too_large or texture_unreadable.
@@ -68,7 +67,7 @@ def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
                         f"{image.width} x {image.height}; at most {max_pixels} "
                         "pixels are left. Make it smaller, or raise own_materials.max_pixels",
                     )
-                return np.ascontiguousarray(_values(image)[::-1])
+                return np.ascontiguousarray(_decode_values(image)[::-1])
     except MemoryError:
         raise
     except Rejected as error:
@@ -84,10 +83,10 @@ def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
         raise Rejected("texture_unreadable", f"{name!r:.80}: {UNREADABLE_PICTURE}") from error
 
 
-def has_colours(data: bytes) -> bool:
-    """Return whether a picture of 8 bits has colours: what USD takes as sRGB where nothing is said.
+def has_colors(data: bytes) -> bool:
+    """Return whether a picture of 8 bits has colors, which USD assumes to be sRGB by default.
 
-    False too for bytes that are no picture.
+    False for bytes that no decoder reads, too.
     """
     try:
         with warnings.catch_warnings():
@@ -110,12 +109,12 @@ def _unit_values(values: NDArray[np.float32]) -> NDArray[np.float16]:
     return rgba
 
 
-def _values(image: Image.Image) -> NDArray:
+def _decode_values(image: Image.Image) -> NDArray:
     if image.mode == "F":
         return _unit_values(np.asarray(image, np.float32)[..., None])
     if image.mode.startswith("I"):
-        grey = np.clip(np.asarray(image), 0, 65535).astype(np.uint16)
-        return np.stack([grey, grey, grey, np.full_like(grey, 65535)], axis=-1)
+        gray = np.clip(np.asarray(image), 0, 65535).astype(np.uint16)
+        return np.stack([gray, gray, gray, np.full_like(gray, 65535)], axis=-1)
     return np.asarray(image.convert("RGBA"))
 
 
@@ -124,37 +123,39 @@ class Picture:
     """Values in [0, 1] over texture coordinates, u to the right and v up."""
 
     values: NDArray
-    """[H, W, 4] as `decoded` returns them, or linear float32."""
+    """[H, W, 4] as `decode_image` returns them, or linear float32."""
     is_srgb: bool
-    """Whether red, green and blue are sRGB-encoded; alpha never is."""
+    """True where red, green and blue are sRGB-encoded; alpha never is."""
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
-    """Along u and along v."""
+    """Wrap modes along u and v."""
     is_nearest: bool = False
-    """Whether texels are flat squares instead of being interpolated."""
+    """True where texels are flat squares instead of being interpolated."""
 
     @cached_property
     def _levels(self) -> list[NDArray[np.float32]]:
         return []
 
     def level(self, number: int) -> NDArray:
-        """Return the picture halved `number` times, in linear values from the first halving on."""
+        """Return the picture halved `number` times, linear from the first halving on."""
         if number == 0:
             return self.values
         if not self._levels:
-            rows = range(0, len(self.values), _STRIP)  # a large picture in floats is too much
-            strips = [_halved(self.linear(self.values[row : row + _STRIP])) for row in rows]
+            rows = range(
+                0, len(self.values), _STRIP
+            )  # a whole large picture in floats takes too much memory
+            strips = [_halve(self.linear(self.values[row : row + _STRIP])) for row in rows]
             self._levels.append(np.concatenate(strips))
         while len(self._levels) < number:
-            self._levels.append(_halved(self._levels[-1]))
+            self._levels.append(_halve(self._levels[-1]))
         return self._levels[number - 1]
 
     @property
-    def most_halvings(self) -> int:
-        """Until one texel is left."""
+    def max_halvings(self) -> int:
+        """Return the number of halvings until one texel is left."""
         return max(self.values.shape[:2]).bit_length() - 1
 
     def linear(self, texels: NDArray) -> NDArray[np.float32]:
-        """Return linear values of texels [..., 4] of the picture or of a level."""
+        """Return the linear values of texels [..., 4] of the picture or of a level."""
         if texels.dtype == np.float32:
             return texels
         if texels.dtype in (np.uint16, np.float16):
@@ -163,45 +164,48 @@ class Picture:
             if self.is_srgb:
                 deep[..., :3] = linear_from_srgb(deep[..., :3])
             return deep
-        found: NDArray[np.float32] = np.divide(texels, 255, dtype=np.float32)
+        linear: NDArray[np.float32] = np.divide(texels, 255, dtype=np.float32)
         if self.is_srgb:
-            found[..., :3] = linear_from_srgb8()[texels[..., :3]]
-        return found
+            linear[..., :3] = linear_from_srgb8()[texels[..., :3]]
+        return linear
 
-    def at(self, uv: NDArray[np.float64], halvings: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return linear values [N, 4] at coordinates [N, 2] of the picture halved so often."""
-        found = np.zeros((len(uv), 4), np.float32)
+    def sample(self, uv: NDArray[np.float64], halvings: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return linear values [N, 4] at coordinates [N, 2], each of the given halving."""
+        values = np.zeros((len(uv), 4), np.float32)
         for number in np.unique(halvings):
             chosen = halvings == number
-            found[chosen] = self._at(uv[chosen], self.level(int(number)))
-        return found
+            values[chosen] = self._sample_level(uv[chosen], self.level(int(number)))
+        return values
 
-    def _at(self, uv: NDArray[np.float64], texels: NDArray) -> NDArray[np.float32]:
+    def _sample_level(self, uv: NDArray[np.float64], texels: NDArray) -> NDArray[np.float32]:
         height, width = texels.shape[:2]
         beyond = np.zeros(len(uv), np.bool_)
-        x = _wrapped(uv[:, 0], self.wrap[0]) * width - 0.5
-        y = _wrapped(uv[:, 1], self.wrap[1]) * height - 0.5
+        x = _wrap_coordinates(uv[:, 0], self.wrap[0]) * width - 0.5
+        y = _wrap_coordinates(uv[:, 1], self.wrap[1]) * height - 0.5
         if self.is_nearest:
-            x, y = np.floor(x + 0.5), np.floor(y + 0.5)
-        column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-        along, across = (x - column)[:, None], (y - row)[:, None]
+            x = np.floor(x + 0.5)
+            y = np.floor(y + 0.5)
+        column = np.floor(x).astype(np.int64)
+        row = np.floor(y).astype(np.int64)
+        along = (x - column)[:, None]
+        across = (y - row)[:, None]
 
         def texel(up: int, right: int) -> NDArray[np.float32]:
-            rows = _within(row + up, height, self.wrap[1])
-            return self.linear(texels[rows, _within(column + right, width, self.wrap[0])])
+            rows = _wrap_index(row + up, height, self.wrap[1])
+            return self.linear(texels[rows, _wrap_index(column + right, width, self.wrap[0])])
 
         for axis in range(2):
             if self.wrap[axis] == "black":
                 beyond |= (uv[:, axis] < 0) | (uv[:, axis] > 1)
         low = (1 - along) * texel(0, 0) + along * texel(0, 1)
         high = (1 - along) * texel(1, 0) + along * texel(1, 1)
-        found: NDArray[np.float32] = ((1 - across) * low + across * high).astype(np.float32)
-        found[beyond] = 0
-        return found
+        values: NDArray[np.float32] = ((1 - across) * low + across * high).astype(np.float32)
+        values[beyond] = 0
+        return values
 
 
-def _halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return means of two by two texels; the last one stands alone where their number is odd."""
+def _halve(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return means of two by two texels; the last row or column of an odd number stays alone."""
     for axis in (0, 1):
         count = values.shape[axis]
         if count > 1:
@@ -212,7 +216,7 @@ def _halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return values
 
 
-def _wrapped(at: NDArray[np.float64], wrap: Wrap) -> NDArray[np.float64]:
+def _wrap_coordinates(at: NDArray[np.float64], wrap: Wrap) -> NDArray[np.float64]:
     if wrap in ("clamp", "black"):
         return np.clip(at, 0, 1)
     if wrap == "mirror":
@@ -221,5 +225,5 @@ def _wrapped(at: NDArray[np.float64], wrap: Wrap) -> NDArray[np.float64]:
     return at - np.floor(at)
 
 
-def _within(index: NDArray[np.int64], count: int, wrap: Wrap) -> NDArray[np.int64]:
+def _wrap_index(index: NDArray[np.int64], count: int, wrap: Wrap) -> NDArray[np.int64]:
     return index % count if wrap == "repeat" else np.clip(index, 0, count - 1)

@@ -1,4 +1,4 @@
-"""The mesh of a PLY, by its header: any elements, properties, types and lists, text or binary."""
+"""Reader of PLY meshes: any elements, properties, types and lists of a header, text or binary."""
 
 import re
 from collections import Counter
@@ -38,7 +38,7 @@ class _Property:
     name: str
     kind: np.dtype
     count: np.dtype | None = None
-    """Type of the number before a list."""
+    """Type of the count before a list; None for a single value."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,16 +51,16 @@ class _Element:
 @dataclass(frozen=True, kw_only=True)
 class _Header:
     order: Order | None
-    """Order of bytes; None of a text."""
+    """Byte order; None for text."""
     elements: Sequence[_Element]
     pictures: Sequence[str]
     size: int
-    """Bytes up to the data."""
+    """Bytes of the header, after which the data begin."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Lists:
-    """The values of a property that is a list, one list after the other."""
+    """The values of a list property, one list after the other."""
 
     values: NDArray
     counts: NDArray[np.int64]
@@ -73,33 +73,35 @@ def read_ply(data: bytes) -> FileMesh:
         Rejected: load_error, header_size_mismatch or index_range.
     """
     header = _read_header(data)
-    seen, (elements, rest) = _Seen(), _read_elements(data, header)
+    reader = _ColumnReader()
+    elements, rest = _read_elements(data, header)
     if rest:
-        seen.note("bytes after the last element")
-    vertex, face = elements.get("vertex", {}), elements.get("face", {})
-    coordinates = seen.take(vertex, "vertex", "x", "y", "z")
+        reader.note("bytes after the last element")
+    vertex = elements.get("vertex", {})
+    face = elements.get("face", {})
+    coordinates = reader.take(vertex, "vertex", "x", "y", "z")
     if coordinates is None:
         raise Rejected("load_error", "the PLY has no vertices with x, y and z")
     points = np.stack(coordinates, axis=1).astype(np.float64)
-    polygons = _read_polygons(seen, face, "face")
-    strips = _cut_strips(_read_polygons(seen, elements.get("tristrips", {}), "tristrips"))
+    polygons = _read_polygons(reader, face, "face")
+    strips = _cut_strips(_read_polygons(reader, elements.get("tristrips", {}), "tristrips"))
     indices = np.concatenate([polygons.values.astype(np.int64), strips.ravel()])
     counts = np.concatenate([polygons.counts, np.full(len(strips), 3)])
-    cut = cut_polygons(points, counts, indices, seen.notes)
-    by_vertex = _read_colors(seen, vertex, "vertex")
-    by_face = _read_colors(seen, face, "face") if by_vertex is None else None
+    cut = cut_polygons(points, counts, indices, reader.notes)
+    by_vertex = _read_colors(reader, vertex, "vertex")
+    by_face = _read_colors(reader, face, "face") if by_vertex is None else None
     if by_face is not None:
         by_face = np.concatenate([by_face, np.ones((len(strips), 3))])
-    number = seen.take(face, "face", "texnumber") or [np.zeros(len(polygons.counts))]
+    number = reader.take(face, "face", "texnumber") or [np.zeros(len(polygons.counts))]
     rows = np.append(number[0].astype(np.int64), np.full(len(strips), -1))[cut.owner]
     return FileMesh(
         mesh=TriangleMesh(positions=points, faces=cut.vertices),
         material=np.where((rows >= 0) & (rows < len(header.pictures)), rows, -1),
         material_names=tuple(header.pictures),
-        uv=_read_uv(seen, elements, polygons, cut),
-        color=cut.spread(by_vertex, by_face),
+        uv=_read_uv(reader, elements, polygons, cut),
+        color=cut.spread_colors(by_vertex, by_face),
         is_single=any(one.dtype == np.float32 for one in coordinates),
-        unread=seen.unread(elements),
+        unread=reader.unread(elements),
     )
 
 
@@ -117,12 +119,15 @@ def _read_header(data: bytes) -> _Header:
     if not begin:
         raise Rejected("load_error", "the PLY header has no beginning")
     form: bytes = b""
-    elements, pictures, start = list[_Element](), list[str](), begin.end()
+    elements: list[_Element] = []
+    pictures: list[str] = []
+    start = begin.end()
     while True:
         end = data.find(begin[1], start)
         if end < 0:
             raise Rejected("header_size_mismatch", "the PLY ends within its header")
-        line, start = data[start:end].strip(), end + len(begin[1])
+        line = data[start:end].strip()
+        start = end + len(begin[1])
         words = line.split()
         key = words[0] if words else b"comment"
         if key == b"end_header":
@@ -159,7 +164,7 @@ Columns = Mapping[str, NDArray | _Lists]
 
 
 def _read_elements(data: bytes, header: _Header) -> tuple[dict[str, Columns], int]:
-    """Return the columns of each element, and how many bytes follow the last one."""
+    """Return the columns of each element, and the number of bytes or words after the last one."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     body = _Binary(data, header.order) if header.order else _Text(data[header.size :])
     columns: dict[str, Columns] = {}
@@ -173,7 +178,7 @@ def _read_elements(data: bytes, header: _Header) -> tuple[dict[str, Columns], in
 
 
 class _Text:
-    """The data of a text, by word."""
+    """The data of a text PLY, addressed by word."""
 
     def __init__(self, data: bytes) -> None:
         self.size = len(split_lines(data).words)
@@ -190,10 +195,11 @@ class _Text:
 
 
 class _Binary:
-    """Binary data, by byte."""
+    """The data of a binary PLY, addressed by byte."""
 
     def __init__(self, data: bytes, order: Order) -> None:
-        self.size, self._data = len(data), data
+        self.size = len(data)
+        self._data = data
         self._order: Order = order
         self._codes = np.frombuffer(data, np.uint8)
 
@@ -211,7 +217,7 @@ class _Binary:
 
 
 def _read_rows(body: _Text | _Binary, element: _Element, at: int) -> tuple[Columns, int]:
-    """Return the columns of an element whose rows begin at a place, and where they end."""
+    """Return the columns of an element whose rows begin at position `at`, and their end."""
     widths = [body.width(one.count or one.kind) for one in element.properties]
     if element.rows * sum(widths) > body.size - at:
         raise Rejected(
@@ -239,7 +245,7 @@ def _read_rows(body: _Text | _Binary, element: _Element, at: int) -> tuple[Colum
 def _place_rows(
     body: _Text | _Binary, element: _Element, at: int, lengths: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Return where each property [rows, P] begins, and where the last one ends."""
+    """Return the start of each property [rows, P], and the end of the last one."""
     steps = np.zeros((element.rows, len(element.properties)), np.int64)
     lists = iter(lengths.T)
     for column, one in enumerate(element.properties):
@@ -250,11 +256,11 @@ def _place_rows(
 
 
 def _list_lengths(body: _Text | _Binary, element: _Element, at: int) -> NDArray[np.int64]:
-    """Return the lengths [rows, L] of lists: those of the first row, where all rows agree."""
+    """Return the lengths [rows, L] of lists, without walking the rows where all are equal."""
     lists = [k for k, one in enumerate(element.properties) if one.count is not None]
     if not lists or not element.rows:
         return np.zeros((element.rows, len(lists)), np.int64)
-    first = _walk(body, element, at, 1)
+    first = _walk_lists(body, element, at, 1)
     lengths = np.broadcast_to(first, (element.rows, len(lists)))
     begins, end = _place_rows(body, element, at, lengths)
     if end <= body.size:
@@ -262,11 +268,11 @@ def _list_lengths(body: _Text | _Binary, element: _Element, at: int) -> NDArray[
         read = [body.take(begins[:, k], kind) for k, kind in zip(lists, kinds, strict=True) if kind]
         if (np.stack(read, axis=1) == lengths).all():
             return lengths
-    return _walk(body, element, at, element.rows)
+    return _walk_lists(body, element, at, element.rows)
 
 
-def _walk(body: _Text | _Binary, element: _Element, at: int, rows: int) -> NDArray[np.int64]:
-    """Return the lengths [rows, L] of lists, row by row."""
+def _walk_lists(body: _Text | _Binary, element: _Element, at: int, rows: int) -> NDArray[np.int64]:
+    """Return the lengths [rows, L] of lists, read row by row."""
     steps: list[tuple[int, np.dtype, int]] = []
     skipped = 0
     for one in element.properties:
@@ -288,19 +294,19 @@ def _walk(body: _Text | _Binary, element: _Element, at: int, rows: int) -> NDArr
     return lengths
 
 
-class _Seen:
-    """Reads columns and notes what was read."""
+class _ColumnReader:
+    """Reads columns and records which were read."""
 
     def __init__(self) -> None:
         self._read: set[tuple[str, str]] = set()
         self.notes = Counter[str]()
 
     def note(self, text: str) -> None:
-        """Add a sentence."""
+        """Add a sentence to the notes."""
         self.notes[text] = 1
 
     def take(self, columns: Columns, element: str, *names: str) -> list[NDArray] | None:
-        """Return single values by their names; None where one is missing."""
+        """Return columns of single values by name; None where one is missing."""
         values = [columns.get(name) for name in names]
         if not all(isinstance(value, np.ndarray) for value in values):
             return None
@@ -308,7 +314,7 @@ class _Seen:
         return [value for value in values if isinstance(value, np.ndarray)]
 
     def take_lists(self, columns: Columns, element: str, *names: str) -> _Lists | None:
-        """Return the first list of these names."""
+        """Return the first list column among these names."""
         for name in names:
             if isinstance(values := columns.get(name), _Lists):
                 self._read.add((element, name))
@@ -316,7 +322,7 @@ class _Seen:
         return None
 
     def unread(self, elements: Mapping[str, Columns]) -> tuple[str, ...]:
-        """Return sentences on what nothing has read."""
+        """Return sentences on elements and properties that were not read."""
         for element, columns in elements.items():
             if element not in ("vertex", "face", "tristrips"):
                 self.note(f"element {element[:24]!r}")
@@ -327,23 +333,24 @@ class _Seen:
         return list_some(self.notes)
 
 
-def _read_polygons(seen: _Seen, columns: Columns, element: str) -> _Lists:
+def _read_polygons(reader: _ColumnReader, columns: Columns, element: str) -> _Lists:
     """Return the vertices of faces or strips."""
-    lists = seen.take_lists(columns, element, *_INDICES)
+    lists = reader.take_lists(columns, element, *_INDICES)
     if lists is None and columns:
         names = [name for name, values in columns.items() if isinstance(values, _Lists)]
-        lists = seen.take_lists(columns, element, *names) if len(names) == 1 else None
+        lists = reader.take_lists(columns, element, *names) if len(names) == 1 else None
     if lists is None:
         return _Lists(values=np.zeros(0, np.int64), counts=np.zeros(0, np.int64))
     return lists
 
 
 def _cut_strips(strips: _Lists) -> NDArray[np.int64]:
-    """Return the triangles [T, 3] of strips; -1 begins another one, every second is turned."""
+    """Return the triangles [T, 3] of strips; -1 starts a new strip, every second one is flipped."""
     values = strips.values.astype(np.int64)
     piece = np.repeat(np.arange(len(strips.counts)), strips.counts) + np.cumsum(values == -1)
-    kept = values != -1
-    values, piece = values[kept], piece[kept]
+    is_vertex = values != -1
+    values = values[is_vertex]
+    piece = piece[is_vertex]
     _, first = np.unique(piece, return_index=True)
     position = np.arange(len(values)) - np.repeat(first, np.diff(np.append(first, len(values))))
     same = np.flatnonzero(piece[2:] == piece[:-2])
@@ -351,32 +358,35 @@ def _cut_strips(strips: _Lists) -> NDArray[np.int64]:
     return np.stack([values[same + turned], values[same + 1 - turned], values[same + 2]], axis=1)
 
 
-def _read_colors(seen: _Seen, columns: Columns, element: str) -> NDArray[np.float64] | None:
+def _read_colors(
+    reader: _ColumnReader, columns: Columns, element: str
+) -> NDArray[np.float64] | None:
     """Return the linear colors [N, 3] of vertices or faces."""
     for names in _COLORS:
-        if (values := seen.take(columns, element, *names)) is not None:
-            alpha = seen.take(columns, element, "alpha") or seen.take(columns, element, "a")
+        if (values := reader.take(columns, element, *names)) is not None:
+            alpha = reader.take(columns, element, "alpha") or reader.take(columns, element, "a")
             if alpha is not None and (decode_colors(alpha[0]) < 1).any():
-                seen.note("transparency of colors")
+                reader.note("transparency of colors")
             return decode_colors(np.stack(values, axis=1))
     return None
 
 
 def _read_uv(
-    seen: _Seen,
+    reader: _ColumnReader,
     columns: Mapping[str, Columns],
     polygons: _Lists,
     cut: CutPolygons,
 ) -> NDArray[np.float64] | None:
     """Return texture coordinates [T, 3, 2] of corners: of faces, or else of vertices."""
-    lists = seen.take_lists(columns.get("face", {}), "face", "texcoord")
+    lists = reader.take_lists(columns.get("face", {}), "face", "texcoord")
     if lists is not None and len(lists.values):
         uv = np.full((max(int(cut.corners.max(initial=-1)) + 1, len(polygons.values)), 2), np.nan)
         has = lists.counts == 2 * polygons.counts
-        own, theirs = np.repeat(has, polygons.counts), np.repeat(has, lists.counts)
-        uv[: len(polygons.values)][own] = lists.values[theirs].reshape(-1, 2)
+        corner_mask = np.repeat(has, polygons.counts)
+        value_mask = np.repeat(has, lists.counts)
+        uv[: len(polygons.values)][corner_mask] = lists.values[value_mask].reshape(-1, 2)
         return uv[cut.corners]
     for names in _UVS:
-        if (values := seen.take(columns.get("vertex", {}), "vertex", *names)) is not None:
+        if (values := reader.take(columns.get("vertex", {}), "vertex", *names)) is not None:
             return np.stack(values, axis=1).astype(np.float64)[cut.vertices]
     return None

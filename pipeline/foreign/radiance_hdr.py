@@ -1,6 +1,6 @@
 """Radiance pictures (`.hdr`, `.pic`, RGBE) as linear radiance in Rec.709.
 
-Decoded here because the readers at hand will not do: Mitsuba's writes beyond its memory for a file
+It is decoded here because no other reader serves: Mitsuba's writes beyond its memory for a file
 whose rows are damaged, and Pillow has none. A value is mantissa / 256 x 2^(exponent - 128), divided
 by the product of all EXPOSURE and COLORCORR lines.
 """
@@ -17,34 +17,35 @@ from pipeline.foreign.numbers import Malformed, parse_number
 from storage.errors import Rejected
 
 MAGIC = b"#?"
-"""First bytes of a file."""
+"""First bytes of a Radiance file."""
 
 _MOST_HEADER = 1 << 16
 _SIZE = re.compile(rb"([-+])([XY])\s+(\d{1,6})\s+([-+])([XY])\s+(\d{1,6})\s*")
 _VARIABLE = re.compile(rb"\s*([A-Z]+)\s*=\s*(.*?)\s*")
-_SHORTEST, _LONGEST = 8, 32767
-"""Widths between which rows may have run lengths."""
+_SHORTEST = 8
+_LONGEST = 32767
+"""Widths of rows within which they may be run-length encoded."""
 _LONG_RUN = 128
 _RADIANCE = (0.640, 0.330, 0.290, 0.600, 0.150, 0.060, 0.3333, 0.3333)
-"""Primaries of files that state none; all programs show them as Rec.709, stated or not."""
+"""Default primaries of the format; all programs show them as Rec.709, stated or not."""
 _SAYS_NOTHING = frozenset("SOFTWARE OWNER CAPDATE GMT INSTRUMENT LATLONG DATE".split())
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Header:
-    """What stands before the pixels."""
+    """The header, which precedes the pixels."""
 
     rows: int
-    """Scanlines, as they are stored."""
+    """Number of scanlines in the file."""
     columns: int
     is_column_major: bool
-    """Whether a scanline is a column."""
+    """True where a scanline is a column."""
     flips: tuple[bool, bool]
-    """Whether rows go up, and columns to the left, once scanlines are rows."""
+    """True for rows that go up, and for columns to the left, once scanlines are rows."""
     start: int
-    """Where the pixels begin."""
+    """Offset of the first pixel in bytes."""
     factors: NDArray[np.float64]
-    """[3] by which the values were multiplied."""
+    """[3] factors of the stored values, which are divided out."""
     primaries: tuple[float, ...]
     unread: tuple[str, ...]
 
@@ -54,22 +55,23 @@ def read_radiance_hdr(data: bytes, max_pixels: int, *, is_color: bool = True) ->
 
     Args:
         data: the file.
-        max_pixels: most pixels; known before memory is taken.
-        is_color: whether its numbers are colors, so that its primaries count.
+        max_pixels: maximum number of pixels, checked before memory is allocated.
+        is_color: whether its numbers are colors, which its primaries apply to.
 
     Raises:
         Rejected: not_hdr, too_many_pixels, load_error.
     """
-    header = _header(data)
-    rows, columns = header.rows, header.columns
+    header = _read_header(data)
+    rows = header.rows
+    columns = header.columns
     if not 0 < rows * columns <= max_pixels:
         raise Rejected(
             "too_many_pixels",
             f"{columns} x {rows}; expected at most {max_pixels} pixels: scale it down",
         )
     if len(data) - header.start < 4 * rows:  # no row is shorter, with or without runs
-        raise _damaged("it is cut off")
-    texels = _texels(data, header.start, rows, columns)
+        raise _damage_error("it is cut off")
+    texels = _decode_texels(data, header.start, rows, columns)
     scale = np.ldexp(np.float32(1), texels[..., 3:].astype(np.int32) - 136)
     values = np.where(texels[..., 3:] > 0, texels[..., :3] * scale, 0).astype(np.float32)
     if (header.factors != 1).any():
@@ -84,22 +86,24 @@ def read_radiance_hdr(data: bytes, max_pixels: int, *, is_color: bool = True) ->
     return LinearPicture(values=np.ascontiguousarray(values), unread=header.unread)
 
 
-def _header(data: bytes) -> _Header:
+def _read_header(data: bytes) -> _Header:
     lines, line, start = _header_lines(data)
     size = _SIZE.fullmatch(line)
     if size is None or size[2] == size[5]:
         raise Rejected("not_hdr", f"its size is {line[:40]!r}; expected one such as -Y 512 +X 1024")
-    factors, primaries, unread = np.ones(3), _RADIANCE, dict[str, None]()
+    factors = np.ones(3)
+    primaries = _RADIANCE
+    unread: dict[str, None] = {}
     for name, value in _variables(lines):
         if name == "FORMAT":
             if value != "32-bit_rle_rgbe":
                 raise Rejected("not_hdr", f"its format is {value!r:.40}; expected 32-bit_rle_rgbe")
         elif name in ("EXPOSURE", "COLORCORR"):
-            factors = factors * _numbers(value, 1 if name == "EXPOSURE" else 3, name)
+            factors = factors * _parse_numbers(value, 1 if name == "EXPOSURE" else 3, name)
         elif name == "PRIMARIES":
-            stated = tuple(_numbers(value, 8, name))
+            stated = tuple(_parse_numbers(value, 8, name))
             primaries = stated if any(stated) else primaries  # Photoshop states none as zeros
-        elif name in ("PIXASPECT", "GAMMA") and (_numbers(value, 1, name) == 1).all():
+        elif name in ("PIXASPECT", "GAMMA") and (_parse_numbers(value, 1, name) == 1).all():
             continue
         elif name not in _SAYS_NOTHING:
             unread[f"header variable {name:.40}"] = None
@@ -119,13 +123,14 @@ def _header(data: bytes) -> _Header:
 
 
 def _header_lines(data: bytes) -> tuple[list[bytes], bytes, int]:
-    """Return the lines before the empty one, the line of the size, and where the pixels begin."""
+    """Return the header lines, the line of the size, and the offset of the pixels."""
     if not data.startswith(MAGIC):
         raise Rejected("not_hdr", "it does not begin as a Radiance picture (#?); write it again")
     lines: list[bytes] = []
     at = 0
     while (end := data.find(b"\n", at, _MOST_HEADER)) >= 0:
-        line, at = data[at:end].rstrip(b"\r"), end + 1
+        line = data[at:end].rstrip(b"\r")
+        at = end + 1
         if lines and not lines[-1]:
             return lines[1:-1], line, at
         lines.append(line)
@@ -135,11 +140,11 @@ def _header_lines(data: bytes) -> tuple[list[bytes], bytes, int]:
 def _variables(lines: Sequence[bytes]) -> Iterator[tuple[str, str]]:
     for line in lines:
         match = None if line.startswith(b"#") else _VARIABLE.fullmatch(line)
-        if match is not None:  # all others are comments, or commands that made the picture
+        if match is not None:  # other lines are comments, or commands that made the picture
             yield match[1].decode(), match[2].decode("latin-1")
 
 
-def _numbers(text: str, count: int, name: str) -> NDArray[np.float64]:
+def _parse_numbers(text: str, count: int, name: str) -> NDArray[np.float64]:
     try:
         numbers = np.array([parse_number(word, name) for word in text.split()])
     except Malformed:
@@ -149,44 +154,47 @@ def _numbers(text: str, count: int, name: str) -> NDArray[np.float64]:
     return numbers
 
 
-def _texels(data: bytes, start: int, rows: int, columns: int) -> NDArray[np.uint8]:
-    """Return [H, W, 4] mantissas and exponent."""
+def _decode_texels(data: bytes, start: int, rows: int, columns: int) -> NDArray[np.uint8]:
+    """Return mantissas and exponents [H, W, 4]."""
     texels = np.zeros((rows, columns, 4), np.uint8)
-    at, mark = start, bytes([2, 2, columns >> 8 & 255, columns & 255])
+    at = start
+    mark = bytes([2, 2, columns >> 8 & 255, columns & 255])
     for row in range(rows):
         if _SHORTEST <= columns <= _LONGEST and data[at : at + 4] == mark:
-            at = _runs(data, at + 4, texels[row])
+            at = _decode_runs(data, at + 4, texels[row])
         elif (
             _SHORTEST <= columns <= _LONGEST
             and data[at : at + 2] == mark[:2]
             and data[at + 2 : at + 3] < b"\x80"
         ):
-            raise _damaged(f"row {row} is cut off or of another width")
+            raise _damage_error(f"row {row} is cut off or of another width")
         else:
-            at = _old_runs(data, at, texels[row])
+            at = _decode_old_runs(data, at, texels[row])
     return texels
 
 
-def _runs(data: bytes, at: int, row: NDArray[np.uint8]) -> int:
-    """Fill a row [W, 4] from its run lengths, and return where they end."""
+def _decode_runs(data: bytes, at: int, row: NDArray[np.uint8]) -> int:
+    """Fill a row [W, 4] from run lengths, and return the offset of their end."""
     width = len(row)
     for channel in range(4):
         done = 0
         while done < width:
             if at + 1 >= len(data):
-                raise _damaged("it is cut off within a row")
-            count, is_run = data[at], data[at] > _LONG_RUN
+                raise _damage_error("it is cut off within a row")
+            count = data[at]
+            is_run = data[at] > _LONG_RUN
             count -= _LONG_RUN if is_run else 0
-            taken = data[at + 1 : at + 2 + (0 if is_run else count - 1)]
-            if not 0 < count <= width - done or len(taken) != (1 if is_run else count):
-                raise _damaged("a row has more or fewer values than it says, or is cut off")
-            row[done : done + count, channel] = np.frombuffer(taken, np.uint8)
-            done, at = done + count, at + 1 + len(taken)
+            run = data[at + 1 : at + 2 + (0 if is_run else count - 1)]
+            if not 0 < count <= width - done or len(run) != (1 if is_run else count):
+                raise _damage_error("a row has more or fewer values than it says, or is cut off")
+            row[done : done + count, channel] = np.frombuffer(run, np.uint8)
+            done += count
+            at += 1 + len(run)
     return at
 
 
-def _old_runs(data: bytes, at: int, row: NDArray[np.uint8]) -> int:
-    """Fill a row [W, 4] of plain texels and runs of the old kind, and return where they end.
+def _decode_old_runs(data: bytes, at: int, row: NDArray[np.uint8]) -> int:
+    """Fill a row [W, 4] from plain texels and old-style runs, and return the offset of their end.
 
     A texel (1, 1, 1, n) repeats the last one n times, and 256 n times where it follows a run.
     """
@@ -195,20 +203,20 @@ def _old_runs(data: bytes, at: int, row: NDArray[np.uint8]) -> int:
     texels = texels[: len(texels) // 4 * 4].reshape(-1, 4)
     is_run = (texels[:, :3] == 1).all(axis=1)
     if is_run[:1].any():
-        raise _damaged("a row begins with a run")
-    place = np.arange(len(texels))
-    plain = np.maximum.accumulate(np.where(is_run, 0, place))
-    level = np.minimum(place - plain - 1, 3)  # a run of the fourth level is beyond any width
+        raise _damage_error("a row begins with a run")
+    index = np.arange(len(texels))
+    plain = np.maximum.accumulate(np.where(is_run, 0, index))
+    level = np.minimum(index - plain - 1, 3)  # a run of the fourth level is beyond any width
     counts = np.where(is_run, texels[:, 3].astype(np.int64) << 8 * np.maximum(level, 0), 1)
     ends = np.cumsum(counts)
     last = int(np.searchsorted(ends, width))
     if last == len(ends):
-        raise _damaged("it is cut off within a row")
+        raise _damage_error("it is cut off within a row")
     if ends[last] != width:
-        raise _damaged("a run is longer than its row")
+        raise _damage_error("a run is longer than its row")
     row[:] = np.repeat(texels[plain[: last + 1]], counts[: last + 1], axis=0)
     return at + 4 * (last + 1)
 
 
-def _damaged(why: str) -> Rejected:
+def _damage_error(why: str) -> Rejected:
     return Rejected("load_error", f"it is damaged or of another kind ({why}); write it again")

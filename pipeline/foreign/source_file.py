@@ -1,7 +1,7 @@
-"""Reading a source: one bounded read of one regular file, and of the buffers that a glTF names.
+"""`read_source`: one bounded read of a regular file, and of the files that it names.
 
-Everything that is read of an object is read here. The mesh library is given bytes, never a path,
-so that no file can make it open another one. USD alone is given paths, which it checks first.
+All files of an object are read here. Parsers receive bytes, never a path, so that no file can make
+them open another one. USD alone receives paths, which it checks first.
 """
 
 import hashlib
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from pipeline.foreign.usd.object_source import UsdSource
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", *USD_SUFFIXES)
-"""Formats that we read. The suffix decides: a file that lies about it is refused or fails to load,
-and is never handed to the loader of another format."""
+"""Suffixes of the formats that are read. The suffix decides: a file of another format is refused or
+fails to load, and never reaches the reader of that format."""
 
 _READERS: Mapping[str, Callable[[bytes], FileMesh]] = {
     "obj": read_obj,
@@ -39,42 +39,41 @@ _READERS: Mapping[str, Callable[[bytes], FileMesh]] = {
     "ply": read_ply,
     "stl": read_stl,
 }
-"""Readers of formats with one mesh a file."""
+"""Readers of the formats with one mesh a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceFile:
-    """The bytes of a source, checked as far as its header goes."""
+    """The bytes of a source whose header has been checked."""
 
     kind: str
     """Suffix without the dot, in lower case."""
     data: bytes
-    """The file."""
+    """Bytes of the file; empty for USD."""
     sha256: str
-    """Digest of the file and of its buffers in the order of their names; and of the files of its
-    materials, where those are kept."""
+    """Digest of the file, its buffers sorted by name, and the material files that are kept."""
     materials: MaterialFiles = field(default_factory=MaterialFiles)
-    """Files that its materials name; empty where nobody keeps them. USD has its own."""
+    """Files that materials name; empty where limits exclude them, and for USD."""
     usd: "UsdSource | None" = None
-    """What a USD file holds; `data` is empty then."""
+    """Contents of a USD file; None for other formats."""
     gltf: GltfDocument | None = None
-    """What a glTF holds."""
+    """Contents of a glTF; None for other formats."""
     notes: list[str] = field(default_factory=list)
-    """What of the file no code reads, in short sentences; added while it is read."""
+    """Short sentences on contents of the file that are not read; readers append to it."""
 
     @cached_property
     def contents(self) -> FileMesh:
-        """Mesh of an OBJ, OFF, PLY or STL; call in a child alone.
+        """Return the mesh of an OBJ, OFF, PLY or STL; call it in a child process only.
 
         Raises:
             Rejected: load_error, index_range, header_size_mismatch or cut_off.
         """
         try:
-            with np.errstate(all="ignore"):  # numbers of strangers: guards look at the results
+            with np.errstate(all="ignore"):  # of untrusted numbers; the results are checked later
                 contents = _READERS[self.kind](self.data)
         except (MemoryError, Rejected):
             raise
-        except Exception as error:  # no file of a stranger may show a mistake of ours as one
+        except Exception as error:  # our own errors must not show as such for untrusted files
             reason = f"the .{self.kind} file is malformed ({type(error).__name__})"
             raise Rejected("load_error", reason) from error
         self.notes.extend(contents.unread)
@@ -82,33 +81,33 @@ class SourceFile:
 
     @property
     def is_single(self) -> bool:
-        """Whether the positions are stored in single precision."""
+        """Return whether the positions are stored in single precision."""
         if self.usd is not None:
             return False
         return self.kind not in _READERS or self.contents.is_single
 
     @property
     def unread(self) -> tuple[str, ...]:
-        """What of the file no code has read, each sentence once."""
+        """Return sentences on contents of the file that were not read, each once."""
         usd = () if self.usd is None else self.usd.unread
         gltf = () if self.gltf is None else self.gltf.unread
         return tuple(dict.fromkeys((*usd, *gltf, *self.notes)))
 
 
 def needs_child(path: Path) -> bool:
-    """Return whether native code reads the file at once, so that only children may."""
+    """Return whether `read_source` runs native code, which only child processes may."""
     return path.suffix.lower() in USD_SUFFIXES
 
 
 def read_source(path: Path, limits: ReadLimits, root: Path | None = None) -> SourceFile:
     """Return a source after the checks that need no mesh library.
 
-    Where `needs_child`, it may only run in one.
+    Call it in a child process where `needs_child` says so.
 
     Args:
         path: the file.
-        limits: what is refused as too much.
-        root: folder below which pictures and materials may lie; the file's own one by default.
+        limits: bounds beyond which the source is refused.
+        root: folder below which pictures and materials may lie; that of the file by default.
 
     Raises:
         Rejected: missing_file, unsupported_format, too_large_bytes, archive_refused,
@@ -124,7 +123,8 @@ def read_source(path: Path, limits: ReadLimits, root: Path | None = None) -> Sou
         return _usd_file(path, limits)
     check_header(data, suffix, limits.max_faces)
     gltf: GltfDocument | None = None
-    materials, keep = MaterialFiles(), limits.with_materials
+    materials = MaterialFiles()
+    keep = limits.with_materials
     folder = SourceFolder(path.parent, root or path.parent, _read_regular)
     if suffix in (".glb", ".gltf"):
         gltf = open_gltf(data, suffix, path.parent, folder, limits, _read_regular)
@@ -155,7 +155,7 @@ def _usd_file(path: Path, limits: ReadLimits) -> SourceFile:
 
 
 def _read_regular(path: Path, max_bytes: int) -> bytes:
-    """Read a file that is one: a pipe or a device would never end."""
+    """Read a regular file, since a pipe or a device would never end."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):

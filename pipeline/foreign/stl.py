@@ -1,4 +1,4 @@
-"""The mesh of an STL: binary of the length that it counts, or text in which white space is free."""
+"""Reader of STL meshes: binary of the stated length, or text with any white space."""
 
 import re
 from collections import Counter
@@ -18,7 +18,7 @@ _AROUND_LOOP = re.compile(rb"facet(?:\s+normal(?:\s+(?!endfacet)\S+){0,3})?\s+en
 _ENDS = re.compile(rb"(?m)^([ \t]*)end[ \t]+(?=(?:facet|loop|solid)\b)")
 _WORDS = {b"facet", b"outer", b"loop", b"vertex"}
 _MOST_INDENT = 4096
-"""Bytes that are looked at before a solid begins or ends."""
+"""Bytes that are searched before the word that begins or ends a solid."""
 
 
 def read_stl(data: bytes) -> FileMesh:
@@ -64,11 +64,14 @@ def _build_mesh(corners: np.ndarray) -> TriangleMesh:
 
 
 def _strip_names(text: bytes) -> tuple[bytes, bool]:
-    """Return a text without what begins and ends solids, and whether each of them ends.
+    """Return a text without the lines that begin and end solids, and whether all solids end.
 
     The name of a solid goes to the end of its line, or to a facet on the same line.
     """
-    pieces, kept, balance, at = list[bytes](), 0, 0, text.find(b"solid")
+    pieces: list[bytes] = []
+    rest_start = 0
+    balance = 0
+    at = text.find(b"solid")
     while at >= 0:
         start = at - 3 if text[at - 3 : at] == b"end" else at
         before = text[max(start - _MOST_INDENT, 0) : start].rpartition(b"\n")[2].rstrip()
@@ -78,10 +81,10 @@ def _strip_names(text: bytes) -> tuple[bytes, bool]:
             last = text.find(b"\n", at)
             last = len(text) if last < 0 else last
             facet = _FACET_BEGINS.search(text, at, last)
-            pieces.append(text[kept:start])
-            kept = end = facet.start() if facet else last
+            pieces.append(text[rest_start:start])
+            rest_start = end = facet.start() if facet else last
         at = text.find(b"solid", end)
-    return b" ".join([*pieces, text[kept:]]), balance == 0
+    return b" ".join([*pieces, text[rest_start:]]), balance == 0
 
 
 def _read_text(text: bytes) -> FileMesh:

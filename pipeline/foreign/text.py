@@ -1,4 +1,4 @@
-"""Text of strangers' files: bytes as lines and words, found by numpy."""
+"""Text of untrusted files: lines and words of bytes, located by numpy."""
 
 import codecs
 import re
@@ -13,15 +13,15 @@ from storage.errors import Rejected
 
 _MARKS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16", codecs.BOM_UTF8: ""}
 PADDING = b"\n\n\n"
-"""What `split_lines` adds to a text."""
+"""Suffix that `split_lines` appends, so that a look beyond a word stays within the text."""
 T = TypeVar("T", bound=np.generic)
 
 _SPACE = 32
-"""Bytes up to this one stand between words."""
+"""Bytes up to this value separate words."""
 
 
 def plain_text(data: bytes) -> bytes:
-    """Return a text without its byte order mark, its lines ended by a line feed."""
+    """Return a text without byte order mark, with line feeds as line ends."""
     for mark, encoding in _MARKS.items():
         if data.startswith(mark):
             data = data[len(mark) :] if not encoding else _from_utf16(data)
@@ -34,7 +34,7 @@ def _from_utf16(data: bytes) -> bytes:
 
 
 def decode_name(data: bytes) -> str:
-    """Return a name in UTF-8, or else each byte as the character of its number (Latin-1)."""
+    """Return a name decoded as UTF-8, or else as Latin-1."""
     try:
         return data.decode().strip()
     except UnicodeDecodeError:
@@ -47,7 +47,7 @@ def unquote_name(name: str) -> str:
 
 
 def join_continued(text: bytes) -> bytes:
-    r"""Return a text whose lines that end with \ go on; comment lines never do."""
+    r"""Return a text with lines that end in \ joined to the next; comment lines are not."""
     if b"\\" not in text:
         return text
     text = re.sub(rb"(?m)^[ \t]*#[^\n]*", b"", text)
@@ -59,20 +59,20 @@ class TextLines:
     """The lines and words of a text."""
 
     text: bytes
-    """With some line breaks more at its end."""
+    """Bytes of the text, followed by `PADDING`."""
     codes: NDArray[np.uint8]
-    """Its bytes."""
+    """[N] the same bytes as an array."""
     starts: NDArray[np.int64]
     """[L] first byte of each line."""
     words: NDArray[np.int64]
     """[W] first byte of each word."""
     first: NDArray[np.int64]
-    """[L] row of `words` with which each line begins, or that of the next line."""
+    """[L] index in `words` of the first word of each line, or of the next line for an empty one."""
     counts: NDArray[np.int64]
-    """[L] words of each line."""
+    """[L] number of words of each line."""
 
     def take_rows(self, rows: NDArray[np.int64], text: bytes) -> bytes:
-        """Return lines of a text that has this one's places."""
+        """Return lines of `text`, which has the same line starts, joined."""
         if not len(rows):
             return b""
         ends = np.append(self.starts[1:], len(self.text))
@@ -82,7 +82,7 @@ class TextLines:
         return b"".join(text[low:high] for low, high in zip(begin, end, strict=True))
 
     def line(self, row: int) -> bytes:
-        """Return one line, without spaces around it."""
+        """Return one line without surrounding space."""
         end = self.starts[row + 1] if row + 1 < len(self.starts) else len(self.text)
         return self.text[self.starts[row] : end].strip()
 
@@ -101,7 +101,7 @@ def split_lines(text: bytes) -> TextLines:
 
 
 def parse_numbers(text: bytes, count: int, dtype: type[T]) -> NDArray[T]:
-    """Return the numbers of a text whose words are as many numbers.
+    """Return the numbers of a text of exactly `count` words.
 
     Raises:
         Rejected: load_error where a word is no number of this kind.
@@ -117,8 +117,8 @@ def parse_numbers(text: bytes, count: int, dtype: type[T]) -> NDArray[T]:
     if len(values) != count:
         kind = int if np.issubdtype(dtype, np.integer) else float
         word = next((word for word in text.split() if not _is_number(word, kind)), b"nothing")
-        wanted = "a whole number" if kind is int else "a number"
-        raise Rejected("load_error", f"{word[:40]!r} stands where {wanted} is expected")
+        expected = "a whole number" if kind is int else "a number"
+        raise Rejected("load_error", f"{word[:40]!r} stands where {expected} is expected")
     return values
 
 
@@ -131,7 +131,7 @@ def _is_number(word: bytes, kind: type) -> bool:
 
 
 def list_some(sentences: dict[str, int], most: int = 12) -> tuple[str, ...]:
-    """Return the first sentences of a file, and how many more there are."""
+    """Return the first sentences of a file, and the number of further ones."""
     listed = [text if count == 1 else f"{count} x {text}" for text, count in sentences.items()]
     more = len(listed) - most
     return (*listed[:most], *([f"{more} other things"] if more > 0 else []))

@@ -15,7 +15,7 @@ from pipeline.generation.child_pool import ChildPool
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, call_with_retries, reach
 from pipeline.objects.maps.listing import PLURALS, FoundMap, find_maps
-from pipeline.objects.maps.prepared import MapFiles, decode_prepared, outcome_name, prepare_map
+from pipeline.objects.maps.prepared import MapFiles, decode_prepared, map_cache_key, prepare_map
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.conventions import SPLITS
@@ -161,14 +161,14 @@ def _unread_failure(locked: LockedObject, path: Path) -> Failure:
 
 def _prepare_file(map_files: MapFiles, child: IsolatedChild) -> Path:
     """Prepare a file in a child unless the cache has it; return its path. Raises Rejected."""
-    name = outcome_name(map_files)
+    name = map_cache_key(map_files)
     path = cache_folder("maps") / name[:2] / f"{name}.safetensors"
     if not path.exists():
         try:
             data, unread = call_with_retries(child, prepare_map, map_files)
         except ChildFailed as failure:
             raise Rejected(failure.reason, failure.sentence) from failure
-        if outcome_name(map_files) != name:
+        if map_cache_key(map_files) != name:
             raise Rejected("unreadable_file", "it changed while it was being prepared")
         if unread:
             message = printable(f"it is used without {'; '.join(unread)}")

@@ -124,7 +124,7 @@ def _prepare(
     work = ObjectWork(
         settings=options.settings.mesh_settings,
         writer=options.writer,
-        fetch=None if listed.listing.is_here else downloads.fetch,
+        fetch=None if listed.listing.is_local else downloads.fetch,
     )
     return prepare_in_batches(
         sorted(records, key=attrgetter("uid")),

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalise
-from pipeline.assets.preview import preview_both
+from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalize
+from pipeline.assets.preview import preview_source_and_level
 from pipeline.assets.recipe import RECIPE, library_versions
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedAsset
@@ -204,7 +204,7 @@ def _geometry_sha256(level: Level) -> str:
     """Return the digest that the mesh stage would compute for the written file of a level."""
     positions = level.positions.astype(np.float64)
     faces = level.faces.astype(np.int64)
-    return geometry_sha256(clean(normalise(TriangleMesh(positions=positions, faces=faces))))
+    return geometry_sha256(clean(normalize(TriangleMesh(positions=positions, faces=faces))))
 
 
 def _row(prepared: PreparedAsset, level: Level) -> AssetRow:
@@ -291,7 +291,7 @@ def _pairs(
                 child.allow_files(reach(files=[Path(path)]))
                 with contextlib.suppress(ChildFailed):  # a missing picture must not stop the run
                     source, result = call_with_retries(
-                        child, preview_both, path, settings, levels[i], _WIDTH_PX
+                        child, preview_source_and_level, path, settings, levels[i], _WIDTH_PX
                     )
                     pairs[name].append(Pair(row=rows[i], source=source, result=result))
     finally:

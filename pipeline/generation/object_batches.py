@@ -77,7 +77,7 @@ def prepared_object(asset: PreparedAsset) -> PreparedObject:
         asset_sha256=asset.asset_sha256,
         geometry_sha256=asset.geometry_sha256,
         least_triangles=least_triangles_in(asset.path),
-        without_own=asset.without_own,
+        without_own=asset.missing_materials_reason,
         unread=asset.unread,
     )
 

@@ -67,7 +67,7 @@ def find_object(
     """Return an object of a source, with its file on this machine; None if the source lacks it."""
     for _ in range(2):  # the cached list may be older than the file
         listed = _list_source(source, licence, work_dir, allowed)
-        for record in listed.found(lambda other: other == uid).records:
+        for record in listed.fetch_selected(lambda other: other == uid).records:
             if Path(record.path).exists():
                 return record
         _list_source.cache_clear()

@@ -15,7 +15,7 @@ from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.environment import environment
 from pipeline.generation.freeze_objects import AcceptedObjects
 from pipeline.generation.machine import children_of_gpu
-from pipeline.objects.sources import look_at_source
+from pipeline.objects.sources import check_source
 from pipeline.renders.variant import Device, Variant, choose_variant, device_of
 from pipeline.renders.visible_gpus import gpu_memory_bytes, visible_gpus
 from storage.dataset.layout import DatasetFolder
@@ -205,7 +205,7 @@ def resolve_settings(
     files = order.scenes_from
     listed = None if files is None else find_scene_files(files, order.albedo_over_one)
     if listed is None and not folder.manifest.exists():
-        look_at_source(source, allowed_licences=settings.allowed_licences, licence=order.licence)
+        check_source(source, allowed_licences=settings.allowed_licences, licence=order.licence)
     return settings_for_files(settings, listed, order.views), listed
 
 

@@ -1,10 +1,10 @@
 """`builtin:`: procedural objects as files, so that a new user needs no download.
 
-`builtin:benchmark-v1` is a set of its own, of which no other source has an object: networks may
-learn from all others and be judged on these.
+`builtin:benchmark-v1` shares no object with other sources: networks may train on all others and be
+evaluated on these.
 
-The files are made anew on every run (milliseconds each) and written only where they differ, so the
-stages after this one read files and nothing else, and a damaged file is mended.
+Each run generates the meshes again (milliseconds each) and writes a file only where it differs: the
+later stages read nothing but files, and a damaged file is repaired.
 """
 
 from collections.abc import Callable, Mapping
@@ -42,7 +42,8 @@ FAMILIES: Mapping[str, Callable[[np.random.Generator], Mesh]] = {
     "lattice": lattice_rand,
     "plant": plant_rand,
 }
-"""Object i of `builtin:` is of family i modulo their number. Order is part of the result."""
+"""Families by name; object i of `builtin:` has family i modulo their number, so the order counts.
+"""
 
 
 PREFIX = "builtin:"
@@ -60,13 +61,14 @@ def generate_objects(source: str, work_dir: Path) -> list[ObjectRecord]:
     Object i does not depend on N, so a larger N keeps the smaller set.
 
     Raises:
-        TrilightError: N is no number from 1 to MAX_COUNT, or `work_dir` cannot be written.
+        TrilightError: N is not a number from 1 to MAX_COUNT, or `work_dir` cannot be written.
     """
     names = list(FAMILIES)
     group = "builtin" if source != BENCHMARK else "builtin-benchmark-v1"
     records = []
     for index in range(num_builtin(source)):
-        family, number = names[index % len(names)], index // len(names)
+        family = names[index % len(names)]
+        number = index // len(names)
         path = work_dir / group / numbered_path(index, f"{family}-{number:05d}.ply")
         data = encode_ply(*builtin_mesh(family, number, group))
         if not path.is_file() or path.read_bytes() != data:
@@ -99,7 +101,7 @@ def builtin_mesh(family: str, number: int, group: str = "builtin") -> Mesh:
 
 
 def num_builtin(source: str) -> int:
-    """Return how many objects a source of built-in ones has; raises as `generate_objects`."""
+    """Return the number of objects of a built-in source; raises as `generate_objects`."""
     if source == BENCHMARK:
         return BENCHMARK_COUNT
     text = source.removeprefix(PREFIX)

@@ -1,8 +1,8 @@
-"""GLB: a mesh with its textures in one file that every modelling program opens.
+"""GLB: a mesh with its textures in one file that every modeling program opens.
 
-Our three columns become a dielectric of glTF whose own light is ours again when the file is read
+The three columns become a glTF dielectric that reads back as the same columns
 (pipeline.foreign.material): the specular albedo F goes back to F0 = (21 F - 1)/20, which
-KHR_materials_specular can say up to 1, and the base colour is diffuse / (1 - F).
+KHR_materials_specular can say up to 1, and the base color is diffuse / (1 - F).
 """
 
 import io
@@ -19,10 +19,12 @@ from storage.conventions import srgb8
 from storage.records.texture import Texture
 
 MOST_SPECULAR = 25.0
-"""Times F0 = 0.04 of an ordinary dielectric is a mirror."""
-_JSON, _BIN = 0x4E4F534A, 0x004E4942
-FLOAT, UNSIGNED = 5126, 5125
-"""Kinds of numbers."""
+"""Specular factor of a mirror: 25 times the F0 = 0.04 of an ordinary dielectric."""
+_JSON = 0x4E4F534A
+_BIN = 0x004E4942
+FLOAT = 5126
+UNSIGNED = 5125
+"""Component types of glTF accessors: float32, and unsigned 32-bit integers."""
 
 
 def encode_glb(
@@ -35,8 +37,8 @@ def encode_glb(
 
     Args:
         positions: [V, 3], +Z up.
-        faces: [F, 3]
-        uv: [F, 3, 2] of each corner, v up.
+        faces: [F, 3] rows of `positions`.
+        uv: [F, 3, 2] texture coordinates of the corners, v up.
         textures: diffuse, specular and roughness.
     """
     file = GlbFile()
@@ -55,15 +57,15 @@ def encode_glb(
         "materials": [_material(file, *textures)],
         "extensionsUsed": ["KHR_materials_specular"],
     }
-    return file.encoded()
+    return file.encode()
 
 
 def _material(
     file: "GlbFile", diffuse: Texture, specular: Texture, roughness: Texture
 ) -> dict[str, Any]:
-    shown = [texture.linear(texture.texels).astype(np.float64) for texture in (diffuse, specular)]
-    base = np.clip(shown[0] / np.maximum(1 - shown[1], 1e-6), 0, 1)
-    f0 = np.clip((21 * shown[1] - 1) / 20, 0, 1)
+    albedos = [texture.linear(texture.texels).astype(np.float64) for texture in (diffuse, specular)]
+    base = np.clip(albedos[0] / np.maximum(1 - albedos[1], 1e-6), 0, 1)
+    f0 = np.clip((21 * albedos[1] - 1) / 20, 0, 1)
     metal: dict[str, Any] = {"metallicFactor": 0}
     if base.shape[:2] == (1, 1):
         metal["baseColorFactor"] = [*base[0, 0].tolist(), 1]
@@ -84,7 +86,7 @@ def _material(
 
 
 class GlbFile:
-    """A file in the making: one buffer, and a tree that whoever writes it completes."""
+    """A GLB file under construction: one buffer, and a JSON tree that the caller completes."""
 
     def __init__(self) -> None:
         self.tree: dict[str, Any] = {
@@ -100,13 +102,13 @@ class GlbFile:
     def accessor(
         self, values: NDArray, kind: str, component: int, more: Mapping[str, Any] | None = None
     ) -> int:
-        """Add numbers; returns their row."""
+        """Add an array of numbers; return the index of its accessor."""
         entry = {"bufferView": self._view(values.tobytes()), "componentType": component}
         self.tree["accessors"].append({**entry, "count": len(values), "type": kind, **(more or {})})
         return len(self.tree["accessors"]) - 1
 
     def picture(self, values: NDArray[np.uint8]) -> int:
-        """Add a picture [H, W, 3], the bottom row first; returns the row of its texture."""
+        """Add a picture [H, W, 3], bottom row first; return the index of its texture."""
         stream = io.BytesIO()
         Image.fromarray(values[::-1]).save(stream, "PNG")
         images, textures = (self.tree.setdefault(name, []) for name in ("images", "textures"))
@@ -114,8 +116,8 @@ class GlbFile:
         textures.append({"source": len(images) - 1})
         return len(textures) - 1
 
-    def encoded(self) -> bytes:
-        """Return the file."""
+    def encode(self) -> bytes:
+        """Return the bytes of the file."""
         self.tree["buffers"] = [{"byteLength": len(self._data)}]
         text = json.dumps(self.tree, sort_keys=True).encode()
         text += b" " * (-len(text) % 4)

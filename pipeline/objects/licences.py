@@ -1,4 +1,4 @@
-"""Which objects may enter a dataset by their licence: an allow-list, so that silence refuses."""
+"""The licence check of objects: an allow-list, so that an unknown licence is refused."""
 
 import re
 from collections.abc import Sequence
@@ -10,10 +10,10 @@ from storage.records.objects import Failure, ObjectRecord
 from storage.remote.safe_url import printable
 
 USER_PROVIDED = "LicenseRef-user-provided"
-"""Licence of files that a user names without a catalogue; we assume that they may use them."""
+"""Licence of files that a user names without a catalogue; their use is assumed to be allowed."""
 
 UNKNOWN = "LicenseRef-unknown"
-"""Licence of objects whose source states none."""
+"""Licence of objects whose source states no licence."""
 
 DEFAULT_ALLOWED: tuple[str, ...] = (
     "CC0-1.0",
@@ -34,8 +34,8 @@ DEFAULT_ALLOWED: tuple[str, ...] = (
     "Apache-2.0",
     USER_PROVIDED,
 )
-"""SPDX identifiers that permit derived and commercial use; attribution and share-alike are kept
-with the object. Not here: unknown, non-commercial (NC) and no-derivatives (ND) licences."""
+"""SPDX identifiers that permit derived and commercial use; attribution and share-alike stay with
+the object. Unknown, non-commercial (NC) and no-derivatives (ND) licences are absent."""
 
 BY_USER = "stated by the user (--licence)"
 """The licence source recorded for `--licence`."""
@@ -50,16 +50,16 @@ _EXPECTED = (
 
 @dataclass(frozen=True, kw_only=True)
 class StatedLicence:
-    """The licence of files that come without a statement of their own."""
+    """The licence of files without a licence statement."""
 
     licence: str
-    """SPDX identifier, or `LicenseRef-...`."""
+    """SPDX identifier such as CC-BY-4.0, or `LicenseRef-...`."""
     licence_source: str
-    """Where the licence is stated."""
+    """Origin of the licence, such as the user or a catalogue."""
 
 
 def stated_licence(licence: str | None) -> StatedLicence:
-    """Return what holds for files without a statement: what the user says, or an assumption.
+    """Return the licence of files without a statement: the user's, or an assumed one.
 
     Raises:
         TrilightError: `licence` does not have the form of an identifier.
@@ -72,7 +72,7 @@ def stated_licence(licence: str | None) -> StatedLicence:
 
 
 def require_unstated(licence: str | None, source: str) -> None:
-    """Raise TrilightError where a user states a licence for a source that states its own."""
+    """Raise TrilightError for a user's licence of a source that states its licences."""
     if licence is not None:
         raise TrilightError(
             f"--licence is {printable(licence)!r}, but {source} states the licence of every "
@@ -82,9 +82,9 @@ def require_unstated(licence: str | None, source: str) -> None:
 
 
 def check_allowed(allowed: Sequence[str]) -> None:
-    """Raise TrilightError for an entry of the allow-list that no licence can ever equal.
+    """Raise TrilightError for an entry of the allow-list that no licence can equal.
 
-    Compound expressions such as `MIT OR Apache-2.0` are not looked into.
+    Compound expressions such as `MIT OR Apache-2.0` are not parsed.
     """
     for name in allowed:
         if not _allowable(name):
@@ -96,17 +96,17 @@ def refuse_licences(
 ) -> tuple[list[ObjectRecord], list[Failure]]:
     """Return the records with an allowed licence, in order, and a failure for each other one.
 
-    Identifiers are compared without regard to case, as SPDX asks. Compound expressions such as
-    `MIT OR Apache-2.0` are not taken apart: they are allowed when listed as they stand.
+    The comparison ignores case, as SPDX demands. Compound expressions such as `MIT OR Apache-2.0`
+    are not parsed: they are allowed where the list holds the same expression.
     """
     names = {name.casefold() for name in allowed}
-    kept = [record for record in records if record.licence.casefold() in names]
+    allowed_records = [record for record in records if record.licence.casefold() in names]
     refused = [
         failure(record.uid, "licence_refused", _refusal(record.licence))
         for record in records
         if record.licence.casefold() not in names
     ]
-    return kept, refused
+    return allowed_records, refused
 
 
 def _refusal(licence: str) -> str:

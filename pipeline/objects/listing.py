@@ -1,4 +1,4 @@
-"""What a source lists: its objects before licences are checked, their uids, their downloads."""
+"""The listing of a source: its objects before the licence check, their uids, their downloads."""
 
 import threading
 from collections.abc import Callable, Iterable
@@ -13,30 +13,30 @@ Fetched = tuple[list[ObjectRecord], list[Failure]]
 CountDone = Callable[[int, int], None]
 
 
-def _here_already(records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
+def _already_local(records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
     return records, []
 
 
 @dataclass(frozen=True, kw_only=True)
 class Listing:
-    """The objects of a source and how to get those of them that may be used."""
+    """The objects of a source, and the function that fetches them."""
 
     records: list[ObjectRecord]
-    """In any order. The path of an object that must be fetched means nothing yet."""
+    """Objects in any order; the path of an object that must be fetched has no meaning yet."""
     failures: list[Failure]
-    """Objects that cannot be used, whatever their licence."""
-    fetch: Callable[[list[ObjectRecord], CountDone], Fetched] = _here_already
-    """Brings objects to this machine; returns them with their paths, and a failure for each that
-    could not be fetched. Files of this machine are left where they are."""
+    """Objects that are unusable, whatever their licence."""
+    fetch: Callable[[list[ObjectRecord], CountDone], Fetched] = _already_local
+    """Downloads objects; returns them with their paths, and a failure for each that could not be
+    fetched. Files of this machine stay in place."""
 
     @property
-    def is_here(self) -> bool:
-        """Whether the files of all objects are on this machine, with nothing to fetch."""
-        return self.fetch is _here_already
+    def is_local(self) -> bool:
+        """True where the files of all objects are on this machine already."""
+        return self.fetch is _already_local
 
 
 def failure(uid: str, reason: str, message: str) -> Failure:
-    """Return the row of an object that this stage refuses."""
+    """Return the failure of an object that the stage `objects` refuses."""
     return Failure(stage="objects", item=uid, reason=reason, message=message)
 
 
@@ -48,20 +48,20 @@ SUFFIXES = (
 
 
 def is_object_file(name: str) -> bool:
-    """Return whether a path names an object and none of its parts is hidden."""
+    """Return True for the path of an object file without hidden folders."""
     return name.lower().endswith(SUFFIXES) and not any(
         part.startswith(".") for part in name.split("/")
     )
 
 
 def assign_uids(names: Iterable[str]) -> tuple[dict[str, str], list[Failure]]:
-    """Return the uid of every file, and a failure for each that can have none of its own.
+    """Return the uid of every file, and a failure for each file without a unique one.
 
     The uid is the path within the folder, made printable, without its suffixes: `banner.gltf.glb`
-    is `banner`. Where that is taken, by the order of the names, it is the full name: of `a.obj` and
-    `a.stl`, `a` and `a.stl`. So a new file may take the uid of an older one that differs in its
-    suffix only; a catalogue keeps uids fixed. Two names that print alike (a line break, and a
-    backslash with an n) cannot be told apart: the later one fails.
+    is `banner`. Where an earlier name has that uid, it is the full name: `a.obj` and `a.stl` become
+    `a` and `a.stl`. So a new file may take the uid of an older one that differs in its suffix only;
+    a catalogue keeps uids fixed. Of two names that print alike (a line break, and a backslash with
+    an n), the later one fails.
     """
     uids: dict[str, str] = {}
     failures = []
@@ -96,17 +96,17 @@ def fetch_all(
     """Fetch every object; a TransferFailed of `fetch` is a failure of that object alone.
 
     Args:
-        records: what to fetch.
+        records: objects to fetch.
         fetch: returns the record with its path; called in threads, at most `threads` at a time.
-        downloaded: called in this thread with how many are done, failed ones included, and with
-            how many there are.
-        threads: at least 1.
+        downloaded: called in this thread with the number of finished objects, failed ones
+            included, and the total.
+        threads: number of threads, at least 1.
         stop: set where the run ends early, so that `fetch` may give up.
 
     Raises:
         Exception: any other error of `fetch`; fetches that have not begun are cancelled.
     """
-    here: list[ObjectRecord] = []
+    fetched: list[ObjectRecord] = []
     failures: list[Failure] = []
     downloaded(0, len(records))
     with ThreadPoolExecutor(threads) as pool:
@@ -114,7 +114,7 @@ def fetch_all(
         try:
             for done, future in enumerate(as_completed(waiting), start=1):
                 try:
-                    here.append(future.result())
+                    fetched.append(future.result())
                 except TransferFailed as error:
                     failures.append(failure(waiting[future].uid, error.reason, error.message))
                 downloaded(done, len(records))
@@ -122,4 +122,4 @@ def fetch_all(
             stop.set()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    return here, failures
+    return fetched, failures

@@ -1,4 +1,4 @@
-"""Binary PLY: the plainest mesh file that every modelling program opens."""
+"""Binary PLY: a plain mesh format that every modeling program opens."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,5 +14,6 @@ def encode_ply(positions: NDArray[np.floating], faces: NDArray[np.integer]) -> b
         "property list uchar int vertex_indices\nend_header\n"
     )
     rows = np.zeros(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
-    rows["count"], rows["corners"] = 3, faces
+    rows["count"] = 3
+    rows["corners"] = faces
     return header.encode() + positions.astype("<f4").tobytes() + rows.tobytes()

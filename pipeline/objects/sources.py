@@ -1,7 +1,7 @@
-"""The sources of objects by the word before their colon, and the objects that one holds.
+"""Object sources by the word before their colon, and the listing of one source.
 
-Sources are folders, catalogues, servers, Objaverse and our own. Nothing is loaded here: a record
-names a file, and the mesh stage finds out whether it is usable.
+Sources are folders, catalogues, servers, Objaverse and built-in objects. Nothing is loaded here: a
+record names a file, and the mesh stage checks whether it is usable.
 """
 
 import contextlib
@@ -34,154 +34,155 @@ from storage.remote.url import PACKAGES, parse_url
 
 @dataclass(frozen=True, kw_only=True)
 class SourceQuery:
-    """What a person asks a source for."""
+    """The options of one request to an object source."""
 
     source: str
-    """The source as it was written, such as `objaverse:category/chair`."""
+    """The source as the user wrote it, such as `objaverse:category/chair`."""
     work_dir: Path
-    """Folder for files that a source makes: of the dataset, or of the user's cache."""
+    """Folder for files that a source writes: in the dataset, or in the user's cache."""
     licence: str | None
     """Licence that the user states for files without a statement of their own."""
     allowed_licences: Sequence[str]
-    """For sources that need not list what would be refused; the others are refused later."""
+    """Licences on the allow-list, for sources that skip refused objects; a later check is final."""
 
     @property
     def after_colon(self) -> str:
-        """What the source is asked for, without its name."""
+        """The part of `source` after the first colon."""
         return self.source.partition(":")[2]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectSource:
-    """A source of objects."""
+    """A source of objects, registered under the word before its colon."""
 
     list: Callable[[SourceQuery], Listing]
-    """Returns what the source holds; raises TrilightError where it is missing or malformed."""
+    """Returns the source's listing; raises TrilightError where it is missing or malformed."""
     look: Callable[[SourceQuery], object] | None = None
-    """Raises the same errors and writes nothing, where `list` would be dear."""
+    """Raises the errors of `list` without its cost, and writes nothing; None where `list` is cheap.
+    """
     states_licences: bool = True
-    """Whether the source states the licence of every object; `--licence` is then refused."""
+    """True where the source states the licence of every object; `--licence` is then refused."""
     is_place: bool = False
-    """Whether the name is the scheme of a URL, which may hold a secret."""
+    """True where the name is the scheme of a URL, which may hold a secret."""
 
-    def asked(self, asked: SourceQuery, *, only_look: bool) -> Listing | None:
-        """Return what `list` does, or have a look; raises TrilightError as they do."""
+    def run_query(self, query: SourceQuery, *, check_only: bool) -> Listing | None:
+        """Return the listing, or check the source only; raises TrilightError as `list`."""
         if self.states_licences:
-            require_unstated(asked.licence, f"{asked.source.partition(':')[0]}:")
-        if only_look and self.look:
-            self.look(asked)
+            require_unstated(query.licence, f"{query.source.partition(':')[0]}:")
+        if check_only and self.look:
+            self.look(query)
             return None
-        return self.list(asked)
+        return self.list(query)
 
 
-def _list_place(asked: SourceQuery) -> Listing:
-    place = parse_url(asked.source, what="objects")
-    if isinstance(place, Path):
-        return list_folder(place, asked.licence)
-    return list_remote(place, asked.licence)
+def _list_folder(query: SourceQuery) -> Listing:
+    location = parse_url(query.source, what="objects")
+    if isinstance(location, Path):
+        return list_folder(location, query.licence)
+    return list_remote(location, query.licence)
 
 
-PLACE = ObjectSource(list=_list_place, states_licences=False, is_place=True)
-"""A folder, here or on a server; also what has no name before a colon."""
+FOLDER_SOURCE = ObjectSource(list=_list_folder, states_licences=False, is_place=True)
+"""A folder, local or on a server; also every source without a known name before a colon."""
 
 SOURCES: Registry[ObjectSource] = Registry(
     "object source",
     ObjectSource,
     {
         "builtin": ObjectSource(
-            list=lambda asked: Listing(
-                records=generate_objects(asked.source, asked.work_dir), failures=[]
+            list=lambda query: Listing(
+                records=generate_objects(query.source, query.work_dir), failures=[]
             ),
-            look=lambda asked: num_builtin(asked.source),
+            look=lambda query: num_builtin(query.source),
         ),
         "objaverse": ObjectSource(
-            list=lambda asked: list_objaverse(asked.source, asked.allowed_licences)
+            list=lambda query: list_objaverse(query.source, query.allowed_licences)
         ),
-        **dict.fromkeys(("file", *PACKAGES, "pipe", "env"), PLACE),
+        **dict.fromkeys(("file", *PACKAGES, "pipe", "env"), FOLDER_SOURCE),
     },
     decides=("data",),
 )
-"""Sources by the word before the colon."""
+"""Object sources by the word before the colon."""
 
 
 def source_of(text: str) -> ObjectSource:
-    """Return what lists a source: that of the word before its colon, or else a folder."""
+    """Return the source of the word before the colon, or else the folder source."""
     name, colon, _ = text.partition(":")
-    return SOURCES.get(name, PLACE) if colon else PLACE
+    return SOURCES.get(name, FOLDER_SOURCE) if colon else FOLDER_SOURCE
 
 
 ENVIRONMENT = "env:"
-"""Prefix of a source that an environment variable holds, for URLs with a secret."""
+"""Prefix of a source that stands in an environment variable, for URLs with a secret."""
 VARIABLES = "TRILIGHT_SOURCE_"
-"""Prefix of the variables that may be named: starting a run must not reveal any other."""
+"""Prefix of allowed variables, so that starting a run cannot reveal any other."""
 
 _QUOTED = re.compile(r"^objects (?:is )?(?:'[^']*'|\"[^\"]*\")")
-"""How messages about a source begin."""
+"""Beginning of messages about a source."""
 _WORD = re.compile(r"\w{3,}")
-_NOT_HAD = ("download_failed", "too_large_bytes", "too_many_buffers", "unsafe_name")
+_DOWNLOAD_REASONS = ("download_failed", "too_large_bytes", "too_many_buffers", "unsafe_name")
 
 
 @dataclass(frozen=True, kw_only=True)
 class FoundObjects:
-    """What a source has to offer."""
+    """The usable objects of a source, and the failures."""
 
     records: tuple[ObjectRecord, ...]
-    """Objects with an allowed licence whose files are on this machine, sorted by uid."""
+    """Objects with an allowed licence and their files on this machine, sorted by uid."""
     failures: tuple[Failure, ...]
-    """The other ones, of the stage `objects`, sorted by uid: licence_refused, download_failed,
+    """Failures of the stage `objects`, sorted by uid: licence_refused, download_failed,
     too_large_bytes, too_many_buffers, unsafe_name, unknown_uid, link_outside, name_clash."""
 
     @property
     def num_found(self) -> int:
-        """How many objects the source has."""
+        """Number of objects in the source."""
         return len(self.records) + len(self.failures)
 
 
-def _silent(done: int, total: int) -> None:
+def _ignore_progress(done: int, total: int) -> None:
     """Show no progress."""
 
 
-def _every(uid: str) -> bool:
+def _select_all(uid: str) -> bool:
     return True
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ListedObjects:
-    """What a source holds; its files are brought to this machine where they are wanted."""
+    """The listing of a source, split by licence; files are downloaded on demand."""
 
     source: str
-    """As it was asked for."""
+    """The source as the user wrote it."""
     listing: Listing
-    """What it said."""
+    """The source's own listing, before the licence check."""
     allowed: list[ObjectRecord]
-    """Objects whose licence is allowed."""
+    """Objects with an allowed licence."""
     refused: list[Failure]
-    """The others, and what cannot be used whatever its licence."""
+    """Failures: objects with a refused licence, and objects that are unusable anyway."""
 
-    def found(
+    def fetch_selected(
         self,
-        wanted: Callable[[str], bool] = _every,
-        downloaded: Callable[[int, int], None] = _silent,
+        is_selected: Callable[[str], bool] = _select_all,
+        downloaded: Callable[[int, int], None] = _ignore_progress,
     ) -> FoundObjects:
-        """Return the objects that may be used, after bringing them here.
+        """Download the selected objects and return them with the failures.
 
-        What is downloaded stays in the user's cache (`storage.cache`; Objaverse in the place of its
-        own package), and is not downloaded again.
+        Downloads stay in the user's cache (`storage.cache`; Objaverse in the folder of its own
+        package) and are not repeated.
 
         Args:
-            wanted: says of a uid whether it is asked for; the others are left where they are.
-            downloaded: called with how many downloads are done, failed ones included, and with how
-                many there are; from the calling thread.
+            is_selected: returns True for the uid of a selected object.
+            downloaded: called with the number of finished downloads, failed ones included, and the
+                total; from the calling thread.
 
         Raises:
-            TrilightError: nothing of what is wanted could be downloaded.
+            TrilightError: none of the selected objects could be downloaded.
         """
-        records = [record for record in self.allowed if wanted(record.uid)]
-        failures = [failure for failure in self.refused if wanted(failure.item)]
-        here, lost = self.fetch(records, downloaded)
-        self.require_some(len(here), [*failures, *lost])
+        records = [record for record in self.allowed if is_selected(record.uid)]
+        failures = [failure for failure in self.refused if is_selected(failure.item)]
+        fetched, lost = self.fetch(records, downloaded)
+        self.require_some(len(fetched), [*failures, *lost])
         return FoundObjects(
-            records=tuple(sorted(here, key=attrgetter("uid"))),
+            records=tuple(sorted(fetched, key=attrgetter("uid"))),
             failures=tuple(sorted([*failures, *lost], key=attrgetter("item"))),
         )
 
@@ -191,17 +192,17 @@ class ListedObjects:
         return len(self.allowed) + len(self.refused)
 
     def fetch(self, records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
-        """Bring some of the allowed objects here; as `Listing.fetch`."""
-        with _said_by(self.source):
+        """Download some of the allowed objects, as `Listing.fetch`."""
+        with _resolve_source(self.source):
             return self.listing.fetch(records, downloaded)
 
     def require_some(self, num_here: int, failures: Sequence[Failure]) -> None:
-        """Raise TrilightError where downloads were tried and none came through."""
-        lost = [failure for failure in failures if failure.reason in _NOT_HAD]
+        """Raise TrilightError where downloads were tried and all failed."""
+        lost = [failure for failure in failures if failure.reason in _DOWNLOAD_REASONS]
         if num_here or not lost:
             return
         first = min(lost, key=attrgetter("item"))
-        with _said_by(self.source) as value:
+        with _resolve_source(self.source) as value:
             raise TrilightError(
                 f"objects {printable(safe_url(value))!r}: none of {len(lost)} objects could be "
                 f"downloaded; the first is {first.reason} ({first.message}); expected at least "
@@ -216,25 +217,25 @@ def list_objects(
     allowed_licences: Sequence[str],
     licence: str | None = None,
 ) -> ListedObjects:
-    """Return what a source holds; the licence of an object is judged before it is downloaded.
+    """List a source; the licence check of an object comes before its download.
 
     Args:
         source: a folder; `http(s)://`, `s3://`, `gs://`, `hf://` or `file://` and a folder;
-            `builtin:` or `builtin:N`; `objaverse:` and uids, a file of uids, or categories. Of a
-            folder, `objects.jsonl` or `objects.csv` is used where it has one, and its object
-            files otherwise. `env:NAME` is what the environment variable NAME says, of which no
-            message quotes anything; NAME begins with VARIABLES.
-        work_dir: where built-in objects are written; not touched for other sources.
-        allowed_licences: SPDX identifiers, `LicenseRef-...`, or compound expressions as they stand.
-        licence: of files that come without any statement, as the user states it.
+            `builtin:` or `builtin:N`; `objaverse:` and uids, a file of uids, or categories. A
+            folder lists the rows of its `objects.jsonl` or `objects.csv`, or else its object
+            files. `env:NAME` is the content of the environment variable NAME, which no message
+            quotes; NAME begins with VARIABLES.
+        work_dir: folder for built-in objects; untouched for other sources.
+        allowed_licences: SPDX identifiers, `LicenseRef-...`, or whole compound expressions.
+        licence: the user's licence for files without a statement.
 
     Raises:
         TrilightError: the source is malformed, missing or empty; its catalogue has a mistake; a
             licence identifier is malformed, or is stated where the source states its own; a package
             is missing, or a server does not answer.
     """
-    with _said_by(source) as value:
-        listing = _listed(value, work_dir, licence, allowed_licences)
+    with _resolve_source(source) as value:
+        listing = _query_source(value, work_dir, licence, allowed_licences)
     assert listing is not None
     allowed, refused = refuse_licences(listing.records, allowed_licences)
     return ListedObjects(
@@ -248,89 +249,90 @@ def find_objects(
     work_dir: Path,
     allowed_licences: Sequence[str],
     licence: str | None = None,
-    downloaded: Callable[[int, int], None] = _silent,
+    downloaded: Callable[[int, int], None] = _ignore_progress,
 ) -> FoundObjects:
-    """Return all objects of a source that may be used; as `list_objects` and what it `found`."""
+    """List a source and download all its usable objects; raises as `list_objects`."""
     listed = list_objects(
         source, work_dir=work_dir, allowed_licences=allowed_licences, licence=licence
     )
-    return listed.found(downloaded=downloaded)
+    return listed.fetch_selected(downloaded=downloaded)
 
 
-def look_at_source(source: str, *, allowed_licences: Sequence[str], licence: str | None) -> None:
-    """Find out whether a source is there and holds anything, before a dataset of it is begun.
+def check_source(source: str, *, allowed_licences: Sequence[str], licence: str | None) -> None:
+    """Check that a source exists and holds an object, before a dataset of it begins.
 
-    Writes nothing except into the user's cache.
+    Only the user's cache is written.
 
     Raises:
         TrilightError: as `list_objects`.
     """
-    with _said_by(source) as value:
-        _listed(value, cache_folder("objects"), licence, allowed_licences, only_look=True)
+    with _resolve_source(source) as value:
+        _query_source(value, cache_folder("objects"), licence, allowed_licences, check_only=True)
 
 
 @contextlib.contextmanager
-def _said_by(source: str) -> Iterator[str]:
-    """Yield the source, or what its environment variable holds; no message quotes that."""
-    value = _value(source)
+def _resolve_source(source: str) -> Iterator[str]:
+    """Yield the source, or its environment variable's content, hidden from error messages."""
+    value = _read_variable(source)
     try:
         yield value
     except TrilightError as mistake:
         if value == source:
             raise
-        raise type(mistake)(_without_value(str(mistake), source, value)) from None
+        raise type(mistake)(_redact_value(str(mistake), source, value)) from None
 
 
-def _value(source: str) -> str:
-    """Return the source, read from the environment variable where one is named."""
+def _read_variable(source: str) -> str:
+    """Return the source, or the content of the environment variable that it names."""
     if not source.startswith(ENVIRONMENT):
         return source
-    name, shown = source.removeprefix(ENVIRONMENT), printable(source)
+    name = source.removeprefix(ENVIRONMENT)
+    label = printable(source)
     if not name.startswith(VARIABLES):
         raise TrilightError(
-            f"objects {shown!r} names a variable that is not for sources; expected one whose name "
+            f"objects {label!r} names a variable that is not for sources; expected one whose name "
             f"begins with {VARIABLES}. Set the source under such a name."
         )
-    if not (found := os.environ.get(name)):
+    if not (value := os.environ.get(name)):
         raise TrilightError(
-            f"objects {shown!r}: the environment variable {printable(name)!r} is not set here; "
+            f"objects {label!r}: the environment variable {printable(name)!r} is not set here; "
             "expected it to name a source of objects."
         )
-    return found
+    return value
 
 
-def _without_value(message: str, source: str, value: str) -> str:
-    """Return a message about a source that a variable says, with the variable instead of it."""
-    shown = f"objects {printable(source)!r}"
-    told = _QUOTED.sub(lambda _: shown, message)
-    rest = told.removeprefix(shown)
-    if rest != told and not any(word in rest for word in _WORD.findall(value)):
-        return told
+def _redact_value(message: str, source: str, value: str) -> str:
+    """Return a message about a source with the variable's name instead of its content."""
+    label = f"objects {printable(source)!r}"
+    redacted = _QUOTED.sub(lambda _: label, message)
+    rest = redacted.removeprefix(label)
+    if rest != redacted and not any(word in rest for word in _WORD.findall(value)):
+        return redacted
     return (
-        f"{shown} cannot be used as what it says; expected a source of objects. Name that source "
-        "itself in a terminal of this machine to be told what is wrong: trilight assets SOURCE."
+        f"{label} cannot be used as what it says; expected a source of objects. Name that source "
+        "itself in a terminal of this machine to see the error: trilight assets SOURCE."
     )
 
 
-def _listed(
+def _query_source(
     source: str,
     work_dir: Path,
     licence: str | None,
     allowed_licences: Sequence[str],
     *,
-    only_look: bool = False,
+    check_only: bool = False,
 ) -> Listing | None:
-    """Return what a source says that it holds, where a look does not do.
+    """Return the listing of a source, or None where a check suffices.
 
     Raises:
-        TrilightError: it holds nothing.
+        TrilightError: the source is invalid or empty.
     """
     check_allowed(allowed_licences)
     stated_licence(licence)
-    asked = SourceQuery(
+    query = SourceQuery(
         source=source, work_dir=work_dir, licence=licence, allowed_licences=allowed_licences
     )
-    listing = source_of(source).asked(asked, only_look=only_look)
+    listing = source_of(source).run_query(query, check_only=check_only)
     if listing and not listing.records and not listing.failures:
         raise TrilightError(
             f"objects {printable(safe_url(source))!r} holds no object; expected "

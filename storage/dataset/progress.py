@@ -279,7 +279,7 @@ class DatasetStatus:
     extensions: Mapping[str, str]
     """The sha256 of each extension that it was begun with, by its name."""
     asked: Sequence[str] | None
-    """Words of the command that makes it, without its place; None where they were not recorded."""
+    """Words of the command that makes the dataset, without its location; None if not recorded."""
 
     @property
     def next_words(self) -> Sequence[str] | None:

@@ -81,7 +81,7 @@ class IndexFacts:
     lock_bytes: int
     """Size of the lock in bytes."""
     asked: str
-    """Digest of what the source was asked for: another source is looked at again."""
+    """Digest of the query to the source; a change of it lists the source again."""
     num_found: int
     """Objects in the source, refused ones included."""
     num_maps: int

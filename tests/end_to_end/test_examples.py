@@ -17,7 +17,7 @@ from pipeline.builds.named import BUILDS, named_build, typed_build
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.executors.registry import EXECUTORS
-from pipeline.objects.sources import find_objects, look_at_source
+from pipeline.objects.sources import check_source, find_objects
 from scene_templates.skies.draw import draw_sky
 from scene_templates.textures import draw_look
 from storage.dataset.manifest import read_manifest
@@ -120,14 +120,14 @@ def test_a_source_lists_objects(
         with pytest.raises(TrilightError, match=r"dice:x'; expected dice:N with N from 1"):
             find_objects("dice:x", work_dir=tmp_path, **asked)
         with pytest.raises(TrilightError, match="dice: states the licence of every object"):
-            look_at_source("dice:3", licence="MIT", **asked)
+            check_source("dice:3", licence="MIT", **asked)
         monkeypatch.chdir(tmp_path)
         monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
         before = set(tmp_path.rglob("*.ply"))
-        look_at_source("dice:3", licence=None, **asked)
+        check_source("dice:3", licence=None, **asked)
         assert {path.parts[-4] for path in set(tmp_path.rglob("*.ply")) - before} == {"cache"}
     with pytest.raises(TrilightError, match="'dice:3' does not exist"):
-        look_at_source("dice:3", licence=None, **asked)
+        check_source("dice:3", licence=None, **asked)
 
 
 def test_a_metric_joins_the_others(copied: Callable[[str], Path]) -> None:

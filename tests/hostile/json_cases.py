@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.exchange.renderformer_json import described_files
+from pipeline.exchange.renderformer_json import describe_scene
 from tests.scenes_by_hand import tiny_scene
 
 Make = Callable[[Path], object]
@@ -14,7 +14,7 @@ LEAK_OBJ = "v 777 0 0\nv 778 0 0\nv 777 1 0\nf 1 2 3\n"
 
 
 def _base(folder: Path) -> dict[str, Any]:
-    files = described_files(tiny_scene(), "s")
+    files = describe_scene(tiny_scene(), "s")
     for path, data in files.meshes.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_bytes(data)

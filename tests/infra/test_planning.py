@@ -199,7 +199,7 @@ def test_what_confines_children_is_said(monkeypatch: pytest.MonkeyPatch) -> None
     ],
 )
 def test_a_probe_that_fails_is_missing(code: str, said: str) -> None:
-    finding = doctor._probe("x", code, found="x 1", consequence="no x", mend="get x")
+    finding = doctor._probe("x", code, summary="x 1", consequence="no x", mend="get x")
     assert finding.state == "missing"
     assert said in finding.found
 

@@ -150,7 +150,7 @@ def test_without_locks_everything_goes_on_after_one_warning(
     with folder.hold_membership(), folder.mutex("manifest") as ours, folder.hold_exclusively():
         with hold_claim(tmp_path / "a") as first, hold_claim(tmp_path / "a", wait=True) as second:
             assert ours and first and second and not is_claimed(tmp_path / "a")
-    with AssetStore(tmp_path / "store").making("abc"):
+    with AssetStore(tmp_path / "store").lock("abc"):
         pass
     with claim_run(RunFolder(tmp_path / "run"), DistributedContext(device=torch.device("cpu"))):
         pass

@@ -1,6 +1,6 @@
 """What `import trilight` offers: the same names to programs, to type checkers, and in documents.
 
-The code of docs/reference/python.md and the notebooks of examples/ run as somebody would run them.
+The code of docs/reference/python.md and the notebooks of examples/ run as a user runs them.
 A notebook's code cells are run in order in one fresh interpreter. A kernel (nbclient, ipykernel,
 pyzmq) would add what no cell needs: the display of values.
 """
@@ -61,7 +61,7 @@ def _code(text: str) -> list[str]:
 
 
 def _require_runs(folder: Path, *words: str) -> None:
-    """Run a program as somebody would in a folder of theirs."""
+    """Run a program as a user does, in a separate folder."""
     ran = subprocess.run(
         [sys.executable, *words],
         cwd=folder,

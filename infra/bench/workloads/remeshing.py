@@ -22,12 +22,12 @@ METHODS: Mapping[str, str] = {
 
 def raw_mesh(path: Path) -> "TriangleMesh":
     """Return the mesh of a file in nominal size, neither cleaned nor oriented; raises Rejected."""
-    from pipeline.assets.cleaning.clean import normalise
+    from pipeline.assets.cleaning.clean import normalize
     from pipeline.foreign.limits import ReadLimits
     from pipeline.foreign.load import load_mesh
     from pipeline.foreign.source_file import read_source
 
-    return normalise(load_mesh(read_source(path, ReadLimits())))
+    return normalize(load_mesh(read_source(path, ReadLimits())))
 
 
 def clean_mesh(raw: "TriangleMesh") -> "TriangleMesh":

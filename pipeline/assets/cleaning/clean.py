@@ -1,9 +1,9 @@
-"""From any triangles to clean ones: unit box, welded, no degenerate or repeated face, canonical.
+"""Mesh cleaning: unit box, welded, no degenerate or repeated face, canonical order.
 
-Clean positions lie on a grid of 2^-20 of the box. That welds (equal cells are one vertex), lets
-zero area be decided exactly in integers, survives the way through float32 unchanged, and makes the
+Clean positions lie on a grid of 2^-20 of the box. The grid welds vertices (equal cells are one
+vertex), decides zero area exactly in integers, passes through float32 unchanged, and makes the
 result independent of the source's scale, offset and order of vertices and faces. The price is a
-shift of at most 5e-7 of the box, and that two vertices closer than one cell may stay apart where
+shift of at most 5e-7 of the box, and that two vertices closer than one cell may stay separate where
 the border of a cell runs between them.
 """
 
@@ -22,32 +22,34 @@ _OFFSET = 1 << (_BITS - 1)
 """A coordinate of the grid lies within +-2^20 and takes 21 bits of a 63-bit key."""
 
 _DIGEST_SHIFT = 3
-"""The digest sees cells eight times as wide (7.6e-6), so that most copies that passed through
-another number format still share it."""
+"""The digest uses cells eight times as wide (7.6e-6), so that most copies that went through another
+number format still share it."""
 
 
-def normalise(mesh: TriangleMesh) -> TriangleMesh:
-    """Return the mesh with its bounding box centred on the origin, the longest side being 1.
+def normalize(mesh: TriangleMesh) -> TriangleMesh:
+    """Return the mesh with its bounding box centered on the origin, the longest side being 1.
 
     Vertices that no face uses are dropped. The mesh must be finite and have an extent.
     """
     used, flat = np.unique(mesh.faces, return_inverse=True)
     positions = mesh.positions[used]
-    low, high = positions.min(axis=0), positions.max(axis=0)
+    low = positions.min(axis=0)
+    high = positions.max(axis=0)
     positions = (positions - (low + high) / 2) / (high - low).max()
     return TriangleMesh(positions=positions, faces=flat.reshape(-1, 3))
 
 
 def clean(mesh: TriangleMesh) -> TriangleMesh:
-    """Return the clean mesh of one in the unit box, possibly without faces (see the module).
+    """Return a clean copy of a mesh in the unit box; it may have no faces left.
 
-    Vertices are sorted by position, faces by vertex, each starting at its lowest vertex. Of faces
-    with the same three vertices one is kept, whatever their windings: orientation comes later.
+    Vertices are sorted by position, faces by vertex, each starting at its lowest vertex. Faces with
+    the same three vertices become one, whatever their windings: orientation comes later.
     """
     cells = np.rint(mesh.positions * GRID).astype(np.int64)
     keys = _keys(cells)
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
-    cells, faces = cells[first], inverse[mesh.faces]
+    cells = cells[first]
+    faces = inverse[mesh.faces]
     faces = faces[_has_area(cells, faces)]
     faces = canonical(faces)
     if len(faces):
@@ -59,9 +61,9 @@ def clean(mesh: TriangleMesh) -> TriangleMesh:
 
 def canonical(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     """Rotate every face to start at its lowest vertex, and sort the faces."""
-    turn = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
-    turned = np.take_along_axis(faces, turn, axis=1)
-    return turned[np.lexsort(turned.T[::-1])]
+    corner_order = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    rotated = np.take_along_axis(faces, corner_order, axis=1)
+    return rotated[np.lexsort(rotated.T[::-1])]
 
 
 def geometry_sha256(mesh: TriangleMesh) -> str:
@@ -73,7 +75,7 @@ def geometry_sha256(mesh: TriangleMesh) -> str:
 
 
 def cell_keys(positions: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return one integer per position [V, 3] of the unit box: equal ones are welded."""
+    """Return one integer per position [V, 3] of the unit box; equal ones are welded."""
     return _keys(np.rint(positions * GRID).astype(np.int64))
 
 
@@ -84,7 +86,7 @@ def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _has_area(cells: NDArray[np.int64], faces: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """[F] whether the corners span a triangle; exact, because products stay below 2^43."""
+    """Return [F] True for nonzero area; exact, because products stay below 2^43."""
     corners = cells[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return (normal != 0).any(axis=1)

@@ -1,4 +1,4 @@
-"""Laws that a source must keep before and after cleaning; each broken one has its reason code."""
+"""Checks of a source before and after cleaning, each with its reason code."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,17 +8,18 @@ from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 
 EXTENT_RANGE = (1e-9, 1e9)
-"""Longest side of the bounding box, in the units of the file."""
+"""Accepted longest side of the bounding box, in the units of the file."""
 
 MAX_OFFSET = 1e5
-"""Distance from the origin in extents: beyond it a float32 vertex is off by 1 % of the object."""
+"""Largest distance from the origin, in extents: beyond it, float32 errors reach 1 % of the object.
+"""
 
 MIN_AREA = 1e-5
-"""Area of the least visible object in the unit box: as long as the box and 1e-5 around."""
+"""Smallest area of an object in the unit box: as long as the box and 1e-5 around."""
 
 MIN_BULK = 0.02
-"""Longest side of the box of 99 % of the area, in the unit box; below it a few far vertices have
-shrunk the object to a dot."""
+"""Smallest longest side of the box that holds 99 % of the area, in the unit box; below it, a few
+far vertices have shrunk the object to a dot."""
 
 
 def check_raw(mesh: TriangleMesh, settings: AssetSettings, *, is_single: bool) -> None:
@@ -27,7 +28,7 @@ def check_raw(mesh: TriangleMesh, settings: AssetSettings, *, is_single: bool) -
     Args:
         mesh: as loaded, in the units of the file.
         settings: the limits.
-        is_single: whether the file stores positions in single precision.
+        is_single: True where the file stores positions in single precision.
     """
     if len(mesh.faces) > settings.max_source_faces:
         raise Rejected(
@@ -38,7 +39,8 @@ def check_raw(mesh: TriangleMesh, settings: AssetSettings, *, is_single: bool) -
         bad = int((~np.isfinite(used)).any(axis=1).sum())
         raise Rejected("nonfinite_vertices", f"{bad} of {len(used)} vertices are not finite")
     with np.errstate(over="ignore"):
-        low, high = used.min(axis=0), used.max(axis=0)
+        low = used.min(axis=0)
+        high = used.max(axis=0)
         extent = float((high - low).max())
         offset = float(np.abs(0.5 * low + 0.5 * high).max())
     if not EXTENT_RANGE[0] <= extent <= EXTENT_RANGE[1]:
@@ -51,7 +53,7 @@ def check_raw(mesh: TriangleMesh, settings: AssetSettings, *, is_single: bool) -
 
 
 def check_clean(mesh: TriangleMesh) -> None:
-    """Raise Rejected where nothing worth rendering is left of a cleaned mesh."""
+    """Raise Rejected where a cleaned mesh has too little area to render."""
     double_areas = np.linalg.norm(mesh.double_area_vectors, axis=1)
     area = 0.5 * float(double_areas.sum())
     bulk = _bulk_extent(mesh.corners.reshape(-1, 3), np.repeat(double_areas, 3)) if area else 0.0
@@ -64,11 +66,11 @@ def check_clean(mesh: TriangleMesh) -> None:
 
 
 def _bulk_extent(points: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-    """Return the longest side of the box that leaves out 0.5 % of the area at either end."""
+    """Return the longest side of the box without the outer 0.5 % of the area at either end."""
     sides = []
     for axis in points.T:
         order = np.argsort(axis, kind="stable")
-        share = np.cumsum(weights[order])
-        low, high = np.searchsorted(share, [0.005 * share[-1], 0.995 * share[-1]])
+        cumulative = np.cumsum(weights[order])
+        low, high = np.searchsorted(cumulative, [0.005 * cumulative[-1], 0.995 * cumulative[-1]])
         sides.append(float(axis[order[min(high, len(order) - 1)]] - axis[order[low]]))
     return max(sides)

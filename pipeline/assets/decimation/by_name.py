@@ -1,4 +1,4 @@
-"""The decimations by name, and the meshes that pymeshlab must not see."""
+"""Decimation methods by name, and the check for meshes that may hang pymeshlab."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,26 +11,26 @@ from pipeline.assets.quality.triangles import count_edges
 from pipeline.foreign.mesh import TriangleMesh
 
 _DETOUR = 8
-"""Sources with more than this many times the budget, and a quarter, are first simplified to it by
-meshoptimizer: its mistakes at that size are far below those of the collapse that follows. Measured
-on 71 objects (study S38): a third to a twentieth of the time, and no more error."""
+"""Multiple of the budget to which meshoptimizer first simplifies larger sources (beyond 1.25 times
+it): its errors at that size are far below those of the collapse that follows. Measured on 71
+objects (study S38): a third to a twentieth of the time, and no more error."""
 
 _MAX_VALENCE = 512
 _MAX_FACES_PER_EDGE = 8
-"""Beyond these, edge collapse and remeshing have been seen to run without end."""
+"""Limits beyond which edge collapse and remeshing ran without end."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Decimation:
-    """A way to make a mesh coarser."""
+    """A decimation method."""
 
     run: Callable[[TriangleMesh, int], TriangleMesh]
-    """Returns a mesh of about so many faces; raises Rejected."""
+    """Returns a mesh of about the given number of faces; raises Rejected."""
     always_ends: bool
-    """Whether it ends on every mesh."""
+    """True where the method ends on every mesh."""
 
 
-def _pre_simplified(mesh: TriangleMesh, budget: int) -> TriangleMesh:
+def _simplify_first(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     if len(mesh.faces) > 1.25 * _DETOUR * budget:
         return clean(meshopt.simplify(mesh, _DETOUR * budget))
     return mesh
@@ -39,13 +39,13 @@ def _pre_simplified(mesh: TriangleMesh, budget: int) -> TriangleMesh:
 def _remesh_evenly(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     from pipeline.assets.decimation import pymeshlab_filters  # may not be installed
 
-    return pymeshlab_filters.remesh_evenly(_pre_simplified(mesh, budget), budget)
+    return pymeshlab_filters.remesh_evenly(_simplify_first(mesh, budget), budget)
 
 
 def _collapse(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     from pipeline.assets.decimation import pymeshlab_filters  # may not be installed
 
-    return pymeshlab_filters.collapse(_pre_simplified(mesh, budget), budget)
+    return pymeshlab_filters.collapse(_simplify_first(mesh, budget), budget)
 
 
 DECIMATIONS: Mapping[str, Decimation] = {
@@ -54,7 +54,7 @@ DECIMATIONS: Mapping[str, Decimation] = {
     "meshoptimizer": Decimation(run=meshopt.simplify, always_ends=True),
     "meshoptimizer_sloppy": Decimation(run=meshopt.simplify_sloppily, always_ends=True),
 }
-"""By the names of `recipe.methods_of`, which says in which order they are tried."""
+"""Methods by the names that `recipe.methods_of` lists in order of trial."""
 
 
 def decimate(mesh: TriangleMesh, budget: int, method: str) -> TriangleMesh:
@@ -63,7 +63,7 @@ def decimate(mesh: TriangleMesh, budget: int, method: str) -> TriangleMesh:
 
 
 def safe_method(mesh: TriangleMesh, method: str) -> str:
-    """Return `method`, or `meshoptimizer` for a mesh on which that method might not end."""
+    """Return `method`, or `meshoptimizer` where that method might not end on the mesh."""
     if DECIMATIONS[method].always_ends:
         return method
     valence = np.bincount(mesh.faces.ravel()).max()

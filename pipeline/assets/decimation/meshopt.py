@@ -1,4 +1,4 @@
-"""meshoptimizer's two simplifiers: no crash, hang or escape from the box has been seen of them.
+"""meshoptimizer's two simplifiers; they never crashed, hung or left the bounding box in tests.
 
 Their vertices are a subset of the source's, which costs about twice the error of edge collapse with
 free placement, at a twentieth of its time.
@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.foreign.mesh import TriangleMesh
 
 _ANY_ERROR = 1e9
-"""The budget decides and the gate judges; the library's own bound would stop it half-way."""
+"""Error bound of the library, set out of reach: the budget and the quality checks decide."""
 
 
 def simplify(mesh: TriangleMesh, budget: int) -> TriangleMesh:
@@ -27,15 +27,15 @@ def simplify_sloppily(mesh: TriangleMesh, budget: int) -> TriangleMesh:
 
 
 def _run(function, mesh: TriangleMesh, budget: int) -> TriangleMesh:  # type: ignore[no-untyped-def]
-    """The library works on float32; clean positions lie on a grid that float32 holds exactly."""
+    """Run a simplifier on float32, which holds the grid of clean positions exactly."""
     corners = np.ascontiguousarray(mesh.faces, np.uint32).reshape(-1)
-    kept = np.zeros_like(corners)
+    simplified = np.zeros_like(corners)
     count = function(
-        kept,
+        simplified,
         corners,
         np.ascontiguousarray(mesh.positions, np.float32),
         target_index_count=3 * budget,
         target_error=_ANY_ERROR,
     )
-    faces = kept[:count].reshape(-1, 3).astype(np.int64)
+    faces = simplified[:count].reshape(-1, 3).astype(np.int64)
     return TriangleMesh(positions=mesh.positions, faces=faces)

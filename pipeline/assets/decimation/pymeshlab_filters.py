@@ -1,6 +1,6 @@
-"""pymeshlab's two filters that we use, with every parameter stated.
+"""The two filters of pymeshlab that the stage calls, with every parameter stated.
 
-pymeshlab takes what a call leaves out from the previous call in the same process, so that results
+pymeshlab takes a missing parameter from the previous call in the same process, so that results
 would depend on history. It may crash or hang: these functions run in child processes only.
 """
 
@@ -14,7 +14,7 @@ REQUIRED_FILTERS = (
     "meshing_decimation_quadric_edge_collapse",
     "meshing_isotropic_explicit_remeshing",
 )
-"""Filters of pymeshlab that this stage calls."""
+"""Names of the pymeshlab filters that the stage calls."""
 
 _COLLAPSE = {
     "targetperc": 0.0,
@@ -30,8 +30,8 @@ _COLLAPSE = {
     "autoclean": True,
     "selected": False,
 }
-"""The values were chosen on 148 objects (study S39): the planar term and the check of normals keep
-flat parts from folding, the low boundary weight keeps borders from spiking."""
+"""Values chosen on 148 objects (study S39): the planar term and the check of normals keep flat
+areas from folding, the low boundary weight keeps borders from spiking."""
 
 _REMESH = {
     "iterations": 10,
@@ -48,15 +48,15 @@ _REMESH = {
 }
 
 _FILL = 0.9
-"""Share of the budget that remeshing aims at: its edge length is met on average only, and the
-collapse that trims what is over would undo the evenness."""
+"""Fraction of the budget that remeshing aims at: its edge length holds on average only, and the
+collapse that trims the excess would undo the evenness."""
 
 
 def collapse(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     """Return the mesh collapsed to at most `budget` faces, in almost all cases.
 
     Quadric edge collapse (Garland and Heckbert 1997). Raises Rejected `decimation_failed` where
-    pymeshlab says so.
+    pymeshlab reports an error.
     """
     return _apply(
         mesh, "meshing_decimation_quadric_edge_collapse", {"targetfacenum": budget, **_COLLAPSE}
@@ -64,11 +64,11 @@ def collapse(mesh: TriangleMesh, budget: int) -> TriangleMesh:
 
 
 def remesh_evenly(mesh: TriangleMesh, budget: int) -> TriangleMesh:
-    """Return the surface with at most `budget` triangles of even size and shape, nearly always.
+    """Return the surface remeshed to at most `budget` even triangles, in almost all cases.
 
     Isotropic explicit remeshing (Hoppe et al. 1993; Botsch and Kobbelt 2004) to the edge length
     that fills most of the budget with equilateral triangles. A source with fewer triangles than the
-    budget gains some. Raises Rejected as `collapse`.
+    budget gains some. Raises Rejected `decimation_failed` too.
     """
     area = 0.5 * float(np.linalg.norm(mesh.double_area_vectors, axis=1).sum())
     edge = float(np.sqrt(4 * area / (np.sqrt(3) * _FILL * budget)))

@@ -1,4 +1,4 @@
-"""The fewest triangles that still pass: a search over budgets."""
+"""A search for the smallest budget that still passes."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -8,39 +8,42 @@ from storage.errors import Rejected
 Result = TypeVar("Result")
 
 _STEP = 2 ** (1 / 8)
-"""Ratio of neighbouring budgets: the result has at most 9 % more triangles than the search could
-have found, and one more trial would halve that."""
+"""Ratio of neighboring budgets: the result has at most 9 % more triangles than the smallest
+possible one, and one more trial would halve that."""
 
 _FEWEST = 4
 """Faces of the smallest closed surface."""
 
 
 def smallest_passing(attempt: Callable[[int], Result], largest: int) -> Result:
-    """Return what `attempt` makes of the smallest budget up to `largest` that it does not reject.
+    """Return the result of `attempt` at the smallest budget up to `largest` that it accepts.
 
-    Halving on a ladder of budgets: six or seven attempts. The error of a decimation falls almost,
-    not exactly, with its budget, so that a smaller budget that passes may be missed; whatever is
-    returned has passed.
+    Bisection over falling budgets: six or seven attempts. The error of a decimation is almost, not
+    exactly, monotonic in its budget, so the search may miss a smaller budget that passes; the
+    returned result always passed.
 
     Raises:
         Rejected: `largest` itself does not pass.
     """
-    budgets = _ladder(largest)
+    budgets = _falling_budgets(largest)
     best = attempt(budgets[0])
-    passed, failed = 0, len(budgets)
+    passed = 0
+    failed = len(budgets)
     while failed - passed > 1:
         middle = (passed + failed) // 2
         try:
-            best, passed = attempt(budgets[middle]), middle
+            best = attempt(budgets[middle])
+            passed = middle
         except Rejected:
             failed = middle
     return best
 
 
-def _ladder(largest: int) -> list[int]:
+def _falling_budgets(largest: int) -> list[int]:
     """Return falling budgets from `largest` down to the fewest faces."""
-    budgets, rung = [largest], float(largest)
-    while (rung := rung / _STEP) >= _FEWEST:
-        if round(rung) < budgets[-1]:
-            budgets.append(round(rung))
+    budgets = [largest]
+    budget = float(largest)
+    while (budget := budget / _STEP) >= _FEWEST:
+        if round(budget) < budgets[-1]:
+            budgets.append(round(budget))
     return budgets

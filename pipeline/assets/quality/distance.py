@@ -1,8 +1,8 @@
-"""How far two surfaces are apart: both ways, by evenly spread points and exact distances.
+"""Two-way distance of two surfaces, by evenly spread points and exact distances.
 
-The 99th percentile rather than the largest value, because one vertex rules the latter; rather than
-the mean, because a mean accepts almost anything. What it cannot see is a part that holds less than
-one percent of the area; `parts.py` looks for those.
+The quality check uses the 99th percentile: one vertex decides the largest value, and a mean accepts
+almost anything. A component with less than one percent of the area escapes it; `Components`
+checks those.
 """
 
 from dataclasses import dataclass
@@ -19,49 +19,54 @@ class SurfacePoints:
     """Points spread evenly over a surface."""
 
     positions: NDArray[np.float64]
-    """[N, 3]"""
+    """[N, 3] positions, in the units of the mesh."""
     faces: NDArray[np.int64]
-    """[N] the face on which each lies."""
+    """[N] face of each point."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Deviation:
-    """What separates a surface from another one, point by point."""
+    """Distances and angles between two surfaces, point by point."""
 
-    there: NDArray[np.float64]
-    """[N] distances from points of the first surface to the second, as shares of the diagonal of
+    to_other: NDArray[np.float64]
+    """[N] distances from points of the first surface to the second, as fractions of the diagonal of
     the first one's bounding box."""
-    back: NDArray[np.float64]
-    """[N] distances from points of the second surface to the first, likewise."""
+    from_other: NDArray[np.float64]
+    """[N] distances from points of the second surface to the first, in the same unit."""
     angle_deg: NDArray[np.float64]
-    """[N] between the normal at each point of the first surface and at the nearest point of the
-    second; 0 to 90, because the nearest point of a thin part may lie on its other side."""
+    """[N] angles between the normal at each point of the first surface and at the nearest point of
+    the second; 0 to 90, because the nearest point of a thin wall may lie on its other side."""
 
     def two_way(self, percentile: float) -> float:
         """Return the larger of the two directions' percentiles."""
-        return float(max(np.percentile(way, percentile) for way in (self.there, self.back)))
+        return float(
+            max(
+                np.percentile(distances, percentile)
+                for distances in (self.to_other, self.from_other)
+            )
+        )
 
 
 def sample_surface(mesh: TriangleMesh, uniform: NDArray[np.float64]) -> SurfacePoints:
-    """Return N points spread evenly by area: one from each of N equal shares of it.
+    """Return N points spread evenly by area: one from each of N equal fractions of it.
 
     Args:
         mesh: at least one face with area.
         uniform: [N, 3] independent numbers in [0, 1).
     """
     total = np.cumsum(np.linalg.norm(mesh.double_area_vectors, axis=1))
-    share = (np.arange(len(uniform)) + uniform[:, 0]) / len(uniform) * total[-1]
-    face = np.minimum(np.searchsorted(total, share, side="right"), len(total) - 1)
+    target = (np.arange(len(uniform)) + uniform[:, 0]) / len(uniform) * total[-1]
+    face = np.minimum(np.searchsorted(total, target, side="right"), len(total) - 1)
     root = np.sqrt(uniform[:, 1])
     weights = np.stack([1 - root, root * (1 - uniform[:, 2]), root * uniform[:, 2]], axis=1)
     return SurfacePoints(positions=np.einsum("ij,ijk->ik", weights, mesh.corners[face]), faces=face)
 
 
 class Surface:
-    """A surface that others are compared with; its points and search tree are made once."""
+    """The reference surface of comparisons, with its points and search tree."""
 
     def __init__(self, mesh: TriangleMesh, uniform: NDArray[np.float64]) -> None:
-        """Sample `mesh`, and later whatever it is compared with, at `uniform` [N, 3]."""
+        """Sample `mesh`, and later each other surface, at `uniform` [N, 3]."""
         self.mesh = mesh
         self.points = sample_surface(mesh, uniform)
         self._uniform = uniform
@@ -70,7 +75,7 @@ class Surface:
         self._tree.init(mesh.positions, mesh.faces)
 
     def deviation(self, other: TriangleMesh) -> Deviation:
-        """Return how far `other` is from this surface, and this surface from it."""
+        """Return the two-way distance between this surface and `other`."""
         points = self.points.positions
         squared, nearest, _ = igl.point_mesh_squared_distance(points, other.positions, other.faces)
         cosine = np.einsum(
@@ -80,8 +85,8 @@ class Surface:
             self.mesh.positions, self.mesh.faces, sample_surface(other, self._uniform).positions
         )[0]
         return Deviation(
-            there=np.sqrt(squared) / self.mesh.diagonal,
-            back=np.sqrt(back) / self.mesh.diagonal,
+            to_other=np.sqrt(squared) / self.mesh.diagonal,
+            from_other=np.sqrt(back) / self.mesh.diagonal,
             angle_deg=np.degrees(np.arccos(np.minimum(np.abs(cosine), 1.0))),
         )
 

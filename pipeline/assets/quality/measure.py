@@ -1,9 +1,9 @@
-"""Everything that is known of a level: measured against the cleaned source, never assumed."""
+"""Measures of a level, all taken against the cleaned source."""
 
 import numpy as np
 
+from pipeline.assets.quality.components import Components
 from pipeline.assets.quality.distance import Deviation, Surface
-from pipeline.assets.quality.parts import Parts
 from pipeline.assets.quality.silhouette import intersection_over_union, silhouette
 from pipeline.assets.quality.triangles import (
     area_variation,
@@ -15,17 +15,17 @@ from storage.records.asset import LevelQuality
 from storage.seeds import rng_for
 
 _NUM_POINTS = 8192
-"""Points per direction: the 99th percentile is then known to within 98.7 to 99.3 (3 sigma)."""
+"""Points per direction: the measured 99th percentile lies between 98.7 and 99.3 (3 sigma)."""
 
 
 class MeasuredSource:
-    """A cleaned source with what its levels are compared with, made once."""
+    """A cleaned source with the reference values of its levels' measures."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
-        """Sample `mesh`, a clean one in the unit box."""
+        """Sample a clean mesh of the unit box."""
         self.mesh = mesh
         self.surface = Surface(mesh, rng_for(0, "asset-error").random((_NUM_POINTS, 3)))
-        self.parts = Parts(self.surface)
+        self.components = Components(self.surface)
         self._silhouette = silhouette(mesh)
         self._area = _area(mesh)
 
@@ -34,27 +34,27 @@ class MeasuredSource:
         return _area(result) / self._area
 
     def silhouette_iou(self, result: TriangleMesh) -> float:
-        """Return how far the outlines agree, 0 to 1."""
+        """Return the intersection over union of the outlines, 0 to 1."""
         return intersection_over_union(self._silhouette, silhouette(result))
 
-    def own_quality(self) -> LevelQuality:
-        """Return the measures of the source as a level of itself: exactly no error."""
+    def source_quality(self) -> LevelQuality:
+        """Return the measures of the unchanged source as a level: the error is exactly 0."""
         none = np.zeros(len(self.surface.points.faces))
-        return self.quality(self.mesh, Deviation(there=none, back=none, angle_deg=none))
+        return self.quality(self.mesh, Deviation(to_other=none, from_other=none, angle_deg=none))
 
     def quality(self, result: TriangleMesh, deviation: Deviation | None = None) -> LevelQuality:
-        """Return all measures of a clean result; `deviation` saves the time to find it again."""
-        found = deviation or self.surface.deviation(result)
+        """Return all measures of a clean result; a known `deviation` saves its computation."""
+        measured = deviation or self.surface.deviation(result)
         return LevelQuality(
-            error_mean=_rounded(max(found.there.mean(), found.back.mean())),
-            error_p99=_rounded(found.two_way(99)),
-            error_max=_rounded(found.two_way(100)),
-            normal_error_deg=_rounded(found.angle_deg.mean()),
-            area_ratio=_rounded(self.area_ratio(result)),
-            silhouette_iou=_rounded(self.silhouette_iou(result)),
-            lost_area=_rounded(self.parts.lost_area(found.there)),
-            area_variation=_rounded(area_variation(result)),
-            min_angle_p5_deg=_rounded(np.percentile(smallest_angles_deg(result), 5)),
+            error_mean=_round_digits(max(measured.to_other.mean(), measured.from_other.mean())),
+            error_p99=_round_digits(measured.two_way(99)),
+            error_max=_round_digits(measured.two_way(100)),
+            normal_error_deg=_round_digits(measured.angle_deg.mean()),
+            area_ratio=_round_digits(self.area_ratio(result)),
+            silhouette_iou=_round_digits(self.silhouette_iou(result)),
+            lost_area=_round_digits(self.components.lost_area(measured.to_other)),
+            area_variation=_round_digits(area_variation(result)),
+            min_angle_p5_deg=_round_digits(np.percentile(smallest_angles_deg(result), 5)),
             open_edges=count_edges(result).open,
         )
 
@@ -63,6 +63,6 @@ def _area(mesh: TriangleMesh) -> float:
     return 0.5 * float(np.linalg.norm(mesh.double_area_vectors, axis=1).sum())
 
 
-def _rounded(value: float) -> float:
-    """Six digits: more than any of these measures has, and short in a file."""
+def _round_digits(value: float) -> float:
+    """Round to six digits: more than these measures have, and short in a file."""
     return float(f"{value:.6g}")

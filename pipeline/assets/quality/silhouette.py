@@ -1,4 +1,4 @@
-"""What a camera notices first: the outline, compared over many directions."""
+"""Comparison of outlines over several directions."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,15 +8,15 @@ from pipeline.foreign.mesh import TriangleMesh
 
 _DIRECTIONS = 8
 _RAYS_PER_SIDE = 64
-"""Rays are 2.8 % of the box apart: one in forty of a large object lies on its outline."""
+"""The ray spacing is 2.8 % of the box: one ray in forty hits the outline of a large object."""
 
 
 def silhouette(mesh: TriangleMesh) -> NDArray[np.bool_]:
-    """Return which rays of a fixed set around the unit box meet the mesh."""
+    """Return True for each ray of a fixed set around the unit box that hits the mesh."""
     return first_faces(mesh, *outside_rays(_DIRECTIONS, _RAYS_PER_SIDE)) >= 0
 
 
 def intersection_over_union(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
-    """Return the share of the rays meeting either that meet both, over all directions together."""
+    """Return the number of rays that hit both over the number that hit either."""
     either = int((a | b).sum())
     return int((a & b).sum()) / either if either else 1.0

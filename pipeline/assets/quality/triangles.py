@@ -1,4 +1,4 @@
-"""The triangles themselves: how even they are, and how they hang together."""
+"""Measures of triangles: evenness, angles, and edges by their number of faces."""
 
 from dataclasses import dataclass
 
@@ -9,18 +9,18 @@ from pipeline.foreign.mesh import TriangleMesh
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeCounts:
-    """Edges by how many faces share them."""
+    """Numbers of edges by how many faces share them."""
 
     open: int
-    """One face: a border."""
+    """Edges of one face: the border of an open surface."""
     nonmanifold: int
-    """Three or more."""
+    """Edges that three or more faces share."""
     most_faces: int
-    """Of any edge."""
+    """Largest number of faces that share one edge."""
 
 
 def area_variation(mesh: TriangleMesh) -> float:
-    """Return the standard deviation of the areas over their mean: 0 where all are equal."""
+    """Return the standard deviation of the areas over their mean; 0 where all are equal."""
     areas = np.linalg.norm(mesh.double_area_vectors, axis=1)
     return float(areas.std() / areas.mean())
 
@@ -35,7 +35,7 @@ def smallest_angles_deg(mesh: TriangleMesh) -> np.ndarray:
 
 
 def count_edges(mesh: TriangleMesh) -> EdgeCounts:
-    """Return how many edges are open or non-manifold."""
+    """Count the open and non-manifold edges."""
     ends = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     shared = np.unique(ends[:, 0] * len(mesh.positions) + ends[:, 1], return_counts=True)[1]
     return EdgeCounts(

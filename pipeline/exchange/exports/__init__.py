@@ -1,1 +1,1 @@
-"""Exports: the samples of a dataset as files that other libraries open."""
+"""Exports of the samples of a dataset to the file formats of other libraries."""

@@ -1,8 +1,8 @@
-"""COCO: masks and boxes of the objects and shell parts that each picture shows.
+"""COCO export: masks and boxes of the visible objects and shells of each picture.
 
     SPLIT/KEY.VIEW.png, annotations/instances_SPLIT.json
 
-Masks are exact: the pixels whose centre shows the object, run-length encoded column by column.
+Masks are exact: pixels whose center shows the object, run-length encoded column by column.
 https://cocodataset.org/#format-data
 """
 
@@ -18,30 +18,30 @@ from storage.records.sample import Sample
 from storage.records.scene import SceneObject
 
 _CATEGORIES = {"object": 1, "shell": 2}
-"""Ids of categories by kind; emitters are hidden from cameras."""
+"""Category ids by kind of object; emitters are hidden from cameras."""
 
 
 def write_coco(samples: Iterator[tuple[str, Sample]], out: Path) -> None:
-    """Write the pictures, and one file of annotations for each split; see the top of this file."""
+    """Write pictures and one annotation file for each split, in the layout of this module."""
     splits: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for split, sample in samples:
-        found = splits.setdefault(split, {"images": [], "annotations": []})
+        tables = splits.setdefault(split, {"images": [], "annotations": []})
         for view in range(sample.scene.num_views):
             name = f"{sample.key}.{view}.png"
             write_png(out / split / name, sample, view)
             size = sample.radiance_rgb.shape[2]
-            image_id = len(found["images"]) + 1
-            found["images"].append(
+            image_id = len(tables["images"]) + 1
+            tables["images"].append(
                 {"id": image_id, "file_name": name, "width": size, "height": size}
             )
             ids = sample.view_passes(["object"], view=view)["object"]
             for annotation in _annotations(ids, sample.scene.objects):
-                number = len(found["annotations"]) + 1
-                found["annotations"].append({"id": number, "image_id": image_id, **annotation})
+                number = len(tables["annotations"]) + 1
+                tables["annotations"].append({"id": number, "image_id": image_id, **annotation})
     categories = [{"id": number, "name": kind} for kind, number in _CATEGORIES.items()]
-    for split, found in splits.items():
+    for split, tables in splits.items():
         path = out / f"annotations/instances_{split}.json"
-        write_json(path, {"info": {}, "licenses": [], "categories": categories, **found})
+        write_json(path, {"info": {}, "licenses": [], "categories": categories, **tables})
 
 
 def _annotations(
@@ -49,19 +49,26 @@ def _annotations(
 ) -> Iterator[dict[str, Any]]:
     """Yield an annotation for each row of `objects` among the ids [R, R] of a picture."""
     for row in np.unique(ids[ids >= 0]).tolist():
-        shown, mask = objects[row], ids == row
+        entry = objects[row]
+        mask = ids == row
         rows, columns = np.nonzero(mask)
-        left, top = int(columns.min()), int(rows.min())
+        min_column = int(columns.min())
+        min_row = int(rows.min())
         yield {
-            "category_id": _CATEGORIES[shown.kind],
+            "category_id": _CATEGORIES[entry.kind],
             "segmentation": {"size": list(mask.shape), "counts": _runs(mask)},
             "area": len(rows),
-            "bbox": [left, top, int(columns.max()) - left + 1, int(rows.max()) - top + 1],
+            "bbox": [
+                min_column,
+                min_row,
+                int(columns.max()) - min_column + 1,
+                int(rows.max()) - min_row + 1,
+            ],
             "iscrowd": 0,
-            "object_name": shown.name,
-            "uid": shown.uid,
-            "licence": shown.licence,
-            "attribution": shown.attribution,
+            "object_name": entry.name,
+            "uid": entry.uid,
+            "licence": entry.licence,
+            "attribution": entry.attribution,
         }
 
 

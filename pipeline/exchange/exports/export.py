@@ -1,16 +1,16 @@
-"""Which exports there are, and how the samples of a dataset go through one."""
+"""Table of the export formats, and the export of a dataset to one of them."""
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
-from pipeline.exchange.chosen import chosen_samples
 from pipeline.exchange.exports.coco import write_coco
 from pipeline.exchange.exports.huggingface import write_huggingface
 from pipeline.exchange.exports.hypersim import write_hypersim
 from pipeline.exchange.exports.nerfstudio import write_nerfstudio
-from pipeline.exchange.exports.scenes import PARTS, write_benchmark, write_scenes
+from pipeline.exchange.exports.scenes import WRITERS, write_benchmark, write_scenes
+from pipeline.exchange.select_samples import select_samples
 from storage.atomic import write_atomically
 from storage.dataset.dataset import open_dataset
 from storage.errors import TrilightError
@@ -21,21 +21,21 @@ ExportForm = Literal[
 ]
 
 Samples = Iterator[tuple[str, Sample]]
-"""Samples with the split of each."""
+"""Samples, each with its split."""
 
 FORMS: dict[str, Callable[[Samples, Path], Sequence[str] | None]] = {
     "nerfstudio": write_nerfstudio,
     "coco": write_coco,
     "huggingface": write_huggingface,
     "hypersim": write_hypersim,
-    **{form: functools.partial(write_scenes, form=form) for form in PARTS},
+    **{form: functools.partial(write_scenes, form=form) for form in WRITERS},
     "benchmark": write_benchmark,
 }
-"""Writers by form; each writes into a folder, the file that names all others last, and returns what
-it could not carry over, where that can happen."""
+"""Writers by format. Each writes into a folder, index files last, and may return sentences about
+losses."""
 
 _RIGHTS = ("LICENSE.md", "attribution.csv")
-"""Files of a dataset that go with every copy of its objects' pictures."""
+"""Files of a dataset on rights, which every export contains."""
 
 
 def export_dataset(
@@ -47,17 +47,17 @@ def export_dataset(
     scene: str | None,
     done: Callable[[Sample], None],
 ) -> Sequence[str]:
-    """Write samples of a dataset in another library's form, with the rights of its objects.
+    """Write samples of a dataset in the format of another library, with the rights of its objects.
 
     Args:
-        source: a dataset, its folder or URL.
+        source: folder or URL of a dataset.
         form: a name of FORMS.
         out: a folder that is empty, or does not exist.
-        split, scene: as `chosen_samples`.
+        split, scene: as `select_samples`.
         done: called with each sample that is read.
 
     Returns:
-        What the form cannot hold, for people.
+        Sentences about what the format cannot hold.
 
     Raises:
         TrilightError: the dataset is unusable, there is no such split or scene, or the folder is
@@ -68,9 +68,9 @@ def export_dataset(
     dataset = open_dataset(source)
 
     def samples() -> Samples:
-        for found in chosen_samples(dataset, split=split, scene=scene):
-            yield found
-            done(found[1])
+        for split_sample in select_samples(dataset, split=split, scene=scene):
+            yield split_sample
+            done(split_sample[1])
 
     lost = FORMS[form](samples(), out)
     for name in _RIGHTS:

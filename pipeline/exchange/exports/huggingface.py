@@ -1,8 +1,8 @@
-"""Hugging Face `datasets`: an image folder, which `load_dataset(FOLDER)` reads without any code.
+"""Hugging Face `datasets` export: an image folder for `load_dataset(FOLDER)`.
 
     SPLIT/metadata.jsonl, SPLIT/KEY.VIEW.{png,depth.tiff,object.tiff,triangle.tiff}
 
-Columns: `image` (8-bit sRGB), `depth` (float32, metres along the axis of the camera, infinite where
+Columns: `image` (8-bit sRGB), `depth` (float32, meters along the axis of the camera, infinite where
 nothing is met), `object` and `triangle` (int32 rows of the scene's objects and triangles, -1 where
 nothing is met), all as pictures; the camera, the picture's noise floor, and the objects' names.
 https://huggingface.co/docs/datasets/image_dataset
@@ -18,26 +18,29 @@ from storage.atomic import write_atomically
 from storage.records.sample import Sample
 
 _PASSES = {"depth": "depth_axis_m", "object": "object", "triangle": "triangle"}
-"""Columns and the passes that they hold."""
+"""Pass of each column."""
 
 
 def write_huggingface(samples: Iterator[tuple[str, Sample]], out: Path) -> None:
-    """Write the pictures, and one table for each split; see the top of this file."""
+    """Write pictures and one table for each split, in the layout of this module."""
     lines: dict[str, list[str]] = {}
     for split, sample in samples:
         for view in range(sample.scene.num_views):
             row = _row(out / split, sample, view)
             lines.setdefault(split, []).append(json.dumps(row, allow_nan=False))
-    for split, found in lines.items():
-        write_atomically(out / split / "metadata.jsonl", "".join(f"{x}\n" for x in found).encode())
+    for split, split_lines in lines.items():
+        write_atomically(
+            out / split / "metadata.jsonl", "".join(f"{x}\n" for x in split_lines).encode()
+        )
 
 
 def _row(folder: Path, sample: Sample, view: int) -> dict[str, Any]:
-    scene, name = sample.scene, f"{sample.key}.{view}"
+    scene = sample.scene
+    name = f"{sample.key}.{view}"
     write_png(folder / f"{name}.png", sample, view)
-    found = sample.view_passes(list(_PASSES.values()), view=view)
-    for column, wanted in _PASSES.items():
-        write_tiff(folder / f"{name}.{column}.tiff", found[wanted])
+    passes = sample.view_passes(list(_PASSES.values()), view=view)
+    for column, pass_name in _PASSES.items():
+        write_tiff(folder / f"{name}.{column}.tiff", passes[pass_name])
     return {
         "file_name": f"{name}.png",
         **{f"{column}_file_name": f"{name}.{column}.tiff" for column in _PASSES},

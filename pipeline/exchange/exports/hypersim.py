@@ -1,13 +1,14 @@
-"""Hypersim: reflectance x illumination + residual = radiance, and geometry, as HDF5 files.
+"""Hypersim export: reflectance x illumination + residual = radiance, and geometry, in HDF5.
 
     KEY/images/scene_cam_00_final_hdf5/frame.VIEW.{color,diffuse_illumination,...}.hdf5
     KEY/images/scene_cam_00_geometry_hdf5/frame.VIEW.{depth_meters,position,normal_cam,...}.hdf5
     KEY/_detail/metadata_{cameras,scene}.csv, KEY/_detail/cam_00/camera_keyframe_*.hdf5
 
 Each file has one array, `dataset`. The residual is all light of the specular lobe, and that of
-surfaces without diffuse reflectance. Where a pixel sees several surfaces, reflectance is that of
-its centre; the product and the residual still add up to the picture. Asset units are metres, and
-cameras are as ours. Nothing is met: NaN, and -1 as id.
+surfaces without diffuse reflectance. Where a pixel shows several surfaces, reflectance is that of
+its center; the product and the residual still add up to the picture. Asset units are meters, and
+poses are camera to world, looking along -Z with +Y up. Pixels without a surface hold NaN, and -1 as
+id.
 https://github.com/apple/ml-hypersim (Roberts et al. 2021)
 """
 
@@ -30,16 +31,16 @@ _GEOMETRY = {
     "normal_world": "shading_normal",
     "render_entity_id": "object",
 }
-"""Files and the passes that they hold; depth is Euclidean there too."""
+"""Pass of each file; depth is the Euclidean distance in both."""
 
 _REFLECTANCE = "material_diffuse"
 
 
 def write_hypersim(samples: Iterator[tuple[str, Sample]], out: Path) -> None:
-    """Write one folder for each sample; see the top of this file.
+    """Write one folder for each sample, in the layout of this module.
 
     Raises:
-        TrilightError: a sample does not keep diffuse and specular light apart.
+        TrilightError: a sample does not store diffuse and specular light separately.
     """
     for _, sample in samples:
         diffuse_rgb = _diffuse_light(sample)
@@ -50,21 +51,23 @@ def write_hypersim(samples: Iterator[tuple[str, Sample]], out: Path) -> None:
 
 def _diffuse_light(sample: Sample) -> NDArray[np.float32]:
     """Return the light [C, R, R, 3] of diffuse lobes."""
-    parts = sample.parts_rgb or {}
-    found = [part for name, part in parts.items() if name.startswith("diffuse")]
-    if not found:
+    components = sample.parts_rgb or {}
+    diffuse_components = [
+        component for name, component in components.items() if name.startswith("diffuse")
+    ]
+    if not diffuse_components:
         raise TrilightError(
-            f"sample {sample.key}: keeps {', '.join(parts) or 'all light together'}; expected "
+            f"sample {sample.key}: keeps {', '.join(components) or 'all light together'}; expected "
             "diffuse and specular light apart. Make the dataset with "
             "--set renders.split_lobes=true."
         )
-    light: NDArray[np.float32] = np.stack(found).sum(axis=0, dtype=np.float32)
+    light: NDArray[np.float32] = np.stack(diffuse_components).sum(axis=0, dtype=np.float32)
     return light if sample.lights_rgb is None else np.stack([view.sum(axis=0) for view in light])
 
 
 def _write_view(images: Path, sample: Sample, view: int, diffuse_rgb: NDArray[np.float32]) -> None:
-    seen = sample.view_passes([_REFLECTANCE, *_GEOMETRY.values()], view=view)
-    reflectance = np.nan_to_num(seen[_REFLECTANCE])
+    passes = sample.view_passes([_REFLECTANCE, *_GEOMETRY.values()], view=view)
+    reflectance = np.nan_to_num(passes[_REFLECTANCE])
     reflects = reflectance > 0
     illumination = np.where(reflects, diffuse_rgb / np.where(reflects, reflectance, 1), 0)
     color = sample.radiance_rgb[view]
@@ -74,7 +77,7 @@ def _write_view(images: Path, sample: Sample, view: int, diffuse_rgb: NDArray[np
         "diffuse_reflectance": reflectance,
         "residual": color - reflectance * illumination,
     }
-    geometry = {name: seen[wanted] for name, wanted in _GEOMETRY.items()}
+    geometry = {name: passes[pass_name] for name, pass_name in _GEOMETRY.items()}
     depth = geometry["depth_meters"]
     geometry["depth_meters"] = np.where(np.isfinite(depth), depth, np.nan)
     for kind, pictures in (("final", shading), ("geometry", geometry)):
@@ -95,7 +98,7 @@ def _write_cameras(detail: Path, sample: Sample) -> None:
 
 
 def _write_array(path: Path, values: NDArray) -> None:
-    """Write floats as float32 and whole numbers as int32; equal arrays give equal bytes."""
+    """Write floats as float32 and integers as int32; equal arrays give equal bytes."""
     stream = io.BytesIO()
     with h5py.File(stream, "w") as file:
         kind = np.int32 if values.dtype.kind == "i" else np.float32

@@ -1,9 +1,9 @@
-"""nerfstudio: a folder a scene, with `transforms.json`, pictures and depths.
+"""nerfstudio export: one folder for each scene, with `transforms.json`, pictures and depths.
 
     KEY/transforms.json, KEY/images/VIEW.png, KEY/depths/VIEW.npy
 
-Poses are ours: camera to world, looking along -Z with +Y up, world +Z up. Depths are along the axis
-of the camera, in millimetres, since nerfstudio multiplies what it reads by 0.001; 0 is unknown.
+Poses are camera to world, looking along -Z with +Y up, world +Z up. Depths are along the axis of
+the camera, in millimeters, since nerfstudio multiplies them by 0.001; 0 is unknown.
 https://docs.nerf.studio/quickstart/data_conventions.html
 """
 
@@ -23,7 +23,7 @@ _MM = np.float32(1000)
 
 
 def write_nerfstudio(samples: Iterator[tuple[str, Sample]], out: Path) -> None:
-    """Write one folder for each sample; see the top of this file."""
+    """Write one folder for each sample, in the layout of this module."""
     for _, sample in samples:
         folder = out / sample.key
         frames = [_frame(folder, sample, view) for view in range(sample.scene.num_views)]
@@ -31,7 +31,8 @@ def write_nerfstudio(samples: Iterator[tuple[str, Sample]], out: Path) -> None:
 
 
 def _frame(folder: Path, sample: Sample, view: int) -> dict[str, Any]:
-    scene, resolution = sample.scene, sample.radiance_rgb.shape[2]
+    scene = sample.scene
+    resolution = sample.radiance_rgb.shape[2]
     depth = sample.view_passes(["depth_axis_m"], view=view)["depth_axis_m"]
     stream = io.BytesIO()
     np.save(stream, np.where(np.isfinite(depth), depth * _MM, np.float32(0)))

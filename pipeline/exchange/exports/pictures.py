@@ -1,4 +1,4 @@
-"""Pictures of a sample as files that common libraries read."""
+"""Writers of PNG, TIFF and JSON files for the exports."""
 
 import io
 import json
@@ -21,12 +21,12 @@ def write_png(path: Path, sample: Sample, view: int) -> None:
 
 
 def write_tiff(path: Path, values: NDArray[np.float32] | NDArray[np.int32]) -> None:
-    """Write one number a pixel [R, R], without loss: 32-bit TIFF of floats or integers."""
+    """Write one value for each pixel [R, R] as a lossless 32-bit TIFF."""
     stream = io.BytesIO()
     Image.fromarray(values).save(stream, "TIFF")
     write_atomically(path, stream.getvalue())
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file with the keys in the order that they have."""
+    """Write a JSON file and keep the order of its keys."""
     write_atomically(path, (json.dumps(value, allow_nan=False) + "\n").encode())

@@ -1,7 +1,7 @@
-"""Materials of a glTF over a mesh of a scene: textures and rows, by the law that objects follow.
+"""Converts glTF materials on a mesh to textures and material rows, as for objects.
 
-glTF reflects more at grazing angles, by Schlick's curve; ours reflects its mean everywhere
-(pipeline.foreign.material).
+glTF reflects more at grazing angles, by Schlick's curve; a scene's material reflects the mean of
+that curve at all angles (pipeline.foreign.material).
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,83 +9,85 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.dressed import PLAIN, DressedTriangles, Worn
 from pipeline.exchange.gltf.meshes import WorldTriangles
-from pipeline.exchange.gltf.textures import SLOTS, Sampled, sample_slots
+from pipeline.exchange.gltf.textures import SLOTS, SampledMaps, sample_slots
 from pipeline.exchange.linear_maps import (
     Map,
-    colour_textures,
+    color_textures,
     constant_map,
     number_texture,
-    on_one_grid,
+    resample_to_largest,
 )
-from pipeline.foreign.material import Seen, SourceMaterial, columns
+from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles, TextureSet
+from pipeline.foreign.material import MaterialSamples, SourceMaterial, source_columns
 from storage.conventions import srgb8
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.records.texture import MapSource
 
 _STRIP = 256
-"""Rows of a map whose columns are computed at a time."""
+"""Number of texel rows whose material columns are computed at a time."""
 
 _MOST_TINTS = 256
-"""Most colors of vertices that are materials of their own; more become a texture."""
+"""Maximum number of vertex colors that become separate materials; more become a texture."""
 
 _MOST_TINTED = 1 << 25
-"""Most texels of all textures of a mesh that differ in the color of its vertices alone."""
+"""Maximum texels of all textures of a mesh that differ in vertex color alone."""
 
 _ROUGH = ("roughness", "glossiness")
 
 
-def dress_triangles(
-    material: SourceMaterial, found: WorldTriangles, source: MapSource, lost: list[str]
-) -> DressedTriangles:
-    """Return triangles with what a material comes to on them.
+def apply_material(
+    material: SourceMaterial, triangles: WorldTriangles, source: MapSource, lost: list[str]
+) -> TexturedTriangles:
+    """Return triangles with the textures and rows of a material.
 
     Args:
-        material: as the file says.
-        found: the triangles, with coordinates and colors.
+        material: the material as the file states it.
+        triangles: the triangles, with coordinates and colors.
         source: name and rights of the textures.
-        lost: receives what cannot be carried over.
+        lost: receives a sentence for each loss.
     """
-    count, most = len(found.positions), _MOST_TINTED
-    shown = sample_slots(material, found.coordinates, lost)
-    if shown.uv is not None:
-        texels = max(values[..., 0].size for values in shown.maps.values())
+    count = len(triangles.positions)
+    most = _MOST_TINTED
+    sampled = sample_slots(material, triangles.coordinates, lost)
+    if sampled.uv is not None:
+        texels = max(values[..., 0].size for values in sampled.maps.values())
         most = min(max(_MOST_TINTED // texels, 1), _MOST_TINTS)
-    tints, worn = _tints(found.colors, count, most, lost)
-    if shown.uv is None and len(tints) > _MOST_TINTS:
-        shown, tints, worn = _with_palette(shown, tints, worn)
+    tints, tint_index = _tints(triangles.colors, count, most, lost)
+    if sampled.uv is None and len(tints) > _MOST_TINTS:
+        sampled, tints, tint_index = _with_palette(sampled, tints, tint_index)
     rows = default_rows(count)
     rows[:, EMISSION] = _emission(material, lost)
-    wardrobe: Sequence[Worn] = (PLAIN,)
-    if shown.uv is not None:
-        wardrobe = [_textures(material, shown.maps, tint, source) for tint in tints]
+    texture_sets: Sequence[TextureSet] = (NO_TEXTURES,)
+    if sampled.uv is not None:
+        texture_sets = [_textures(material, sampled.maps, tint, source) for tint in tints]
     else:
-        values = _columns(material, shown.maps, np.asarray(tints)[None])[0, worn]
-        rows[:, DIFFUSE], rows[:, SPECULAR] = values[:, :3], values[:, 3:6]
+        values = _columns(material, sampled.maps, np.asarray(tints)[None])[0, tint_index]
+        rows[:, DIFFUSE] = values[:, :3]
+        rows[:, SPECULAR] = values[:, 3:6]
         rows[:, ROUGHNESS] = values[:, 6]
-    return DressedTriangles(
-        positions=found.positions,
-        normals=found.normals,
+    return TexturedTriangles(
+        positions=triangles.positions,
+        normals=triangles.normals,
         rows=rows,
-        uv=np.zeros((count, 3, 2), np.float32) if shown.uv is None else shown.uv,
-        worn=worn % len(wardrobe),
-        wardrobe=wardrobe,
+        uv=np.zeros((count, 3, 2), np.float32) if sampled.uv is None else sampled.uv,
+        texture_set_index=tint_index % len(texture_sets),
+        texture_sets=texture_sets,
     )
 
 
 def _textures(
     material: SourceMaterial, maps: Mapping[str, Map], tint: NDArray[np.float64], source: MapSource
-) -> Worn:
+) -> TextureSet:
     """Return the textures of a material whose base color is multiplied by a tint [3]."""
     colored = {name: values for name, values in maps.items() if name not in _ROUGH}
     rough = {name: values for name, values in maps.items() if name in _ROUGH}
     values = _columns(material, colored, tint[None, None])
     roughness = _columns(material, rough, np.ones((1, 1, 3)))[..., 6:]
-    diffuse, specular = colour_textures(
-        _reduced(values[..., :3]), _reduced(values[..., 3:6]), source
+    diffuse, specular = color_textures(
+        _collapse_constant(values[..., :3]), _collapse_constant(values[..., 3:6]), source
     )
-    return diffuse, specular, number_texture(_reduced(roughness), source)
+    return diffuse, specular, number_texture(_collapse_constant(roughness), source)
 
 
 def _columns(
@@ -93,84 +95,88 @@ def _columns(
 ) -> NDArray[np.float32]:
     """Return the columns [H, W, 7] of a material whose base is multiplied by a tint [., ., 3]."""
     names = list(maps)
-    shown = dict(zip(names, on_one_grid(*maps.values()), strict=True)) if names else {}
+    resampled = dict(zip(names, resample_to_largest(*maps.values()), strict=True)) if names else {}
     height, width = np.broadcast_shapes(
-        tint.shape[:2], *(map_.shape[:2] for map_ in shown.values())
+        tint.shape[:2], *(map_.shape[:2] for map_ in resampled.values())
     )
-    found = np.zeros((height, width, 7), np.float32)
+    values = np.zeros((height, width, 7), np.float32)
     for first in range(0, height, _STRIP):
         size = min(_STRIP, height - first)
-        seen = {
-            name: _places(map_[first : first + size] if len(map_) > 1 else map_, size, width)
-            for name, map_ in shown.items()
+        texel_values = {
+            name: _flatten_on_grid(
+                map_[first : first + size] if len(map_) > 1 else map_, size, width
+            )
+            for name, map_ in resampled.items()
         }
-        colors = _places(tint, size, width)
-        seen["base"] = seen["base"][:, :3] * colors if "base" in seen else colors
-        known = Seen(**{name: seen.get(name) for name in SLOTS})
-        rows = columns(material, known, size * width, least_roughness=0)
-        found[first : first + size] = rows.reshape(size, width, 7)
-    return found
+        colors = _flatten_on_grid(tint, size, width)
+        texel_values["base"] = (
+            texel_values["base"][:, :3] * colors if "base" in texel_values else colors
+        )
+        known = MaterialSamples(**{name: texel_values.get(name) for name in SLOTS})
+        rows = source_columns(material, known, size * width, least_roughness=0)
+        values[first : first + size] = rows.reshape(size, width, 7)
+    return values
 
 
-def _places(values: NDArray, height: int, width: int) -> NDArray:
+def _flatten_on_grid(values: NDArray, height: int, width: int) -> NDArray:
     """Return the values [N, C] of a map at each texel of a grid."""
     return np.broadcast_to(values, (height, width, values.shape[2])).reshape(-1, values.shape[2])
 
 
-def _reduced(values: NDArray[np.float32]) -> Map:
-    """Return a map of one texel where all are equal."""
+def _collapse_constant(values: NDArray[np.float32]) -> Map:
+    """Return a map of one texel where all texels are equal."""
     return values[:1, :1] if (values == values[0, 0]).all() else values
 
 
 def _tints(
     colors: NDArray[np.float64] | None, count: int, most: int, lost: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return at most `most` colors [K, 3] of triangles, and the one [T] of each."""
+    """Return at most `most` colors [K, 3], and the index [T] of the color of each triangle."""
     if colors is None or not count:
         return np.ones((1, 3)), np.zeros(count, np.int64)
     if np.ptp(colors, axis=1).max() > 1 / 255:
-        lost.append("colors of vertices: the mean of each triangle")
+        lost.append("colors of vertices: replaced by the mean of each triangle")
     plain = np.clip(np.nan_to_num(colors.mean(axis=1)), 0, 1)
-    tints, worn = _grouped(plain, np.round(plain * 1e6).astype(np.int64))
+    tints, tint_index = _group_colors(plain, np.round(plain * 1e6).astype(np.int64))
     coded = srgb8(plain).astype(np.int64)
     shift = 0
     while len(tints) > most:
-        tints, worn = _grouped(plain, coded >> shift)
+        tints, tint_index = _group_colors(plain, coded >> shift)
         shift += 1
     if shift:
         lost.append("colors of vertices over textures: rounded to a few")
-    return tints, worn
+    return tints, tint_index
 
 
-def _grouped(
+def _group_colors(
     colors: NDArray[np.float64], codes: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the mean color [K, 3] of equal codes [T, 3], and the group [T] of each."""
+    """Group colors by equal codes [T, 3]; return group means [K, 3] and indices [T]."""
     keys = codes @ np.array([1 << 42, 1 << 21, 1])
-    _, worn, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    sums = [np.bincount(worn, colors[:, channel]) for channel in range(3)]
-    return np.stack(sums, axis=1) / counts[:, None], worn.astype(np.int64)
+    _, group_index, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    sums = [np.bincount(group_index, colors[:, channel]) for channel in range(3)]
+    return np.stack(sums, axis=1) / counts[:, None], group_index.astype(np.int64)
 
 
 def _with_palette(
-    found: Sampled, tints: NDArray[np.float64], worn: NDArray[np.int64]
-) -> tuple[Sampled, NDArray[np.float64], NDArray[np.int64]]:
-    """Return many colors as a texture of a texel each, looked up in the middles of texels."""
+    sampled: SampledMaps, tints: NDArray[np.float64], tint_index: NDArray[np.int64]
+) -> tuple[SampledMaps, NDArray[np.float64], NDArray[np.int64]]:
+    """Return many colors as a texture with one texel each, looked up at texel centers."""
     side = int(np.ceil(np.sqrt(len(tints))))
     texels = np.ones((side * side, 4), np.float32)
     texels[: len(tints), :3] = tints
-    base = found.maps.get("base", constant_map([1, 1, 1, 1])) * texels.reshape(side, side, 4)
-    centers = (np.stack([worn % side, worn // side], axis=1) + 0.5) / side
+    base = sampled.maps.get("base", constant_map([1, 1, 1, 1])) * texels.reshape(side, side, 4)
+    centers = (np.stack([tint_index % side, tint_index // side], axis=1) + 0.5) / side
     uv = np.repeat(centers[:, None], 3, axis=1).astype(np.float32)
-    sampled = Sampled(maps={**found.maps, "base": base}, uv=uv)
-    return sampled, np.ones((1, 3)), np.zeros(len(worn), np.int64)
+    with_palette = SampledMaps(maps={**sampled.maps, "base": base}, uv=uv)
+    return with_palette, np.ones((1, 3)), np.zeros(len(tint_index), np.int64)
 
 
 def _emission(material: SourceMaterial, lost: list[str]) -> NDArray[np.float64]:
-    """Return the radiance [3] of a material; of a texture its mean."""
+    """Return the radiance [3] of a material; a texture counts by its mean."""
     radiance: NDArray[np.float64] = np.array(material.emission_rgb)
     if material.emission is not None:
         picture = material.emission.picture
-        lost.append("textures of emission: their means were taken")
+        lost.append("textures of emission: replaced by their means")
         radiance = radiance * picture.linear(picture.values).mean(axis=(0, 1))[:3]
     return radiance

@@ -1,6 +1,6 @@
-"""A glTF file as a scene: meshes in their places, materials with textures, cameras and lights.
+"""Reads a glTF file as a scene: placed meshes, materials with textures, cameras and lights.
 
-Only children with limits come here (pipeline.isolation): a stranger's file is read.
+Only child processes with limits import this (pipeline.isolation), since the file is untrusted.
 """
 
 from collections.abc import Iterator
@@ -12,32 +12,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.dressed import (
-    DressedPiece,
-    DressedTriangles,
-    by_kind,
-    dressed,
-    joined_arrays,
-    scene_with_worn,
-)
-from pipeline.exchange.gltf.materials import dress_triangles
-from pipeline.exchange.gltf.meshes import WorldTriangles
-from pipeline.exchange.gltf.seen_and_lit import (
+from pipeline.exchange.gltf.cameras_and_lights import (
     DIRECTIONAL,
-    camera_of,
+    build_sun_sky,
     even_sky,
     light_triangles,
-    sky_with_suns,
+    read_camera,
 )
+from pipeline.exchange.gltf.materials import apply_material
+from pipeline.exchange.gltf.meshes import WorldTriangles
 from pipeline.exchange.pictures import MAX_PIXELS
-from pipeline.exchange.usd.foreign_cameras import camera_that_sees_all
+from pipeline.exchange.textured_triangles import (
+    TexturedPiece,
+    TexturedTriangles,
+    build_piece,
+    build_textured_scene,
+    join_arrays,
+    split_by_kind,
+)
+from pipeline.exchange.usd.foreign_cameras import fit_camera
 from pipeline.foreign.gltf.document import GltfDocument, refuse_malformed
 from pipeline.foreign.gltf.materials import DEFAULT, GltfMaterials
 from pipeline.foreign.gltf.nodes import PlacedNode, entry, extension, placed_nodes
 from pipeline.foreign.gltf.primitives import PlacedPrimitive, placed_primitives
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material import SourceMaterial
-from pipeline.foreign.picture import decoded
+from pipeline.foreign.picture import decode_image
 from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import ObjectKind, Scene, SceneObject
@@ -50,36 +50,36 @@ _LIMITS = ReadLimits(max_bytes=1 << 30, with_materials=True)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GltfScene:
-    """A scene and what could not be carried over."""
+    """A scene that was read, with its losses."""
 
     scene: Scene
-    """It passes `Scene.check`."""
+    """The scene, which passes `Scene.check`."""
     lost: tuple[str, ...]
-    """For people."""
+    """Sentences about parts of the file that were lost."""
 
 
 def read_gltf(path: Path, licence: str) -> GltfScene:
     """Read the default scene of a file.
 
     Args:
-        path: the file; buffers and pictures lie in its folder or in the file.
-        licence: of its objects and textures, which glTF has no word for.
+        path: the file; buffers and pictures are in its folder or in the file.
+        licence: licence of its objects and textures, which glTF cannot state.
 
     Raises:
-        TrilightError: the file is unusable, holds too much, or is none that a `Scene` can hold.
+        TrilightError: the file is unusable or too large, or a `Scene` cannot hold it.
     """
     try:
         with refuse_malformed("load_error", "the glTF tree is"):
             document = read_source(path, _LIMITS).gltf
             assert document is not None
-            return _Reading(document=document, name=path.name, licence=licence).scene()
+            return _GltfReader(document=document, name=path.name, licence=licence).scene()
     except Rejected as error:
         raise TrilightError(f"{path.name}: {error}") from error
 
 
 @dataclass(kw_only=True, eq=False)
-class _Reading:
-    """One file on its way to a scene."""
+class _GltfReader:
+    """State of reading one file: the document, names in use and losses."""
 
     document: GltfDocument
     name: str
@@ -88,30 +88,32 @@ class _Reading:
     names: dict[str, int] = field(default_factory=dict)
 
     def scene(self) -> GltfScene:
-        """Return what the file shows."""
+        """Build the scene of the file."""
         tree = self.document.tree
         nodes = list(placed_nodes(tree))
-        shown = [placed for placed in nodes if placed.is_visible]
-        pieces = [piece for placed in shown for piece in self._pieces(placed)]
+        visible = [placed for placed in nodes if placed.is_visible]
+        pieces = [piece for placed in visible for piece in self._pieces(placed)]
         if not pieces:
             raise TrilightError(f"{self.name}: no triangle with an area is placed.")
         points = np.concatenate([each.piece.mesh.positions for each in pieces])
         reach = float(np.linalg.norm(np.ptp(points, axis=0)))
-        pieces += [piece for placed in shown for piece in self._lights(placed, reach)]
-        arrays = joined_arrays(pieces)
-        seen = [camera_of(tree, placed, self.lost) for placed in nodes if "camera" in placed.node]
-        poses = [each for each in seen if each is not None]
+        pieces += [piece for placed in visible for piece in self._lights(placed, reach)]
+        arrays = join_arrays(pieces)
+        cameras = [
+            read_camera(tree, placed, self.lost) for placed in nodes if "camera" in placed.node
+        ]
+        poses = [each for each in cameras if each is not None]
         if poses:
             c2w = np.stack([pose for pose, _ in poses]).astype(np.float32)
             fov_deg = np.array([angle for _, angle in poses], np.float32)
         else:
             self.lost.append("no camera: one was added that sees everything")
-            c2w, fov_deg = camera_that_sees_all(points)
-        sky = sky_with_suns([each for placed in shown for each in self._suns(placed)], self.lost)
+            c2w, fov_deg = fit_camera(points)
+        sky = build_sun_sky([each for placed in visible for each in self._suns(placed)], self.lost)
         if sky is None and not any(each.piece.entry.kind == "emitter" for each in pieces):
             self.lost.append("no light: an even sky of radiance 1 lights it")
             sky = even_sky()
-        scene = scene_with_worn(
+        scene = build_textured_scene(
             arrays,
             pieces,
             c2w=c2w,
@@ -122,14 +124,14 @@ class _Reading:
         lost = dict.fromkeys([*self.document.unread, *self.lost])
         return GltfScene(scene=scene, lost=tuple(lost))
 
-    def _pieces(self, placed: PlacedNode) -> Iterator[DressedPiece]:
+    def _pieces(self, placed: PlacedNode) -> Iterator[TexturedPiece]:
         if "mesh" not in placed.node:
             return
         mesh = entry(self.document.tree, "meshes", placed.node["mesh"])
         name = str(placed.node.get("name") or mesh.get("name") or "object")
         for primitive in placed_primitives(self.document, placed):
-            for kind, triangles in by_kind(self._triangles(primitive)):
-                yield dressed(self._entry(name, kind), triangles)
+            for kind, triangles in split_by_kind(self._triangles(primitive)):
+                yield build_piece(self._entry(name, kind), triangles)
 
     @cached_property
     def _materials(self) -> GltfMaterials:
@@ -137,7 +139,7 @@ class _Reading:
 
     def _decode(self, data: bytes, name: str) -> NDArray:
         try:
-            return decoded(data, name, MAX_PIXELS)
+            return decode_image(data, name, MAX_PIXELS)
         except Rejected as why:
             if why.reason != "texture_too_large":
                 raise
@@ -146,13 +148,13 @@ class _Reading:
             ) from why
 
     def _material(self, number: int | None) -> SourceMaterial:
-        found = DEFAULT if number is None else self._materials.material(number)
-        self.lost += [f"{word} of materials" for word in found.lost if word != "emission"]
-        return found
+        material = DEFAULT if number is None else self._materials.material(number)
+        self.lost += [f"{word} of materials" for word in material.lost if word != "emission"]
+        return material
 
-    def _triangles(self, primitive: PlacedPrimitive) -> DressedTriangles:
-        found = WorldTriangles(primitive)
-        if found.without_area:
+    def _triangles(self, primitive: PlacedPrimitive) -> TexturedTriangles:
+        triangles = WorldTriangles(primitive)
+        if triangles.num_without_area:
             self.lost.append("triangles without an area")
         number = primitive.primitive.material
         row = {} if number is None else entry(self.document.tree, "materials", number)
@@ -161,10 +163,10 @@ class _Reading:
             licence=self.licence,
             attribution=self._attribution(),
         )
-        return dress_triangles(self._material(number), found, source, self.lost)
+        return apply_material(self._material(number), triangles, source, self.lost)
 
     def _light(self, placed: PlacedNode) -> dict[str, Any] | None:
-        """Return the JSON of the light of a node; None where it has none."""
+        """Return the JSON of a node's light; None where it has none."""
         reference = extension(placed.node, "KHR_lights_punctual")
         if "light" not in reference:
             return None
@@ -172,13 +174,13 @@ class _Reading:
             extension(self.document.tree, "KHR_lights_punctual"), "lights", reference["light"]
         )
 
-    def _lights(self, placed: PlacedNode, reach: float) -> Iterator[DressedPiece]:
+    def _lights(self, placed: PlacedNode, reach: float) -> Iterator[TexturedPiece]:
         light = self._light(placed)
         if light is not None and light.get("type") != DIRECTIONAL:
-            found = light_triangles(light, placed, reach, self.lost)
+            triangles = light_triangles(light, placed, reach, self.lost)
             name = str(placed.node.get("name") or "light")
-            if found is not None:
-                yield dressed(self._entry(name, "emitter"), found)
+            if triangles is not None:
+                yield build_piece(self._entry(name, "emitter"), triangles)
 
     def _suns(self, placed: PlacedNode) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
         light = self._light(placed)

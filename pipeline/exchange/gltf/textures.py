@@ -1,7 +1,7 @@
-"""The pictures of a source's material, as maps of linear values over the coordinates of a mesh.
+"""Samples the pictures of a material as linear maps over the coordinates of a mesh.
 
-A material has one set of coordinates here: that of its first picture. A picture with others becomes
-its mean.
+A material has one set of coordinates here: that of its first picture. A picture with another set
+becomes its mean.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.linear_maps import Map, constant_map
-from pipeline.exchange.wrapping import repeated_near_zero, tiled, tiles_of
+from pipeline.exchange.wrapping import choose_tiles, expand_tiles, shift_near_zero
 from pipeline.foreign.material import Slot, SourceMaterial
 
 SLOTS: Mapping[str, str] = {
@@ -22,66 +22,74 @@ SLOTS: Mapping[str, str] = {
     "specular_strength": "specular_strength_map",
     "glossiness": "glossiness",
 }
-"""Fields of `Seen`, and the slot of `SourceMaterial` that shows each."""
+"""Slot of `SourceMaterial` for each field of `MaterialSamples`."""
 
 Coordinates = Callable[[int], NDArray[np.float64] | None]
-"""Gives a set of texture coordinates [T, 3, 2] of a mesh by its number, v up."""
+"""Function from the number of a set to its texture coordinates [T, 3, 2], v up."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sampled:
-    """What the pictures of a material show over a mesh."""
+class SampledMaps:
+    """Linear maps of a material's pictures, and the coordinates of a mesh in them."""
 
     maps: Mapping[str, Map]
-    """By the field of `Seen`: [H, W, 4] linear, the bottom row first."""
+    """[H, W, 4] linear values by the field of `MaterialSamples`, the bottom row first."""
     uv: NDArray[np.float32] | None
-    """[T, 3, 2] where the maps are looked up; None where all are constants."""
+    """[T, 3, 2] coordinates in the maps; None where all maps are constants."""
 
 
-def sample_slots(material: SourceMaterial, coordinates: Coordinates, lost: list[str]) -> Sampled:
+def sample_slots(
+    material: SourceMaterial, coordinates: Coordinates, lost: list[str]
+) -> SampledMaps:
     """Return the maps of a material.
 
     Args:
-        material: whose first slot decides on coordinates.
-        coordinates: of the mesh.
-        lost: receives what cannot be carried over.
+        material: the material; its first slot decides on the coordinates.
+        coordinates: function that returns a set of coordinates of the mesh.
+        lost: receives a sentence for each loss.
     """
     stated = {name: getattr(material, field) for name, field in SLOTS.items()}
     slots: dict[str, Slot] = {name: slot for name, slot in stated.items() if slot is not None}
     pictures = {name: slot.picture.linear(slot.picture.values) for name, slot in slots.items()}
     first = next(iter(slots.values()), None)
     plain = None if first is None else coordinates(first.uv_set)
-    uv = None if first is None or plain is None else plain @ first.turn.T + first.shift
+    uv = None if first is None or plain is None else plain @ first.uv_matrix.T + first.uv_offset
     if slots and uv is None:
-        lost.append("textures of a mesh without texture coordinates: their means were taken")
-    kept = [
+        lost.append("textures of a mesh without texture coordinates: replaced by their means")
+    same_chart = [
         name
         for name, slot in slots.items()
         if first and uv is not None and _chart(slot) == _chart(first)
     ]
-    if uv is not None and len(kept) < len(slots):
-        lost.append("textures with coordinates unlike the first of their material: their means")
+    if uv is not None and len(same_chart) < len(slots):
+        lost.append(
+            "textures with other coordinates than the first of a material: replaced by means"
+        )
     maps = {name: constant_map(picture.mean(axis=(0, 1))) for name, picture in pictures.items()}
     if uv is None:
-        return Sampled(maps=maps, uv=None)
-    axes, same = [], True
+        return SampledMaps(maps=maps, uv=None)
+    tiles_by_axis = []
+    is_exact = True
     for axis in range(2):
-        texels = max(pictures[name].shape[1 - axis] for name in kept)
-        wraps = [slots[name].picture.wrap[axis] for name in kept]
-        tiles, fits = tiles_of(wraps, uv[..., axis], texels)
-        axes.append(tiles)
-        same &= fits
-    for name in kept:
+        texels = max(pictures[name].shape[1 - axis] for name in same_chart)
+        wraps = [slots[name].picture.wrap[axis] for name in same_chart]
+        tiles, fits = choose_tiles(wraps, uv[..., axis], texels)
+        tiles_by_axis.append(tiles)
+        is_exact &= fits
+    for name in same_chart:
         wrap = slots[name].picture.wrap
-        across = tiled(pictures[name], wrap[0], axes[0], 1)
-        maps[name] = tiled(across, wrap[1], axes[1], 0)
-    moved = (uv - [axes[0].first, axes[1].first]) / [axes[0].count, axes[1].count]
-    near, all_near = repeated_near_zero(moved)
-    if not (same and all_near):
-        lost.append("textures far outside of [0, 1]: some look otherwise there")
-    return Sampled(maps=maps, uv=near.astype(np.float32))
+        across = expand_tiles(pictures[name], wrap[0], tiles_by_axis[0], 1)
+        maps[name] = expand_tiles(across, wrap[1], tiles_by_axis[1], 0)
+    moved = (uv - [tiles_by_axis[0].first, tiles_by_axis[1].first]) / [
+        tiles_by_axis[0].count,
+        tiles_by_axis[1].count,
+    ]
+    near, all_near = shift_near_zero(moved)
+    if not (is_exact and all_near):
+        lost.append("coordinates far outside [0, 1]: some textures look different there")
+    return SampledMaps(maps=maps, uv=near.astype(np.float32))
 
 
 def _chart(slot: Slot) -> tuple[int, bytes, bytes]:
-    """Return what says where a picture lies."""
-    return (slot.uv_set, slot.turn.tobytes(), slot.shift.tobytes())
+    """Return a key that is equal for pictures with the same coordinates."""
+    return (slot.uv_set, slot.uv_matrix.tobytes(), slot.uv_offset.tobytes())

@@ -1,9 +1,9 @@
-"""A scene as GLB: one file that every modelling program, browser and game engine opens.
+"""Writes a scene as GLB, a single file for modeling programs, browsers and game engines.
 
-Our materials become dielectrics of glTF whose reading (pipeline.exchange.gltf.materials) gives ours
-again. The specular albedo F is the mean of Schlick's term, F0 + (F90 - F0)/21. The strength of
-KHR_materials_specular is F90: it is chosen as the strongest channel of F, which then reflects the
-same at every angle, as ours does; the tint gives the other channels. The base colour is
+Materials become glTF dielectrics that reading (pipeline.exchange.gltf.materials) converts back. The
+specular albedo F is the mean of Schlick's term, F0 + (F90 - F0)/21. The strength of
+KHR_materials_specular is F90. It is set to the strongest channel of F, which then reflects the same
+at every angle, as in Trilight; the tint gives the other channels. The base color is
 diffuse / (1 - F). Lamps are surfaces that emit (KHR_materials_emissive_strength).
 """
 
@@ -14,7 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.linear_maps import Map, constant_map, is_constant, linear_map, on_one_grid
+from pipeline.exchange.linear_maps import (
+    Map,
+    constant_map,
+    is_constant,
+    linear_map,
+    resample_to_largest,
+)
 from pipeline.objects.glb import FLOAT, MOST_SPECULAR, UNSIGNED, GlbFile
 from storage.atomic import write_atomically
 from storage.conventions import srgb8
@@ -29,13 +35,13 @@ CARRIED = frozenset(
 """Members of a scene that the file holds (pipeline.exchange.formats)."""
 
 _TO_Y_UP = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)
-"""Quaternion of the node below which all stands as it does in our world."""
+"""Quaternion of the root node, which rotates +Z up to the +Y up of glTF."""
 
 _USED = ["KHR_materials_specular", "KHR_materials_emissive_strength"]
 
 
 def write_gltf(path: Path, scene: Scene) -> tuple[str, ...]:
-    """Write a scene, and return what of CARRIED does not come back whole.
+    """Write a scene, and return sentences about members in CARRIED that lose something.
 
     Args:
         path: ends in `.glb`.
@@ -56,7 +62,7 @@ def write_gltf(path: Path, scene: Scene) -> tuple[str, ...]:
 def encode_scene_glb(scene: Scene) -> bytes:
     """Return a scene as the bytes of a GLB file; its environment and rights are left out."""
     file = GlbFile()
-    parts = list(_parts(scene))
+    parts = list(_group_triangles(scene))
     nodes: list[dict[str, Any]] = [{"rotation": list(_TO_Y_UP), "children": []}]
     meshes = list[dict[str, Any]]()
     for row, entry in enumerate(scene.objects):
@@ -78,10 +84,10 @@ def encode_scene_glb(scene: Scene) -> bytes:
         "materials": [_material(file, scene, row) for row in range(len(scene.materials))],
         "extensionsUsed": _USED,
     }
-    return file.encoded()
+    return file.encode()
 
 
-def _parts(scene: Scene) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
+def _group_triangles(scene: Scene) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
     """Yield object, material and triangles of each pair of the two."""
     pair = scene.object_index.astype(np.int64) << 16 | scene.material_index
     order = np.argsort(pair, kind="stable")
@@ -97,7 +103,8 @@ def _primitive(
     if scene.uv is None:
         vertices, indices = np.unique(corners, return_inverse=True)
     else:
-        vertices, indices = corners, np.arange(len(corners))
+        vertices = corners
+        indices = np.arange(len(corners))
     points = scene.vertex_positions[vertices].astype("<f4")
     bounds = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
     normals = scene.vertex_normals[vertices].astype("<f4")
@@ -117,22 +124,23 @@ def _primitive(
 
 
 def _material(file: GlbFile, scene: Scene, row: int) -> dict[str, Any]:
-    values, maps = scene.materials[row], _maps(scene, row)
-    diffuse, specular = on_one_grid(maps["diffuse"], maps["specular"])
+    values = scene.materials[row]
+    maps = _maps(scene, row)
+    diffuse, specular = resample_to_largest(maps["diffuse"], maps["specular"])
     strength = float(specular.max())
     base: Map = np.clip(diffuse / np.maximum(1 - specular, 1e-6), 0, 1).astype(np.float32)
-    share: Map = np.clip((21 * specular / max(strength, 1e-6) - 1) / 20, 0, 1).astype(np.float32)
+    tint: Map = np.clip((21 * specular / max(strength, 1e-6) - 1) / 20, 0, 1).astype(np.float32)
     surface: dict[str, Any] = {"metallicFactor": 0.0}
     lobe: dict[str, Any] = {"specularFactor": strength}
     if is_constant(base):
         surface["baseColorFactor"] = [*base[0, 0].astype(float).tolist(), 1.0]
     else:
         surface["baseColorTexture"] = {"index": file.picture(srgb8(base))}
-    if is_constant(share):
-        lobe["specularColorFactor"] = (MOST_SPECULAR * share[0, 0].astype(float)).tolist()
+    if is_constant(tint):
+        lobe["specularColorFactor"] = (MOST_SPECULAR * tint[0, 0].astype(float)).tolist()
     else:
         lobe["specularColorFactor"] = [MOST_SPECULAR] * 3
-        lobe["specularColorTexture"] = {"index": file.picture(srgb8(share))}
+        lobe["specularColorTexture"] = {"index": file.picture(srgb8(tint))}
     if is_constant(maps["roughness"]):
         surface["roughnessFactor"] = float(maps["roughness"][0, 0, 0])
     else:
@@ -150,9 +158,9 @@ def _material(file: GlbFile, scene: Scene, row: int) -> dict[str, Any]:
 
 
 def _maps(scene: Scene, row: int) -> Mapping[str, Map]:
-    """Return what a material says of each column that a texture may stand for."""
-    places = {"diffuse": DIFFUSE, "specular": SPECULAR, "roughness": ROUGHNESS}
-    maps = {name: constant_map(scene.materials[row, part]) for name, part in places.items()}
+    """Return the map of each column of a material that may be textured."""
+    column_slices = {"diffuse": DIFFUSE, "specular": SPECULAR, "roughness": ROUGHNESS}
+    maps = {name: constant_map(scene.materials[row, part]) for name, part in column_slices.items()}
     if scene.material_textures is not None:
         for name, texture in zip(TEXTURED, scene.material_textures[row], strict=True):
             if texture >= 0:

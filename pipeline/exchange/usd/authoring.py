@@ -1,7 +1,7 @@
-"""Writing prims and attributes straight into a layer: a hundred times fewer calls than by schema.
+"""Writes prims and attributes straight into a layer, with a hundredth of the calls of schemas.
 
-An attribute is stated as (type name of USD, value); a table of them by name is both what is written
-and what an exact reader expects to find.
+An attribute is a pair (USD type name, value). The writer and the exact reader use the same tables
+of attributes by name: one writes the values, the other compares them.
 """
 
 import functools
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.exchange.usd.names import NAMESPACE
 
 Attributes = Mapping[str, tuple[str, Any]]
-"""Type name and value of each attribute; a type that begins with "uniform " is uniform."""
+"""Type name and value of each attribute by name; the prefix "uniform " sets its variability."""
 
 UNIFORM = "uniform "
 
@@ -56,9 +56,9 @@ def add_relationship(prim: Any, name: str, target: str) -> None:
 
 
 def add_link(prim: Any, name: str, kind: str, source: str | None = None) -> None:
-    """Write an input or output, connected to an output where there is a source.
+    """Write an input or output, connected to the output `source` where that is given.
 
-    Where the prim has it with a value, the value stays.
+    An existing attribute keeps its value.
     """
     from pxr import Sdf
 
@@ -67,19 +67,19 @@ def add_link(prim: Any, name: str, kind: str, source: str | None = None) -> None
         link.connectionPathList.explicitItems = [_target(source)]
 
 
-def as_expected(prim: Any, attributes: Attributes) -> bool:
-    """Return whether a prim holds these attributes with these values and no other time."""
+def has_attributes(prim: Any, attributes: Attributes) -> bool:
+    """Return whether a prim has these attributes with these values and no time samples."""
     for name, (kind, value) in attributes.items():
-        found = prim.attributes.get(name)
-        if found is None or found.HasInfo("timeSamples"):
+        attribute = prim.attributes.get(name)
+        if attribute is None or attribute.HasInfo("timeSamples"):
             return False
-        if found.typeName != _value_type(kind) or found.default != usd_value(kind, value):
+        if attribute.typeName != _value_type(kind) or attribute.default != usd_value(kind, value):
             return False
     return True
 
 
 def _target(path: str) -> Any:
-    """Return the path by which others name a prim: the one that it has once variants are chosen."""
+    """Return the path of a prim as other prims name it, without variant selections."""
     from pxr import Sdf
 
     return Sdf.Path(path).StripAllVariantSelections()
@@ -93,13 +93,13 @@ def _value_type(kind: str) -> Any:
 
 
 def usd_value(kind: str, value: Any) -> Any:
-    """Return a value as USD holds one of that type."""
+    """Return a value as the USD type `kind`."""
     return _converter(kind)(value)
 
 
 @functools.cache
 def _converter(kind: str) -> Callable[[Any], Any]:
-    """Return what makes USD's value of ours; asked once a type, since scenes have 10^5 values."""
+    """Return the converter to a USD type; cached, since scenes have 10^5 values."""
     from pxr import Gf, Sdf, Vt
 
     known: dict[str, Callable[[Any], Any]] = {
@@ -116,7 +116,7 @@ def _converter(kind: str) -> Callable[[Any], Any]:
         "double3": lambda value: Gf.Vec3d(*value),
     }
     plain = kind.removeprefix(UNIFORM)
-    return known.get(plain, _vectors if plain.endswith("[]") else _as_it_is)
+    return known.get(plain, _vectors if plain.endswith("[]") else _identity)
 
 
 def _vectors(values: NDArray[np.float32]) -> Any:
@@ -125,5 +125,5 @@ def _vectors(values: NDArray[np.float32]) -> Any:
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values))
 
 
-def _as_it_is(value: Any) -> Any:
+def _identity(value: Any) -> Any:
     return value

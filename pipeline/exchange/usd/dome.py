@@ -1,9 +1,10 @@
-"""The environment of a scene as a DomeLight of USD, with its map in a file beside the stage.
+"""Writes and reads the environment of a scene as a USD DomeLight with a map file.
 
 A dome has the middle of its picture towards +Z, a quarter from the left towards +X and the top
-towards +Y, whatever the axis of the stage; ours are a cyclic permutation of those. Both directions
-turn by it here, so that a scene comes back bit for bit and other programs show what we render. The
-file is an OpenEXR of float32, because half floats end below the radiance of suns.
+towards +Y, whatever the axis of the stage; the axes of an `Environment` are a cyclic permutation of
+these. Writing and reading both apply it, so that a scene round-trips bit for bit and other programs
+show the same sky. The file is an OpenEXR of float32, because half floats end below the radiance of
+suns.
 """
 
 import dataclasses
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.pictures import MAX_BYTES, decoded_pixels, linear_rgb
+from pipeline.exchange.pictures import MAX_BYTES, decode_pixels, linear_rgb
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
 from pipeline.exchange.usd.foreign_lights import read_light_color
 from pipeline.exchange.usd.held_materials import parse_map_text
@@ -32,19 +33,19 @@ from storage.records.exr import MAX_RESOLUTION, decode_exr, encode_channels
 from storage.records.texture import MapSource
 
 TO_OUR_AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""From the axes of a dome to those of a map: X becomes Y, Y becomes Z, Z becomes X."""
+"""Rotation from the axes of a dome to those of a map: X to Y, Y to Z, Z to X."""
 
 _PATH = "inputs:texture:file"
 
-_SAME_TURN = 1e-5
-"""Difference up to which a rotation is the one that Trilight wrote: angles have float32 there."""
+_SAME_ROTATION = 1e-5
+"""Tolerance for a rotation that Trilight wrote: other programs keep angles in float32."""
 
 
 def add_dome(layer: Any, path: str, sky: Environment) -> dict[str, bytes]:
-    """Write the prim of an environment, and return the file that it names, by its name.
+    """Write the prim of an environment; return its map file by name.
 
     Raises:
-        TrilightError: the map is larger than OpenEXR files that are read.
+        TrilightError: the map is larger than the OpenEXR reader accepts.
     """
     if max(sky.radiance_rgb.shape) > MAX_RESOLUTION:
         raise TrilightError(
@@ -56,7 +57,7 @@ def add_dome(layer: Any, path: str, sky: Environment) -> dict[str, bytes]:
 
 
 def map_file(sky: Environment) -> str:
-    """Return the name of the file of a map: equal maps have one file."""
+    """Return the file name of a map; equal maps share a file."""
     return f"sky-{sky.sha256[:16]}.exr"
 
 
@@ -77,7 +78,7 @@ def dome_attributes(sky: Environment) -> Attributes:
 
 
 def sky_attributes(sky: Environment | None) -> Attributes:
-    """Return what the prim of a scene says of its environment: nothing where there is none."""
+    """Return the attributes of a scene's prim about its environment; empty without one."""
     if sky is None:
         return {}
     return {
@@ -90,10 +91,10 @@ def sky_attributes(sky: Environment | None) -> Attributes:
     }
 
 
-def dome_as_written(prim: Any, layer: Any, opened: OpenedUsd) -> Environment:
-    """Return the environment of a prim that `add_dome` wrote; raises LookupError without a file."""
-    found = opened.inside(layer, prim.attributes[_PATH].default.path)
-    data = None if found is None else asset_bytes(found, MAX_BYTES)
+def read_exact_dome(prim: Any, layer: Any, opened: OpenedUsd) -> Environment:
+    """Read the environment that `add_dome` wrote; raises LookupError without its file."""
+    resolved = opened.resolve(layer, prim.attributes[_PATH].default.path)
+    data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
     if data is None:
         raise LookupError(_PATH)
     matrix = np.array(prim.attributes["xformOp:transform"].default).T
@@ -106,48 +107,48 @@ def dome_as_written(prim: Any, layer: Any, opened: OpenedUsd) -> Environment:
     )
 
 
-def foreign_dome(
+def read_foreign_dome(
     prim: Any, to_world: NDArray[np.float64], time: Any, opened: OpenedUsd, licence: str
 ) -> Environment | None:
-    """Return the environment of any DomeLight, or None, with a note, where it cannot be read.
+    """Read the environment of any DomeLight; return None, with a note, where it is unusable.
 
     Args:
         prim: the light.
-        to_world: [4, 4] into our world.
-        time: of the values.
-        opened: the file; what is lost is noted there.
-        licence: of a map that states none.
+        to_world: [4, 4] transform to world space.
+        time: time code of the values.
+        opened: the open file, which collects notes on losses.
+        licence: licence of a map that states none.
 
     Raises:
-        TrilightError: its file is outside of the folder or on the network.
+        TrilightError: the map file is outside the folder or on the network.
     """
-    place = str(prim.GetPath())
-    radiance = _picture(prim, time, opened)
+    prim_path = str(prim.GetPath())
+    radiance = _read_map(prim, time, opened)
     if radiance is None:
         return None
     tinted = radiance * read_light_color(prim, time, opened.lost)
-    left, _, right = np.linalg.svd(to_world[:3, :3] @ _turn_pole(prim))
-    turn = left @ right
-    if np.linalg.det(turn) < 0:
-        opened.lost.append(f"{place}: a mirrored dome; its light was left out")
+    left_basis, _, right_basis = np.linalg.svd(to_world[:3, :3] @ _pole_rotation(prim))
+    rotation = left_basis @ right_basis
+    if np.linalg.det(rotation) < 0:
+        opened.lost.append(f"{prim_path}: a mirrored dome; its light was left out")
         return None
-    seen = prim.GetAttribute(VISIBLE_TO_CAMERA)
+    visibility = prim.GetAttribute(VISIBLE_TO_CAMERA)
     sky = Environment(
         radiance_rgb=tinted.astype(np.float32),
-        rotation=(turn @ TO_OUR_AXES.T).astype(np.float32),
-        is_seen=bool(seen and seen.Get(time)),
+        rotation=(rotation @ TO_OUR_AXES.T).astype(np.float32),
+        is_seen=bool(visibility and visibility.Get(time)),
         source=MapSource(name=prim.GetName(), licence=licence),
     )
     try:
         sky.check()
     except TrilightError as error:
-        opened.lost.append(f"{place}: {error}; its light was left out")
+        opened.lost.append(f"{prim_path}: {error}; its light was left out")
         return None
     return _take_held(sky, prim, time)
 
 
 def _take_held(sky: Environment, dome: Any, time: Any) -> Environment:
-    """Return an environment with what Trilight once wrote of it on the prim of the scene."""
+    """Return an environment with the values that Trilight wrote on the prim of the scene."""
     stage = dome.GetStage()
     holder = next((prim for prim in stage.Traverse() if prim.HasAttribute(SKY_SOURCE)), None)
     held = None if holder is None else parse_map_text(holder.GetAttribute(SKY_SOURCE).Get(time))
@@ -157,13 +158,13 @@ def _take_held(sky: Environment, dome: Any, time: Any) -> Environment:
     if not dome.HasAttribute(VISIBLE_TO_CAMERA):
         sky = dataclasses.replace(sky, is_seen=bool(holder.GetAttribute(SKY_VISIBLE).Get(time)))
     rows = [holder.GetAttribute(name).Get(time) for name in SKY_ROWS]
-    if None in rows or not np.allclose(rows, sky.rotation, atol=_SAME_TURN):
+    if None in rows or not np.allclose(rows, sky.rotation, atol=_SAME_ROTATION):
         return sky
     return dataclasses.replace(sky, rotation=np.array(rows, np.float32))
 
 
-def _turn_pole(prim: Any) -> NDArray[np.float64]:
-    """Return what turns a dome, whose pole is +Y, to the axis that a DomeLight_1 states."""
+def _pole_rotation(prim: Any) -> NDArray[np.float64]:
+    """Return the rotation of a dome from its pole +Y to the axis that a DomeLight_1 states."""
     from pxr import UsdGeom
 
     stated = prim.GetAttribute("poleAxis")
@@ -174,24 +175,27 @@ def _turn_pole(prim: Any) -> NDArray[np.float64]:
     return np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) if is_turned else np.eye(3)
 
 
-def _picture(prim: Any, time: Any, opened: OpenedUsd) -> NDArray[np.float64] | None:
-    """Return the map [H, 2 H, 3] of a dome: even where it names no file."""
-    place, attribute = str(prim.GetPath()), prim.GetAttribute(_PATH)
+def _read_map(prim: Any, time: Any, opened: OpenedUsd) -> NDArray[np.float64] | None:
+    """Return the map [H, 2 H, 3] of a dome; uniform radiance 1 where it names no file."""
+    prim_path = str(prim.GetPath())
+    attribute = prim.GetAttribute(_PATH)
     asset = attribute.Get(time) if attribute else None
     if asset is None or not asset.path:
         return np.ones((1, 2, 3))
     layout = prim.GetAttribute("inputs:texture:format").Get(time)
     if layout not in (None, "automatic", "latlong"):
-        opened.lost.append(f"{place}: a picture of format {layout}; expected latlong")
+        opened.lost.append(f"{prim_path}: a picture of format {layout}; expected latlong")
         return None
     specs = attribute.GetPropertyStack(time)
-    found = opened.inside(specs[0].layer if specs else opened.root, asset.path)
-    data = None if found is None else asset_bytes(found, MAX_BYTES)
+    resolved = opened.resolve(specs[0].layer if specs else opened.root, asset.path)
+    data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
     if data is None:
-        opened.lost.append(f"{place}: map {asset.path!r:.100} is missing")
+        opened.lost.append(f"{prim_path}: map {asset.path!r:.100} is missing")
         return None
-    pixels = decoded_pixels(data, asset.path, opened.lost)
+    pixels = decode_pixels(data, asset.path, opened.lost)
     if pixels is None:
-        opened.lost.append(f"{place}: map {asset.path!r:.100} is not read; its light was left out")
+        opened.lost.append(
+            f"{prim_path}: map {asset.path!r:.100} is not read; its light was left out"
+        )
         return None
     return linear_rgb(pixels).astype(np.float64)

@@ -1,7 +1,7 @@
-"""Looks at prims of a layer that Trilight may have written, and that may have been edited since.
+"""Checked access to prims that Trilight may have written, and that may have been edited since.
 
-Each function gives what stands there, or raises `Changed`, LookupError, TypeError or ValueError
-where it is not as export writes it.
+Each function returns a value of the layer. It raises `Changed`, LookupError, TypeError or
+ValueError where the layer is not as export writes it.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 T = TypeVar("T")
 
 _PLAIN_INFO = {"specifier", "typeName", "apiSchemas", "documentation", "comment", "displayName"}
-"""What may stand on a prim without changing what it shows."""
+"""Metadata that does not change how a prim looks."""
 
 
 class Changed(Exception):
@@ -21,7 +21,7 @@ class Changed(Exception):
 
 
 def drop_absent(prim: Any, properties: Mapping[str, T], added: set[str]) -> dict[str, T]:
-    """Return what is expected of a prim without what an older Trilight did not write yet."""
+    """Return the expected properties without missing ones that older Trilights did not write."""
     return {
         name: value
         for name, value in properties.items()
@@ -29,37 +29,37 @@ def drop_absent(prim: Any, properties: Mapping[str, T], added: set[str]) -> dict
     }
 
 
-def numbered(folder: Any, name: Callable[[int], str]) -> list[Any]:
-    """Return the children of a folder by their rows; asking it for each by name is quadratic."""
+def children_by_row(folder: Any, name: Callable[[int], str]) -> list[Any]:
+    """Return the children of a prim in the order of their rows; look-ups by name are quadratic."""
     prims = {prim.name: prim for prim in folder.nameChildren}
     return [prims[name(row)] for row in range(len(prims))]
 
 
-def children_of(prim: Any, expected: set[str]) -> Any:
+def require_children(prim: Any, expected: set[str]) -> Any:
     require(set(prim.nameChildren.keys()) == expected)
     return prim.nameChildren
 
 
 def require_plain(prim: Any, properties: set[str]) -> None:
-    """Require that a prim has exactly these properties, and nothing that composes or hides."""
+    """Require that a prim has exactly these properties and no composition or visibility."""
     require(set(prim.properties.keys()) == properties)
     require(set(prim.ListInfoKeys()) <= _PLAIN_INFO)
 
 
-def whole_numbers(prim: Any, name: str) -> NDArray[np.int64]:
+def read_integers(prim: Any, name: str) -> NDArray[np.int64]:
     attribute = prim.attributes[name]
     values = np.array(attribute.default, np.int64)
     require(values.ndim == 1 and not attribute.HasInfo("timeSamples"))
     return values
 
 
-def vectors(prim: Any, name: str) -> NDArray[np.float32]:
+def read_vectors(prim: Any, name: str) -> NDArray[np.float32]:
     attribute = prim.attributes[name]
     values = np.array(attribute.default, np.float32).reshape(-1, 3)
     require(not attribute.HasInfo("timeSamples"))
     return values
 
 
-def require(law: Any) -> None:
-    if not law:
+def require(condition: Any) -> None:
+    if not condition:
         raise Changed

@@ -1,4 +1,4 @@
-"""Cameras of a USD stage as poses and angles of square pictures."""
+"""Reads the cameras of a USD stage as poses and angles of square pictures."""
 
 import math
 from collections.abc import Sequence
@@ -9,44 +9,50 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.usd.names import FOV_DEG
 from pipeline.foreign.numbers import read_number
-from pipeline.foreign.usd.placed import Placed
+from pipeline.foreign.usd.placed import PlacedPrim
 from storage.conventions import look_at_c2w
 
 _FOV_DEG = 40.0
 """Field of view of the camera that is added to a stage without cameras."""
-_SAME = 1e-5
-"""Relative difference up to which a lens is the one that Trilight wrote."""
+_SAME_LENS = 1e-5
+"""Relative tolerance for a lens that Trilight wrote."""
 
 
-def cameras(
-    placed: Sequence[Placed], time: Any, lost: list[str]
+def read_stage_cameras(
+    placed: Sequence[PlacedPrim], time: Any, lost: list[str]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return poses [C, 4, 4] and full angles [C] in degrees; C is 0 where none can be used."""
-    poses, angles = [], []
+    """Return poses [C, 4, 4] and full angles [C] in degrees of the usable cameras."""
+    poses = []
+    angles = []
     for each in placed:
-        found = _camera(each, time, lost)
-        if found is not None:
-            poses.append(found[0])
-            angles.append(found[1])
+        pose_and_angle = _read_camera(each, time, lost)
+        if pose_and_angle is not None:
+            poses.append(pose_and_angle[0])
+            angles.append(pose_and_angle[1])
     return np.array(poses, np.float32).reshape(-1, 4, 4), np.array(angles, np.float32)
 
 
-def camera_that_sees_all(
+def fit_camera(
     points: NDArray[np.float32],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return one camera that sees all points [N, 3], from above and from the side."""
-    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
-    middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-3)
-    away = np.array([0.6, -1.0, 0.6]) / np.linalg.norm([0.6, -1.0, 0.6])
-    eye = middle + away * reach / math.sin(math.radians(_FOV_DEG) / 2)
-    pose = look_at_c2w(eye=eye, target=middle, up=[0, 0, 1])
+    """Return the pose and angle of a camera that sees all points [N, 3], obliquely from above."""
+    low = points.min(axis=0).astype(np.float64)
+    high = points.max(axis=0).astype(np.float64)
+    center = (low + high) / 2
+    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    direction = np.array([0.6, -1.0, 0.6]) / np.linalg.norm([0.6, -1.0, 0.6])
+    eye = center + direction * radius / math.sin(math.radians(_FOV_DEG) / 2)
+    pose = look_at_c2w(eye=eye, target=center, up=[0, 0, 1])
     return pose[None].astype(np.float32), np.array([_FOV_DEG], np.float32)
 
 
-def _camera(placed: Placed, time: Any, lost: list[str]) -> tuple[NDArray[np.float64], float] | None:
+def _read_camera(
+    placed: PlacedPrim, time: Any, lost: list[str]
+) -> tuple[NDArray[np.float64], float] | None:
     from pxr import UsdGeom
 
-    camera, where = UsdGeom.Camera(placed.prim), placed.prim.GetPath()
+    camera = UsdGeom.Camera(placed.prim)
+    where = placed.prim.GetPath()
     lens = (
         camera.GetFocalLengthAttr(),
         camera.GetHorizontalApertureAttr(),
@@ -59,9 +65,9 @@ def _camera(placed: Placed, time: Any, lost: list[str]) -> tuple[NDArray[np.floa
         return None
     angle = math.degrees(2 * math.atan(wide / (2 * focal)))
     held = placed.prim.GetAttribute(FOV_DEG).Get(time)
-    is_held = isinstance(held, float) and math.isclose(held, angle, rel_tol=_SAME)
+    is_held = isinstance(held, float) and math.isclose(held, angle, rel_tol=_SAME_LENS)
     if not is_held and not math.isclose(wide, high, rel_tol=1e-4):
-        lost.append(f"{where}: pictures are square here; its horizontal angle was taken")
+        lost.append(f"{where}: pictures are square; its horizontal angle was used")
     if any(a.Get(time) for a in (camera.GetHorizontalApertureOffsetAttr(),
                                  camera.GetVerticalApertureOffsetAttr())):  # fmt: skip
         lost.append(f"{where}: its shift has no place here")
@@ -72,8 +78,9 @@ def _camera(placed: Placed, time: Any, lost: list[str]) -> tuple[NDArray[np.floa
 
 
 def rigid_pose(matrix: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return a place without its scale; None where it has no direction."""
-    backward, right = matrix[:3, 2], matrix[:3, 0]
+    """Return a transform [4, 4] without its scale; None where it has no direction."""
+    backward = matrix[:3, 2]
+    right = matrix[:3, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         backward = backward / np.linalg.norm(backward)
         right = right - backward * np.einsum("i,i->", right, backward)

@@ -1,9 +1,9 @@
-"""Lights of USD as emissive triangles: rectangles, disks, spheres, cylinders, and meshes.
+"""Converts USD lights to emissive triangles: rectangles, disks, spheres, cylinders and meshes.
 
-Radiance is intensity x 2^exposure x color, divided by the area where the light is normalized: in
-the units of the stage, as UsdLux has it, also where those are no metres. Polygons stand for round
-lights and have exactly their area. Ours emit to both sides; rectangles and disks of USD do so to
-one, which is said.
+Radiance is intensity x 2^exposure x color, divided by the area where the light is normalized. The
+area is in the units of the stage, as UsdLux defines it, even where these are not meters. Polygons
+approximate round lights and have exactly their area. Triangles emit to both sides; rectangles and
+disks of USD emit to one, so a note is added.
 """
 
 import math
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.numbers import FINITE, read_number, read_numbers
 from pipeline.foreign.usd.colors import convert_to_rec709
-from pipeline.foreign.usd.placed import Placed
+from pipeline.foreign.usd.placed import PlacedPrim
 from storage.settings.ranges import Within
 
 _DISK_CORNERS = 24
@@ -30,14 +30,14 @@ _NEUTRAL: Mapping[str, Any] = {
     "inputs:shadow:distance": -1.0,
     "inputs:shadow:falloff": -1.0,
 }
-"""Inputs that have no place here, with the value at which they do nothing."""
+"""Unsupported inputs, each with the value at which it has no effect."""
 
 
 _EXPOSURES = Within(-1000, 1000, unit="stops")
 
 
-def light_triangles(placed: Placed, time: Any, lost: list[str]) -> NDArray[np.float32] | None:
-    """Return the triangles [T, 3, 3] of a light in our world; None where it has no area."""
+def light_triangles(placed: PlacedPrim, time: Any, lost: list[str]) -> NDArray[np.float32] | None:
+    """Return the world-space triangles [T, 3, 3] of a light; None where it has no area."""
     prim = placed.prim
     kind = str(prim.GetTypeName())
 
@@ -57,33 +57,33 @@ def light_triangles(placed: Placed, time: Any, lost: list[str]) -> NDArray[np.fl
         lost.append(f"{prim.GetPath()}: a light without an area")
         return None
     if kind in ("RectLight", "DiskLight"):
-        lost.append(f"{prim.GetPath()}: emits to one side there, and to both sides here")
+        lost.append(f"{prim.GetPath()}: emits to one side in USD, and to both sides in a scene")
     return world.astype(np.float32)
 
 
-def radiance(
-    placed: Placed, triangles: NDArray[np.float32], time: Any, lost: list[str]
+def compute_radiance(
+    placed: PlacedPrim, triangles: NDArray[np.float32], time: Any, lost: list[str]
 ) -> NDArray[np.float32]:
     """Return the radiance [3] that the light API of a prim states.
 
     Args:
-        placed: a light, or a mesh that is one.
-        triangles: [T, 3, 3] in metres, for the area.
-        time: of the values.
-        lost: receives what cannot be carried over.
+        placed: a light, or a mesh with the light API.
+        triangles: [T, 3, 3] in meters, for the area.
+        time: time code of the values.
+        lost: receives a sentence for each loss.
     """
-    found = read_light_color(placed.prim, time, lost)
+    emitted = read_light_color(placed.prim, time, lost)
     if placed.prim.GetAttribute("inputs:normalize").Get(time):
-        area = _area(triangles.astype(np.float64)) / placed.metres**2
-        found = found / max(area, 1e-30)
-    if (found < 0).any():
-        lost.append(f"{placed.prim.GetPath()}: a light below zero; it emits nothing")
-    found = np.maximum(found, 0)
-    return np.where(np.isfinite(found), found, 0).astype(np.float32)
+        area = _area(triangles.astype(np.float64)) / placed.meters_per_unit**2
+        emitted = emitted / max(area, 1e-30)
+    if (emitted < 0).any():
+        lost.append(f"{placed.prim.GetPath()}: negative radiance; the light emits nothing")
+    emitted = np.maximum(emitted, 0)
+    return np.where(np.isfinite(emitted), emitted, 0).astype(np.float32)
 
 
 def read_light_color(prim: Any, time: Any, lost: list[str]) -> NDArray[np.float64]:
-    """Return intensity x 2^exposure x color [3] of any light, tinted by its temperature."""
+    """Return intensity x 2^exposure x color [3] of a light, tinted by its temperature."""
     from pxr import UsdLux
 
     light = UsdLux.LightAPI(prim)
@@ -93,7 +93,7 @@ def read_light_color(prim: Any, time: Any, lost: list[str]) -> NDArray[np.float6
     rgb = read_numbers(stated.Get(time), 3, str(stated.GetPath()))
     color = convert_to_rec709(stated, np.array(rgb))
     kelvin = light.GetColorTemperatureAttr()
-    # Blender switches it on for every light and states none; the default of USD would tint by 4 %
+    # Blender enables temperature on every light but sets none; the USD default would tint by 4 %
     if light.GetEnableColorTemperatureAttr().Get(time) and kelvin.HasAuthoredValue():
         color = color * np.array(UsdLux.BlackbodyTemperatureAsRgb(_read(kelvin, time)))
     _note_losses(prim, time, lost)
@@ -138,38 +138,39 @@ def _area(triangles: NDArray[np.float64]) -> float:
 
 
 def _square() -> NDArray[np.float64]:
-    """Return a square of side 1 in XY that faces -Z, as its light does."""
+    """Return a square of side 1 in XY that faces -Z, the direction of RectLight."""
     a, b, c, d = np.array([[-0.5, -0.5, 0], [-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0]])
     return np.array([[a, b, c], [a, c, d]])
 
 
 def _disk() -> NDArray[np.float64]:
-    """Return a polygon of the area of the unit disk, facing -Z."""
-    turn = -2 * math.pi * np.arange(_DISK_CORNERS) / _DISK_CORNERS
-    rim = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
+    """Return a polygon with the area of the unit disk, facing -Z."""
+    angle = -2 * math.pi * np.arange(_DISK_CORNERS) / _DISK_CORNERS
+    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
     fan = np.stack([np.zeros_like(rim), rim, np.roll(rim, -1, axis=0)], axis=1)
     return fan * math.sqrt(math.pi / _area(fan))
 
 
 def _build_tube() -> NDArray[np.float64]:
-    """Return a tube of length 1 along X, of the area of a cylinder of radius 1 without its ends."""
-    turn = 2 * math.pi * np.arange(_DISK_CORNERS) / _DISK_CORNERS
-    low = np.stack([np.full_like(turn, -0.5), np.cos(turn), np.sin(turn)], axis=1)
+    """Return a tube of length 1 along X, with the area of a cylinder of radius 1 without caps."""
+    angle = 2 * math.pi * np.arange(_DISK_CORNERS) / _DISK_CORNERS
+    low = np.stack([np.full_like(angle, -0.5), np.cos(angle), np.sin(angle)], axis=1)
     low[:, 1:] *= math.pi / _DISK_CORNERS / math.sin(math.pi / _DISK_CORNERS)
     along = np.array([1.0, 0.0, 0.0])
-    high, ahead = low + along, np.roll(low, -1, axis=0)
+    high = low + along
+    ahead = np.roll(low, -1, axis=0)
     sides = [(low, ahead, high), (high, ahead, ahead + along)]
     return np.concatenate([np.stack(side, axis=1) for side in sides])
 
 
 def _sphere() -> NDArray[np.float64]:
-    """Return 128 triangles of the area of the unit sphere, facing out."""
+    """Return 128 triangles with the total area of the unit sphere, facing out."""
     octahedron = np.array(
         [[[x, 0, 0], [0, y, 0], [0, 0, z]] for x in (1, -1) for y in (1, -1) for z in (1, -1)],
         float,
     )
-    turned = np.prod(octahedron.sum(axis=1), axis=1) < 0
-    octahedron[turned] = octahedron[turned][:, ::-1]
+    faces_inward = np.prod(octahedron.sum(axis=1), axis=1) < 0
+    octahedron[faces_inward] = octahedron[faces_inward][:, ::-1]
     faces = octahedron
     for _ in range(2):
         middle = (faces + np.roll(faces, -1, axis=1)) / 2

@@ -1,4 +1,4 @@
-"""A USD mesh as triangles in our world, with the normals that it states or that its faces have."""
+"""Reads a USD mesh as world-space triangles, with its normals or those of its faces."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,78 +6,80 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.dressed import have_areas
-from pipeline.foreign.usd.placed import Placed
+from pipeline.exchange.textured_triangles import have_areas
+from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.polygons import (
     CutMesh,
     MeshPolygons,
     as_array,
     cut_mesh,
     mesh_polygons,
-    moved,
+    place_points,
 )
 from pipeline.foreign.usd.texture_nodes import UvChart, chart_corners
 from pipeline.scenes.shading import smooth_shaded
 
 SMOOTH_ANGLE_DEG = 30.0
-"""Edges up to this angle are smooth where a subdivision surface states no normals."""
+"""Maximum angle of a smooth edge where a subdivision surface states no normals."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TriangleSoup:
-    """Triangles with three corners of their own each."""
+    """Triangles with three separate corners each."""
 
     positions: NDArray[np.float32]  # [T, 3, 3] world
     normals: NDArray[np.float32]  # [T, 3, 3] unit
-    cut: CutMesh  # which corners of the mesh they were: where what lies at them is found
+    cut: CutMesh  # corners of the mesh, for values at them
 
     @property
     def prim(self) -> Any:
-        """The mesh."""
+        """The prim of the mesh."""
         return self.cut.prim
 
     def read_coordinates(self, chart: UvChart, time: Any) -> NDArray[np.float64] | None:
-        """Return texture coordinates [T, 3, 2]; None where not every corner has some."""
+        """Return texture coordinates [T, 3, 2]; None where a corner lacks them."""
         uv = chart_corners(chart, self.cut, time)
         if uv is None or not np.isfinite(uv).all():
             return None
-        for move in chart.moves:
-            uv = np.einsum("ij,tcj->tci", move.turn, uv) + move.translation
+        for move in chart.transforms:
+            uv = np.einsum("ij,tcj->tci", move.matrix, uv) + move.translation
         return uv
 
 
-def read_mesh(placed: Placed, time: Any, lost: list[str]) -> TriangleSoup:
+def read_mesh(placed: PlacedPrim, time: Any, lost: list[str]) -> TriangleSoup:
     """Return the triangles of a mesh that have an area.
 
     Raises:
-        TrilightError: its arrays contradict each other, or are not finite.
+        TrilightError: the arrays of the mesh contradict each other, or are not finite.
     """
-    found = mesh_polygons(placed, time)
-    cut = cut_mesh(found)
+    polygons = mesh_polygons(placed, time)
+    cut = cut_mesh(polygons)
     rows = cut.indices[cut.corners]
-    positions = moved(found.points, placed.to_world)[rows].astype(np.float32)
+    positions = place_points(polygons.points, placed.to_world)[rows].astype(np.float32)
     cross = _cross(positions)
     solid = have_areas(positions, cross)
     if not solid.all():
         lost.append(f"{cut.prim.GetPath()}: {int((~solid).sum())} triangles without an area")
-    cut, positions = cut.select(solid), positions[solid]
-    normals = _normals(found, cut, time, positions, lost)
+    cut = cut.select(solid)
+    positions = positions[solid]
+    normals = _normals(polygons, cut, time, positions, lost)
     return TriangleSoup(positions=positions, normals=normals, cut=cut)
 
 
 def _normals(
-    found: MeshPolygons,
+    polygons: MeshPolygons,
     cut: CutMesh,
     time: Any,
     positions: NDArray[np.float32],
     lost: list[str],
 ) -> NDArray[np.float32]:
-    placed, where = found.placed, cut.prim.GetPath()
+    placed = polygons.placed
+    where = cut.prim.GetPath()
     cross = _cross(positions)
     flat = cross / np.linalg.norm(cross, axis=1, keepdims=True)
     stated = None if placed.skin is not None else _stated_normals(cut.prim, time)
     if stated is None:
-        if not (found.is_smooth or placed.skin is not None) or not len(positions):
+        if not (polygons.is_smooth or placed.skin is not None) or not len(positions):
             return np.repeat(flat[:, None], 3, axis=1).astype(np.float32)
         if placed.skin is not None:
             lost.append(f"{where}: posed by bones; its normals are those of its faces")
@@ -86,13 +88,13 @@ def _normals(
         return _smooth(positions, cut)
     normals = cut.per_corner(*stated)
     if normals is None:
-        lost.append(f"{where}: normals whose number does not fit")
+        lost.append(f"{where}: the number of normals does not match")
         return np.repeat(flat[:, None], 3, axis=1).astype(np.float32)
-    turn = np.linalg.inv(placed.to_world[:3, :3]).T
-    turned = np.einsum("ij,tcj->tci", turn, normals)
-    length = np.linalg.norm(turned, axis=2, keepdims=True)
+    normal_matrix = np.linalg.inv(placed.to_world[:3, :3]).T
+    world_normals = np.einsum("ij,tcj->tci", normal_matrix, normals)
+    length = np.linalg.norm(world_normals, axis=2, keepdims=True)
     usable = np.isfinite(length) & (length > 0)
-    unit = np.where(usable, turned / np.where(usable, length, 1), flat[:, None])
+    unit = np.where(usable, world_normals / np.where(usable, length, 1), flat[:, None])
     return np.asarray(unit, np.float32)
 
 
@@ -112,9 +114,11 @@ def _stated_normals(prim: Any, time: Any) -> tuple[NDArray[np.float64], str] | N
         return None
     primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
     if primvar and primvar.HasValue():
-        values, interpolation = primvar.ComputeFlattened(time), str(primvar.GetInterpolation())
+        values = primvar.ComputeFlattened(time)
+        interpolation = str(primvar.GetInterpolation())
     else:
-        values, interpolation = mesh.GetNormalsAttr().Get(time), str(mesh.GetNormalsInterpolation())
+        values = mesh.GetNormalsAttr().Get(time)
+        interpolation = str(mesh.GetNormalsInterpolation())
     if values is None or len(values) == 0:
         return None
     return as_array(values, np.float64, (-1, 3)), interpolation

@@ -1,4 +1,4 @@
-"""Makes a `Scene` of the placed prims of a stage."""
+"""Builds a `Scene` from the placed prims of a USD stage."""
 
 import math
 from collections.abc import Sequence
@@ -7,22 +7,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.dressed import (
-    PLAIN,
-    DressedPiece,
-    DressedTriangles,
-    by_kind,
-    dressed,
-    joined_arrays,
-    scene_with_worn,
+from pipeline.exchange.textured_triangles import (
+    NO_TEXTURES,
+    TexturedPiece,
+    TexturedTriangles,
+    build_piece,
+    build_textured_scene,
+    join_arrays,
+    split_by_kind,
 )
-from pipeline.exchange.usd.dome import foreign_dome
-from pipeline.exchange.usd.foreign_cameras import camera_that_sees_all, cameras
-from pipeline.exchange.usd.foreign_lights import light_triangles, radiance
-from pipeline.exchange.usd.foreign_materials import dressing
+from pipeline.exchange.usd.dome import read_foreign_dome
+from pipeline.exchange.usd.foreign_cameras import fit_camera, read_stage_cameras
+from pipeline.exchange.usd.foreign_lights import compute_radiance, light_triangles
+from pipeline.exchange.usd.foreign_materials import read_surface_materials
 from pipeline.exchange.usd.foreign_meshes import TriangleSoup, read_mesh
 from pipeline.exchange.usd.names import FOV_DEG, INDEX, OBJECT_TEXTS, parse_camera_row
-from pipeline.foreign.usd.placed import DOMES, Placed, placed_prims
+from pipeline.foreign.usd.placed import DOMES, PlacedPrim, placed_prims
 from pipeline.foreign.usd.solids import SOLIDS
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.scenes.shading import flat_shaded
@@ -33,31 +33,31 @@ from storage.records.scene import ObjectKind, Scene, SceneObject
 
 MAX_TRIANGLES = 1_000_000
 MAX_ROWS = 1 << 16
-"""Maximum number of objects and of materials in a scene."""
+"""Maximum number of objects, and of materials, in a scene."""
 
 
-def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Scene:
-    """Return the scene that a stage shows at a time; what is lost goes to `opened.lost`.
+def build_stage_scene(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Scene:
+    """Build the scene of a stage at a time; `opened.lost` receives notes on losses.
 
     Raises:
-        TrilightError: too much of something, arrays that contradict each other, or no triangle or
-            no light at all.
+        TrilightError: a count exceeds its maximum, arrays contradict each other, or the stage lacks
+            triangles or light.
     """
     placed = sorted(placed_prims(stage, time, opened.lost), key=_read_row)
-    pieces: list[DressedPiece] = []
+    pieces: list[TexturedPiece] = []
     names: set[str] = set()
     triangles = 0
     for each in placed:
         if each.prim.GetTypeName() in ("Camera", *DOMES):
             continue
-        found = _pieces(each, time, opened, licence, names)
-        triangles += sum(len(one.piece.mesh.faces) for one in found)
+        new_pieces = _pieces(each, time, opened, licence, names)
+        triangles += sum(len(one.piece.mesh.faces) for one in new_pieces)
         if triangles > MAX_TRIANGLES:
             raise TrilightError(f"more than {MAX_TRIANGLES} triangles.")
-        pieces += found
+        pieces += new_pieces
         if len(pieces) > MAX_ROWS:
             raise TrilightError(f"more than {MAX_ROWS} objects.")
-    sky = _environment(placed, time, opened, licence)
+    sky = _read_environment(placed, time, opened, licence)
     is_lit = sky is not None and sky.radiance_rgb.any()
     if not is_lit and not any(one.piece.entry.kind == "emitter" for one in pieces):
         unread = "; ".join(note for note in opened.lost if "light" in note.lower())
@@ -68,11 +68,11 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
     materials = sum(len(one.piece.materials) for one in pieces)
     if materials > MAX_ROWS:
         raise TrilightError(f"{materials} materials; expected at most {MAX_ROWS}.")
-    return _scene(pieces, placed, time, opened, sky)
+    return _build_scene(pieces, placed, time, opened, sky)
 
 
-def _read_row(each: Placed) -> float:
-    """Return the row that Trilight once wrote on an object or camera; infinity for any other."""
+def _read_row(each: PlacedPrim) -> float:
+    """Return the row that Trilight wrote on an object or camera; infinity for other prims."""
     prim = each.prim
     row = prim.GetAttribute(INDEX).Get()
     if prim.HasAttribute(FOV_DEG):
@@ -80,21 +80,21 @@ def _read_row(each: Placed) -> float:
     return row if isinstance(row, int) else math.inf
 
 
-def _scene(
-    pieces: Sequence[DressedPiece],
-    placed: Sequence[Placed],
+def _build_scene(
+    pieces: Sequence[TexturedPiece],
+    placed: Sequence[PlacedPrim],
     time: Any,
     opened: OpenedUsd,
     sky: Environment | None,
 ) -> Scene:
-    arrays = joined_arrays(pieces)
-    seen = [each for each in placed if each.prim.GetTypeName() == "Camera"]
-    c2w, fov_deg = cameras(seen, time, opened.lost)
+    arrays = join_arrays(pieces)
+    camera_prims = [each for each in placed if each.prim.GetTypeName() == "Camera"]
+    c2w, fov_deg = read_stage_cameras(camera_prims, time, opened.lost)
     if not len(c2w):
         opened.lost.append("no camera: one was added that sees everything")
-        c2w, fov_deg = camera_that_sees_all(arrays["vertex_positions"])
+        c2w, fov_deg = fit_camera(arrays["vertex_positions"])
     code = time.GetValue() if time.IsNumeric() and not time.IsEarliestTime() else None
-    return scene_with_worn(
+    return build_textured_scene(
         arrays,
         pieces,
         c2w=c2w,
@@ -104,95 +104,97 @@ def _scene(
     )
 
 
-def _environment(
-    placed: Sequence[Placed], time: Any, opened: OpenedUsd, licence: str
+def _read_environment(
+    placed: Sequence[PlacedPrim], time: Any, opened: OpenedUsd, licence: str
 ) -> Environment | None:
-    """Return that of the first dome that can be read; others are noted."""
+    """Return the environment of the first readable dome; note the others."""
     domes = [each for each in placed if each.prim.GetTypeName() in DOMES]
     sky = None
     for each in domes:
         if sky is not None:
-            opened.lost.append(f"{each.prim.GetPath()}: a second dome; one lights a scene here")
+            opened.lost.append(f"{each.prim.GetPath()}: a second dome; a scene has one environment")
             continue
-        sky = foreign_dome(each.prim, each.to_world, time, opened, licence)
+        sky = read_foreign_dome(each.prim, each.to_world, time, opened, licence)
     return sky
 
 
 def _pieces(
-    each: Placed, time: Any, opened: OpenedUsd, licence: str, names: set[str]
-) -> list[DressedPiece]:
+    each: PlacedPrim, time: Any, opened: OpenedUsd, licence: str, names: set[str]
+) -> list[TexturedPiece]:
     prim = each.prim
     if prim.GetTypeName() not in ("Mesh", *SOLIDS):
         triangles = light_triangles(each, time, opened.lost)
         if triangles is None:
             return []
-        light = radiance(each, triangles, time, opened.lost)
-        return _split(each, _of_light(triangles, light), licence, names)
+        light = compute_radiance(each, triangles, time, opened.lost)
+        return _split(each, _build_light(triangles, light), licence, names)
     soup = read_mesh(each, time, opened.lost)
     if not len(soup.positions):
         opened.lost.append(f"{prim.GetPath()}: no triangle with an area")
         return []
-    return _split(each, _of_mesh(each, soup, time, opened, licence), licence, names)
+    return _split(each, _build_mesh(each, soup, time, opened, licence), licence, names)
 
 
-def _of_light(triangles: NDArray[np.float32], light: NDArray[np.float32]) -> DressedTriangles:
+def _build_light(triangles: NDArray[np.float32], light: NDArray[np.float32]) -> TexturedTriangles:
     count = len(triangles)
     rows = default_rows(count)
     rows[:, ROUGHNESS] = 1
     rows[:, EMISSION] = light
     corners = triangles.reshape(-1, 3)
     flat = flat_shaded(corners, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3))
-    return DressedTriangles(
+    return TexturedTriangles(
         positions=triangles,
         normals=flat.normals.reshape(-1, 3, 3),
         rows=rows,
         uv=np.zeros((count, 3, 2), np.float32),
-        worn=np.zeros(count, np.int64),
-        wardrobe=(PLAIN,),
+        texture_set_index=np.zeros(count, np.int64),
+        texture_sets=(NO_TEXTURES,),
     )
 
 
-def _of_mesh(
-    placed: Placed, soup: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
-) -> DressedTriangles:
+def _build_mesh(
+    placed: PlacedPrim, soup: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
+) -> TexturedTriangles:
     prim = placed.prim
-    found = dressing(soup, time, opened, licence)
-    rows = found.rows
+    materials = read_surface_materials(soup, time, opened, licence)
+    rows = materials.rows
     if prim.HasAPI("MeshLightAPI"):
-        light = radiance(placed, soup.positions, time, opened.lost)
+        light = compute_radiance(placed, soup.positions, time, opened.lost)
         mode = prim.GetAttribute("light:materialSyncMode").Get(time)
         glows = rows[:, EMISSION].any()
         tints = mode == "materialGlowTintsLight" and glows
         rows[:, EMISSION] = rows[:, EMISSION] * light if tints else light
         if mode == "materialGlowTintsLight" and not glows:
             opened.lost.append(
-                f"{prim.GetPath()}: its material does not glow; the light's own taken"
+                f"{prim.GetPath()}: its material emits nothing; the radiance of the light is used"
             )
-    return DressedTriangles(
+    return TexturedTriangles(
         positions=soup.positions,
         normals=soup.normals,
         rows=rows,
-        uv=found.uv,
-        worn=found.worn,
-        wardrobe=found.wardrobe,
+        uv=materials.uv,
+        texture_set_index=materials.texture_set_index,
+        texture_sets=materials.texture_sets,
     )
 
 
 def _split(
-    each: Placed, triangles: DressedTriangles, licence: str, names: set[str]
-) -> list[DressedPiece]:
-    """Return the part of a mesh that reflects, and the part that emits, where there are both."""
+    each: PlacedPrim, triangles: TexturedTriangles, licence: str, names: set[str]
+) -> list[TexturedPiece]:
+    """Build an object of the triangles that reflect, and one of those that emit."""
     return [
-        dressed(_entry(each.prim, kind, licence, names), part) for kind, part in by_kind(triangles)
+        build_piece(_entry(each.prim, kind, licence, names), part)
+        for kind, part in split_by_kind(triangles)
     ]
 
 
 def _entry(prim: Any, kind: ObjectKind, licence: str, names: set[str]) -> SceneObject:
-    """Return what is known of a prim: what Trilight once wrote on it, or its name."""
+    """Return the object entry of a prim: values that Trilight wrote on it, or its name."""
     texts = {field: prim.GetAttribute(name).Get() for field, name in OBJECT_TEXTS.items()}
     known = {field: text for field, text in texts.items() if isinstance(text, str)}
     base = known.get("name") or prim.GetName()
-    name, count = base, 1
+    name = base
+    count = 1
     while name in names:
         count += 1
         name = f"{base}.{count}"

@@ -1,7 +1,7 @@
-"""Textures of a USD material: pictures with their colour space, channel, scale and wrapping.
+"""Reads textures of a USD material: pictures with color space, channel, scale and wrap modes.
 
-Where nothing is scaled, the bytes of a picture stay as they are. What a colour space says is taken
-as said; without one, colours in 8 bits are sRGB-encoded, as USD states.
+Without a scale, the bytes of a picture stay unchanged. A stated color space is used; without one,
+colors in 8 bits are sRGB-encoded, as USD specifies.
 """
 
 from dataclasses import dataclass
@@ -10,48 +10,48 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.pictures import MAX_BYTES, Pixels, decoded_pixels, is_encoded
+from pipeline.exchange.pictures import MAX_BYTES, Pixels, decode_pixels, is_encoded
 from pipeline.exchange.wrapping import Wrap
 from pipeline.foreign.usd.stage import OpenedUsd
 from pipeline.foreign.usd.texture_nodes import TextureNode, UvChart, asset_bytes
 from storage.records.texture import MapSource, Texture
 
 _STEPS = 8
-"""Points along an edge of the grid over a triangle; (8 + 1) 8 / 2 of them in all."""
+"""Number of points along an edge of the grid over a triangle; (8 + 1) 8 / 2 in all."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ForeignTexture:
-    """A picture as a material uses it."""
+    """A picture with the settings of its texture node."""
 
     pixels: Pixels
     """[H, W, 1 to 4] as stored, the bottom row first."""
     is_srgb: bool
-    """Whether its colours are sRGB-encoded; alpha is not."""
+    """True where colors are sRGB-encoded; alpha is always linear."""
     wrap: tuple[Wrap, Wrap]
     """Wrap modes along s and t."""
     scale: NDArray[np.float32]
-    """[4]"""
+    """[4] factors of the linear RGBA values."""
     bias: NDArray[np.float32]
-    """[4]"""
+    """[4] offsets that are added after `scale`."""
     chart: UvChart
-    """Where it is looked up."""
+    """Texture coordinates at which the picture is looked up."""
     output: str
-    """rgb, r, g, b or a: what is connected."""
+    """Connected output of the node: rgb, r, g, b or a."""
 
     def texture(self, channels: int, source: MapSource, lost: list[str]) -> Texture:
-        """Return what is connected, as a texture of one or of three channels.
+        """Return the connected output as a texture of one or three channels.
 
-        It does not repeat yet as the picture wraps.
+        The wrap modes of the picture are not applied yet.
         """
         is_plain = (self.scale == 1).all() and (self.bias == 0).all()
         if self.pixels.dtype == np.uint8 and is_plain:
             chosen = _channels(self.pixels, self.output, channels, 255)
             is_srgb = self.is_srgb and not self._is_alpha
             return Texture(texels=np.ascontiguousarray(chosen), is_srgb=is_srgb, source=source)
-        values = _channels(self._scaled(), self.output, channels, 1)
+        values = _channels(self._scale_texels(), self.output, channels, 1)
         if not (values.min() >= 0 and values.max() <= 1):  # or NaN
-            lost.append("texels that are no number from 0 to 1: they were clamped, NaN to 0")
+            lost.append("texels outside [0, 1]: clamped, and NaN replaced by 0")
             values = np.clip(np.nan_to_num(values, nan=0.0), 0, 1)
         return Texture(texels=np.ascontiguousarray(values, np.float32), source=source)
 
@@ -59,9 +59,9 @@ class ForeignTexture:
         """Return the means [T, 3] over triangles with coordinates [T, 3, 2], at 36 points each."""
         points = np.einsum("pk,tkc->tpc", _grid(), uv)
         height, width = self.pixels.shape[:2]
-        columns = _wrapped(points[..., 0], width, self.wrap[0])
-        rows = _wrapped(points[..., 1], height, self.wrap[1])
-        values = _channels(self._scaled(), self.output, 3, 1)
+        columns = _wrap_texels(points[..., 0], width, self.wrap[0])
+        rows = _wrap_texels(points[..., 1], height, self.wrap[1])
+        values = _channels(self._scale_texels(), self.output, 3, 1)
         means: NDArray[np.float32] = np.nan_to_num(values[rows, columns].mean(axis=1), nan=0.0)
         return means.astype(np.float32)
 
@@ -69,30 +69,31 @@ class ForeignTexture:
     def _is_alpha(self) -> bool:
         return self.output == "a"
 
-    def _scaled(self) -> NDArray[np.float32]:
-        """Return linear values [H, W, 4], scaled and moved."""
+    def _scale_texels(self) -> NDArray[np.float32]:
+        """Return linear RGBA values [H, W, 4] with scale and bias applied."""
         values = self.pixels.astype(np.float32)
         if self.pixels.dtype == np.uint8:
             values = values / np.float32(255)
         count = values.shape[2]
-        whole = np.ones((*values.shape[:2], 4), np.float32)
-        whole[..., :3] = values[..., :3] if count >= 3 else values[..., :1]
+        rgba = np.ones((*values.shape[:2], 4), np.float32)
+        rgba[..., :3] = values[..., :3] if count >= 3 else values[..., :1]
         if self.is_srgb:
-            whole[..., :3] = _linear(whole[..., :3])
+            rgba[..., :3] = _linear(rgba[..., :3])
         if count in (2, 4):
-            whole[..., 3] = values[..., -1]
-        return whole * self.scale + self.bias
+            rgba[..., 3] = values[..., -1]
+        return rgba * self.scale + self.bias
 
 
 def read_texture(node: TextureNode, opened: OpenedUsd) -> ForeignTexture | None:
-    """Return the texture of a node, or None with a note where its picture is not readable.
+    """Read the texture of a node; return None, with a note, where its picture is unreadable.
 
     Raises:
-        TrilightError: it is too large.
+        TrilightError: the picture is too large.
     """
     data = None if node.resolved is None else asset_bytes(node.resolved, MAX_BYTES)
-    name, is_color = Path(node.named).name, node.colour_space != "raw"
-    pixels = decoded_pixels(data, name, opened.lost, is_color=is_color) if data else None
+    name = Path(node.named).name
+    is_color = node.color_space != "raw"
+    pixels = decode_pixels(data, name, opened.lost, is_color=is_color) if data else None
     if pixels is None:
         opened.lost.append(
             f"texture {node.named!r:.100}: missing or not readable as a picture"
@@ -100,7 +101,7 @@ def read_texture(node: TextureNode, opened: OpenedUsd) -> ForeignTexture | None:
             else "a texture without a file"
         )
         return None
-    space = node.colour_space
+    space = node.color_space
     return ForeignTexture(
         pixels=pixels[::-1],
         is_srgb=is_encoded(pixels) if space not in ("sRGB", "raw") else space == "sRGB",
@@ -113,7 +114,7 @@ def read_texture(node: TextureNode, opened: OpenedUsd) -> ForeignTexture | None:
 
 
 def _channels(values: NDArray, output: str, channels: int, opaque: int) -> NDArray:
-    """Return one or three channels [H, W, 1 or 3] of a picture for what is connected."""
+    """Return one or three channels [H, W, 1 or 3] of a picture for the connected output."""
     count = values.shape[2]
     if output == "a":
         alpha = values[..., -1:] if count in (2, 4) else np.full_like(values[..., :1], opaque)
@@ -129,8 +130,8 @@ def _linear(encoded: NDArray[np.float32]) -> NDArray[np.float32]:
     return linear.astype(np.float32)
 
 
-def _wrapped(at: NDArray[np.float64], size: int, mode: str) -> NDArray[np.int64]:
-    """Return the texel of coordinates; `black` is treated as `clamp`."""
+def _wrap_texels(at: NDArray[np.float64], size: int, mode: str) -> NDArray[np.int64]:
+    """Return the texel index at coordinates; `black` is treated as `clamp`."""
     if mode == "mirror":
         at = 1 - np.abs(np.mod(at, 2) - 1)
     elif mode in ("clamp", "black"):

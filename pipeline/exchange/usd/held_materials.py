@@ -1,8 +1,8 @@
-"""What Trilight once wrote on a material, where another program has kept it.
+"""Reads the exact material values that Trilight wrote and another program has kept.
 
-Blender keeps the exact values of a material beside the shader that it writes itself. They stand for
-what that shader still shows as Trilight wrote it; a column that was changed there is taken from the
-shader, and said. Blender writes no specular albedo, so that the exact one stays.
+Blender keeps the exact values of a material in addition to its shader. A column that the shader
+still shows as Trilight wrote it gets its exact value; a changed column is read from the shader,
+with a note. Blender writes no specular albedo, so that the exact one stays.
 """
 
 import dataclasses
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.linear_maps import constant_map, over_one
-from pipeline.exchange.usd.foreign_inputs import ShaderInputs, lower_diffuse, worn_textures
+from pipeline.exchange.linear_maps import constant_map, may_exceed_one
+from pipeline.exchange.usd.foreign_inputs import ShaderInputs, build_textures, lower_diffuse
 from pipeline.exchange.usd.foreign_textures import ForeignTexture, read_texture
 from pipeline.exchange.usd.names import (
     ADDED_COLUMNS,
@@ -26,7 +26,7 @@ from pipeline.exchange.usd.names import (
 from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS
 from pipeline.foreign.usd.shaders import surface_shader
 from pipeline.foreign.usd.stage import OpenedUsd
-from pipeline.foreign.usd.texture_nodes import find_sources, is_output, texture_node
+from pipeline.foreign.usd.texture_nodes import find_sources, is_output, read_texture_node
 from storage.records.material import EMISSION, declared_column, default_rows, laid_out
 from storage.records.texture import TEXTURED, MapSource, Texture
 
@@ -35,26 +35,26 @@ _STATED = {
     "specular": ("specularColor", 3),
     "roughness": ("roughness", 1),
 }
-"""Of each column that may be textured: the input of a preview, and its channels."""
+"""Preview input and its channel count, by column that may be textured."""
 
-_SAME = 1e-5
-"""Relative difference up to which a value is what was written: programs count in float32."""
+_SAME_VALUE = 1e-5
+"""Relative tolerance for a value that Trilight wrote: programs compute in float32."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeldMaterial:
-    """The exact values of a material."""
+    """Exact values of a material that Trilight wrote."""
 
     where: str
-    """The path of its prim, for notes."""
+    """Path of the material's prim, for notes."""
     columns: Mapping[str, NDArray[np.float32]]
-    """By the names of the published columns."""
+    """Value of each published column by name."""
     maps: Mapping[str, tuple[str, MapSource]]
-    """Digest, and name and rights, of the texture of each textured column."""
+    """Digest and source of the texture of each textured column."""
 
     @property
     def row(self) -> NDArray[np.float32]:
-        """[10 or more] the columns of `Scene.materials`."""
+        """Row [10 or more] of `Scene.materials` with the exact values."""
         row = default_rows(1)[0]
         for column, part in laid_out():
             if column.name in self.columns:
@@ -63,10 +63,12 @@ class HeldMaterial:
 
 
 def read_held_material(material: Any, time: Any) -> HeldMaterial | None:
-    """Return the exact values of a material; None where it does not hold all of them."""
-    prim, columns = material.GetPrim(), dict[str, NDArray[np.float32]]()
+    """Read the exact values of a material; return None where one is missing."""
+    prim = material.GetPrim()
+    columns = dict[str, NDArray[np.float32]]()
     for name, attribute in MATERIAL_ATTRIBUTES.items():
-        value, column = prim.GetAttribute(attribute), declared_column(name)
+        value = prim.GetAttribute(attribute)
+        column = declared_column(name)
         stated = parse_numbers(value.Get(time) if value else None)
         if len(stated) != column.width or not np.all(column.within.holds(stated)):
             return None
@@ -81,10 +83,11 @@ def read_held_material(material: Any, time: Any) -> HeldMaterial | None:
 
 
 def parse_map_text(text: Any) -> tuple[str, MapSource] | None:
-    """Return digest, and name and rights, of a map from a line of names.format_map; else None."""
+    """Parse a line of `names.format_map` to digest and source; return None for other text."""
     try:
         fields = json.loads(text)
-        sha256, source = fields.pop("sha256"), MapSource(**fields)
+        sha256 = fields.pop("sha256")
+        source = MapSource(**fields)
     except (TypeError, ValueError, KeyError, AttributeError):
         return None
     texts = (sha256, *dataclasses.astuple(source))
@@ -94,7 +97,7 @@ def parse_map_text(text: Any) -> tuple[str, MapSource] | None:
 def read_held_textures(
     held: HeldMaterial | None, material: Any, time: Any, opened: OpenedUsd
 ) -> dict[str, ForeignTexture]:
-    """Return the specular texture where only the roughness of a coat still names it."""
+    """Read the specular texture where only the coat roughness still refers to it."""
     from pxr import UsdShade
 
     if held is None or "specular" not in held.maps:
@@ -105,8 +108,8 @@ def read_held_textures(
     node = UsdShade.Shader(sources[0].GetPrim())
     if node.GetShaderId() != "UsdUVTexture":
         return {}
-    found = read_texture(texture_node(node, "rgb", time, opened), opened)
-    return {} if found is None else {"specularColor": found}
+    texture = read_texture(read_texture_node(node, "rgb", time, opened), opened)
+    return {} if texture is None else {"specularColor": texture}
 
 
 def choose_textures(
@@ -117,63 +120,69 @@ def choose_textures(
     where: str,
     lost: list[str],
 ) -> tuple[Texture, Texture, Texture]:
-    """Return diffuse, specular and roughness of a material, exact where they are as written.
+    """Return diffuse, specular and roughness of a material, exact where they are unchanged.
 
     Args:
-        held: what was written, if anything.
-        inputs: of its shader.
-        textures: of inputs that have one.
+        held: exact values that Trilight wrote, if any.
+        inputs: inputs of the shader.
+        textures: textures by input.
         source: name and rights of other textures.
-        where: the mesh, for notes.
-        lost: receives what was changed.
+        where: path of the mesh, for notes.
+        lost: receives a sentence for each change.
     """
     if held is None:
-        return worn_textures(inputs, textures, source, where, lost)
+        return build_textures(inputs, textures, source, where, lost)
     is_specular = inputs.stated.is_specular
     if not is_specular and ("metallic" in textures or inputs.constant("metallic").any()):
         lost.append(
             f"{held.where}: became a metal since Trilight wrote it; read as any other material"
         )
-        return worn_textures(inputs, textures, source, where, lost)
-    worn, is_changed = dict[str, Texture](), False
+        return build_textures(inputs, textures, source, where, lost)
+    chosen = dict[str, Texture]()
+    is_changed = False
     for column, (name, channels) in _STATED.items():
         stated = textures.get(name)
         if stated is None and (column != "specular" or is_specular):
             stated = inputs.build_constant(name, channels, source)
         exact = _find_exact(held, column, stated)
         if exact is None and stated is None:
-            lost.append(f"{held.where}: the texture of {column} is not in the file; its mean taken")
+            lost.append(
+                f"{held.where}: the texture of {column} is not in the file; its mean is used"
+            )
             stated = Texture(texels=constant_map(held.columns[column]), source=source)
         elif exact is None:
             lost.append(
-                f"{held.where}: {column} was changed since Trilight wrote it; taken as it is now"
+                f"{held.where}: {column} was changed since Trilight wrote it; the new value is used"
             )
             is_changed = True
         texture = stated if exact is None else exact
         assert texture is not None
-        worn[column] = texture
-    diffuse, specular = worn["diffuse"], worn["specular"]
+        chosen[column] = texture
+    diffuse = chosen["diffuse"]
+    specular = chosen["specular"]
     is_textured = any(texture.constant is None for texture in (diffuse, specular))
-    if is_changed and is_textured and over_one(diffuse, specular):
+    if is_changed and is_textured and may_exceed_one(diffuse, specular):
         diffuse, specular = lower_diffuse(diffuse, specular, source, where, lost)
-    return diffuse, specular, worn["roughness"]
+    return diffuse, specular, chosen["roughness"]
 
 
 def choose_emission(
     held: HeldMaterial | None, stated: NDArray[np.float32], lost: list[str]
 ) -> NDArray[np.float32]:
-    """Return the radiance [T, 3] of triangles: the exact one where the shader states the same."""
+    """Return the radiance [T, 3] of triangles; the exact value where the shader agrees."""
     if held is None:
         return stated
     exact = held.row[EMISSION]
     if _agree(stated, exact):
         return np.broadcast_to(exact, stated.shape).astype(np.float32)
-    lost.append(f"{held.where}: emission was changed since Trilight wrote it; taken as it is now")
+    lost.append(
+        f"{held.where}: emission was changed since Trilight wrote it; the new value is used"
+    )
     return stated
 
 
 def _find_exact(held: HeldMaterial, column: str, stated: Texture | None) -> Texture | None:
-    """Return the exact texture or constant of a column; None where another one is stated."""
+    """Return the exact texture or constant of a column; None where the shader differs."""
     if column in held.maps:
         sha256, source = held.maps[column]
         is_same = stated is not None and stated.sha256 == sha256
@@ -186,21 +195,21 @@ def _find_exact(held: HeldMaterial, column: str, stated: Texture | None) -> Text
 
 
 def _agree(stated: NDArray[np.float32], exact: NDArray[np.float32]) -> bool:
-    return bool(np.allclose(stated, exact, rtol=_SAME, atol=0))
+    return bool(np.allclose(stated, exact, rtol=_SAME_VALUE, atol=0))
 
 
 def name_lost_columns(material: Any) -> list[str]:
-    """Return a note for each added column that another program has not kept."""
+    """Return a note for each added column that the file has lost."""
     prim = material.GetPrim()
     return [
-        f"{prim.GetPath()}: material column {name!r} is not in the file any more; its default taken"
+        f"{prim.GetPath()}: material column {name!r} is not in the file any more; default used"
         for name in str(prim.GetAttribute(ADDED_COLUMNS).Get() or "").split()
         if not prim.HasAttribute(column_attribute(name))
     ]
 
 
 def parse_numbers(value: Any) -> NDArray[np.float64]:
-    """Return what an attribute holds as a row of numbers; an empty one of anything else."""
+    """Return an attribute's value as a row of numbers; empty for other values."""
     try:
         return np.array(value, np.float64).reshape(-1)
     except (TypeError, ValueError):

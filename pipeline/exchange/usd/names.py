@@ -1,4 +1,4 @@
-"""Paths of a scene in a USD stage, and attributes for what USD has no word for.
+"""Names of the prims of a scene in a USD stage, and of Trilight's attributes.
 
     /Scene                        Xform, the default prim: provenance and digest
     /Scene/Materials/material_<m> one per material row: UsdPreviewSurface, and OpenPBR or textures
@@ -6,12 +6,12 @@
     /Scene/Cameras/camera_<c>     one per camera
     /Scene/Environment            a DomeLight, where there is an environment
 
-Programs that know nothing of Trilight keep attributes of prims, but not of shaders, and no arrays:
-materials also say what their textures are, and the scene what its sky is.
+Other programs keep attributes of prims, but not of shaders, and no arrays. So materials also record
+their textures, and the scene its sky.
 
 A shard is `/Scenes` with a variant set `scene`: one variant per sample, named by its key, each with
-a `/Scenes/Scene` as above. Everything under the namespace `trilight:` is exact; the rest of a prim
-says the same as well as USD can.
+a `/Scenes/Scene` as above. Attributes in the namespace `trilight:` are exact; the rest of a
+prim states the same as closely as USD can.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ PROVENANCE = NAMESPACE + "provenance"
 UNUSED_ROWS = NAMESPACE + "unusedVertexRows"
 UNUSED_POSITIONS = NAMESPACE + "unusedPositions"
 UNUSED_NORMALS = NAMESPACE + "unusedNormals"
-"""Attributes of `/Scene`, which also keeps the vertices that belong to no triangle."""
+"""Attributes of `/Scene`, which also stores the vertices that belong to no triangle."""
 
 INDEX = NAMESPACE + "index"
 VERTEX_ROWS = NAMESPACE + "vertexRows"
@@ -57,19 +57,19 @@ MAP_TEXTS = {
 SKY_ROWS = tuple(f"{NAMESPACE}skyRotationRow{row}" for row in range(3))
 SKY_VISIBLE = NAMESPACE + "skyVisibleToCamera"
 SKY_SOURCE = NAMESPACE + "skySource"
-"""Attributes of `/Scene` where there is an environment: its rotation in rows, whether it is seen,
-and its map (format_map). Blender makes a world of a dome, which keeps no attribute of its prim."""
+"""Attributes of `/Scene` where there is an environment: rotation rows, visibility, and map
+(format_map). Blender converts a dome to a world and drops the attributes of its prim."""
 
 TEXTURE_ROW = NAMESPACE + "textureRow"
 """Attribute of a texture's shader: its row among the textures of the scene."""
 
 EXACT_ROWS = NAMESPACE + "exactRows"
 EXACT_POSITIONS = NAMESPACE + "exactPositions"
-"""Attributes of a mesh: its vertices whose position is not the sum of center and point, in single
-precision, and where they are."""
+"""Attributes of a mesh: rows and positions of the vertices whose position differs from center plus
+point in float32."""
 
 _TEXTURE_SOURCE = NAMESPACE + "texture:"
-"""Prefix of the attribute of a textured column of a material: its texture (format_map)."""
+"""Prefix of the attribute that names the texture of a material column (format_map)."""
 
 MATERIAL_ATTRIBUTES = {
     "diffuse": NAMESPACE + "diffuseAlbedo",
@@ -80,33 +80,33 @@ MATERIAL_ATTRIBUTES = {
 """Attributes of a material, by the names of its columns (storage.records.material)."""
 
 _ADDED_COLUMN = NAMESPACE + "column:"
-"""Prefix of the attribute of a column that was added to the published ones."""
+"""Prefix of the attribute of a column beyond the published ones."""
 
 ADDED_COLUMNS = NAMESPACE + "columns"
-"""Attribute of a material: names of its added columns, since programs may keep texts alone."""
+"""Attribute of a material: names of its added columns, since some programs keep only texts."""
 
 FOV_DEG = NAMESPACE + "fovDeg"
 """Attribute of a camera; its pose is the transform, in doubles that hold floats exactly."""
 
 
 def column_attribute(column: str) -> str:
-    """Return the attribute of a material column; of an added one it ends in the column's name."""
+    """Return the attribute name of a material column."""
     return MATERIAL_ATTRIBUTES.get(column, _ADDED_COLUMN + column)
 
 
 def added_column(attribute: str) -> str | None:
-    """Return the column beyond the published ones whose attribute this is; None for any other."""
+    """Return the added column of an attribute name; None for other attributes."""
     column = attribute.removeprefix(_ADDED_COLUMN)
     return None if column == attribute else column
 
 
 def texture_attribute(column: str) -> str:
-    """Return the attribute of a material that says which texture stands for a column."""
+    """Return the attribute name for the texture of a material column."""
     return _TEXTURE_SOURCE + column
 
 
 def format_map(sha256: str, source: MapSource) -> str:
-    """Return one line for a texture or a map: the digest of its content, its name and rights."""
+    """Return one line of JSON for a texture or map: content digest, name and rights."""
     return canonical_json({"sha256": sha256, **dataclasses.asdict(source)}).decode()
 
 
@@ -121,6 +121,6 @@ def camera_name(row: int) -> str:
 
 
 def parse_camera_row(name: str) -> int | None:
-    """Return the row of the camera of a prim's name; None where it is no such name."""
+    """Return the camera row in a prim's name; None for other names."""
     row = name.removeprefix("camera_")
     return int(row) if row.isdecimal() and camera_name(int(row)) == name else None

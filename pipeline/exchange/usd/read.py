@@ -1,6 +1,6 @@
-"""A USD file as scenes: our own bit for bit, others as far as a `Scene` can hold them.
+"""Reads USD files: scenes of Trilight bit for bit, others as far as a `Scene` can hold them.
 
-Only children with limits come here (pipeline.isolation): native code reads the file.
+Only child processes with limits import this (pipeline.isolation): native code parses the file.
 """
 
 from collections.abc import Iterator
@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.exchange.usd.foreign_scene import scene_of_stage
-from pipeline.exchange.usd.read_ours import is_marked, read_exact, scene_keys
-from pipeline.foreign.usd.stage import OpenedUsd, quietly
+from pipeline.exchange.usd.foreign_scene import build_stage_scene
+from pipeline.exchange.usd.read_exact_scene import is_marked, read_exact, scene_keys
+from pipeline.foreign.usd.stage import OpenedUsd, read_quietly
 from storage.errors import TrilightError
 from storage.records.scene import Scene
 
@@ -22,21 +22,21 @@ MAX_FRAMES = 10_000
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class UsdScene:
-    """A scene and what could not be carried over."""
+    """A scene that was read, with its losses."""
 
-    key: str  # key of a shard's sample, or time code of a frame; empty where the file has one scene
-    scene: Scene  # it passes `Scene.check`
-    lost: tuple[str, ...]  # for people
-    exact: bool  # whether Trilight wrote the file, and nothing has been changed since
+    key: str  # key in a shard, or time code of a frame; empty for a single scene
+    scene: Scene  # passes `Scene.check`
+    lost: tuple[str, ...]  # sentences about parts of the file that were lost
+    exact: bool  # True where Trilight wrote the file and it is unchanged
 
 
 def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
-    """Return the keys of the scenes of a file; one empty key where it has one scene.
+    """Return the keys of the scenes of a file; one empty key for a single scene.
 
     Raises:
         TrilightError: the file is unusable (pipeline.foreign.usd.stage).
     """
-    return quietly(path, lambda: _keys(OpenedUsd(path, folder)))
+    return read_quietly(path, lambda: _keys(OpenedUsd(path, folder)))
 
 
 def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> UsdScene:
@@ -44,21 +44,21 @@ def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> 
 
     Args:
         path: the file.
-        key: which, where it has several: a key of a shard, or a time code; the first by default.
-        folder: files below it may be read; that of `path` by default.
-        licence: of objects that state none.
+        key: key in a shard, or time code; the first scene by default.
+        folder: folder whose files may be read; that of `path` by default.
+        licence: licence of objects that state none.
 
     Raises:
-        TrilightError: the file is unusable, has no such scene, or is none that a `Scene` can hold.
+        TrilightError: the file is unusable, lacks the scene, or a `Scene` cannot hold it.
     """
-    return quietly(path, lambda: _read(path, key, folder, licence))
+    return read_quietly(path, lambda: _read(path, key, folder, licence))
 
 
 def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> UsdScene:
     opened = OpenedUsd(path, folder)
     shard = scene_keys(opened.root)
     if shard is not None:
-        return _of_shard(opened, shard, key or shard[0])
+        return _read_shard_scene(opened, shard, key or shard[0])
     if key is None:
         scene = read_exact(opened.root, opened=opened)
         if scene is not None:
@@ -68,20 +68,20 @@ def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> Usd
     if is_marked(opened.root):
         opened.lost.append("changed since Trilight wrote it: read as any other file")
     if key is not None and key not in frames:
-        shown = f"{frames[0]} to {frames[-1]}" if frames else "none: it does not move"
-        raise TrilightError(f"{path.name}: no time code {key}; expected one of {shown}.")
+        expected = f"{frames[0]} to {frames[-1]}" if frames else "none: it does not move"
+        raise TrilightError(f"{path.name}: no time code {key}; expected one of {expected}.")
     chosen = key or (frames[0] if frames else "")
     if frames and key is None:
         opened.lost.append(f"time codes other than {chosen} of {len(frames)}")
     try:
-        scene = scene_of_stage(stage, _time(chosen), opened, licence)
+        scene = build_stage_scene(stage, _time(chosen), opened, licence)
     except TrilightError as error:
         text = str(error).removeprefix(f"{path.name}: ")
         raise TrilightError(f"{path.name}: {text}") from error
     return UsdScene(key=chosen, scene=scene, lost=opened.notes, exact=False)
 
 
-def _of_shard(opened: OpenedUsd, keys: list[str], key: str) -> UsdScene:
+def _read_shard_scene(opened: OpenedUsd, keys: list[str], key: str) -> UsdScene:
     name = opened.path.name
     if key not in keys:
         raise TrilightError(f"{name}: no scene {key}; expected one of {keys[0]} to {keys[-1]}.")
@@ -104,14 +104,15 @@ def _keys(opened: OpenedUsd) -> list[str]:
 
 
 def _frames(stage: Any) -> Iterator[str]:
-    """Yield the time codes of a stage that moves: its frames, or else its samples."""
+    """Yield the time codes of an animated stage: its frames, or else its samples."""
     if len({t for layer in stage.GetUsedLayers() for t in layer.ListAllTimeSamples()}) < 2:
         return
     if not stage.HasAuthoredTimeCodeRange():
         times = np.unique([code for prim in _list_prims(stage) for code in _list_samples(prim)])
     else:
-        first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
-        if not last - first < MAX_FRAMES:  # not a number neither
+        first = stage.GetStartTimeCode()
+        last = stage.GetEndTimeCode()
+        if not last - first < MAX_FRAMES:  # also refuses NaN
             raise TrilightError(
                 f"time codes from {first:g} to {last:g}; expected at most {MAX_FRAMES}."
             )
@@ -130,7 +131,7 @@ def _list_prims(stage: Any) -> Iterator[Any]:
 
 
 def _list_samples(prim: Any) -> Iterator[float]:
-    """Yield the time codes of a prim's samples: of the stage, whatever offsets its layers have."""
+    """Yield the time codes of a prim's samples, in the time of the stage."""
     for attribute in prim.GetAuthoredAttributes():
         yield from attribute.GetTimeSamples()
 

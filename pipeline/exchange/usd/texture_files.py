@@ -1,7 +1,7 @@
-"""A texture as a file beside a stage: the texels that the record holds, to the last bit.
+"""Writes and reads a texture as a lossless file beside a stage.
 
-8-bit textures become PNG, float32 ones OpenEXR, of one channel or three. Files of pictures begin
-with their top row, textures of the record with their bottom one. Equal textures have one file.
+8-bit textures become PNG, float32 ones OpenEXR, with one channel or three. Picture files begin with
+the top row, textures of a scene with the bottom row. Equal textures share a file.
 """
 
 import io
@@ -15,20 +15,20 @@ from storage.records.exr import MAX_RESOLUTION, decode_channels, encode_channels
 from storage.records.texture import MapSource, Texture
 
 _CHANNELS = {1: "Y", 3: "RGB"}
-"""What OpenEXR calls the channels of a number and of a colour."""
+"""OpenEXR channel names by channel count: a number or a color."""
 
 
 def texture_file(texture: Texture) -> str:
-    """Return the name of the file of a texture."""
+    """Return the file name of a texture."""
     suffix = "png" if texture.texels.dtype == np.uint8 else "exr"
     return f"texture-{texture.sha256[:16]}.{suffix}"
 
 
-def encoded_texture(texture: Texture) -> bytes:
-    """Return the file of a texture; no clock is in it.
+def encode_texture(texture: Texture) -> bytes:
+    """Return the bytes of a texture's file; they contain no time stamp.
 
     Raises:
-        TrilightError: it is larger than textures that are read from USD.
+        TrilightError: the texture is larger than the USD reader accepts.
     """
     from PIL import Image
 
@@ -47,11 +47,11 @@ def encoded_texture(texture: Texture) -> bytes:
     return stream.getvalue()
 
 
-def decoded_texture(data: bytes, *, is_exr: bool, is_srgb: bool, source: MapSource) -> Texture:
-    """Return the texture of a file that `encoded_texture` made.
+def decode_texture(data: bytes, *, is_exr: bool, is_srgb: bool, source: MapSource) -> Texture:
+    """Decode a file of `encode_texture`.
 
     Raises:
-        LookupError: it is another file.
+        LookupError: `encode_texture` did not write the file.
     """
     try:
         texels: NDArray[Any] = _exr_texels(data) if is_exr else _png_texels(data)

@@ -1,10 +1,10 @@
-"""`Scene` to USD: `.usda`, `.usdc` or `.usdz`, one scene or the scenes of a whole shard.
+"""Writes USD: `.usda`, `.usdc` or `.usdz`, with one scene or all scenes of a shard.
 
-Z up, metres, a default prim; textures and an environment map are files beside it, or in the
-archive. Equal scenes give equal bytes.
-`pipeline.exchange.usd.names` lists the paths; `pipeline.exchange.usd.read_ours` reads it back. A
-camera has a pose and a lens, in tenths of a metre, on a square film of 36 mm. A `.usdz` file is a
-zip archive of plainly stored members that begin at multiples of 64 bytes.
+Stages are Z up, in meters, with a default prim; textures and an environment map are files next to
+the stage, or in the archive. Equal scenes give equal bytes.
+`pipeline.exchange.usd.names` lists the paths; `pipeline.exchange.usd.read_exact_scene` reads them.
+A camera has a pose and a lens, in tenths of a meter, on a square film of 36 mm. A `.usdz` file is a
+zip archive of uncompressed members that begin at multiples of 64 bytes.
 """
 
 import io
@@ -61,15 +61,15 @@ def write_usd(path: Path, scene: Scene) -> None:
     """Write one scene; the file appears whole or not at all.
 
     Raises:
-        TrilightError: another suffix, the scene breaks a law or holds text that USD cannot keep, or
-            the file cannot be written.
+        TrilightError: the suffix is not USD's, the scene breaks a law or holds text that USD cannot
+            store, or the file cannot be written.
     """
     layer = _new_layer(path, ROOT)
     _save(path, layer, _add_scene(layer, ROOT, scene))
 
 
 def write_usd_shard(path: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
-    """Write many scenes under their keys, as variants of which a program shows one at a time.
+    """Write many scenes as variants, named by their keys; programs show one at a time.
 
     Raises:
         TrilightError: as `write_usd`, or there is no scene.
@@ -79,7 +79,8 @@ def write_usd_shard(path: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
     layer = _new_layer(path, SHARD_ROOT)
     root = add_prim(layer, SHARD_ROOT, "Xform")
     root.variantSetNameList.Prepend(VARIANT_SET)
-    keys, files = [], dict[str, bytes]()
+    keys = []
+    files = dict[str, bytes]()
     for key, scene in scenes:
         variant = f"{SHARD_ROOT}{{{VARIANT_SET}={key}}}"
         Sdf.CreatePrimInLayer(layer, variant)
@@ -108,7 +109,7 @@ def root_attributes(scene: Scene) -> Attributes:
 
 
 def _add_scene(layer: Any, path: str, scene: Scene) -> dict[str, bytes]:
-    """Write a scene, and return the files that it names."""
+    """Write a scene into a layer; return its texture and map files by name."""
     from pxr import Sdf
 
     scene.check()
@@ -150,22 +151,24 @@ def _new_layer(path: Path, root: str) -> Any:
 def _save(path: Path, layer: Any, files: Mapping[str, bytes]) -> None:
     with tempfile.TemporaryDirectory(dir=path.parent if path.parent.is_dir() else None) as folder:
         plain = Path(folder) / "scene.usdc"
-        if path.suffix.lower() == ".usda":  # whose Export changes rights, as no confined child may
+        if (
+            path.suffix.lower() == ".usda"
+        ):  # Export would change file modes, which a confined child may not
             data = layer.ExportToString().encode()
         elif layer.Export(str(plain)):
             data = plain.read_bytes()
         else:
             raise TrilightError(f"{path.name}: USD could not write the scene.")
     if path.suffix.lower() == ".usdz":
-        write_atomically(path, packaged(data, files))
+        write_atomically(path, encode_usdz(data, files))
         return
     for name, content in files.items():
         write_atomically(path.parent / name, content)
-    write_atomically(path, data)  # last: what it names is there
+    write_atomically(path, data)  # last, so that the files that it names exist
 
 
 APERTURE = 0.36
-"""Width and height of the film in tenths of a metre."""
+"""Width and height of the film in tenths of a meter."""
 
 CLIP_METRES = (1e-3, 1e4)
 
@@ -179,7 +182,7 @@ def add_cameras(layer: Any, folder: str, scene: Scene) -> None:
 
 
 def camera_attributes(c2w: NDArray[np.float32], fov_deg: float) -> Attributes:
-    """Return the attributes of a camera's prim: pose [4, 4], and full field of view in degrees."""
+    """Return the attributes of a camera from its pose [4, 4] and full field of view in degrees."""
     focal = APERTURE / (2 * math.tan(math.radians(fov_deg) / 2))
     rows = c2w.astype(np.float64).T.tolist()  # USD multiplies rows from the left
     return {
@@ -199,11 +202,11 @@ LAYER_NAME = "scene.usdc"
 
 _HEADER_BYTES = 30
 _PADDING_ID = 0x1986
-"""Identifier of the extra field that aligns a member's bytes; readers skip it."""
+"""Identifier of the extra field that aligns the bytes of a zip member; readers skip it."""
 
 
-def packaged(layer: bytes, files: Mapping[str, bytes] | None = None) -> bytes:
-    """Return the `.usdz` of one `.usdc` layer and files that it names; no clock is in it."""
+def encode_usdz(layer: bytes, files: Mapping[str, bytes] | None = None) -> bytes:
+    """Return the `.usdz` archive of a `.usdc` layer and its files, without time stamps."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
         for name, data in {LAYER_NAME: layer, **(files or {})}.items():

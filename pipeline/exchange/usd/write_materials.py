@@ -1,14 +1,14 @@
-"""A material row as USD: exact attributes, UsdPreviewSurface, and OpenPBR for MaterialX renderers.
+"""Writes material rows to USD: exact attributes, UsdPreviewSurface, and OpenPBR for MaterialX.
 
-Our BRDF is Lambert + specular x GGX without a Fresnel term. UsdPreviewSurface in its specular
-workflow takes the same albedos and roughness, but lets its specular albedo rise to 1 at grazing
-angles. Blender multiplies that albedo by what the index of refraction reflects head-on, which
-nothing else reads here: the index is one that reflects almost all. OpenPBR's base has one index of
-refraction: it is chosen so that the strongest channel reflects our specular albedo head-on, and the
-tint gives the others. So both look alike and neither is equal; the exact values are in the
-attributes. Textures are connected to the preview (pipeline.exchange.usd.write_textures).
+The BRDF of a scene is Lambert + specular x GGX without a Fresnel term. UsdPreviewSurface in its
+specular workflow has the same albedos and roughness, but its specular albedo rises to 1 at grazing
+angles. Blender multiplies that albedo by the head-on reflectance of the index of refraction, which
+other programs ignore; so the written index reflects almost everything. OpenPBR's base has one index
+of refraction: it is set so that the strongest channel reflects the specular albedo head-on, and the
+tint gives the other channels. Both shaders look similar and neither is equal; the attributes hold
+the exact values. Textures are connected to the preview (pipeline.exchange.usd.write_textures).
 
-OpenPBR counts emission in nits and UsdPreviewSurface as a plain colour: both get our radiance.
+OpenPBR counts emission in nits and UsdPreviewSurface as a plain color: both get the radiance.
 """
 
 import math
@@ -50,20 +50,20 @@ from storage.records.material import (
 )
 from storage.records.scene import Scene
 
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
 INDEX_OF_REFRACTION = 1000.0
-"""Of the preview; 1000 is the most that Blender takes, and reflects 0.996 head-on."""
+"""Index of refraction of the preview; 1000 is Blender's maximum and reflects 0.996 head-on."""
 
 _MOST_REFLECTING = 0.98
-"""Head-on reflectance beyond which no index of refraction is sought: 0.98 needs 199."""
+"""Maximum head-on reflectance that sets the index of refraction: 0.98 needs 199."""
 
 
 def add_materials(layer: Any, folder: str, scene: Scene) -> None:
     """Write a prim for each material row below `folder`.
 
-    Copies of the first prim without textures get their values: that takes half the time of writing
-    each anew.
+    Rows without textures are copies of the first such prim with other values, which takes half the
+    time of writing each prim.
     """
     from pxr import Sdf
 
@@ -71,14 +71,15 @@ def add_materials(layer: Any, folder: str, scene: Scene) -> None:
     first = None
     names = stored_columns(scene.materials)
     for row, values in enumerate(scene.materials):
-        path, used = f"{folder}/{material_name(row)}", used_textures(scene, row)
+        path = f"{folder}/{material_name(row)}"
+        used = used_textures(scene, row)
         if used or first is None:
             _add_material(layer, path, material_tables(values, names, used), list(used))
             first = first if used else path
             continue
         Sdf.CopySpec(layer, first, layer, path)
-        for place, attributes in material_tables(values, names).items():
-            prim = layer.GetPrimAtPath(path + place)
+        for relative_path, attributes in material_tables(values, names).items():
+            prim = layer.GetPrimAtPath(path + relative_path)
             for name, (kind, value) in attributes.items():
                 if kind in ("color3f", "float", "float[]"):
                     prim.attributes[name].default = usd_value(kind, value)
@@ -87,17 +88,17 @@ def add_materials(layer: Any, folder: str, scene: Scene) -> None:
 def material_tables(
     values: NDArray[np.float32], columns: Sequence[str], used: Used | None = None
 ) -> dict[str, Attributes]:
-    """Return the attributes of the prims of a material row, by their place below it.
+    """Return the attributes of a material row's prims, by their path below the material.
 
     Args:
         values: the row, with all declared columns.
-        columns: names of those that the file holds (storage.records.material.stored_columns).
-        used: its textures; none by default.
+        columns: names of the stored columns (storage.records.material.stored_columns).
+        used: textures of the row; none by default.
     """
     diffuse, specular, emission = (_rgb(values[part]) for part in (DIFFUSE, SPECULAR, EMISSION))
     roughness = float(values[ROUGHNESS])
     tables: dict[str, Attributes] = {
-        "": _exact(values, columns),
+        "": _exact_attributes(values, columns),
         f"/{PREVIEW}": {
             "info:id": ("uniform token", "UsdPreviewSurface"),
             "inputs:useSpecularWorkflow": ("int", 1),
@@ -114,62 +115,63 @@ def material_tables(
     return {**tables, f"/{OPENPBR}": _openpbr(diffuse, specular, roughness, emission)}
 
 
-def _openpbr(diffuse: Colour, specular: Colour, roughness: float, emission: Colour) -> Attributes:
-    head_on, luminance = max(specular), max(emission)
-    root = math.sqrt(min(head_on, _MOST_REFLECTING))
+def _openpbr(diffuse: Color, specular: Color, roughness: float, emission: Color) -> Attributes:
+    max_specular = max(specular)
+    max_emission = max(emission)
+    root = math.sqrt(min(max_specular, _MOST_REFLECTING))
     return {
         "info:id": ("uniform token", "ND_open_pbr_surface_surfaceshader"),
         "inputs:base_color": ("color3f", diffuse),
         "inputs:base_weight": ("float", 1.0),
         "inputs:base_diffuse_roughness": ("float", 0.0),
-        "inputs:specular_weight": ("float", 1.0 if head_on > 0 else 0.0),
-        "inputs:specular_color": ("color3f", _share(specular, head_on)),
+        "inputs:specular_weight": ("float", 1.0 if max_specular > 0 else 0.0),
+        "inputs:specular_color": ("color3f", _divide_by_largest(specular, max_specular)),
         "inputs:specular_roughness": ("float", roughness),
-        "inputs:specular_ior": ("float", _single((1 + root) / (1 - root))),
-        "inputs:emission_luminance": ("float", luminance),
-        "inputs:emission_color": ("color3f", _share(emission, luminance)),
+        "inputs:specular_ior": ("float", _round_to_float32((1 + root) / (1 - root))),
+        "inputs:emission_luminance": ("float", max_emission),
+        "inputs:emission_color": ("color3f", _divide_by_largest(emission, max_emission)),
     }
 
 
-def _exact(values: NDArray[np.float32], columns: Sequence[str]) -> Attributes:
+def _exact_attributes(values: NDArray[np.float32], columns: Sequence[str]) -> Attributes:
     """Return the attributes that hold the columns exactly."""
-    found: dict[str, tuple[str, Any]] = {}
+    attributes: dict[str, tuple[str, Any]] = {}
     for column, part in laid_out():
         if column.name in columns:
             kind = "color3f" if column.is_colour else "float" if column.width == 1 else "float[]"
             value = _rgb(values[part]) if column.is_colour else values[part]
-            found[column_attribute(column.name)] = (
+            attributes[column_attribute(column.name)] = (
                 kind,
                 float(value[0]) if kind == "float" else value,
             )
     if added := [name for name in columns if name not in MATERIAL_ATTRIBUTES]:
-        found[ADDED_COLUMNS] = ("string", " ".join(added))
-    return found
+        attributes[ADDED_COLUMNS] = ("string", " ".join(added))
+    return attributes
 
 
 def _add_material(
     layer: Any, path: str, tables: Mapping[str, Attributes], textured: Sequence[str]
 ) -> None:
     links = material_links(textured)
-    for place, attributes in tables.items():
-        prim = add_prim(layer, path + place, "Shader" if place else "Material")
+    for relative_path, attributes in tables.items():
+        prim = add_prim(layer, path + relative_path, "Shader" if relative_path else "Material")
         add_attributes(prim, attributes)
-        for name, (kind, source) in links[place].items():
+        for name, (kind, source) in links[relative_path].items():
             add_link(prim, name, kind, None if source is None else f"{path}/{source}")
 
 
-def _rgb(values: NDArray[np.float32]) -> Colour:
+def _rgb(values: NDArray[np.float32]) -> Color:
     red, green, blue = (float(value) for value in values)
     return red, green, blue
 
 
-def _share(rgb: Colour, largest: float) -> Colour:
-    """Return a colour divided by its largest channel; white for black."""
+def _divide_by_largest(rgb: Color, largest: float) -> Color:
+    """Return a color divided by its largest channel; white for black."""
     if largest <= 0:
         return 1.0, 1.0, 1.0
-    red, green, blue = (_single(value / largest) for value in rgb)
+    red, green, blue = (_round_to_float32(value / largest) for value in rgb)
     return red, green, blue
 
 
-def _single(value: float) -> float:
+def _round_to_float32(value: float) -> float:
     return float(np.float32(value))

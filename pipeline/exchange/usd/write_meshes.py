@@ -1,11 +1,11 @@
-"""The objects of a scene as meshes: one each, with its normals, and a subset per material.
+"""Writes each object of a scene as a mesh with normals and a subset for each material.
 
-A mesh stands at the middle of its box, and its points are relative to it: other programs turn and
-scale an object about its origin. Where center plus point, in single precision, is not the position
-to the last bit, the mesh says the position.
+The origin of a mesh is the center of its bounding box, since other programs rotate and scale an
+object about its origin; points are relative to it. Where center plus point in float32 differs from
+the position, an attribute holds the exact position.
 
-An emitter is emissive geometry and a light at once: its material glows, and `MeshLightAPI` with its
-default `materialGlowTintsLight` and a white intensity of 1 emits what the material glows.
+An emitter is emissive geometry and a light: its material emits, and `MeshLightAPI` with its default
+`materialGlowTintsLight` and a white intensity of 1 emits the radiance of the material.
 """
 
 from typing import Any
@@ -47,7 +47,7 @@ MESH: Attributes = {
     "subsetFamily:materialBind:familyType": ("uniform token", "partition"),
 }
 CENTER = "xformOp:translate:center"
-"""Has a name of its own, so that others may add a translation."""
+"""Name of the transform to the center; the suffix lets programs add a translation."""
 
 SUBSET: Attributes = {
     "elementType": ("uniform token", "face"),
@@ -56,7 +56,7 @@ SUBSET: Attributes = {
 
 
 def add_objects(layer: Any, folder: str, scene: Scene, materials: str) -> None:
-    """Write a prim for each object below `folder`; their materials stand below `materials`."""
+    """Write a prim for each object below `folder`; the materials are below `materials`."""
     add_prim(layer, folder, "Scope")
     order = np.argsort(scene.object_index, kind="stable")
     counts = np.bincount(scene.object_index, minlength=len(scene.objects))
@@ -67,7 +67,7 @@ def add_objects(layer: Any, folder: str, scene: Scene, materials: str) -> None:
 
 
 def prim_names(scene: Scene) -> list[str]:
-    """Return a name for each object that USD admits and that no other has."""
+    """Return a unique and valid USD name for each object."""
     from pxr import Tf
 
     taken: set[str] = set()
@@ -118,7 +118,7 @@ def _add_object(
 def center_points(
     positions: NDArray[np.float32],
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return the middle [3] of positions [V, 3], which fits single precision, and points [V, 3]."""
+    """Return the center [3] of positions [V, 3] as float32 values, and points relative to it."""
     wide = positions.astype(np.float64)
     middle = (wide.min(axis=0) + wide.max(axis=0)) / 2
     center = middle.astype(np.float32).astype(np.float64)
@@ -126,14 +126,14 @@ def center_points(
 
 
 def sum_positions(center: NDArray[np.float64], points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return where points [V, 3] about a center are, in single precision."""
+    """Return the float32 positions of points [V, 3] about a center."""
     return (points.astype(np.float64) + center).astype(np.float32)
 
 
-def place_attributes(
+def position_attributes(
     center: NDArray[np.float64], points: NDArray[np.float32], positions: NDArray[np.float32]
 ) -> Attributes:
-    """Return the attributes that place a mesh, with the positions that its sums do not give."""
+    """Return the center of a mesh, and exact positions where center plus point differs."""
     same = sum_positions(center, points).view(np.uint32) == positions.view(np.uint32)
     rows = np.flatnonzero(~same.all(axis=1))
     return {
@@ -151,7 +151,7 @@ def _add_arrays(prim: Any, scene: Scene, faces: NDArray[np.intp]) -> None:
     add_attributes(
         prim,
         {
-            **place_attributes(center, points, scene.vertex_positions[rows]),
+            **position_attributes(center, points, scene.vertex_positions[rows]),
             "faceVertexCounts": ("int[]", np.full(len(faces), 3, np.int32)),
             "faceVertexIndices": ("int[]", corners.ravel().astype(np.int32)),
             "points": ("point3f[]", points),
@@ -163,6 +163,6 @@ def _add_arrays(prim: Any, scene: Scene, faces: NDArray[np.intp]) -> None:
     )
     prim.attributes["normals"].SetInfo("interpolation", "vertex")
     if scene.uv is not None:
-        own = np.ascontiguousarray(scene.uv.reshape(-1, 3, 2)[faces].reshape(-1, 2))
-        add_attributes(prim, {ST: ("texCoord2f[]", own)})
+        corner_uv = np.ascontiguousarray(scene.uv.reshape(-1, 3, 2)[faces].reshape(-1, 2))
+        add_attributes(prim, {ST: ("texCoord2f[]", corner_uv)})
         prim.attributes[ST].SetInfo("interpolation", "faceVarying")

@@ -1,10 +1,10 @@
-"""The textures of a material as UsdUVTexture shaders below it, and how its prims are connected.
+"""Writes the textures of a material as UsdUVTexture shaders, and the connections of its prims.
 
 A textured column of a material is an input of its UsdPreviewSurface that is connected to a texture,
-which reads the coordinates `st` of the meshes. USD's coordinates are ours: v up, the bottom row of
-a picture at v = 0. A textured material has no OpenPBR beside it: renderers of MaterialX then take
-the preview, with its textures, instead of one colour. A specular texture is also that of the
-roughness of a coat that is not there: Blender writes no specular texture, and keeps this one.
+which reads the coordinates `st` of the meshes. Coordinates need no conversion: v is up, and the
+bottom row of a picture is at v = 0. A textured material has no OpenPBR shader, so that MaterialX
+renderers use the preview with its textures instead of one color. A specular texture is also
+connected to the roughness of an absent coat: Blender drops specular textures, but keeps this one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,11 +13,12 @@ import numpy as np
 
 from pipeline.exchange.usd.authoring import Attributes
 from pipeline.exchange.usd.names import MAP_TEXTS, TEXTURE_ROW, format_map, texture_attribute
-from pipeline.exchange.usd.texture_files import encoded_texture, texture_file
+from pipeline.exchange.usd.texture_files import encode_texture, texture_file
 from storage.records.scene import Scene
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
-PREVIEW, OPENPBR = "Preview", "OpenPBR"
+PREVIEW = "Preview"
+OPENPBR = "OpenPBR"
 """Names of the two shaders of a material."""
 
 SHADERS = {
@@ -25,7 +26,7 @@ SHADERS = {
     "specular": "SpecularTexture",
     "roughness": "RoughnessTexture",
 }
-"""Name of the texture's shader, by the column that it stands for."""
+"""Name of the texture shader of each column."""
 
 COORDINATES = "Coordinates"
 """Name of the shader that reads texture coordinates."""
@@ -38,16 +39,16 @@ _INPUTS = {
     "specular": ("color3f", "inputs:specularColor", "outputs:rgb", "float3"),
     "roughness": ("float", "inputs:roughness", "outputs:r", "float"),
 }
-"""Of each column: type and name of the input, and name and type of the output that it reads."""
+"""Type and name of the input, and name and type of its output, by column."""
 
 COAT_ROUGHNESS = "inputs:clearcoatRoughness"
-"""Input of a preview without a coat that keeps the specular texture where others lose it."""
+"""Input of a preview without a coat; it preserves the specular texture in Blender."""
 
 Used = Mapping[str, tuple[int, Texture]]
-"""The textures of a material by the columns that they stand for, with their rows."""
+"""Row and texture of each textured column of a material."""
 
 Links = Mapping[str, tuple[str, str | None]]
-"""Inputs and outputs by name: their type, and the output that each is connected to, if any."""
+"""Type and connected output, if any, of each input and output by name."""
 
 
 def used_textures(scene: Scene, row: int) -> Used:
@@ -63,12 +64,12 @@ def used_textures(scene: Scene, row: int) -> Used:
 
 
 def texture_files(scene: Scene) -> dict[str, bytes]:
-    """Return the files of the textures of a scene by their names; raises TrilightError."""
-    return {texture_file(texture): encoded_texture(texture) for texture in scene.textures}
+    """Return the texture files of a scene by name; raises TrilightError."""
+    return {texture_file(texture): encode_texture(texture) for texture in scene.textures}
 
 
 def build_source_table(used: Used) -> Attributes:
-    """Return the attributes of a material that say which textures it has."""
+    """Return the attributes of a material that record its textures."""
     return {
         texture_attribute(name): ("string", format_map(texture.sha256, texture.source))
         for name, (_, texture) in used.items()
@@ -76,7 +77,7 @@ def build_source_table(used: Used) -> Attributes:
 
 
 def texture_tables(used: Used) -> dict[str, Attributes]:
-    """Return the attributes of the shaders of a material's textures, by their place below it."""
+    """Return the attributes of a material's texture shaders, by path below the material."""
     tables = {
         f"/{SHADERS[name]}": _texture_table(row, texture) for name, (row, texture) in used.items()
     }
@@ -89,19 +90,19 @@ def texture_tables(used: Used) -> dict[str, Attributes]:
 
 
 def material_links(textured: Sequence[str]) -> dict[str, Links]:
-    """Return what the prims of a material are connected to, by their place below it.
+    """Return the connections of a material's prims, by path below the material.
 
     Args:
-        textured: columns that have a texture.
+        textured: names of the columns with a texture.
     """
     surface: dict[str, tuple[str, str | None]] = {
         "outputs:surface": ("token", f"{PREVIEW}.outputs:surface")
     }
     preview: dict[str, tuple[str, str | None]] = {"outputs:surface": ("token", None)}
-    places: dict[str, dict[str, tuple[str, str | None]]] = {"": surface, f"/{PREVIEW}": preview}
+    links: dict[str, dict[str, tuple[str, str | None]]] = {"": surface, f"/{PREVIEW}": preview}
     if not textured:
         surface["outputs:mtlx:surface"] = ("token", f"{OPENPBR}.outputs:out")
-        return {**places, f"/{OPENPBR}": {"outputs:out": ("token", None)}}
+        return {**links, f"/{OPENPBR}": {"outputs:out": ("token", None)}}
     for name in textured:
         kind, socket, output, output_kind = _INPUTS[name]
         preview[socket] = (kind, f"{SHADERS[name]}.{output}")
@@ -112,8 +113,8 @@ def material_links(textured: Sequence[str]) -> dict[str, Links]:
         if name == "specular":
             preview[COAT_ROUGHNESS] = ("float", f"{SHADERS[name]}.outputs:r")
             shader["outputs:r"] = ("float", None)
-        places[f"/{SHADERS[name]}"] = shader
-    return {**places, f"/{COORDINATES}": {"outputs:result": ("float2", None)}}
+        links[f"/{SHADERS[name]}"] = shader
+    return {**links, f"/{COORDINATES}": {"outputs:result": ("float2", None)}}
 
 
 def _texture_table(row: int, texture: Texture) -> Attributes:

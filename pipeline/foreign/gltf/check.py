@@ -1,7 +1,7 @@
-"""What of a glTF is refused, and its counts within limits, before any buffer is read.
+"""Checks of a glTF before any buffer is read: refused features, and counts within limits.
 
-What would give a plausible but wrong mesh is refused by name: compressed geometry without plain
-data, skins, and extensions that the file cannot be read without.
+Features that would give a plausible but wrong mesh are refused by name: compressed geometry without
+plain data, skins, and required extensions that are unknown.
 """
 
 from typing import Any
@@ -13,43 +13,46 @@ from pipeline.foreign.numbers import Malformed, read_count
 from storage.errors import Rejected
 
 _SURFACE_EXTENSIONS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_")
-"""A file may require these: they change how a surface looks, which is named where it is lost."""
+"""Prefixes of extensions that a file may require: they only change how a surface looks."""
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 _UNPACK = "unpack it first, for example with gltf-transform"
 _LISTS = ("scenes", "nodes", "meshes", "accessors", "bufferViews", "buffers")
 POINTS_AND_LINES = (0, 1, 2, 3)
-TRIANGLES, STRIP, FAN = 4, 5, 6
+TRIANGLES = 4
+STRIP = 5
+FAN = 6
 
 
 def check_tree(tree: dict[str, Any], limits: ReadLimits) -> None:
-    """Raise Rejected for a tree that would load wrongly, or as more than the limits."""
+    """Raise Rejected for a tree that would load wrongly or exceeds the limits."""
     for kind in _LISTS:
         if not isinstance(tree.get(kind, []), list):
             raise Malformed(f"{kind} is no list")
     _check_extensions(tree)
     faces: dict[int, int] = {}
-    placed = total = 0
-    for place in placed_meshes(tree):
-        if "skin" in place.node:
+    num_placed = num_faces = 0
+    for placed in placed_meshes(tree):
+        if "skin" in placed.node:
             raise Rejected("skinned_mesh", "bones pose a mesh; apply the skin before exporting")
-        number = place.node["mesh"]
+        number = placed.node["mesh"]
         if number not in faces:
             faces[number] = sum(
                 _count_faces(tree, primitive, limits)
                 for primitive in entry(tree, "meshes", number)["primitives"]
             )
-        count = num_instances(tree, place.node)
-        placed, total = placed + count, total + count * faces[number]
-        if placed > limits.max_instances:
+        count = num_instances(tree, placed.node)
+        num_placed += count
+        num_faces += count * faces[number]
+        if num_placed > limits.max_instances:
             raise Rejected(
                 "too_many_instances", f"more than {limits.max_instances} nodes place a mesh"
             )
-    if total > limits.max_faces:
-        raise Rejected("too_many_faces", f"{total} faces; expected <= {limits.max_faces}")
+    if num_faces > limits.max_faces:
+        raise Rejected("too_many_faces", f"{num_faces} faces; expected <= {limits.max_faces}")
 
 
 def _check_extensions(tree: dict[str, Any]) -> None:
-    """Refuse what the file cannot be read without.
+    """Refuse required extensions that are not supported.
 
     A file that uses compression without requiring it holds plain data as well.
     """

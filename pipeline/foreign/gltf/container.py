@@ -1,4 +1,4 @@
-"""The JSON and the binary chunk of a glTF, and what its URIs name."""
+"""The JSON and the binary chunk of a glTF, and the data of its URIs."""
 
 import base64
 import json
@@ -16,7 +16,7 @@ _MAX_JSON_BYTES = 64_000_000
 _HEADER = struct.Struct("<4sII")
 _CHUNK = struct.Struct("<I4s")
 _BASE64 = bytes.maketrans(b"-_", b"+/")
-"""From the base64 of URLs to that of files."""
+"""Translation from URL-safe base64 to the standard alphabet."""
 
 
 def read_container(data: bytes, suffix: str) -> tuple[dict[str, Any], memoryview | None]:
@@ -38,12 +38,12 @@ def _chunks(data: bytes) -> tuple[bytes, memoryview | None]:
     if data[:4] != b"glTF":
         raise Rejected("load_error", "the file is no GLB: it does not begin with glTF")
     if len(data) < _HEADER.size:
-        raise _cut_off(_HEADER.size, len(data))
+        raise _cut_off_error(_HEADER.size, len(data))
     _, version, length = _HEADER.unpack_from(data)
     if version != 2:
-        raise _other_version(str(version))
+        raise _version_error(str(version))
     if length > len(data):
-        raise _cut_off(length, len(data))
+        raise _cut_off_error(length, len(data))
     chunks = list(_split(memoryview(data)[:length]))
     if not chunks or chunks[0][0] != b"JSON":
         raise Rejected("load_error", "the first chunk of the GLB is no JSON")
@@ -51,19 +51,19 @@ def _chunks(data: bytes) -> tuple[bytes, memoryview | None]:
 
 
 def _split(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield kind and bytes of each chunk; kinds that nobody knows are legal."""
+    """Yield kind and bytes of each chunk; unknown kinds are legal."""
     start = _HEADER.size
     while start + _CHUNK.size <= len(data):
         size, kind = _CHUNK.unpack_from(data, start)
         start += _CHUNK.size
         if start + size > len(data):
-            raise _cut_off(start + size, len(data))
+            raise _cut_off_error(start + size, len(data))
         yield kind, data[start : start + size]
         start += size
 
 
-def _cut_off(wanted: int, got: int) -> Rejected:
-    return Rejected("cut_off", f"the file is cut off: it states {wanted} bytes and has {got}")
+def _cut_off_error(expected: int, present: int) -> Rejected:
+    return Rejected("cut_off", f"the file is cut off: it states {expected} bytes and has {present}")
 
 
 def _parse_json(text: bytes) -> dict[str, Any]:
@@ -91,20 +91,21 @@ def _check_version(tree: dict[str, Any]) -> None:
     """Refuse a file that needs another version; a later 2.x without `minVersion` is readable."""
     asset = tree.get("asset")
     stated = asset if isinstance(asset, dict) else {}
-    least, version = stated.get("minVersion"), str(stated.get("version", "2.0"))
+    least = stated.get("minVersion")
+    version = str(stated.get("version", "2.0"))
     if least not in (None, "2.0"):
-        raise _other_version(f"{least!s:.20}")
+        raise _version_error(f"{least!s:.20}")
     if version.partition(".")[0] != "2" or isinstance(tree.get("meshes"), dict):
-        raise _other_version("1.0" if isinstance(tree.get("meshes"), dict) else f"{version:.20}")
+        raise _version_error("1.0" if isinstance(tree.get("meshes"), dict) else f"{version:.20}")
 
 
-def _other_version(version: str) -> Rejected:
+def _version_error(version: str) -> Rejected:
     message = f"the file needs glTF {version}; expected 2.0: export it as that"
     return Rejected("unsupported_format", message)
 
 
 def data_uri_bytes(uri: str) -> bytes:
-    """Return what a data: URI of any media type holds; raises Malformed where it is no base64."""
+    """Return the bytes of a data: URI of any media type; raises Malformed without a comma."""
     head, comma, body = uri.partition(",")
     if not comma:
         raise Malformed(f"the URI {uri!r:.40} has no data")
@@ -121,7 +122,7 @@ def is_data_uri(uri: str) -> bool:
 
 
 def local_path(uri: str, folder: Path) -> Path:
-    """Return the file below a folder that a relative URI names, escaped or as it is.
+    """Return the file below a folder that a relative URI names, percent-encoded or not.
 
     Raises:
         Rejected: external_uri or missing_file.
@@ -131,7 +132,8 @@ def local_path(uri: str, folder: Path) -> Path:
         plain = unquote_to_bytes(uri).decode("utf-8", "replace")
         parts = urlsplit(uri)
     except ValueError:
-        plain, parts = "\0", urlsplit("")
+        plain = "\0"
+        parts = urlsplit("")
     if "\0" in plain or parts.scheme or parts.netloc:
         raise Rejected("external_uri", f"{uri[:80]!r} lies elsewhere, not in the file's folder")
     targets = [(root / name).resolve() for name in (plain, uri, plain.replace("\\", "/"))]

@@ -17,7 +17,7 @@ from pipeline.foreign.gltf.container import (
     read_container,
 )
 from pipeline.foreign.gltf.nodes import INSTANCING, PlacedNode, entry, extension, transforms
-from pipeline.foreign.gltf.unread import unread_parts
+from pipeline.foreign.gltf.unread import list_unread_parts
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material_files import MaterialFiles, ReadFile, SourceFolder, gltf_files
 from pipeline.foreign.numbers import Malformed, read_count
@@ -26,16 +26,16 @@ from storage.errors import Rejected, TrilightError
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _PADDING = 3
-"""Bytes by which a buffer may be shorter than stated: exporters count its padding."""
+"""Bytes by which a buffer may be shorter than stated, since exporters count its padding."""
 _MOST_REPLACED = 1 << 23
-"""Most values of a sparse accessor, which are copied."""
+"""Maximum number of values of a sparse accessor, since they are copied."""
 
 Rows = NDArray[np.int64] | slice
 
 
 @contextmanager
 def refuse_malformed(reason: str, subject: str) -> Iterator[None]:
-    """Turn what Python says of a tree that keeps no law of its format into Rejected."""
+    """Turn Python's errors about a malformed tree into Rejected."""
     try:
         yield
     except Malformed as error:
@@ -51,18 +51,18 @@ def refuse_malformed(reason: str, subject: str) -> Iterator[None]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GltfDocument:
-    """One file with its buffers."""
+    """The JSON of a glTF file with its buffers and pictures."""
 
     tree: dict[str, Any]
-    """Its JSON."""
+    """Parsed JSON of the file."""
     binary: memoryview | None
-    """The binary chunk of a GLB."""
+    """Binary chunk of a GLB; None without one."""
     buffers: Mapping[str, bytes]
-    """Files that its buffers name, by URI."""
+    """Contents of the files that buffers name, by URI."""
     pictures: MaterialFiles
-    """Files that its images name; empty where they are not kept."""
+    """Contents of the files that images name; empty where limits exclude materials."""
     unread: tuple[str, ...]
-    """What it says and no code reads, as short sentences."""
+    """Short sentences on contents of the file that are not read."""
     _embedded: dict[str, bytes] = field(default_factory=dict)
 
     def values(
@@ -71,94 +71,105 @@ class GltfDocument:
         """Return rows [N, K] of an accessor; integers as fractions where they are normalized.
 
         Args:
-            index: its number.
-            widths: how many components K may be.
-            rows: which of its values.
-            is_unit: whether integers are fractions; as the accessor says by default.
+            index: index of the accessor.
+            widths: allowed numbers of components K.
+            rows: rows to return.
+            is_unit: whether integers are fractions; as the accessor states by default.
 
         Raises:
             Rejected: cut_off, unsupported_accessor, load_error.
         """
-        stated, whole = self._stated(index), self._elements(index)
-        if whole.shape[1] not in widths:
-            raise Malformed(f"accessor {index} has {whole.shape[1]} components")
-        if not isinstance(rows, slice) and rows.size and rows.max() >= len(whole):
-            raise Malformed(f"accessor {index} has {len(whole)} values, one for each vertex")
-        found = whole[rows].astype(np.float64)
-        if whole.dtype.kind in "ui" and (stated.get("normalized") if is_unit is None else is_unit):
-            found = np.maximum(found / np.iinfo(whole.dtype).max, -1)
-        return found
+        accessor = self._accessor(index)
+        elements = self._elements(index)
+        if elements.shape[1] not in widths:
+            raise Malformed(f"accessor {index} has {elements.shape[1]} components")
+        if not isinstance(rows, slice) and rows.size and rows.max() >= len(elements):
+            raise Malformed(f"accessor {index} has {len(elements)} values, one for each vertex")
+        result = elements[rows].astype(np.float64)
+        if elements.dtype.kind in "ui" and (
+            accessor.get("normalized") if is_unit is None else is_unit
+        ):
+            result = np.maximum(result / np.iinfo(elements.dtype).max, -1)
+        return result
 
     def indices(self, index: Any) -> NDArray[np.int64]:
-        """Return an accessor of vertices [N]."""
-        whole = self._elements(index)
-        if whole.shape[1] != 1 or whole.dtype.kind != "u":
-            raise Malformed(f"indices are of type {whole.dtype} x {whole.shape[1]}")
-        return whole[:, 0].astype(np.int64)
+        """Return an accessor of vertex indices [N]."""
+        elements = self._elements(index)
+        if elements.shape[1] != 1 or elements.dtype.kind != "u":
+            raise Malformed(f"indices are of type {elements.dtype} x {elements.shape[1]}")
+        return elements[:, 0].astype(np.int64)
 
     def count(self, index: Any) -> int:
         """Return the number of values of an accessor."""
-        return read_count(self._stated(index), "count")
+        return read_count(self._accessor(index), "count")
 
-    def instances(self, place: PlacedNode) -> NDArray[np.float64]:
-        """Return the places [N, 4, 4] of the mesh of a node."""
-        attributes = extension(place.node, INSTANCING).get("attributes", {})
+    def instances(self, placed: PlacedNode) -> NDArray[np.float64]:
+        """Return the matrices [N, 4, 4] of all instances of a node's mesh."""
+        attributes = extension(placed.node, INSTANCING).get("attributes", {})
         if not attributes:
-            return place.to_world[None]
+            return placed.to_world[None]
         count = self.count(next(iter(attributes.values())))
-        parts = [np.tile(row, (count, 1)) for row in ([0.0] * 3, [0.0, 0.0, 0.0, 1.0], [1.0] * 3)]
+        components = [
+            np.tile(row, (count, 1)) for row in ([0.0] * 3, [0.0, 0.0, 0.0, 1.0], [1.0] * 3)
+        ]
         for row, name in enumerate(("TRANSLATION", "ROTATION", "SCALE")):
             if name in attributes:
-                width = parts[row].shape[1]
-                parts[row] = self.values(
+                width = components[row].shape[1]
+                components[row] = self.values(
                     attributes[name], (width,), slice(None), is_unit=name == "ROTATION" or None
                 )
-        return np.einsum("ij,njk->nik", place.to_world, transforms(*parts))
+        return np.einsum("ij,njk->nik", placed.to_world, transforms(*components))
 
     def picture_bytes(self, image: Mapping[str, Any]) -> bytes:
-        """Return the file of an image; raises Rejected where it is not there."""
+        """Return the bytes of an image; raises Rejected where its file is missing."""
         if "bufferView" in image:
             return bytes(self._view(image["bufferView"]))
         uri = image["uri"]
-        return data_uri_bytes(uri) if is_data_uri(uri) else self.pictures.of(uri)
+        return data_uri_bytes(uri) if is_data_uri(uri) else self.pictures.require(uri)
 
-    def _stated(self, index: Any) -> dict[str, Any]:
+    def _accessor(self, index: Any) -> dict[str, Any]:
         return entry(self.tree, "accessors", index)
 
     def _elements(self, index: Any) -> NDArray:
-        """Return the values [N, K] of an accessor as they are stored; zeros where nothing is."""
-        stated = self._stated(index)
-        code, kind, count = stated["componentType"], stated["type"], read_count(stated, "count")
+        """Return the stored values [N, K] of an accessor; zeros without a buffer view."""
+        accessor = self._accessor(index)
+        code = accessor["componentType"]
+        kind = accessor["type"]
+        count = read_count(accessor, "count")
         if code not in _DTYPES or kind not in _WIDTHS:
             raise Rejected("unsupported_accessor", f"values of type {code!r:.20} {kind!r:.20}")
-        dtype, width = np.dtype(_DTYPES[code]), _WIDTHS[kind]
-        if "bufferView" in stated:
-            offset = read_count(stated, "byteOffset", 0)
-            values = self._strided(stated["bufferView"], offset, dtype, width, count)
+        dtype = np.dtype(_DTYPES[code])
+        width = _WIDTHS[kind]
+        if "bufferView" in accessor:
+            offset = read_count(accessor, "byteOffset", 0)
+            values = self._read_strided(accessor["bufferView"], offset, dtype, width, count)
         else:
             values = np.broadcast_to(np.zeros(1, dtype), (count, width))
-        return self._with_replaced(values, stated["sparse"]) if "sparse" in stated else values
+        return self._replace_sparse(values, accessor["sparse"]) if "sparse" in accessor else values
 
-    def _with_replaced(self, values: NDArray, sparse: Mapping[str, Any]) -> NDArray:
-        """Return values with those that a sparse accessor replaces."""
-        count, where, stated = read_count(sparse, "count"), sparse["indices"], sparse["values"]
-        dtype = np.dtype(_DTYPES[where["componentType"]])
-        offsets = [read_count(each, "byteOffset", 0) for each in (where, stated)]
-        rows = self._strided(where["bufferView"], offsets[0], dtype, 1, count)[:, 0]
+    def _replace_sparse(self, values: NDArray, sparse: Mapping[str, Any]) -> NDArray:
+        """Return a copy of values with those of a sparse accessor replaced."""
+        count = read_count(sparse, "count")
+        sparse_indices = sparse["indices"]
+        sparse_values = sparse["values"]
+        dtype = np.dtype(_DTYPES[sparse_indices["componentType"]])
+        offsets = [read_count(each, "byteOffset", 0) for each in (sparse_indices, sparse_values)]
+        rows = self._read_strided(sparse_indices["bufferView"], offsets[0], dtype, 1, count)[:, 0]
         if count and int(rows.max()) >= len(values):
             raise Malformed(f"a sparse accessor replaces value {rows.max()} of {len(values)}")
         if len(values) > _MOST_REPLACED:
             raise Rejected("too_many_faces", f"a sparse accessor counts {len(values)} items")
-        found = values.copy()
-        found[rows.astype(np.int64)] = self._strided(
-            stated["bufferView"], offsets[1], values.dtype, values.shape[1], count
+        result = values.copy()
+        result[rows.astype(np.int64)] = self._read_strided(
+            sparse_values["bufferView"], offsets[1], values.dtype, values.shape[1], count
         )
-        return found
+        return result
 
-    def _strided(
+    def _read_strided(
         self, view: Any, offset: int, dtype: np.dtype[Any], width: int, count: int
     ) -> NDArray:
-        data, size = self._view(view), dtype.itemsize * width
+        data = self._view(view)
+        size = dtype.itemsize * width
         step = read_count(entry(self.tree, "bufferViews", view), "byteStride", 0) or size
         if step < size:
             raise Malformed(f"byteStride is {step}; expected at least {size}")
@@ -174,7 +185,8 @@ class GltfDocument:
     def _view(self, index: Any) -> memoryview:
         view = entry(self.tree, "bufferViews", index)
         buffer = entry(self.tree, "buffers", view["buffer"])
-        uri, data = buffer.get("uri"), self.binary
+        uri = buffer.get("uri")
+        data = self.binary
         if uri is not None:
             if is_data_uri(uri) and uri not in self._embedded:
                 self._embedded[uri] = data_uri_bytes(uri)
@@ -185,7 +197,8 @@ class GltfDocument:
                 f"a buffer is cut off: it states {buffer['byteLength']} bytes and has "
                 f"{0 if data is None else len(data)}",
             )
-        start, length = read_count(view, "byteOffset", 0), read_count(view, "byteLength")
+        start = read_count(view, "byteOffset", 0)
+        length = read_count(view, "byteLength")
         if start + length > len(data):
             raise Rejected("load_error", f"buffer view {index} goes beyond its buffer")
         return memoryview(data)[start : start + length]
@@ -199,15 +212,15 @@ def open_gltf(
     limits: ReadLimits,
     read: ReadFile,
 ) -> GltfDocument:
-    """Return a glTF with its buffers, and with its pictures where the limits say so.
+    """Return a glTF with its buffers, and with its pictures where the limits include materials.
 
     Args:
         data: the file.
-        suffix: of its name, `.glb` or `.gltf`.
-        folder: of the file; no buffer outside of it is read.
-        files: reads pictures.
-        limits: bound what is read.
-        read: reads a regular file of at most so many bytes.
+        suffix: suffix of its name, `.glb` or `.gltf`.
+        folder: folder of the file; no buffer outside of it is read.
+        files: reader of picture files.
+        limits: bounds of what is read.
+        read: function that reads a regular file of at most so many bytes.
 
     Raises:
         Rejected: as `read_container`, `check_tree`, and of a buffer external_uri or missing_file.
@@ -215,19 +228,19 @@ def open_gltf(
     tree, binary = read_container(data, suffix)
     with refuse_malformed("load_error", "the glTF tree is"):
         check_tree(tree, limits)
-        unread = unread_parts(tree)
+        unread = list_unread_parts(tree)
         uris = [row["uri"] for row in tree.get("buffers", ()) if "uri" in row]
         named = {uri: local_path(uri, folder) for uri in uris if not is_data_uri(uri)}
     buffers: dict[str, bytes] = {}
-    left = limits.max_bytes - len(data)
+    bytes_left = limits.max_bytes - len(data)
     for uri, path in named.items():
-        buffers[uri] = read(path, left)
-        left -= len(buffers[uri])
+        buffers[uri] = read(path, bytes_left)
+        bytes_left -= len(buffers[uri])
     has_pictures = limits.with_materials and isinstance(tree.get("images"), list)
     return GltfDocument(
         tree=tree,
         binary=binary,
         buffers=buffers,
-        pictures=gltf_files(tree, files, left) if has_pictures else MaterialFiles(),
+        pictures=gltf_files(tree, files, bytes_left) if has_pictures else MaterialFiles(),
         unread=unread,
     )

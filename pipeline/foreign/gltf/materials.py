@@ -1,6 +1,7 @@
 """Materials of a glTF as `SourceMaterial`, for objects and for scenes.
 
-A picture counts as its slot says: base and specular colors are sRGB-encoded, all else is linear.
+The slot of a picture decides on its encoding: base and specular colors are sRGB-encoded, all other
+slots are linear.
 """
 
 import dataclasses
@@ -18,18 +19,18 @@ from pipeline.foreign.picture import Picture, Wrap
 from storage.errors import Rejected
 
 DEFAULT = SourceMaterial(metallic=1.0)
-"""What glTF says of a mesh without a material."""
+"""Material that glTF defines for a mesh without one."""
 
 _WRAPS: Mapping[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728
 _MOST_EMISSION = 1e9
 
 Decode = Callable[[bytes, str], NDArray]
-"""Returns the values of a picture's bytes; its name is for messages."""
+"""Function that returns the values of a picture's bytes; the name is for messages."""
 
 
 class GltfMaterials:
-    """Reads the materials of one glTF, each picture once."""
+    """Reads the materials of one glTF, decoding each picture once."""
 
     def __init__(
         self,
@@ -39,21 +40,24 @@ class GltfMaterials:
         emission: bool = False,
         notes: list[str] | None = None,
     ) -> None:
-        """Read nothing yet.
+        """Store the arguments; materials are read on demand.
 
         Args:
             document: the file.
-            decode: what makes values of the bytes of a picture.
-            emission: whether what emits is read too.
-            notes: receives what cannot be read, which is then left out; without it that is refused.
+            decode: returns the values of a picture's bytes.
+            emission: whether emission is read, too.
+            notes: receives sentences on parts that are left out; None refuses the file for these.
         """
-        self._document, self._tree = document, document.tree
-        self._decode, self._emission, self._notes = decode, emission, notes
+        self._document = document
+        self._tree = document.tree
+        self._decode = decode
+        self._emission = emission
+        self._notes = notes
         self._values: dict[int, NDArray] = {}
         self._known: dict[int, SourceMaterial] = {}
 
-    def used(self) -> dict[int, SourceMaterial]:
-        """Return the materials that any mesh has, by number.
+    def used_materials(self) -> dict[int, SourceMaterial]:
+        """Return the materials that meshes use, by index.
 
         Raises:
             Rejected: as reading a picture.
@@ -73,17 +77,17 @@ class GltfMaterials:
         glossy = row.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
         if "KHR_materials_unlit" in row.get("extensions", {}):
             return self._unlit(row)
-        found = self._metallic(row) if glossy is None else self._glossy(glossy)
-        return self._with_emission(dataclasses.replace(found, lost=_lost(row)), row)
+        material = self._metallic(row) if glossy is None else self._glossy(glossy)
+        return self._with_emission(dataclasses.replace(material, lost=_list_unsupported(row)), row)
 
     def _unlit(self, row: Mapping[str, Any]) -> SourceMaterial:
-        """Return a diffuse surface of the base color: what shows it as it is in even light."""
+        """Return a diffuse surface of the base color, which looks unlit under uniform light."""
         metal = row.get("pbrMetallicRoughness", {})
         return SourceMaterial(
             base_rgb=self._rgb(metal, "baseColorFactor", 4),
             base=self._slot(metal, "baseColorTexture", is_srgb=True),
             specular_strength=0.0,
-            lost=("unlit", *_lost(row)),
+            lost=("unlit", *_list_unsupported(row)),
         )
 
     def _metallic(self, row: Mapping[str, Any]) -> SourceMaterial:
@@ -116,17 +120,17 @@ class GltfMaterials:
             glossiness=self._slot(row, "specularGlossinessTexture"),
         )
 
-    def _with_emission(self, found: SourceMaterial, row: Mapping[str, Any]) -> SourceMaterial:
-        """Return a material with what it emits, where that is read."""
+    def _with_emission(self, material: SourceMaterial, row: Mapping[str, Any]) -> SourceMaterial:
+        """Return a material with its emission, where emission is read."""
         if not self._emission:
-            return found
+            return material
         strength = extension(row, "KHR_materials_emissive_strength")
         times = self._number(strength, "emissiveStrength", 1, _MOST_EMISSION)
         red, green, blue = self._numbers(row, "emissiveFactor", (0.0,) * 3, _MOST_EMISSION)
         if not any((red, green, blue)) or not times:
-            return found
+            return material
         return dataclasses.replace(
-            found,
+            material,
             emission_rgb=(red * times, green * times, blue * times),
             emission=self._slot(row, "emissiveTexture", is_srgb=True),
         )
@@ -151,9 +155,9 @@ class GltfMaterials:
             raise Rejected("texture_unreadable", f"its picture is in no form read here: {forms}")
         sampler = entry(self._tree, "samplers", texture["sampler"]) if "sampler" in texture else {}
         wrap = _WRAPS[sampler.get("wrapS", 10497)], _WRAPS[sampler.get("wrapT", 10497)]
-        moved = extension(info, "KHR_texture_transform")
-        turn, shift = _moves(moved)
-        uv_set = read_count(moved, "texCoord", info.get("texCoord", 0))
+        transform = extension(info, "KHR_texture_transform")
+        uv_matrix, uv_offset = _uv_transform(transform)
+        uv_set = read_count(transform, "texCoord", info.get("texCoord", 0))
         if uv_set >= MOST_UV_SETS:
             raise Rejected("no_texture_coordinates", f"a texture lies on TEXCOORD_{uv_set}")
         values = self._picture(source)
@@ -165,8 +169,8 @@ class GltfMaterials:
                 is_nearest=sampler.get("magFilter") == _NEAREST,
             ),
             uv_set=uv_set,
-            turn=turn,
-            shift=shift,
+            uv_matrix=uv_matrix,
+            uv_offset=uv_offset,
         )
 
     def _picture(self, number: int) -> NDArray:
@@ -190,26 +194,26 @@ class GltfMaterials:
     def _numbers(
         self, row: Mapping[str, Any], name: str, default: tuple[float, ...], most: float
     ) -> list[float]:
-        """Return factors within [0, `most`]; the default, with a note, where they are none."""
+        """Return factors clamped to [0, `most`]; malformed ones become the default, with a note."""
         try:
-            found = [*read_numbers(row.get(name, default), len(default), name)]
-            if most > 1 and max(found) > most and self._notes is None:
-                raise Malformed(f"{name} is {max(found):g}; expected at most {most:g}")
+            factors = [*read_numbers(row.get(name, default), len(default), name)]
+            if most > 1 and max(factors) > most and self._notes is None:
+                raise Malformed(f"{name} is {max(factors):g}; expected at most {most:g}")
         except Malformed as error:
             if self._notes is None:
                 raise
             self._notes.append(f"{error}; {[*default]} taken")
             return list(default)
-        clamped = [min(max(value, 0.0), most) for value in found]
-        if self._notes is not None and clamped != found:
+        clamped = [min(max(value, 0.0), most) for value in factors]
+        if self._notes is not None and clamped != factors:
             self._notes.append(f"{name}: clamped to [0, {most:g}]")
         return clamped
 
 
-def _lost(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return what a material says beyond what is read of it."""
+def _list_unsupported(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return words for stated features that are not read."""
     extensions = row.get("extensions", {})
-    found = {
+    unsupported = {
         "emission": any(row.get("emissiveFactor", ())),
         "normal map": "normalTexture" in row,
         "transparency": row.get("alphaMode", "OPAQUE") != "OPAQUE",
@@ -218,19 +222,20 @@ def _lost(row: Mapping[str, Any]) -> tuple[str, ...]:
             for word in ("clearcoat", "transmission", "sheen", "anisotropy", "iridescence")
         },
     }
-    return tuple(word for word, is_there in found.items() if is_there)
+    return tuple(word for word, is_there in unsupported.items() if is_there)
 
 
-def _moves(moved: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the turn and shift of KHR_texture_transform for coordinates with v up.
+def _uv_transform(transform: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the matrix [2, 2] and offset [2] of KHR_texture_transform for coordinates with v up.
 
-    The extension says (u, w)' = shift + R S (u, w) with w down, and w = 1 - v.
+    The extension defines (u, w)' = shift + R S (u, w) with w down, and w = 1 - v.
     """
-    angle = read_number(moved.get("rotation", 0), "rotation")
-    scale = read_numbers(moved.get("scale", (1, 1)), 2, "scale")
-    cos, sin = np.cos(angle), np.sin(angle)
+    angle = read_number(transform.get("rotation", 0), "rotation")
+    scale = read_numbers(transform.get("scale", (1, 1)), 2, "scale")
+    cos = np.cos(angle)
+    sin = np.sin(angle)
     down = np.array([[cos, sin], [-sin, cos]]) @ np.diag(scale)
-    offset = np.array(read_numbers(moved.get("offset", (0, 0)), 2, "offset"))
+    offset = np.array(read_numbers(transform.get("offset", (0, 0)), 2, "offset"))
     flip = np.diag([1.0, -1.0])
     one = np.array([0.0, 1.0])
     return flip @ down @ flip, flip @ (offset + down @ one) + one

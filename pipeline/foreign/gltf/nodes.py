@@ -1,4 +1,4 @@
-"""The nodes of a glTF scene with their places in our world: metres, +Z up."""
+"""The nodes of a glTF scene with their transforms to world space: meters, +Z up."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -18,18 +18,18 @@ _TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], n
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlacedNode:
-    """A node in its place."""
+    """A node with its world transform."""
 
     node: dict[str, Any]
-    """Its JSON."""
+    """JSON object of the node."""
     to_world: NDArray[np.float64]
-    """[4, 4] for column vectors, into our world."""
+    """[4, 4] matrix for column vectors, to meters with +Z up."""
     is_visible: bool
-    """Whether the meshes and lights of the node are shown (KHR_node_visibility)."""
+    """True where the node's meshes and lights are shown (KHR_node_visibility)."""
 
 
 def entry(tree: Mapping[str, Any], kind: str, index: Any) -> dict[str, Any]:
-    """Return an entry of a list of the tree; raises Malformed where there is none."""
+    """Return an entry of a list of the tree; raises Malformed for an index out of range."""
     rows = tree.get(kind, ())
     if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(rows):
         raise Malformed(f"{kind} {index!r:.20} of {len(rows)}")
@@ -48,7 +48,7 @@ def extension(row: Mapping[str, Any], name: str) -> dict[str, Any]:
 def placed_nodes(tree: Mapping[str, Any]) -> Iterator[PlacedNode]:
     """Yield the nodes of the default scene, or else of the first one, parents before children.
 
-    A file without scenes shows all nodes.
+    All nodes count in a file without scenes.
 
     Raises:
         Rejected: scene_cycle.
@@ -71,16 +71,16 @@ def placed_nodes(tree: Mapping[str, Any]) -> Iterator[PlacedNode]:
 
 
 def placed_meshes(tree: Mapping[str, Any]) -> Iterator[PlacedNode]:
-    """Yield the nodes that show a mesh; raises Rejected nonfinite_vertices, or as placed nodes."""
-    for place in placed_nodes(tree):
-        if "mesh" in place.node and place.is_visible:
-            if not np.isfinite(place.to_world).all():
+    """Yield visible nodes with a mesh; raises Rejected nonfinite_vertices or scene_cycle."""
+    for placed in placed_nodes(tree):
+        if "mesh" in placed.node and placed.is_visible:
+            if not np.isfinite(placed.to_world).all():
                 fields = ("matrix", "translation", "rotation", "scale", "name")
-                said = {name: place.node[name] for name in fields if name in place.node}
+                stated = {name: placed.node[name] for name in fields if name in placed.node}
                 raise Rejected(
-                    "nonfinite_vertices", f"a node or one above it has a place {said!r:.120}"
+                    "nonfinite_vertices", f"a node or one above it has a place {stated!r:.120}"
                 )
-            yield place
+            yield placed
 
 
 def _roots(tree: Mapping[str, Any]) -> list[int]:
@@ -112,13 +112,13 @@ def transforms(
     x, y, z, w = rotation.T
     length = x * x + y * y + z * z + w * w
     twice = np.divide(2, length, out=np.zeros_like(length), where=length > 0)
-    turn = _rows(
+    rotations = _rows(
         [1 - twice * (y * y + z * z), twice * (x * y - z * w), twice * (x * z + y * w)],
         [twice * (x * y + z * w), 1 - twice * (x * x + z * z), twice * (y * z - x * w)],
         [twice * (x * z - y * w), twice * (y * z + x * w), 1 - twice * (x * x + y * y)],
     )
     matrices = np.tile(np.eye(4), (len(x), 1, 1))
-    matrices[:, :3, :3] = turn * scale[:, None]
+    matrices[:, :3, :3] = rotations * scale[:, None]
     matrices[:, :3, 3] = translation
     return matrices
 
@@ -128,7 +128,7 @@ def _rows(*rows: list[ArrayLike]) -> NDArray[np.float64]:
 
 
 def num_instances(tree: Mapping[str, Any], node: Mapping[str, Any]) -> int:
-    """Return how often a node places its mesh; raises Malformed where attributes disagree."""
+    """Return the number of instances of a node; raises Malformed where attributes disagree."""
     attributes = extension(node, INSTANCING).get("attributes", {})
     counts = {
         read_count(entry(tree, "accessors", number), "count") for number in attributes.values()

@@ -1,4 +1,4 @@
-"""The triangles of a glTF primitive, in the axes of its node."""
+"""The triangles of a glTF primitive, in the space of its node or of the world."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from storage.errors import Rejected
 
 
 class GltfPrimitive:
-    """The triangles of a primitive; morph targets shape it as its weights say."""
+    """The triangles of a primitive, deformed by its weighted morph targets."""
 
     def __init__(
         self, document: GltfDocument, primitive: dict[str, Any], weights: Sequence[float]
@@ -24,7 +24,8 @@ class GltfPrimitive:
         Raises:
             Rejected: index_range where a corner is no vertex, or as `GltfDocument.values`.
         """
-        self._document, self._primitive = document, primitive
+        self._document = document
+        self._primitive = primitive
         self._weights = weights
         attributes = primitive["attributes"]
         count = document.count(attributes["POSITION"])
@@ -36,15 +37,17 @@ class GltfPrimitive:
         self.faces = _faces(order, primitive.get("mode", TRIANGLES))
         """[T, 3] rows of `positions`."""
         self._rows: Rows = slice(None)
-        if count > self.faces.size:  # so that sharing a large accessor costs nothing
+        if (
+            count > self.faces.size
+        ):  # primitives that share a large accessor each read only their own rows
             self._rows, faces = np.unique(self.faces, return_inverse=True)
             self.faces = faces.reshape(-1, 3)
-        self.positions = self._shaped("POSITION", (3,))
-        """[V, 3]"""
+        self.positions = self._read_attribute("POSITION", (3,))
+        """[V, 3] in the space of the node."""
 
     @property
     def material(self) -> int | None:
-        """Row of the file's materials; None is glTF's default material."""
+        """Return the index of the material; None is glTF's default material."""
         number = self._primitive.get("material")
         if number is not None:
             entry(self._document.tree, "materials", number)
@@ -56,7 +59,7 @@ class GltfPrimitive:
         if name not in self._primitive["attributes"]:
             return None
         may_be_whole = "KHR_mesh_quantization" in self._document.tree.get("extensionsUsed", ())
-        uv = self._shaped(name, (2,), is_unit=None if may_be_whole else True)
+        uv = self._read_attribute(name, (2,), is_unit=None if may_be_whole else True)
         return np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)[self.faces]
 
     @property
@@ -64,76 +67,78 @@ class GltfPrimitive:
         """Linear colors [T, 3, 3] of the corners; None where there are none."""
         if "COLOR_0" not in self._primitive["attributes"]:
             return None
-        return self._shaped("COLOR_0", (3, 4), is_unit=True)[self.faces, :3]
+        return self._read_attribute("COLOR_0", (3, 4), is_unit=True)[self.faces, :3]
 
     @property
     def normals(self) -> NDArray[np.float64] | None:
         """Normals [T, 3, 3] of the corners; None where there are none."""
         if "NORMAL" not in self._primitive["attributes"]:
             return None
-        return self._shaped("NORMAL", (3,))[self.faces]
+        return self._read_attribute("NORMAL", (3,))[self.faces]
 
-    def _shaped(
+    def _read_attribute(
         self, name: str, widths: tuple[int, ...], *, is_unit: bool | None = None
     ) -> NDArray[np.float64]:
-        """Return an attribute [V, K] of the vertices, with what morph targets add to it."""
+        """Return an attribute [V, K] of the vertices, with weighted morph targets added."""
         number = self._primitive["attributes"][name]
         values = self._document.values(number, widths, self._rows, is_unit=is_unit)
         targets = self._primitive.get("targets", ())
         for weight, target in zip(self._weights, targets, strict=False):
             if weight and name in target:
-                more = self._document.values(target[name], widths, self._rows, is_unit=is_unit)
+                morph = self._document.values(target[name], widths, self._rows, is_unit=is_unit)
                 with np.errstate(invalid="ignore", over="ignore"):
-                    values = values + read_number(weight, "weights") * more
+                    values = values + read_number(weight, "weights") * morph
         return values
 
 
 class PlacedPrimitive:
-    """A primitive in one of its places; a mirrored one has its corners in the other order."""
+    """An instance of a primitive; corners of a mirrored one have the reverse order."""
 
     def __init__(self, primitive: GltfPrimitive, to_world: NDArray[np.float64]) -> None:
-        """Place its vertices by a matrix [4, 4]."""
+        """Transform its vertices by a matrix [4, 4]."""
         self.primitive = primitive
-        turn = to_world[:3, :3]
+        linear = to_world[:3, :3]
         with np.errstate(invalid="ignore", over="ignore"):
-            self._step = -1 if np.linalg.det(turn) < 0 else 1
-            world = np.einsum("ij,vj->vi", turn, primitive.positions) + to_world[:3, 3]
-            self._cofactors = np.cross(turn[[1, 2, 0]], turn[[2, 0, 1]]) * self._step
+            self._winding = -1 if np.linalg.det(linear) < 0 else 1
+            world = np.einsum("ij,vj->vi", linear, primitive.positions) + to_world[:3, 3]
+            self._cofactors = np.cross(linear[[1, 2, 0]], linear[[2, 0, 1]]) * self._winding
         self.positions: NDArray[np.float64] = world
-        """[V, 3]"""
-        self.faces = primitive.faces[:, :: self._step]
+        """[V, 3] in world space."""
+        self.faces = primitive.faces[:, :: self._winding]
         """[T, 3] rows of `positions`."""
 
     @property
     def colors(self) -> NDArray[np.float64] | None:
         """Linear colors [T, 3, 3] of the corners; None where there are none."""
-        return self._turned(self.primitive.colors)
+        return self._orient_corners(self.primitive.colors)
 
     @property
     def normals(self) -> NDArray[np.float64] | None:
         """Normals [T, 3, 3] of the corners, of any length; None where there are none."""
-        found = self._turned(self.primitive.normals)
-        return None if found is None else np.einsum("ij,tcj->tci", self._cofactors, found)
+        normals = self._orient_corners(self.primitive.normals)
+        return None if normals is None else np.einsum("ij,tcj->tci", self._cofactors, normals)
 
     def coordinates(self, number: int) -> NDArray[np.float64] | None:
         """Return a set of texture coordinates [T, 3, 2], v up; None where there is none."""
-        return self._turned(self.primitive.coordinates(number))
+        return self._orient_corners(self.primitive.coordinates(number))
 
-    def _turned(self, of_corners: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-        return None if of_corners is None else of_corners[:, :: self._step]
+    def _orient_corners(
+        self, corner_values: NDArray[np.float64] | None
+    ) -> NDArray[np.float64] | None:
+        return None if corner_values is None else corner_values[:, :: self._winding]
 
 
-def placed_primitives(document: GltfDocument, place: PlacedNode) -> Iterator[PlacedPrimitive]:
-    """Yield what has triangles of the mesh of a node, in each of its places."""
-    mesh = entry(document.tree, "meshes", place.node["mesh"])
-    weights = place.node.get("weights", mesh.get("weights", ()))
+def placed_primitives(document: GltfDocument, placed: PlacedNode) -> Iterator[PlacedPrimitive]:
+    """Yield the primitives of a node's mesh that have triangles, once for each instance."""
+    mesh = entry(document.tree, "meshes", placed.node["mesh"])
+    weights = placed.node.get("weights", mesh.get("weights", ()))
     primitives = [
         GltfPrimitive(document, primitive, list(weights))
         for primitive in mesh["primitives"]
         if primitive.get("mode", TRIANGLES) not in POINTS_AND_LINES
         and "POSITION" in primitive["attributes"]
     ]
-    for to_world in document.instances(place):
+    for to_world in document.instances(placed):
         yield from (PlacedPrimitive(primitive, to_world) for primitive in primitives)
 
 

@@ -1,4 +1,4 @@
-"""What a glTF says and no code here reads, as short sentences, each once a file."""
+"""Short sentences on contents of a glTF that no code here reads, each once a file."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -13,13 +13,13 @@ _CHANGES_NOTHING = frozenset(
     "EXT_structural_metadata FB_geometry_metadata GODOT_single_root KHR_animation_pointer "
     "KHR_node_hoverability KHR_node_selectability KHR_xmp KHR_xmp_json_ld MSFT_lod".split()
 )
-"""Metadata, ways to animate, and coarser copies of what the scene shows."""
+"""Extensions for metadata, animation, and coarser copies of meshes."""
 _NAMED_ELSEWHERE = frozenset(
     "EXT_meshopt_compression KHR_draco_mesh_compression KHR_meshopt_compression "
     "KHR_materials_anisotropy KHR_materials_clearcoat KHR_materials_iridescence "
     "KHR_materials_sheen KHR_materials_transmission".split()
 )
-"""Compression beside plain data, which is read; and what `SourceMaterial.lost` names."""
+"""Compression beside plain data, which is read, and features that `SourceMaterial.lost` names."""
 
 _KEYS: Mapping[str, str] = {
     "the file": "asset scene scenes nodes meshes accessors bufferViews buffers materials textures "
@@ -32,29 +32,29 @@ _KEYS: Mapping[str, str] = {
     "emissiveFactor alphaMode alphaCutoff doubleSided",
     "accessors": "bufferView byteOffset componentType normalized count type max min sparse name",
 }
-"""The keys of glTF 2.0 by the list that they are in."""
+"""Keys of glTF 2.0 by the list that holds them."""
 
 _ATTRIBUTES: Mapping[str, tuple[str, ...]] = {
     "primitives": ("POSITION", "NORMAL", "TANGENT", "COLOR_0", "TEXCOORD_", "JOINTS_", "WEIGHTS_"),
     "nodes, EXT_mesh_gpu_instancing": ("TRANSLATION", "ROTATION", "SCALE"),
 }
-"""How the attributes begin that are read, or that only skins have."""
+"""Prefixes of attributes that are read, or that only skins have."""
 
 
 def is_known(name: str) -> bool:
-    """Return whether an extension is read here, or changes no triangle, color or light."""
+    """Return whether an extension is read, or changes no triangle, color or light."""
     return name in _READ or name in _CHANGES_NOTHING
 
 
-def unread_parts(tree: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return what no code reads; a file that is malformed is refused elsewhere."""
+def list_unread_parts(tree: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return sentences on contents that no code reads; malformed files are refused elsewhere."""
     extensions: dict[str, str] = {}
-    others: dict[str, None] = {}
+    sentences: dict[str, None] = {}
     for kind, row in _rows(tree):
         for name in row.get("extensions", ()):
             if extensions.get(name, "the file") == "the file":
                 extensions[name] = kind
-        others |= dict.fromkeys(_of_row(kind, row))
+        sentences |= dict.fromkeys(_list_unread(kind, row))
     for name in tree.get("extensionsUsed", ()):
         extensions.setdefault(name, "the file")
     silent = _READ | _CHANGES_NOTHING | _NAMED_ELSEWHERE
@@ -63,11 +63,11 @@ def unread_parts(tree: Mapping[str, Any]) -> tuple[str, ...]:
         for name, kind in extensions.items()
         if name not in silent
     ]
-    return (*named, *others)
+    return (*named, *sentences)
 
 
 def _rows(tree: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield every object of a tree but those of `extras`, with the list that it is in."""
+    """Yield every JSON object of a tree outside of `extras`, with the name of its list."""
     waiting: list[tuple[str, Any]] = [("the file", tree)]
     while waiting:
         kind, value = waiting.pop()
@@ -83,8 +83,8 @@ def _rows(tree: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
             waiting += [(kind, each) for each in value if isinstance(each, (dict, list))]
 
 
-def _of_row(kind: str, row: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what is not read of one object of the tree, but for its extensions."""
+def _list_unread(kind: str, row: Mapping[str, Any]) -> Iterator[str]:
+    """Yield sentences on one JSON object of the tree, its extensions excluded."""
     if "extras" in row:
         yield f"extras of {kind}"
     if kind in _KEYS:
@@ -92,8 +92,8 @@ def _of_row(kind: str, row: Mapping[str, Any]) -> Iterator[str]:
         yield from (f"key {key!r:.60} of {kind}" for key in row if key not in known)
     if kind in _ATTRIBUTES:
         names = row.get("attributes", ())
-        others = (name for name in names if not name.startswith(_ATTRIBUTES[kind]))
-        yield from (f"attribute {name!r:.60} of {kind}" for name in others)
+        unknown = (name for name in names if not name.startswith(_ATTRIBUTES[kind]))
+        yield from (f"attribute {name!r:.60} of {kind}" for name in unknown)
     if kind == "primitives":
         if row.get("mode", 4) in (0, 1, 2, 3):
             yield "points and lines"

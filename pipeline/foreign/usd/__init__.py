@@ -1,10 +1,10 @@
-"""USD files of strangers: opened within bounds, and read as plain arrays and numbers.
+"""Reader of untrusted USD files: opened within bounds, and read as plain arrays and numbers.
 
-Scenes (pipeline.exchange.usd) and objects (pipeline.assets) both read what is here. Native code
-parses the bytes, so only children with limits come here (pipeline.isolation).
+Scenes (pipeline.exchange.usd) and objects (pipeline.assets) both use it. Native code parses the
+bytes, so only processes with limits import this (pipeline.isolation).
 
 - `stage`, `composition`: a file and the files that it names, bounded before it is composed.
-- `placed`, `schemas`: what is seen, and where; what is not read.
-- `polygons`, `solids`, `skins`: a mesh as triangles, as its bones pose it.
-- `shaders`, `texture_nodes`, `colors`: what a material states, before a caller interprets it.
+- `placed`, `schemas`: the visible prims with their transforms; names of unread contents.
+- `polygons`, `solids`, `skins`: a mesh as triangles, posed by its skeleton.
+- `shaders`, `texture_nodes`, `colors`: the inputs of a material, before a caller interprets them.
 """

@@ -1,4 +1,4 @@
-"""Colors of a stage in linear Rec.709, which is what everything here is computed in."""
+"""Conversion of the colors of a stage to linear Rec.709, which all code here computes in."""
 
 from typing import Any
 
@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 
 def convert_to_rec709(attribute: Any, stated: NDArray) -> NDArray:
-    """Return the colors [..., 3 or 4] of an attribute, turned from the color space that USD states.
+    """Return the colors [..., 3 or 4] of an attribute, converted from the color space of USD.
 
-    Without one, and where they are called data, they stay as they are.
+    Colors without a space, and those declared as data, stay as they are.
     """
     from pxr import Gf, Usd, Vt
 

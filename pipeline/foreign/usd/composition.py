@@ -1,10 +1,10 @@
-"""How large a stage becomes: its prims are composed one by one, and counted, before it is opened.
+"""Bounds of the size of a stage: its prims are composed and counted before it is opened.
 
 References, payloads, inherits and variants multiply prims without end, in more ways than a walk
-over the arcs of single prims sees: a reference to `</A/B>` brings the arcs of `</A>` along, and a
-class is inherited again wherever its heir is referenced. So nothing is foretold here. USD's own
-composition engine makes the prims, in the order of the tree, and is left as soon as there are too
-many or they take too long. No composed prim can hold more than 32,767 sites, which is its limit.
+over the arcs of single prims sees: a reference to `</A/B>` also brings the arcs of `</A>`, and a
+class is inherited again wherever its heir is referenced. So no size is predicted here. USD's own
+composition engine makes the prims, in the order of the tree, and is stopped as soon as there are
+too many or they take too long. A composed prim holds at most 32,767 sites, which is USD's limit.
 """
 
 import time
@@ -18,8 +18,8 @@ MAX_PRIMS = 500_000
 MAX_DEPTH = 150
 """Maximum nesting of prims."""
 MAX_COMPOSITION_S = 20.0
-"""Maximum processor seconds for all prims: 500,000 of few arcs each take 4 to 10;
-chains of thousands of references or prims of thousands of sites take hours."""
+"""Maximum CPU seconds for all prims: 500,000 of few arcs each take 4 to 10; chains of thousands of
+references, or prims of thousands of sites, take hours."""
 
 
 def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
@@ -28,7 +28,7 @@ def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
     Args:
         root: the layer; every file it names must have been checked (pipeline.foreign.usd.stage).
         context: resolver context of the stage that will be opened.
-        name: of the file, for messages.
+        name: name of the file, for messages.
 
     Raises:
         TrilightError: too many prims, nested too deep, or not composed in time.
@@ -37,17 +37,19 @@ def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
 
     cache = Pcp.Cache(Pcp.LayerStackIdentifier(root, None, context), "usd", True)
     _, errors = cache.ComputeLayerStack(cache.GetLayerStackIdentifier())
-    waiting, prototypes, made = [Sdf.Path.absoluteRootPath], set(), 0
-    begun_s = time.process_time()
+    waiting = [Sdf.Path.absoluteRootPath]
+    prototypes = set()
+    num_prims = 0
+    start_s = time.process_time()
     while waiting:
         path = waiting.pop()
-        made += 1
-        _require_bounds(name, path, made, time.process_time() - begun_s)
-        index, found = cache.ComputePrimIndex(path)
+        num_prims += 1
+        _require_bounds(name, path, num_prims, time.process_time() - start_s)
+        index, prim_errors = cache.ComputePrimIndex(path)
         if index.hasAnyPayloads:
             cache.RequestPayloads([path], [])
-            index, found = cache.ComputePrimIndex(path)
-        errors += found
+            index, prim_errors = cache.ComputePrimIndex(path)
+        errors += prim_errors
         if index.IsInstanceable():
             prototype = Pcp.InstanceKey(index)
             if prototype in prototypes:
@@ -58,15 +60,15 @@ def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
     return errors
 
 
-def _require_bounds(name: str, path: Any, made: int, took_s: float) -> None:
-    if made > MAX_PRIMS:
+def _require_bounds(name: str, path: Any, num_prims: int, elapsed_s: float) -> None:
+    if num_prims > MAX_PRIMS:
         raise TrilightError(f"{name}: composes more than {MAX_PRIMS} prims, the most that is read.")
     if path.pathElementCount > MAX_DEPTH:
         raise TrilightError(
             f"{name}: prims are nested more than {MAX_DEPTH} deep ({str(path)[:60]}...)."
         )
-    if took_s > MAX_COMPOSITION_S:
+    if elapsed_s > MAX_COMPOSITION_S:
         raise TrilightError(
-            f"{name}: {made} prims took {took_s:.0f} processor seconds to compose and more follow; "
-            f"expected all within {MAX_COMPOSITION_S:.0f}. Flatten the stage."
+            f"{name}: {num_prims} prims took {elapsed_s:.0f} processor seconds to compose and more "
+            f"follow; expected all within {MAX_COMPOSITION_S:.0f}. Flatten the stage."
         )

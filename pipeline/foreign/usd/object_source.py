@@ -1,4 +1,4 @@
-"""`UsdSource`: a USD file of an object, its triangles and its materials; only children make one."""
+"""`UsdSource`: the triangles and materials of a USD object; only child processes make one."""
 
 import hashlib
 from collections.abc import Sequence
@@ -7,14 +7,14 @@ from pathlib import Path
 
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.usd.object_looks import StageLooks, stage_looks
-from pipeline.foreign.usd.object_meshes import PlacedPart, joined, placed_parts
-from pipeline.foreign.usd.object_stage import UsdStage, open_stage, refusing
+from pipeline.foreign.usd.object_meshes import PlacedMesh, join_meshes, place_meshes
+from pipeline.foreign.usd.object_stage import UsdStage, open_stage, read_or_reject
+from pipeline.foreign.usd.stage_materials import StageMaterials, read_stage_materials
 from storage.errors import Rejected
 
 
 class UsdSource:
-    """What a USD file holds. The materials are looked at where limits keep them."""
+    """The contents of a USD file; materials are read where limits include them."""
 
     def __init__(self, path: Path, limits: ReadLimits) -> None:
         """Open the file and those that it names.
@@ -22,57 +22,60 @@ class UsdSource:
         Raises:
             Rejected: as `open_stage`, or too_large_bytes for all layers together.
         """
-        self._path, self._limits = path, limits
+        self._path = path
+        self._limits = limits
         self.stage: UsdStage = open_stage(path, limits)
-        self._digest, left = _digest(self.stage.opened.files, limits.max_bytes)
-        self._looks: StageLooks | Rejected | None = None
+        self._digest, bytes_left = _digest_files(self.stage.opened.files, limits.max_bytes)
+        self._materials: StageMaterials | Rejected | None = None
         if limits.with_materials:
             try:
-                self._looks = refusing(path, lambda: stage_looks(self.stage, left))
+                self._materials = read_or_reject(
+                    path, lambda: read_stage_materials(self.stage, bytes_left)
+                )
             except Rejected as why:
-                self._looks = Rejected(why.reason, why.message)  # its traceback holds the stage
+                self._materials = Rejected(why.reason, why.message)  # its traceback holds the stage
 
     @property
     def sha256(self) -> str:
-        """Digest of all layers, the root first, and of the pictures that materials name."""
+        """Return the digest of all layers, the root first, and of the pictures of materials."""
         digest = self._digest.copy()
-        if isinstance(self._looks, StageLooks):
-            pictures = self._looks.pictures.data
+        if isinstance(self._materials, StageMaterials):
+            pictures = self._materials.pictures.data
             for place in sorted(pictures):
                 digest.update(pictures[place])
         return digest.hexdigest()
 
     @property
     def unread(self) -> tuple[str, ...]:
-        """What the file says and nothing reads, each once."""
+        """Return sentences on contents of the file that are not read, each once."""
         return self.stage.opened.notes
 
     @cached_property
-    def parts(self) -> tuple[PlacedPart, ...]:
-        """Its meshes; raises Rejected as `placed_parts`, or load_error."""
-        return refusing(self._path, lambda: placed_parts(self.stage, self._limits))
+    def meshes(self) -> tuple[PlacedMesh, ...]:
+        """Return the meshes; raises Rejected as `place_meshes`, or load_error."""
+        return read_or_reject(self._path, lambda: place_meshes(self.stage, self._limits))
 
     @cached_property
     def mesh(self) -> TriangleMesh:
-        """All of them as one, in metres, +Z up; raises Rejected as `parts`."""
-        return joined(self.parts)
+        """Return all meshes as one, in meters, +Z up; raises Rejected as `meshes`."""
+        return join_meshes(self.meshes)
 
-    def looks(self) -> StageLooks:
-        """Return its materials; raises Rejected as `stage_looks`, or where nobody keeps them."""
-        if isinstance(self._looks, Rejected):
-            raise self._looks
-        if self._looks is None:
+    def materials(self) -> StageMaterials:
+        """Return the materials; raises Rejected as `read_stage_materials`, or no_materials."""
+        if isinstance(self._materials, Rejected):
+            raise self._materials
+        if self._materials is None:
             raise Rejected("no_materials", "materials were not asked for")
-        return self._looks
+        return self._materials
 
 
-def _digest(files: Sequence[Path], left: int) -> "tuple[hashlib._Hash, int]":
-    """Return the digest of files, and how many bytes are left of a bound on them."""
+def _digest_files(files: Sequence[Path], bytes_left: int) -> "tuple[hashlib._Hash, int]":
+    """Return the digest of files, and the bytes that are left of their bound."""
     digest = hashlib.sha256()
     for path in files:
         data = path.read_bytes()
-        if len(data) > left:
-            raise Rejected("too_large_bytes", f"the layers together; {left} bytes are left")
+        if len(data) > bytes_left:
+            raise Rejected("too_large_bytes", f"the layers together; {bytes_left} bytes are left")
         digest.update(data)
-        left -= len(data)
-    return digest, left
+        bytes_left -= len(data)
+    return digest, bytes_left

@@ -1,8 +1,8 @@
-"""A USD file as an object: opened within bounds, with what is seen of it, and refused by name.
+"""`open_stage`: the visible meshes of a USD object, opened within bounds, or its refusal by name.
 
-USD resolves what a file names by itself, so it is given a path; every file that it may open is
-checked first (pipeline.foreign.usd.stage). What would give a plausible but wrong mesh is refused: a
-missing reference, surfaces that are no polygons, bones that nothing poses.
+USD itself resolves the names of other files, so it receives a path; every file that it may open is
+checked first (pipeline.foreign.usd.stage). Contents that would give a plausible but wrong mesh are
+refused: a missing reference, surfaces other than polygons, bones without a pose.
 """
 
 from collections.abc import Callable
@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.usd.placed import Placed, placed_prims
+from pipeline.foreign.usd.placed import PlacedPrim, placed_prims
 from pipeline.foreign.usd.skins import UnposedMesh
 from pipeline.foreign.usd.solids import SOLIDS
-from pipeline.foreign.usd.stage import OpenedUsd, OutsideFile, quietly
+from pipeline.foreign.usd.stage import OpenedUsd, OutsideFile, read_quietly
 from storage.errors import Rejected, TrilightError
 
 Read = TypeVar("Read")
@@ -22,16 +22,16 @@ Read = TypeVar("Read")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class UsdStage:
-    """An open stage."""
+    """A composed stage with its visible meshes."""
 
     opened: OpenedUsd
-    """Its files."""
+    """Opened layers of the stage, with notes on unread contents."""
     composed: Any
-    """The stage itself, without which its prims expire."""
-    meshes: tuple[Placed, ...]
-    """What is seen of it, into metres with +Z up."""
+    """The Usd.Stage, kept because its prims expire with it."""
+    meshes: tuple[PlacedPrim, ...]
+    """Visible meshes with transforms to meters, +Z up."""
     time: Any
-    """The first of a stage that moves."""
+    """The Usd.TimeCode at which values are read: the first of an animated stage."""
 
 
 def open_stage(path: Path, limits: ReadLimits) -> UsdStage:
@@ -41,34 +41,36 @@ def open_stage(path: Path, limits: ReadLimits) -> UsdStage:
         Rejected: external_uri, load_error, missing_file, too_many_instances,
             unsupported_primitive, skinned_mesh.
     """
-    return refusing(path, lambda: _opened(path, limits))
+    return read_or_reject(path, lambda: _read_stage(path, limits))
 
 
-def refusing(path: Path, read: Callable[[], Read]) -> Read:
-    """Return what `read` makes of a USD file; its errors become reasons.
+def read_or_reject(path: Path, read: Callable[[], Read]) -> Read:
+    """Return the result of `read` for a USD file; its errors become reasons of Rejected.
 
     Raises:
         Rejected: external_uri, skinned_mesh, load_error, or as `read`.
     """
     try:
-        return quietly(path, read)
+        return read_quietly(path, read)
     except TrilightError as error:
         reasons = {OutsideFile: "external_uri", UnposedMesh: "skinned_mesh"}
         raise Rejected(reasons.get(type(error), "load_error"), f"{error!s:.300}") from error
 
 
-def _opened(path: Path, limits: ReadLimits) -> UsdStage:
+def _read_stage(path: Path, limits: ReadLimits) -> UsdStage:
     from pxr import Usd
 
     opened = OpenedUsd(path, max_file_bytes=limits.max_bytes)
-    stage, time = opened.compose(), Usd.TimeCode.EarliestTime()
+    stage = opened.compose()
+    time = Usd.TimeCode.EarliestTime()
     if opened.unresolved:
         raise Rejected("missing_file", f"{opened.unresolved[0]}; an object needs all of its parts")
     placed = placed_prims(stage, time, opened.lost, ("Mesh", *SOLIDS, "NurbsPatch"))
     if len(placed) > limits.max_instances:
         raise Rejected("too_many_instances", f"{len(placed)} meshes; <= {limits.max_instances}")
     for each in placed:
-        kind, where = each.prim.GetTypeName(), str(each.prim.GetPath())
+        kind = each.prim.GetTypeName()
+        where = str(each.prim.GetPath())
         if kind == "NurbsPatch":
             raise Rejected("unsupported_primitive", f"{where!r:.100} is a {kind}; make it a mesh")
         scheme = each.prim.GetAttribute("subdivisionScheme")

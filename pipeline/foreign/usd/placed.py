@@ -1,7 +1,7 @@
-"""Every mesh, light and camera of a composed stage with its place in our world, instances too.
+"""Visible meshes, lights and cameras of a stage with their world transforms, instances included.
 
-What is seen is what UsdGeom says: visibility and purposes as they are inherited, prototypes of a
-PointInstancer wherever they stand, also below an `over` or a class.
+UsdGeom defines visibility: inherited visibility and purposes, and prototypes of a PointInstancer
+wherever they are defined, also below an `over` or a class.
 """
 
 import dataclasses
@@ -28,82 +28,98 @@ MAX_NESTED = 150
 DOMES = ("DomeLight", "DomeLight_1")
 LAMPS = ("RectLight", "DiskLight", "SphereLight", "CylinderLight")
 SCENE_KINDS = ("Mesh", *SOLIDS, "Camera", *LAMPS, *DOMES)
-"""Kinds of prims that a scene is made of."""
+"""Types of prims that scenes are read from."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Placed:
-    """A prim in its place."""
+class PlacedPrim:
+    """A prim with its world transform."""
 
-    prim: Any  # the USD prim; several places may share one
-    to_world: NDArray[np.float64]  # [4, 4], for column vectors, into metres with +Z up
-    metres: float = 1.0  # of a unit of the stage
-    skin: BoundSkin | None = None  # what poses a mesh
-    lost: list[str] = field(default_factory=list)  # receives what is not read of it
+    prim: Any  # the Usd.Prim; several instances may share one
+    to_world: NDArray[np.float64]  # [4, 4] for column vectors, to meters with +Z up
+    meters_per_unit: float = 1.0  # length of a unit of the stage
+    skin: BoundSkin | None = None  # the skin that poses a mesh
+    lost: list[str] = field(default_factory=list)  # receives notes on contents that are not read
 
 
 def placed_prims(
     stage: Any, time: Any, lost: list[str], kinds: Collection[str] = SCENE_KINDS
-) -> list[Placed]:
-    """Return the prims of some kinds that are seen of a stage at a time, in its own order.
+) -> list[PlacedPrim]:
+    """Return the visible prims of some kinds of a stage at a time, in the order of the stage.
 
-    Invisible prims, guides and proxies are left out; schemas that nothing reads are noted.
+    Invisible prims, guides and proxies are left out; notes name unread schemas.
 
     Raises:
         TrilightError: more than MAX_PLACED prims with all instances, prims or prototypes that are
-            nested more than MAX_NESTED deep, a place that is not finite, or UnposedMesh.
+            nested more than MAX_NESTED deep, a transform that is not finite, or UnposedMesh.
     """
     from pxr import UsdGeom
 
-    found: list[Placed] = []
-    unread, known = Counter[str](), dict[Any, list[str]]()
-    skins, visits, above_zero = BoundSkins(time), 0, Within(0, FINITE.high, low_open=True)
-    metres = read_number(UsdGeom.GetStageMetersPerUnit(stage), "metersPerUnit", above_zero)
-    for visit in _visited(stage, _base(stage, metres), time, lost):
+    placed: list[PlacedPrim] = []
+    unread = Counter[str]()
+    known: dict[Any, list[str]] = {}
+    skins = BoundSkins(time)
+    visits = 0
+    above_zero = Within(0, FINITE.high, low_open=True)
+    meters_per_unit = read_number(UsdGeom.GetStageMetersPerUnit(stage), "metersPerUnit", above_zero)
+    for visit in _visit_prims(stage, _stage_to_world(stage, meters_per_unit), time, lost):
         visits += 1
         if visits > MAX_PLACED:
             raise TrilightError(f"more than {MAX_PLACED} prims with all instances.")
-        prim, to_world = visit.prim, visit.to_world
+        prim = visit.prim
+        to_world = visit.to_world
         kind = str(prim.GetTypeName())
         path = prim.GetPath()
         if path not in known:  # instances of one prototype have one path
             known[path] = list(list_unread(prim, time, kinds))
         unread.update(known[path])
         if kind == "SkelRoot":
-            skins.take(prim, visit.predicate)
+            skins.add_root(prim, visit.predicate)
         if kind in kinds:
             if not np.isfinite(to_world).all():
                 raise TrilightError(f"{prim.GetPath()}: its place is not finite.")
             skin = skins.find(prim)
-            found.append(Placed(prim=prim, to_world=to_world, metres=metres, skin=skin, lost=lost))
+            placed.append(
+                PlacedPrim(
+                    prim=prim,
+                    to_world=to_world,
+                    meters_per_unit=meters_per_unit,
+                    skin=skin,
+                    lost=lost,
+                )
+            )
     lost += [f"{count} x {kind}: not read" for kind, count in sorted(unread.items())]
-    return found
+    return placed
 
 
-def _base(stage: Any, metres: float) -> NDArray[np.float64]:
-    """Return the matrix from a stage's units and axis to metres with +Z up."""
+def _stage_to_world(stage: Any, meters_per_unit: float) -> NDArray[np.float64]:
+    """Return the matrix [4, 4] from a stage's units and up axis to meters with +Z up."""
     from pxr import UsdGeom
 
-    base = np.diag([metres, metres, metres, 1.0])
+    base = np.diag([meters_per_unit, meters_per_unit, meters_per_unit, 1.0])
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
-        base[:3, :3] = metres * np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+        base[:3, :3] = meters_per_unit * np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     return base
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Visit:
-    """A prim, and what it has from above."""
+    """A prim with the state that it inherits from its ancestors."""
 
     prim: Any
-    to_world: NDArray[np.float64]  # of what is above it until it is moved
-    origin: NDArray[np.float64]  # where `!resetXformStack!` begins: the stage, or an instance
+    to_world: NDArray[np.float64]  # of its parent until its own transform is applied
+    origin: NDArray[
+        np.float64
+    ]  # start of `!resetXformStack!`: that of the stage, or of an instance
     purpose: str = "default"
-    is_render_shown: bool = True  # what VisibilityAPI says of the purpose `render`
-    predicate: Any = None  # which children there are
+    is_render_shown: bool = True  # VisibilityAPI's answer for the purpose `render`
+    predicate: Any = None  # selects the children to visit
 
 
-def _visited(stage: Any, base: NDArray[np.float64], time: Any, lost: list[str]) -> Iterator[_Visit]:
-    """Yield what is seen of a stage with its place, in the order of the tree."""
+def _visit_prims(
+    stage: Any, base: NDArray[np.float64], time: Any, lost: list[str]
+) -> Iterator[_Visit]:
+    """Yield the visible prims of a stage with world transforms, in the order of the tree."""
     from pxr import Usd, UsdGeom
 
     root = _Visit(
@@ -112,7 +128,7 @@ def _visited(stage: Any, base: NDArray[np.float64], time: Any, lost: list[str]) 
         origin=base,
         predicate=Usd.TraverseInstanceProxies(),
     )
-    levels = [_children(root)]
+    levels = [_visit_children(root)]
     while levels:
         above = next(levels[-1], None)
         if above is None:
@@ -126,8 +142,8 @@ def _visited(stage: Any, base: NDArray[np.float64], time: Any, lost: list[str]) 
         imageable = UsdGeom.Imageable(prim)
         if imageable and imageable.GetVisibilityAttr().Get(time) == UsdGeom.Tokens.invisible:
             continue
-        visit = _take_purpose(above, imageable, time)
-        visit = dataclasses.replace(visit, to_world=_moved(visit, time))
+        visit = _inherit_purpose(above, imageable, time)
+        visit = dataclasses.replace(visit, to_world=_compute_world(visit, time))
         is_shown = visit.purpose == "default" or (
             visit.purpose == "render" and visit.is_render_shown
         )
@@ -135,29 +151,32 @@ def _visited(stage: Any, base: NDArray[np.float64], time: Any, lost: list[str]) 
             yield visit
         is_instancer = prim.IsA(UsdGeom.PointInstancer)
         if is_shown or not is_instancer:
-            levels.append(_instances(visit, time, lost) if is_instancer else _children(visit))
+            levels.append(
+                _visit_instances(visit, time, lost) if is_instancer else _visit_children(visit)
+            )
 
 
-def _children(above: _Visit) -> Iterator[_Visit]:
+def _visit_children(above: _Visit) -> Iterator[_Visit]:
     children = above.prim.GetFilteredChildren(above.predicate)
     return (dataclasses.replace(above, prim=child) for child in children)
 
 
-def _take_purpose(above: _Visit, imageable: Any, time: Any) -> _Visit:
-    """Return a visit with the prim's own purpose, which its children have too, if it has one."""
+def _inherit_purpose(above: _Visit, imageable: Any, time: Any) -> _Visit:
+    """Return a visit with the prim's authored purpose, if any, which its children inherit."""
     from pxr import UsdGeom
 
     if not imageable:
         return above
-    purpose, shown = imageable.GetPurposeAttr(), above.is_render_shown
+    purpose = imageable.GetPurposeAttr()
+    is_shown = above.is_render_shown
     if above.prim.HasAPI(UsdGeom.VisibilityAPI):
         stated = UsdGeom.VisibilityAPI(above.prim).GetRenderVisibilityAttr().Get(time)
-        shown = shown if stated in (None, "inherited") else stated == "visible"
-    own = str(purpose.Get()) if purpose.HasAuthoredValue() else above.purpose
-    return dataclasses.replace(above, purpose=own, is_render_shown=shown)
+        is_shown = is_shown if stated in (None, "inherited") else stated == "visible"
+    purpose_name = str(purpose.Get()) if purpose.HasAuthoredValue() else above.purpose
+    return dataclasses.replace(above, purpose=purpose_name, is_render_shown=is_shown)
 
 
-def _moved(visit: _Visit, time: Any) -> NDArray[np.float64]:
+def _compute_world(visit: _Visit, time: Any) -> NDArray[np.float64]:
     from pxr import UsdGeom
 
     move = UsdGeom.Xformable(visit.prim)
@@ -168,44 +187,44 @@ def _moved(visit: _Visit, time: Any) -> NDArray[np.float64]:
     return np.einsum("ij,jk->ik", start, local)
 
 
-def _instances(above: _Visit, time: Any, lost: list[str]) -> Iterator[_Visit]:
+def _visit_instances(above: _Visit, time: Any, lost: list[str]) -> Iterator[_Visit]:
     from pxr import Usd, UsdGeom
 
     prim = above.prim
     instancer = UsdGeom.PointInstancer(prim)
     targets = instancer.GetPrototypesRel().GetForwardedTargets()
-    which = instancer.GetProtoIndicesAttr().Get(time) or []
-    if len(which) > MAX_PLACED:  # before their places are computed
+    prototype_indices = instancer.GetProtoIndicesAttr().Get(time) or []
+    if len(prototype_indices) > MAX_PLACED:  # before their transforms are computed
         raise TrilightError(
-            f"{prim.GetPath()}: {len(which)} instances; expected at most {MAX_PLACED}."
+            f"{prim.GetPath()}: {len(prototype_indices)} instances; expected at most {MAX_PLACED}."
         )
     moves = instancer.ComputeInstanceTransformsAtTime(
         time, time, UsdGeom.PointInstancer.ExcludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
     )
-    if len(moves) != len(which):
+    if len(moves) != len(prototype_indices):
         raise TrilightError(
             f"{prim.GetPath()}: its positions, orientations or scales are not as many as its "
-            f"{len(which)} protoIndices."
+            f"{len(prototype_indices)} protoIndices."
         )
     lost += [
         f"{prim.GetPath()}.{primvar.GetName()}: values of single instances are not read"
         for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()
         if primvar.GetInterpolation() != UsdGeom.Tokens.constant
     ]
-    shown = instancer.ComputeMaskAtTime(time) or [True] * len(which)
+    visibilities = instancer.ComputeMaskAtTime(time) or [True] * len(prototype_indices)
     plain = Usd.PrimIsActive & Usd.PrimIsLoaded & Usd.PrimHasDefiningSpecifier
-    for index, move, visible in zip(which, moves, shown, strict=True):
+    for index, move, visible in zip(prototype_indices, moves, visibilities, strict=True):
         named = targets[index] if 0 <= index < len(targets) else None
         prototype = None if named is None else prim.GetStage().GetPrimAtPath(named)
         if not prototype:
             lost.append(f"{prim.GetPath()}: instances of prototype {index}, which is not there")
         elif visible and prototype.IsActive():
-            place = np.einsum("ij,jk->ik", above.to_world, np.array(move).T)
+            to_world = np.einsum("ij,jk->ik", above.to_world, np.array(move).T)
             known = plain if prototype.IsAbstract() else plain & ~Usd.PrimIsAbstract
             yield dataclasses.replace(
                 above,
                 prim=prototype,
-                to_world=place,
-                origin=place,
+                to_world=to_world,
+                origin=to_world,
                 predicate=Usd.TraverseInstanceProxies(known),
             )

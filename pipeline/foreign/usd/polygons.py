@@ -1,4 +1,4 @@
-"""A mesh or a solid of a stage as polygons with its numbers checked, and as triangles."""
+"""A mesh or solid of a stage as checked polygons, and as triangles."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -9,43 +9,45 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.polygons import triangulate
 from pipeline.foreign.usd.colors import convert_to_rec709
-from pipeline.foreign.usd.placed import Placed
+from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.solids import SOLIDS, build_solid
 from storage.errors import TrilightError
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MeshPolygons:
-    """The arrays of a mesh, which fit each other."""
+    """The arrays of a mesh, checked to be consistent."""
 
-    placed: Placed
+    placed: PlacedPrim
     points: NDArray[np.float64]  # [P, 3] in the units of the mesh, finite
     counts: NDArray[np.int64]  # [F] corners of each polygon
     indices: NDArray[np.int64]  # [sum of counts] rows of `points`
-    holes: NDArray[np.int64]  # polygons that are none
-    is_smooth: bool  # whether normals that nobody states are smooth: it stands for a curved surface
+    holes: NDArray[np.int64]  # [H] indices of polygons that are holes
+    is_smooth: bool  # the mesh stands for a curved surface: normals are smooth by default
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CutMesh:
-    """The triangles of a mesh, and what lies at their corners."""
+    """The triangles of a mesh, with access to values at their corners."""
 
     prim: Any
     indices: NDArray[np.int64]
-    """Point of each corner of the mesh."""
+    """[sum of corners] index of the point of each polygon corner."""
     corners: NDArray[np.int64]
     """[T, 3] rows of `indices`, counter-clockwise from outside."""
     polygons: NDArray[np.int64]
-    """[T] of the mesh"""
+    """[T] index of the polygon of each triangle."""
     lost: list[str]
-    """Receives what does not fit."""
+    """Receives notes on primvars whose number of values does not fit."""
 
-    def select(self, part: NDArray[np.bool_]) -> "CutMesh":
-        """Return some of the triangles."""
-        return dataclasses.replace(self, corners=self.corners[part], polygons=self.polygons[part])
+    def select(self, chosen: NDArray[np.bool_]) -> "CutMesh":
+        """Return the triangles that a mask [T] selects."""
+        return dataclasses.replace(
+            self, corners=self.corners[chosen], polygons=self.polygons[chosen]
+        )
 
     def per_corner(self, values: NDArray, interpolation: str) -> NDArray | None:
-        """Return values [N, ...] at corners [T, 3, ...]; None where their number is wrong.
+        """Return values [N, ...] at corners [T, 3, ...]; None where their number does not fit.
 
         Args:
             values: one for each element.
@@ -63,28 +65,29 @@ class CutMesh:
         return values[where]
 
     def read_primvar(self, name: str, time: Any) -> NDArray | None:
-        """Return a primvar of the mesh, or of what is above it, at corners [T, 3, ...].
+        """Return a primvar of the mesh, or an inherited one, at corners [T, 3, ...].
 
-        None where it has none, or not for every corner.
+        None where there is none, or not for every corner.
         """
         from pxr import UsdGeom
 
         primvar = UsdGeom.PrimvarsAPI(self.prim).FindPrimvarWithInheritance(name)
         if not primvar or not primvar.HasValue():
             return None
-        values, spread = np.array(primvar.ComputeFlattened(time)), str(primvar.GetInterpolation())
+        values = np.array(primvar.ComputeFlattened(time))
+        spread = str(primvar.GetInterpolation())
         if values.ndim == 0 or values.dtype.kind not in "fiu":
             return None
         if str(self.prim.GetTypeName()) in SOLIDS and spread != "constant":
-            return None  # their polygons are ours
+            return None  # the polygons of solids are generated here, so its values cannot fit
         fitting = self.per_corner(convert_to_rec709(primvar.GetAttr(), values), spread)
         if fitting is None:
             self.lost.append(f"{self.prim.GetPath()}.{primvar.GetName()}: its number does not fit")
         return fitting
 
 
-def mesh_polygons(placed: Placed, time: Any) -> MeshPolygons:
-    """Return the polygons of a mesh or solid at a time, posed by its bones if it has any.
+def mesh_polygons(placed: PlacedPrim, time: Any) -> MeshPolygons:
+    """Return the polygons of a mesh or solid at a time, posed by its skeleton if it has one.
 
     Raises:
         TrilightError: its arrays contradict each other, or are not finite.
@@ -117,16 +120,18 @@ def mesh_polygons(placed: Placed, time: Any) -> MeshPolygons:
 
 
 def cut_mesh(mesh: MeshPolygons) -> CutMesh:
-    """Return the triangles of a mesh in its place, holes left out.
+    """Return the triangles of a placed mesh without its holes.
 
-    A mirrored place turns windings round.
+    A mirroring transform reverses the order of corners.
     """
     from pxr import UsdGeom
 
-    prim, to_world = mesh.placed.prim, mesh.placed.to_world
+    prim = mesh.placed.prim
+    to_world = mesh.placed.to_world
     corners, polygons = triangulate(mesh.points, mesh.counts, mesh.indices)
-    kept = ~np.isin(polygons, mesh.holes)
-    corners, polygons = corners[kept], polygons[kept]
+    is_surface = ~np.isin(polygons, mesh.holes)
+    corners = corners[is_surface]
+    polygons = polygons[is_surface]
     mirrored = np.linalg.det(to_world[:3, :3]) < 0
     if mirrored != (UsdGeom.Gprim(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded):
         corners = corners[:, ::-1]
@@ -139,16 +144,16 @@ def cut_mesh(mesh: MeshPolygons) -> CutMesh:
     )
 
 
-def moved(points: NDArray[np.float64], to_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return points [P, 3] in their place."""
-    placed: NDArray[np.float64] = np.einsum("ij,vj->vi", to_world[:3, :3], points)
-    return placed + to_world[:3, 3]
+def place_points(points: NDArray[np.float64], to_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points [P, 3] transformed by a matrix [4, 4]."""
+    rotated: NDArray[np.float64] = np.einsum("ij,vj->vi", to_world[:3, :3], points)
+    return rotated + to_world[:3, 3]
 
 
 def as_array(values: Any, dtype: type, shape: tuple[int, ...]) -> NDArray:
-    """Return values of USD as an array of a kind and shape; raises TypeError for another kind."""
-    found = np.zeros(0, dtype) if values is None else np.array(values)
-    return found.astype(dtype, casting="same_kind").reshape(shape)
+    """Return USD values as an array of a type and shape; raises TypeError for another kind."""
+    array = np.zeros(0, dtype) if values is None else np.array(values)
+    return array.astype(dtype, casting="same_kind").reshape(shape)
 
 
 def _check(

@@ -1,4 +1,4 @@
-"""What a prim of a stage is or has on it that nothing here reads, by name."""
+"""Names of types and API schemas of prims that no code here reads."""
 
 from collections.abc import Collection, Iterator
 from typing import Any
@@ -7,7 +7,7 @@ _SILENT = (
     "|Xform|Scope|Camera|Material|Shader|NodeGraph|GeomSubset|PointInstancer|SkelRoot|Skeleton|"
     "SkelAnimation|BlendShape|Backdrop|SpatialAudio"
 ).split("|")
-"""Kinds of prims that are read, or that change neither a shape nor a color nor light."""
+"""Types of prims that are read, or that change no shape, color or light."""
 
 _READ = (
     "MaterialBindingAPI|SkelBindingAPI|ColorSpaceAPI|ColorSpaceDefinitionAPI|VisibilityAPI|"
@@ -15,14 +15,14 @@ _READ = (
     "AssetPreviewsAPI|NodeGraphNodeAPI|SceneGraphPrimAPI|AccessibilityAPI|NodeDefAPI|"
     "MaterialXConfigAPI|CoordSysAPI"
 ).split("|")
-"""Likewise for API schemas; what lights lose of theirs is said of each."""
+"""API schemas that are read, or that change no shape, color or light; each light notes its own."""
 
 _OF_OTHERS = ("Physics", "Physx", "Semantics", "Render", "Hydra")
-"""What schemas begin with that say how things move, what they mean, or how they are rendered."""
+"""Prefixes of schemas for physics, semantics and render settings."""
 
 
 def list_unread(prim: Any, time: Any, kinds: Collection[str]) -> Iterator[str]:
-    """Yield what a prim is or has that is not read, if only `kinds` are."""
+    """Yield names of contents of a prim that are not read, where only types `kinds` are."""
     kind = str(prim.GetTypeName())
     if not (kind in kinds or kind in _SILENT or kind.startswith(_OF_OTHERS)):
         yield kind

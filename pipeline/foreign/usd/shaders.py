@@ -1,7 +1,7 @@
-"""What a material of a stage states, by the names of UsdPreviewSurface.
+"""`read_material`: the inputs of a material of a stage, by the names of UsdPreviewSurface.
 
-OpenPBR and Standard Surface, which MaterialX brings, are read by the same names as far as they mean
-the same. An input is a constant, a texture, or a primvar of the mesh.
+Inputs of OpenPBR and Standard Surface (MaterialX) get these names where they have the same meaning.
+An input is a constant, a texture, or a primvar of the mesh.
 """
 
 from collections.abc import Collection, Iterator, Mapping
@@ -18,8 +18,8 @@ from pipeline.foreign.usd.texture_nodes import (
     TextureNode,
     find_sources,
     is_output,
-    texture_node,
-    value_of,
+    read_input,
+    read_texture_node,
 )
 
 PREVIEW = "UsdPreviewSurface"
@@ -42,7 +42,7 @@ NAMES: Mapping[str, Mapping[str, str]] = {
         "strength": "emission",
     },
 }
-"""How shaders call what UsdPreviewSurface calls by the first name."""
+"""Names of inputs in each shader, by their names in UsdPreviewSurface."""
 
 DEFAULTS: Mapping[str, Any] = {
     "diffuseColor": (0.18, 0.18, 0.18),
@@ -69,10 +69,10 @@ _DEFAULTS: Mapping[str, Mapping[str, Any]] = {
         "emissiveColor": 1.0,
     },
 }
-"""What a shader takes for an input that is not stated."""
+"""Defaults of each shader for inputs that are not stated."""
 
 TEXTURED = ("diffuseColor", "specularColor", "emissiveColor", "metallic", "roughness", "ior")
-"""Inputs that need not be constants."""
+"""Inputs that may be textures or primvars."""
 
 _NEUTRAL: Mapping[str, float] = {
     **dict.fromkeys(
@@ -89,15 +89,15 @@ _NEUTRAL: Mapping[str, float] = {
         0.0,
     ),
 }  # fmt: skip
-"""Inputs that have no place here, with the value at which they do nothing."""
+"""Unsupported inputs, with the value at which they have no effect."""
 _OF_BLENDER = {"specular": 0.5}
-"""Likewise of a preview that Blender writes: its text knows no such input."""
+"""Unsupported inputs that Blender writes to UsdPreviewSurface, which does not define them."""
 
 _WEIGHTS = ("base", "base_weight")
-"""What the color of a base is multiplied with."""
+"""Inputs that the base color is multiplied with."""
 
 _PARTS = "clearcoat|coat_|opacity|transmission_|subsurface_|fuzz_|sheen_|thin_film_".split("|")
-"""What inputs begin with that only say more of one of those above."""
+"""Prefixes of inputs that only refine an unsupported one."""
 
 _READERS: Mapping[str, tuple[str, str]] = {
     **{
@@ -109,37 +109,37 @@ _READERS: Mapping[str, tuple[str, str]] = {
         for kind in ("float", "color3", "color4", "vector3")
     },
 }
-"""Nodes that read a primvar: their inputs for its name, and for what stands where there is none."""
+"""Nodes that read a primvar: their inputs for its name and for its fallback."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StatedMaterial:
-    """One material before its pictures are decoded."""
+    """The inputs of a material, before its pictures are decoded."""
 
     name: str
-    """Of its prim."""
+    """Name of the material's prim."""
     where: str
-    """The path of its shader, for notes."""
+    """Path of its shader, for notes."""
     constants: Mapping[str, NDArray[np.float32]]
-    """[3] by names of UsdPreviewSurface; of a primvar what stands where a mesh has none."""
+    """Values [3] of all inputs by name in UsdPreviewSurface; fallbacks for primvars."""
     textures: Mapping[str, TextureNode]
-    """Likewise; they stand before constants."""
+    """Textures by name of the input; they override constants."""
     primvars: Mapping[str, str]
-    """Names of primvars by those of inputs; likewise."""
+    """Names of primvars by name of the input; they override constants."""
     has_strength: bool
-    """Whether emission is times `strength`."""
+    """True where emission is multiplied with `strength`."""
     lost: tuple[str, ...]
-    """Inputs that have no place here and do something."""
+    """Names of unsupported inputs that have an effect."""
     has_networks: bool
-    """Whether inputs are fed by nodes that are not read, or by no finite number."""
+    """True where nodes that are not read, or values that are not finite, feed an input."""
 
     @property
     def is_specular(self) -> bool:
-        """Whether its workflow is the specular one."""
+        """Return whether the material uses the specular workflow."""
         return bool(self.constants["useSpecularWorkflow"].any())
 
     def read_values(self, name: str, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:
-        """Return what the primvar of an input is at corners [T, 3, 3]; None where there is none."""
+        """Return the primvar of an input at corners [T, 3, 3]; None where there is none."""
         if name not in self.primvars:
             return None
         values = read_colors(cut, self.primvars[name], time)
@@ -169,8 +169,8 @@ def reflect_head_on(ior: Any) -> Any:
 def read_bindings(prim: Any, time: Any) -> Iterator[tuple[Any, NDArray[np.int64] | None]]:
     """Yield the material of a mesh, or None; then those of its subsets with their polygons.
 
-    Of what is bound for rendering in full and for a preview, the first one counts that has a shader
-    which is understood. Later subsets stand before earlier ones.
+    The binding for full rendering, or else that for previews, counts if its shader is supported.
+    Later subsets override earlier ones.
     """
     from pxr import UsdShade
 
@@ -194,26 +194,26 @@ def _find_material(prim: Any) -> Any:
 
 
 def surface_shader(material: Any) -> Any:
-    """Return the shader of a material that is understood, a preview before others; else None."""
-    found = None
+    """Return a supported shader of a material, UsdPreviewSurface first, or None."""
+    shader = None
     for context in ("", "mtlx"):
         source = material.ComputeSurfaceSource(context)[0]
         known = source and source.GetShaderId() in NAMES
-        if known and (found is None or source.GetShaderId() == PREVIEW):
-            found = source
-    return found
+        if known and (shader is None or source.GetShaderId() == PREVIEW):
+            shader = source
+    return shader
 
 
 def read_material(
     material: Any, time: Any, opened: OpenedUsd, known: Collection[str] = ()
 ) -> StatedMaterial | None:
-    """Return what a material states, or None where no shader of it is understood.
+    """Return the inputs of a material, or None where it has no supported shader.
 
     Args:
         material: the UsdShade.Material.
-        time: of the values.
-        opened: the file; what is lost is noted there.
-        known: inputs without a place here whose meaning the caller knows.
+        time: time of the values.
+        opened: the file, which receives notes.
+        known: unsupported inputs that the caller reads itself.
 
     Raises:
         TrilightError: a picture is outside of the folder, or on the network.
@@ -221,15 +221,16 @@ def read_material(
     shader = surface_shader(material)
     if shader is None:
         return None
-    reader, notes = _Reader(shader, time, opened), len(opened.lost)
+    reader = _Reader(shader, time, opened)
+    notes = len(opened.lost)
     for name in TEXTURED:
-        reader.take(name)
+        reader.read_connection(name)
     constants = {name: reader.constant(name) for name in DEFAULTS}
     has_networks = len(opened.lost) > notes
     constants["diffuseColor"] = constants["diffuseColor"] * reader.weight()
     if material.GetDisplacementOutput().HasConnectedSource():
         opened.lost.append(f"{material.GetPath()}: its displacement has no place here")
-    lost = tuple(name for name in reader.without_place() if name not in known)
+    lost = tuple(name for name in reader.list_unsupported() if name not in known)
     opened.lost += [f"{shader.GetPath()}.{name}: has no place here" for name in lost]
     return StatedMaterial(
         name=str(material.GetPrim().GetName()),
@@ -244,10 +245,12 @@ def read_material(
 
 
 class _Reader:
-    """Reads the inputs of a shader."""
+    """Reads the inputs of one shader."""
 
     def __init__(self, shader: Any, time: Any, opened: OpenedUsd) -> None:
-        self._shader, self._time, self._opened = shader, time, opened
+        self._shader = shader
+        self._time = time
+        self._opened = opened
         self._names = NAMES[shader.GetShaderId()]
         self._defaults = _DEFAULTS[shader.GetShaderId()]
         is_preview = shader.GetShaderId() == PREVIEW
@@ -257,11 +260,11 @@ class _Reader:
         self._fallbacks: dict[str, Any] = {}
 
     def has(self, name: str) -> bool:
-        """Return whether this kind of shader has the input under a name of its own."""
+        """Return whether this shader has an input for a name of UsdPreviewSurface."""
         return name in self._names
 
-    def take(self, name: str) -> None:
-        """Take the texture or the primvar that an input is connected to."""
+    def read_connection(self, name: str) -> None:
+        """Store the texture or the primvar that an input is connected to."""
         from pxr import UsdShade
 
         sources = self._sources(name)
@@ -270,16 +273,16 @@ class _Reader:
         node = UsdShade.Shader(sources[0].GetPrim())
         if node.GetShaderId() == "UsdUVTexture":
             output = UsdShade.Output(sources[0]).GetBaseName()
-            self.textures[name] = texture_node(node, output, self._time, self._opened)
+            self.textures[name] = read_texture_node(node, output, self._time, self._opened)
         elif node.GetShaderId() in _READERS:
             primvar, fallback = _READERS[node.GetShaderId()]
-            self.primvars[name] = str(value_of(node, primvar, self._time, ""))
-            self._fallbacks[name] = value_of(node, fallback, self._time, 0.0)
+            self.primvars[name] = str(read_input(node, primvar, self._time, ""))
+            self._fallbacks[name] = read_input(node, fallback, self._time, 0.0)
         else:
             self._lose(name, f"{node.GetShaderId() or 'a network'} that is not read")
 
     def constant(self, name: str) -> NDArray[np.float32]:
-        """Return the value [3] of an input without a texture; a number stands in every channel."""
+        """Return the constant [3] of an input; a number fills all channels."""
         if name in self._fallbacks:
             return self._finite(name, self._fallbacks[name])
         sources = self._sources(name)
@@ -289,7 +292,7 @@ class _Reader:
         return self._finite(name, convert_to_rec709(sources[0], np.array(stated)))
 
     def weight(self) -> NDArray[np.float32]:
-        """Return what the color of the base is multiplied with; textures are not."""
+        """Return the factor [3] of a base color; a textured one is not multiplied."""
         product = np.ones(3, np.float32)
         for name in _WEIGHTS:
             value = self._value(name, 1.0)
@@ -299,8 +302,8 @@ class _Reader:
                 product = product * value
         return product
 
-    def without_place(self) -> list[str]:
-        """Return inputs that do something, and have no place here; unknown ones too."""
+    def list_unsupported(self) -> list[str]:
+        """Return names of unsupported inputs that have an effect, unknown ones included."""
         read = {*(self._names.get(name, name) for name in DEFAULTS), *_WEIGHTS}
         names = []
         for each in self._shader.GetInputs():
@@ -319,11 +322,11 @@ class _Reader:
         return names
 
     def _value(self, name: str, default: float) -> NDArray[np.float32] | None:
-        """Return what an input states [3]; None where that is a network, or no color."""
+        """Return the value [3] of an input; None for a network, or a value that is no color."""
         sources = self._sources(name)
         if sources and is_output(sources[0]):
             return None
-        return parse_color(value_of(self._shader, name, self._time, default))
+        return parse_color(read_input(self._shader, name, self._time, default))
 
     def _finite(self, name: str, stated: Any) -> NDArray[np.float32]:
         value = parse_color(stated)
@@ -344,7 +347,7 @@ class _Reader:
 
 def parse_color(stated: Any) -> NDArray[np.float32] | None:
     """Return a number or color as a color [3]; None for anything else."""
-    value = np.array(stated, np.float32)  # None becomes no number
+    value = np.array(stated, np.float32)  # None becomes NaN
     if value.shape == (4,):  # alpha is an input of its own
         value = value[:3]
     if value.shape not in ((), (3,)) or not np.isfinite(value).all():

@@ -1,4 +1,4 @@
-"""Meshes that bones and blend shapes pose, as UsdSkel computes them."""
+"""Meshes posed by skeletons and blend shapes, as UsdSkel computes them."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,24 +13,24 @@ _ANIMATION = "skel:animationSource"
 
 
 class UnposedMesh(TrilightError):
-    """A mesh with bones that UsdSkel does not pose as its file seems to mean."""
+    """A mesh with bones that UsdSkel does not pose as its file seems to intend."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BoundSkin:
-    """What poses a mesh."""
+    """A skeleton bound to a mesh."""
 
-    bones: Any  # the prim of the skeleton, in whose space the posed points are
+    bones: Any  # prim of the skeleton; posed points are in its space
     skeleton: Any  # UsdSkel.SkeletonQuery
     binding: Any  # UsdSkel.SkinningQuery
 
     def pose(self, prim: Any, stated: Any, time: Any) -> NDArray[np.float64]:
-        """Return points [P, 3] of a mesh in its own space.
+        """Return the posed points [P, 3] of a mesh in its own space.
 
         Args:
             prim: the mesh.
-            stated: its points as USD has them.
-            time: of the pose.
+            stated: unposed points as a USD array.
+            time: time of the pose.
 
         Raises:
             UnposedMesh: joints, weights and points contradict each other.
@@ -39,7 +39,7 @@ class BoundSkin:
 
         points = Vt.Vec3fArray(stated)
         if self.binding.HasBlendShapes():
-            _bend(self.skeleton, self.binding, prim, points, time)
+            _blend_shapes(self.skeleton, self.binding, prim, points, time)
         if not self.binding.HasJointInfluences():
             return np.array(points, np.float64)
         is_bound = self.skeleton and self.skeleton.HasBindPose()
@@ -53,18 +53,18 @@ class BoundSkin:
 
 
 class BoundSkins:
-    """The skins of a stage."""
+    """All skins of a stage, by the path of their mesh."""
 
     def __init__(self, time: Any) -> None:
-        """Begin without any."""
         from pxr import UsdSkel
 
-        self._time, self._cache = time, UsdSkel.Cache()
+        self._time = time
+        self._cache = UsdSkel.Cache()
         self._bound: dict[Any, BoundSkin] = {}
         self._roots: set[Any] = set()
 
-    def take(self, prim: Any, predicate: Any) -> None:
-        """Take what a SkelRoot binds below it."""
+    def add_root(self, prim: Any, predicate: Any) -> None:
+        """Add the skins that a SkelRoot binds below it."""
         from pxr import UsdSkel
 
         if prim.GetPath() in self._roots:
@@ -82,10 +82,10 @@ class BoundSkins:
                 self._bound[path] = BoundSkin(bones=bones, skeleton=skeleton, binding=target)
 
     def find(self, prim: Any) -> BoundSkin | None:
-        """Return what poses a prim, or None.
+        """Return the skin of a prim, or None.
 
         Raises:
-            UnposedMesh: bones are bound to it in another way than UsdSkel understands.
+            UnposedMesh: bones are bound to it in a way that UsdSkel does not support.
         """
         skin = self._bound.get(prim.GetPath())
         stated = prim.GetRelationship(_ANIMATION)
@@ -105,8 +105,8 @@ class BoundSkins:
         return skin
 
 
-def _bend(skeleton: Any, binding: Any, prim: Any, points: Any, time: Any) -> None:
-    """Move points by the blend shapes of an animation, which there may be."""
+def _blend_shapes(skeleton: Any, binding: Any, prim: Any, points: Any, time: Any) -> None:
+    """Deform points in place by the blend shapes of an animation, if there is one."""
     from pxr import UsdSkel
 
     animation = skeleton.GetAnimQuery() if skeleton else None
@@ -114,10 +114,10 @@ def _bend(skeleton: Any, binding: Any, prim: Any, points: Any, time: Any) -> Non
     if not weights:
         return
     mapper = binding.GetBlendShapeMapper()
-    own = mapper.Remap(weights) if mapper else weights
+    shape_weights = mapper.Remap(weights) if mapper else weights
     shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim))
     shapes.ComputeDeformedPoints(
-        *shapes.ComputeSubShapeWeights(own),
+        *shapes.ComputeSubShapeWeights(shape_weights),
         shapes.ComputeBlendShapePointIndices(),
         shapes.ComputeSubShapePointOffsets(),
         points,

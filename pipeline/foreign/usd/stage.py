@@ -1,13 +1,13 @@
 """Opens an untrusted USD file, and decides which other files it may read.
 
-A USD file can name other files, and the network. Which of them composition opens cannot
-be known beforehand, so every file that any layer names for composition, used or not, is checked by
-the path that USD's own resolver gives, is refused outside of the folder, and is opened here first:
-the closure of all names holds every file that composition can ask for. When the stage stands, its
-layers are compared with the folder once more, before anything of it is used.
+A USD file can name other files, and the network. Which of them composition opens cannot be known
+beforehand. So every file that any layer names for composition, used or not, is checked by the path
+that USD's own resolver gives, is refused outside of the folder, and is opened here first: the
+closure of all names holds every file that composition can ask for. The layers of the composed stage
+are compared with the folder once more, before anything of it is used.
 `pipeline.foreign.usd.composition` bounds the size of the stage. The bytes are still parsed by
 native code, so untrusted files are opened in a child process with limits (pipeline.isolation).
-`quietly` turns USD's own errors into one line that names the file and no folder of this machine.
+`read_quietly` turns USD's own errors into one line that names the file, but no folder.
 """
 
 import re
@@ -26,20 +26,20 @@ MAX_FILE_BYTES = 1 << 30
 """Maximum size of a file; a million triangles take about 70 MB."""
 MAX_LAYERS = 1000
 MAX_NOTES = 40
-"""Maximum number of notes on what is lost of one file; further notes are only counted."""
+"""Maximum number of notes on one file; further notes are only counted."""
 MAX_MEMBERS = 10_000
 """Maximum number of members in a usdz archive."""
 
 _LOOKS = (".mtlx",)
-"""Files that hold materials only: without them a stage has all of its surfaces."""
+"""Suffixes of files that hold materials only; a stage is complete in shape without them."""
 
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
 
 
 def file_and_member(name: str) -> tuple[Path, str]:
-    """Return the file of a name as USD's resolver gives it, and the member of an archive, or "".
+    """Split a name of USD's resolver into its file and the member of an archive, or "".
 
-    Brackets of folders are their own: only those at the end of `a.usdz[b.usda]` hold a member.
+    Brackets in folder names do not count: only those at the end of `a.usdz[b.usda]` hold a member.
     """
     from pxr import Ar
 
@@ -48,11 +48,11 @@ def file_and_member(name: str) -> tuple[Path, str]:
 
 
 class OutsideFile(TrilightError):
-    """A file that is named and may not be read: elsewhere, on the network, or no plain file."""
+    """A named file that may not be read: in another folder, on the network, or no plain file."""
 
 
 class OpenedUsd:
-    """A root layer, and the only way to the files that it names."""
+    """A root layer with its notes; it resolves and opens all files that layers name."""
 
     def __init__(
         self, path: Path, folder: Path | None = None, *, max_file_bytes: int = MAX_FILE_BYTES
@@ -80,13 +80,13 @@ class OpenedUsd:
 
     @property
     def files(self) -> list[Path]:
-        """The files that are open, the root first and the others sorted."""
+        """Return the open files, the root first and the others sorted."""
         outer = {file_and_member(name)[0] for name in self._layers}
         return [self.path, *sorted(outer - {self.path})]
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is lost, each kind once with the first place that it is of."""
+        """Return notes on unread contents, each kind once with the path of its first one."""
         kinds = Counter[tuple[str, str]]()
         first = dict[tuple[str, str], str]()
         for note in dict.fromkeys(self.lost):
@@ -101,8 +101,8 @@ class OpenedUsd:
         more = len(notes) - MAX_NOTES
         return tuple(notes if more <= 0 else [*notes[:MAX_NOTES], f"and {more} more"])
 
-    def inside(self, layer: Any, asset_path: str) -> str | None:
-        """Return where USD finds a file that a layer names, or None where there is none.
+    def resolve(self, layer: Any, asset_path: str) -> str | None:
+        """Return the resolved path of a file that a layer names, or None for a missing file.
 
         Raises:
             OutsideFile: it is on the network, outside of the folder, no plain file, or named by a
@@ -119,9 +119,9 @@ class OpenedUsd:
             self._refuse(plain, ", a variable expression; expected a name. Write it out")
         with Ar.ResolverContextBinder(self._context):
             identifier = Sdf.ComputeAssetPathRelativeToLayer(layer, plain)
-            found = str(Ar.GetResolver().Resolve(identifier))
-        outer = file_and_member(found or identifier)[0]
-        if not found and not outer.is_absolute():
+            resolved = str(Ar.GetResolver().Resolve(identifier))
+        outer = file_and_member(resolved or identifier)[0]
+        if not resolved and not outer.is_absolute():
             return None  # looked for in several folders
         try:
             target = outer.resolve()
@@ -130,9 +130,9 @@ class OpenedUsd:
         member = file_and_member(plain)[1]
         if not target.is_relative_to(self.folder) or ".." in Path(member).parts:
             self._refuse(plain, ", which is outside of its folder; copy it there")
-        if found and not target.is_file():  # opening a FIFO would block forever
+        if resolved and not target.is_file():  # opening a FIFO would block forever
             self._refuse(plain, ", which is no plain file")
-        return found or None
+        return resolved or None
 
     def compose(self) -> Any:
         """Return the composed stage; all of its files have been checked.
@@ -145,7 +145,7 @@ class OpenedUsd:
 
         self._open_all()
         for error in composition_errors(self.root, self._context, self.path.name):
-            self._take(error)
+            self._note_error(error)
         stage = Usd.Stage.Open(self.root, self._context, Usd.Stage.LoadAll)
         for layer in stage.GetUsedLayers():
             real = file_and_member(layer.realPath)[0].resolve()
@@ -181,12 +181,12 @@ class OpenedUsd:
                 f"{self.path.name}: {clipped[0]} uses value clips, which are not read; bake them."
             )
 
-    def _take(self, error: Any) -> None:
-        """Note what composition could not do; raises TrilightError where nothing can be read."""
+    def _note_error(self, error: Any) -> None:
+        """Note an error of composition; raises TrilightError for one that makes it unreadable."""
         from pxr import Pcp
 
         if isinstance(error, Pcp.ErrorInvalidAssetPath | Pcp.ErrorInvalidSublayerPath):
-            return  # noted when its file was looked for
+            return  # noted by `_named_layer`
         site = re.search(r"<[^<>]*>$", str(error.rootSite))
         text = f"{type(error).__name__.removeprefix('Error')} {site[0] if site else ''}"
         if isinstance(error, Pcp.ErrorArcCycle | Pcp.ErrorSublayerCycle):
@@ -196,19 +196,19 @@ class OpenedUsd:
         self._miss(f"composition: {text:.160}")
 
     def _named_layer(self, anchor: Any, asset_path: str) -> Any:
-        """Return the layer that another one names, or None where it is missing (it is noted)."""
+        """Return the layer that another one names, or None with a note where it is missing."""
         from pxr import Sdf
 
-        found = self.inside(anchor, asset_path)
-        if found is None or Sdf.FileFormat.FindByExtension(found) is None:
-            why = "is missing" if found is None else "is no USD file"
+        resolved = self.resolve(anchor, asset_path)
+        if resolved is None or Sdf.FileFormat.FindByExtension(resolved) is None:
+            why = "is missing" if resolved is None else "is no USD file"
             note = f"file {asset_path!r:.100} {why}"
             if asset_path.endswith(_LOOKS):
                 self.lost.append(note)
             else:
                 self._miss(note)
             return None
-        return self._open(found)
+        return self._open(resolved)
 
     def _miss(self, note: str) -> None:
         self.lost.append(note)
@@ -240,7 +240,7 @@ class OpenedUsd:
 
 
 def _check_file(path: Path, max_bytes: int) -> None:
-    """Refuse what is too large; and an archive that is compressed, or names what is not in it."""
+    """Refuse a file that is too large, and an archive that is compressed or inconsistent."""
     try:
         size = path.stat().st_size
         if not path.is_file() or not 0 < size <= max_bytes:
@@ -275,11 +275,11 @@ def _check_package(path: Path, size: int) -> None:
 Read = TypeVar("Read")
 
 
-def quietly(path: Path, read: Callable[[], Read]) -> Read:
-    """Return what `read` makes of a file, without USD's own warnings on standard error.
+def read_quietly(path: Path, read: Callable[[], Read]) -> Read:
+    """Return the result of `read` for a file, without USD's own warnings on standard error.
 
     Raises:
-        TrilightError: as `read`, or it met what is broken, or of another type than USD states.
+        TrilightError: as `read`, or the file is broken or has a value of a wrong type.
     """
     from pxr import Tf, UsdUtils
 
@@ -302,9 +302,9 @@ def quietly(path: Path, read: Callable[[], Read]) -> Read:
 
 
 def _find_line(error: Exception) -> str:
-    """Return where USD's parser stopped: a number of its sentence, which no record holds itself."""
+    """Return the line where USD's parser stopped; records hold the number, never USD's message."""
     try:
         line = re.search(r":(\d{1,9}):\d+: ", str(error))
-    except UnicodeDecodeError:  # it cites the file
+    except UnicodeDecodeError:  # the message cites bytes of the file
         line = None
     return f" from line {line[1]} on" if line else ""

@@ -1,6 +1,6 @@
-"""Furniture: tables, stools, chairs, benches and shelves, joined from bevelled boards and legs.
+"""Furniture: tables, stools, chairs, benches and shelves, joined from beveled boards and legs.
 
-Many separate closed parts with flat faces, as in most models that people make.
+Many separate closed components with flat faces, as in most hand-made models.
 """
 
 from dataclasses import dataclass
@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.objects.builtin.grids import Mesh
-from pipeline.objects.builtin.solids import beam, box, join, lathe, moved
+from pipeline.objects.builtin.solids import beam, box, join, lathe, scale_and_move
 
 
 @dataclass(frozen=True, kw_only=True)
 class FurnitureParams:
-    """Shape of one piece of furniture; lengths are in about metres."""
+    """Shape of one piece of furniture; lengths are roughly in meters."""
 
     kind: str  # `table`, `round` (a round top), `chair` (a seat with a back) or `shelf`
     width: float  # along x
@@ -30,11 +30,11 @@ class FurnitureParams:
     level_slats: bool  # whether the back's boards lie level rather than upright
     boards: int  # boards of a shelf between its top and bottom
     books: tuple[tuple[float, float], ...]
-    """Thickness and height of what stands on a shelf, from its lowest board upwards."""
+    """Thickness and height of the books on a shelf, from its lowest board upwards."""
 
 
 def furniture(params: FurnitureParams) -> Mesh:
-    """Return closed parts that reach into each other."""
+    """Return closed components that reach into each other."""
     if params.kind == "shelf":
         return join(_shelf(params))
     parts = [*_top(params), *_legs(params)]
@@ -75,13 +75,15 @@ def furniture_rand(rng: np.random.Generator) -> Mesh:
 
 
 def _top(params: FurnitureParams) -> list[Mesh]:
-    """Return the top or seat: a disc, a board, or slats on two battens."""
-    high, half = params.height, params.board / 2
+    """Return the top or seat: a disk, a board, or slats on two battens."""
+    high = params.height
+    half = params.board / 2
     if params.kind == "round":
-        radius, cut = params.width / 2, 0.3 * params.board
+        radius = params.width / 2
+        cut = 0.3 * params.board
         outline = [(radius - cut, -half), (radius, cut - half)]
         outline += [(r, -z) for r, z in reversed(outline)]
-        return [moved(lathe(outline, 32), [0, 0, high - half])]
+        return [scale_and_move(lathe(outline, 32), [0, 0, high - half])]
     if params.kind == "chair" or params.slats == 1:
         size = [params.width / 2, params.depth / 2, half]
         return [box([0, 0, high - half], size, 0.25 * params.board)]
@@ -95,15 +97,16 @@ def _top(params: FurnitureParams) -> list[Mesh]:
         for number in range(params.slats)
     ]
     for side in (-1, 1):
-        place = [side * 0.3 * params.width, 0, high - 1.9 * half]
-        parts.append(box(place, [0.02, 0.45 * params.depth, half], 0.15 * half))
+        center = [side * 0.3 * params.width, 0, high - 1.9 * half]
+        parts.append(box(center, [0.02, 0.45 * params.depth, half], 0.15 * half))
     return parts
 
 
 def _legs(params: FurnitureParams) -> list[Mesh]:
     """Return four legs, the aprons under the top, and stretchers if any."""
     inset = 1.3 * params.leg + 0.6 * params.splay
-    x, y = params.width / 2 - inset, params.depth / 2 - inset
+    x = params.width / 2 - inset
+    y = params.depth / 2 - inset
     if params.kind == "round":
         x = y = 0.62 * params.width / 2
     feet = [(-x, -y), (x, -y), (x, y), (-x, y)]
@@ -118,8 +121,8 @@ def _legs(params: FurnitureParams) -> list[Mesh]:
     for number in range(4):
         other = (number + 1) % 4
         for level, thick, tall in levels:
-            share = level / high
-            start, end = (ends[n] + share * (tops[n] - ends[n]) for n in (number, other))
+            fraction = level / high
+            start, end = (ends[n] + fraction * (tops[n] - ends[n]) for n in (number, other))
             # Bars of one level cross inside the legs; unequal heights keep their faces apart.
             lift = np.array([0, 0, 0.004 * (number % 2)])
             parts.append(beam(start + lift, end + lift, (thick, tall), 0.003))
@@ -147,29 +150,36 @@ def _leg(top: NDArray[np.float64], foot: NDArray[np.float64], params: FurnitureP
 
 def _back(params: FurnitureParams) -> list[Mesh]:
     """Return two posts that lean back, and boards between them."""
-    x, y = params.width / 2 - 1.4 * params.leg, params.depth / 2 - 1.4 * params.leg
-    low, lean = params.height - 0.6 * params.board, 0.2 * params.back
-    foot, head = np.array([x, y, low]), np.array([x, y + lean, params.height + params.back])
-    mirror, post = np.array([-1, 1, 1]), (0.8 * params.leg, 0.8 * params.leg)
+    x = params.width / 2 - 1.4 * params.leg
+    y = params.depth / 2 - 1.4 * params.leg
+    low = params.height - 0.6 * params.board
+    lean = 0.2 * params.back
+    foot = np.array([x, y, low])
+    head = np.array([x, y + lean, params.height + params.back])
+    mirror = np.array([-1, 1, 1])
+    post = (0.8 * params.leg, 0.8 * params.leg)
     parts = [beam(foot * side, head * side, post, 0.12 * params.leg) for side in (mirror, 1)]
     levels = np.linspace(0.3, 0.93, params.slats) if params.level_slats else np.array([0.93])
     tall = min(0.1, 0.2 / len(levels)) * params.back
-    for share in levels:
-        end = foot + share * (head - foot)
+    for fraction in levels:
+        end = foot + fraction * (head - foot)
         parts.append(beam(end * mirror, end, (0.5 * params.leg, tall), 0.003))
     if params.level_slats:
         return parts
-    bottom, rail = foot + 0.02 * (head - foot), foot + 0.93 * (head - foot)
+    bottom = foot + 0.02 * (head - foot)
+    rail = foot + 0.93 * (head - foot)
     for number in range(params.slats):
-        place = np.array([(number + 1) / (params.slats + 1) * 2 - 1, 1, 1])
+        scale = np.array([(number + 1) / (params.slats + 1) * 2 - 1, 1, 1])
         wide = min(0.03, 0.6 * x / params.slats)
-        parts.append(beam(bottom * place, rail * place, (wide, 0.25 * params.leg), 0.002))
+        parts.append(beam(bottom * scale, rail * scale, (wide, 0.25 * params.leg), 0.002))
     return parts
 
 
 def _shelf(params: FurnitureParams) -> list[Mesh]:
     """Return two sides, boards between them, and books."""
-    width, depth, half = params.width / 2, params.depth / 2, params.board / 2
+    width = params.width / 2
+    depth = params.depth / 2
+    half = params.board / 2
     cut = 0.1 * params.board
     parts = [
         box([side * width, 0, params.height / 2], [half, depth, params.height / 2], cut)
@@ -179,14 +189,16 @@ def _shelf(params: FurnitureParams) -> list[Mesh]:
     plank = [width, depth - 0.006, 0.8 * half]
     parts += [box([0, 0, level], plank, 0.8 * cut) for level in levels]
     bay = levels[1] - levels[0] - 2 * half
-    place, storey = -width + half + 0.01, 0
+    offset = -width + half + 0.01
+    storey = 0
     for thick, tall in params.books:
-        if place + thick > width - half - 0.01:
-            place, storey = -width + half + 0.01, storey + 1
+        if offset + thick > width - half - 0.01:
+            offset = -width + half + 0.01
+            storey += 1
         if storey > params.boards:
             break
         size = [thick / 2, 0.5 * depth * (0.8 + 0.4 * tall), bay * tall / 2]
         floor = levels[storey] + 0.8 * half - 0.003
-        parts.append(box([place + thick / 2, 0.05 * depth, floor + size[2]], size, 0.002))
-        place += thick + 0.003
+        parts.append(box([offset + thick / 2, 0.05 * depth, floor + size[2]], size, 0.002))
+        offset += thick + 0.003
     return parts

@@ -1,4 +1,4 @@
-"""Gears: spur, helical and bevelled, with a hub, a thinner web and a bore.
+"""Gears: spur, helical and beveled, with a hub, a thinner web and a bore.
 
 The cross section in a half plane through the axis is a closed loop; sweeping it around the axis
 while the teeth push its outer corners in and out gives a torus. Sharp edges and flat faces are what
@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.objects.builtin.grids import Mesh, torus_faces
 
 _TOOTH = np.array([0.0, 0.0, 0.6, 1.0, 1.0, 0.6])
-"""Height of the outline at six equal steps of one tooth: gap, flank, tip, flank."""
+"""Relative height of the outline at six equal steps of one tooth: gap, flank, tip, flank."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,9 +36,12 @@ class GearParams:
 def gear(params: GearParams) -> Mesh:
     """Return the closed surface of 168 triangles per tooth."""
     root = 1 - params.tooth_depth
-    hub, rim = params.bore + params.hub_width, root - params.rim_width
-    half, cut = params.half_thickness, params.chamfer
-    hub_z, web_z = half * params.hub_height, half * params.web_height
+    hub = params.bore + params.hub_width
+    rim = root - params.rim_width
+    half = params.half_thickness
+    cut = params.chamfer
+    hub_z = half * params.hub_height
+    web_z = half * params.web_height
     upper = [(1.0, half - cut), (1 - cut, half), (rim, half), (rim, web_z)]
     upper += [(hub, web_z), (hub, hub_z), (params.bore, hub_z)]
     section = np.array(upper + [(radius, -height) for radius, height in reversed(upper)])

@@ -1,6 +1,6 @@
 """Surfaces as grids of vertices: a torus, a sphere with two poles, and an open sheet.
 
-Families move the vertices of such grids, so what is closed is closed by construction.
+Families move the vertices of such grids, so closed surfaces are closed by construction.
 """
 
 import numpy as np
@@ -11,18 +11,19 @@ Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 
 
 def torus_faces(rows: int, columns: int) -> NDArray[np.int64]:
-    """Return the faces of a grid [rows, columns] that is periodic both ways: 2 rows columns.
+    """Return the 2 rows columns faces of a grid [rows, columns] that is periodic both ways.
 
-    They face the side from which rows run upwards and columns to the left.
+    The faces point to the side from which rows run upwards and columns to the left.
     """
     row, column = np.divmod(np.arange(rows * columns), columns)
-    above, beside = (row + 1) % rows, (column + 1) % columns
+    next_row = (row + 1) % rows
+    next_column = (column + 1) % columns
     corners = np.stack(
         [
             row * columns + column,
-            above * columns + column,
-            above * columns + beside,
-            row * columns + beside,
+            next_row * columns + column,
+            next_row * columns + next_column,
+            row * columns + next_column,
         ],
         axis=1,
     )
@@ -30,24 +31,27 @@ def torus_faces(rows: int, columns: int) -> NDArray[np.int64]:
 
 
 def sphere_faces(rings: int, columns: int) -> NDArray[np.int64]:
-    """Return the faces of rings [rings, columns] between two poles: 2 rings columns.
+    """Return the 2 rings columns faces of rings [rings, columns] between two poles.
 
-    The first pole is vertex rings * columns, the last one follows it. They face the side from which
-    rings run upwards and columns to the right: outwards, for columns counter-clockwise from above.
+    The first pole is vertex rings * columns, the last one follows it. The faces point to the side
+    from which rings run upwards and columns to the right: outwards, for columns counter-clockwise
+    from above.
     """
     body = torus_faces(rings, columns)[: 2 * (rings - 1) * columns]
     column = np.arange(columns)
-    beside = (column + 1) % columns
-    first, last, start = rings * columns, rings * columns + 1, (rings - 1) * columns
-    bottom = np.stack([np.full(columns, first), column, beside], axis=1)
-    top = np.stack([np.full(columns, last), start + beside, start + column], axis=1)
+    next_column = (column + 1) % columns
+    first = rings * columns
+    last = rings * columns + 1
+    start = (rings - 1) * columns
+    bottom = np.stack([np.full(columns, first), column, next_column], axis=1)
+    top = np.stack([np.full(columns, last), start + next_column, start + column], axis=1)
     return np.concatenate([bottom, body, top])[:, ::-1]
 
 
 def sheet_faces(rows: int, columns: int) -> NDArray[np.int64]:
-    """Return the faces of an open grid [rows, columns]: 2 (rows - 1) (columns - 1).
+    """Return the 2 (rows - 1) (columns - 1) faces of an open grid [rows, columns].
 
-    They face the side from which rows run upwards and columns to the right.
+    The faces point to the side from which rows run upwards and columns to the right.
     """
     row, column = np.divmod(np.arange((rows - 1) * (columns - 1)), columns - 1)
     start = row * columns + column

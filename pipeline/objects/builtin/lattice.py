@@ -18,8 +18,8 @@ class LatticeParams:
     cells: tuple[int, int, int]  # holes along x, y and z; 0 is a grille, one bar thick that way
     half_sizes: tuple[float, float, float]  # half extents along x, y and z, before it is warped
     bar: float  # thickness of a bar, in steps of the lattice, in (0, 1)
-    hollow: bool  # whether bars are on the outside only, as in a crate
-    crate: bool  # whether the lowest layer is a plate and the highest a mere rim
+    hollow: bool  # True for bars on the outside only, as in a crate
+    crate: bool  # True where the lowest layer is a plate and the highest a mere rim
     splits: int  # pieces of a bar between two crossings; more bend better
     roundness: float  # from 0, a box, to 1, a ball
     taper: float  # relative growth of width from the middle to the top, in (-1, 1)
@@ -29,7 +29,7 @@ class LatticeParams:
 
 def lattice(params: LatticeParams) -> Mesh:
     """Return the closed surface; about 10 splits triangles per bar."""
-    places, bars = zip(*(_steps(cells, params) for cells in params.cells), strict=True)
+    planes, bars = zip(*(_steps(cells, params) for cells in params.cells), strict=True)
     x, y, z = np.meshgrid(*bars, indexing="ij")
     solid = x.astype(np.int64) + y + z >= 2
     if params.hollow:
@@ -42,8 +42,8 @@ def lattice(params: LatticeParams) -> Mesh:
         solid[:, :, 0] = True
         solid[1:-1, 1:-1, -1] = False
     corner, faces = _surface(solid)
-    unit = np.stack([np.array(places[axis])[corner[:, axis]] for axis in range(3)], axis=1)
-    return _warped(unit, params), faces
+    unit = np.stack([np.array(planes[axis])[corner[:, axis]] for axis in range(3)], axis=1)
+    return _warp(unit, params), faces
 
 
 def lattice_rand(rng: np.random.Generator) -> Mesh:
@@ -62,7 +62,6 @@ def lattice_rand(rng: np.random.Generator) -> Mesh:
         sizes *= [0.4, 0.4, 1.3]
     if kind == "grille":
         sizes *= [1.0, 0.06, 1.0]
-    # A pyramid, a slanting tower, a screen, or straight.
     taper = float(rng.uniform(-0.75, 0.0)) if kind == "tower" or rng.random() < 0.5 else 0.0
     bend = float(rng.choice([0.0, rng.uniform(1.0, 3.5)])) if kind == "grille" else 0.0
     # Holes cannot be decimated away: a lattice of many bars has no triangles to spare.
@@ -84,25 +83,26 @@ def lattice_rand(rng: np.random.Generator) -> Mesh:
 
 
 def _steps(cells: int, params: LatticeParams) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the places of grid planes [N + 1] from -1 to 1, and which steps [N] are bars."""
+    """Return the positions of grid planes [N + 1] from -1 to 1, and which steps [N] are bars."""
     gap = [(1 - params.bar) / params.splits] * params.splits
     widths = np.array([params.bar] + [*gap, params.bar] * cells)
     bars = np.array([True] + ([False] * params.splits + [True]) * cells)
-    places = np.concatenate([[0.0], np.cumsum(widths)])
-    return 2 * places / places[-1] - 1, bars
+    planes = np.concatenate([[0.0], np.cumsum(widths)])
+    return 2 * planes / planes[-1] - 1, bars
 
 
 def _surface(solid: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the grid points [V, 3] and the faces between cells that are solid and not.
+    """Return the grid points [V, 3] and the faces between solid and empty cells.
 
-    Cells that share an edge and nothing else would make an edge of four faces; bars that meet at
-    crossings never do.
+    Cells that share only an edge would give that edge four faces; bars that meet at crossings never
+    do.
     """
     padded = np.pad(solid, 1).astype(np.int64)
     shape = tuple(size + 1 for size in solid.shape)
     quads = []
     for axis in range(3):
-        b, c = (axis + 1) % 3, (axis + 2) % 3
+        b = (axis + 1) % 3
+        c = (axis + 2) % 3
         change = np.diff(padded, axis=axis)
         for sign in (1, -1):
             # A cell begins where occupancy rises: its face looks down the axis.
@@ -120,19 +120,22 @@ def _surface(solid: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.in
     return points, flat.reshape(-1, 4)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
-def _warped(unit: NDArray[np.float64], params: LatticeParams) -> NDArray[np.float64]:
-    """Return points [V, 3] of the cube from -1 to 1 rounded, scaled, tapered, twisted, bent."""
+def _warp(unit: NDArray[np.float64], params: LatticeParams) -> NDArray[np.float64]:
+    """Round, scale, taper, twist and bend points [V, 3] of the cube from -1 to 1."""
     largest = np.abs(unit).max(axis=1, keepdims=True)
     length = np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
     ball = unit * largest / length
     points = (unit + params.roundness * (ball - unit)) * np.array(params.half_sizes)
     points[:, :2] *= 1 + params.taper * unit[:, 2:]
     angle = params.twist_rad * unit[:, 2]
-    x, y = points[:, 0].copy(), points[:, 1].copy()
+    x = points[:, 0].copy()
+    y = points[:, 1].copy()
     points[:, 0] = np.cos(angle) * x - np.sin(angle) * y
     points[:, 1] = np.sin(angle) * x + np.cos(angle) * y
     if params.bend_rad:
         radius = 2 * params.half_sizes[0] / params.bend_rad
-        turn, x = points[:, 0] / radius, radius - points[:, 1]
-        points[:, 0], points[:, 1] = x * np.sin(turn), radius - x * np.cos(turn)
+        arc_angle = points[:, 0] / radius
+        x = radius - points[:, 1]
+        points[:, 0] = x * np.sin(arc_angle)
+        points[:, 1] = radius - x * np.cos(arc_angle)
     return points

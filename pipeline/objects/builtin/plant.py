@@ -1,7 +1,7 @@
 """Potted plants: leaves are open sheets, curved and folded, on stems in a pot.
 
-The one family that is not closed: what is thin in nature is a sheet with two sides in most models
-that people make, and a renderer has to cope with it.
+The one family that is not closed: most hand-made models have two-sided sheets for thin objects, so
+renderers must handle them.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from pipeline.objects.builtin.solids import join, lathe, tube
 
 @dataclass(frozen=True, kw_only=True)
 class LeafParams:
-    """Shape of one leaf; lengths are shares of its own length."""
+    """Shape of one leaf; lengths are fractions of the leaf's length."""
 
     length: float  # from base to tip, along the midrib
     width: float  # largest width
@@ -30,7 +30,7 @@ class LeafParams:
 
 @dataclass(frozen=True, kw_only=True)
 class PlantParams:
-    """Shape of one plant; the pot's rim has about radius 0.3."""
+    """Shape of one plant; the rim of its pot has a radius of about 0.3."""
 
     leaf: LeafParams  # the largest leaf
     leaves: int  # their number
@@ -53,12 +53,12 @@ def plant(params: PlantParams) -> Mesh:
         path[:, 2] += top - 0.02
         parts.append(tube(path, 0.045 - 0.02 * bend, 8))
     for number in range(params.leaves):
-        share = (number + 0.5) / params.leaves
+        fraction = (number + 0.5) / params.leaves
         azimuth = number * np.pi * (3 - np.sqrt(5))
-        rise = params.flattest_rad + share * (params.steepest_rad - params.flattest_rad)
-        level = (0.35 + 0.65 * share) * params.stem
+        rise = params.flattest_rad + fraction * (params.steepest_rad - params.flattest_rad)
+        level = (0.35 + 0.65 * fraction) * params.stem
         foot = np.array([0.1 * level**2 / params.stem if params.stem else 0.0, 0.0, top + level])
-        size = 1 - share * (1 - params.smallest)
+        size = 1 - fraction * (1 - params.smallest)
         parts += _leaf_on_stalk(params, foot, azimuth, rise, size)
     return join(parts)
 
@@ -66,7 +66,7 @@ def plant(params: PlantParams) -> Mesh:
 def leaf_sheet(leaf: LeafParams, rise_rad: float) -> Mesh:
     """Return one leaf: an open sheet of 8 (rows - 1) + 4 triangles from the origin towards x.
 
-    It faces upwards. The tip is a point.
+    The sheet faces upwards and ends in a point.
     """
     along = np.arange(leaf.rows) / leaf.rows
     across = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
@@ -142,9 +142,9 @@ def _leaf_on_stalk(
     stalk = params.stalk * size
     # Without a stalk it begins just inside the stem or the earth.
     start = foot + (direction * stalk if stalk else 0.025 * ahead - [0.0, 0.0, 0.01])
-    own = replace(params.leaf, length=params.leaf.length * size)
+    scaled = replace(params.leaf, length=params.leaf.length * size)
     # A leaf at the end of a stalk hangs from it, the others go on in their own direction.
-    positions, faces = leaf_sheet(own, rise - 0.5 if stalk > 0.2 else rise)
+    positions, faces = leaf_sheet(scaled, rise - 0.5 if stalk > 0.2 else rise)
     aside = np.array([-ahead[1], ahead[0], 0.0])
     turned = positions @ np.stack([ahead, aside, [0.0, 0.0, 1.0]])
     parts: list[Mesh] = [(turned + start, faces)]
@@ -156,7 +156,8 @@ def _leaf_on_stalk(
 
 def _pot(params: PlantParams) -> Mesh:
     """Return a pot with a rim, filled with earth to just below it."""
-    height, foot = params.pot_height, 0.28 * params.pot_foot
+    height = params.pot_height
+    foot = 0.28 * params.pot_foot
     outline = [(0.9 * foot, 0.0), (foot, 0.02), (0.28, height - 0.1), (0.31, height - 0.09)]
     outline += [(0.31, height), (0.28, height), (0.27, height - 0.03), (0.14, height - 0.025)]
     return lathe(outline, 20)

@@ -1,6 +1,6 @@
 """Rocks: balls cut by planes, softly or sharply, with bumps and with layers.
 
-Large flat facets that meet at any angle, which no grid of rings has.
+Large flat facets that meet at any angle, unlike on a grid of rings.
 """
 
 from dataclasses import dataclass
@@ -14,13 +14,13 @@ from pipeline.objects.builtin.solids import icosphere
 
 @dataclass(frozen=True, kw_only=True)
 class RockParams:
-    """Shape of one rock, about a ball of radius 1."""
+    """Shape of one rock; it starts as a ball of radius 1."""
 
     cuts: tuple[tuple[float, float, float, float], ...]
-    """Planes that cut the ball: a direction (of length 1) and the distance from the centre."""
+    """Planes that cut the ball: a unit direction and the distance from the center."""
     sharpness: float  # of the edges between cuts: 6 is a pebble, 30 a broken stone
     bumps: tuple[tuple[float, float, float, float], ...]
-    """Waves over the surface: three numbers of waves per radius, and a phase."""
+    """Waves over the surface: waves per radius along x, y and z, and a phase."""
     bump_height: float  # of all bumps together, in radii; below 0.5
     layers: float  # layers per radius of height; 0 is none
     layer_depth: float  # how far the joints between layers are cut back, in radii; below 0.3
@@ -47,7 +47,8 @@ def rock(params: RockParams) -> Mesh:
 def rock_rand(rng: np.random.Generator) -> Mesh:
     """Return a random rock."""
     kind = rng.choice(["pebble", "broken", "layered"])
-    cuts, sizes = _rand_cuts(rng, int(rng.integers(9, 22))), rng.uniform(0.55, 1.0, 3)
+    cuts = _rand_cuts(rng, int(rng.integers(9, 22)))
+    sizes = rng.uniform(0.55, 1.0, 3)
     waves = rng.normal(size=(12, 4)) * [0.5, 0.5, 0.5, 3.0]
     return rock(
         RockParams(
@@ -80,9 +81,10 @@ def _cut_ball(direction: NDArray[np.float64], params: RockParams) -> NDArray[np.
 
 
 def _rand_cuts(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-    """Return planes [count, 4] in even but turned and shaken directions."""
+    """Return planes [count, 4] in even directions with a random rotation and noise."""
     index = np.arange(count) + 0.5
-    z, azimuth = 1 - 2 * index / count, np.pi * (1 + np.sqrt(5)) * index + rng.uniform(0, 6)
+    z = 1 - 2 * index / count
+    azimuth = np.pi * (1 + np.sqrt(5)) * index + rng.uniform(0, 6)
     ring = np.sqrt(1 - z * z)
     spread = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
     spread += rng.normal(size=spread.shape) * 0.35

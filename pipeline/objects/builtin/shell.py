@@ -1,6 +1,6 @@
 """Sea shells (after Raup 1966): a growing tube on a spiral about an axis, open at its mouth.
 
-Smooth, with an inside that one looks into, and detail that shrinks towards the tip.
+Smooth, with a visible inside, and detail that shrinks towards the tip.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from pipeline.objects.builtin.grids import Mesh, sphere_faces
 
 @dataclass(frozen=True, kw_only=True)
 class ShellParams:
-    """Shape of one shell; lengths are in distances of the mouth's centre from the axis."""
+    """Shape of one shell; lengths are in distances of the mouth's center from the axis."""
 
     turns: float  # turns about the axis
     growth: float  # size over that one turn before; above 1
@@ -38,15 +38,16 @@ def shell(params: ShellParams) -> Mesh:
     """
     rings = int(params.turns * params.rings_per_turn)
     inside = params.rings_per_turn // 2
-    turn = np.linspace(-params.turns, 0, rings)
-    outer = _rings(turn, 1 + _relief(turn, params), params)
+    winding = np.linspace(-params.turns, 0, rings)
+    outer = _rings(winding, 1 + _relief(winding, params), params)
     # The lip's two edges lie on one ring of angles, the mouth's.
-    back = turn[: -inside - 1 : -1]
+    back = winding[: -inside - 1 : -1]
     fade = np.linspace(1 - params.wall, 0.5 * (1 - params.wall), inside)[:, None]
     inner = _rings(back, np.broadcast_to(fade, (inside, params.columns)), params)
     poles = np.stack([outer[0].mean(axis=0), inner[-1].mean(axis=0)])
     grid = np.concatenate([outer, inner]).reshape(-1, 3)
-    cosine, sine = np.cos(params.lean_rad), np.sin(params.lean_rad)
+    cosine = np.cos(params.lean_rad)
+    sine = np.sin(params.lean_rad)
     lean = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
     faces = sphere_faces(rings + inside, params.columns)
     return np.concatenate([grid, poles]) @ lean.T, faces
@@ -64,7 +65,7 @@ def shell_rand(rng: np.random.Generator) -> Mesh:
     turn_count = float(rng.uniform(*turns))
     cords = int(rng.choice([0, 0, 5, 7]))
     columns = int(rng.integers(14, 19)) if not cords else 3 * cords
-    # No more than about 5500 triangles, whatever was drawn.
+    # At most about 5500 triangles, whatever the random parameters.
     most = int(2700 / (columns * (turn_count + 0.5)))
     return shell(
         ShellParams(
@@ -86,12 +87,12 @@ def shell_rand(rng: np.random.Generator) -> Mesh:
     )
 
 
-def _relief(turn: NDArray[np.float64], params: ShellParams) -> NDArray[np.float64]:
+def _relief(winding: NDArray[np.float64], params: ShellParams) -> NDArray[np.float64]:
     """Return the height [rings, columns] of ribs, spines and cords, at least 0."""
     around = 2 * np.pi * np.arange(params.columns) / params.columns
-    relief = np.zeros((len(turn), params.columns))
+    relief = np.zeros((len(winding), params.columns))
     if params.ribs:
-        crest = (0.5 + 0.5 * np.cos(2 * np.pi * params.ribs * turn)) ** 2
+        crest = (0.5 + 0.5 * np.cos(2 * np.pi * params.ribs * winding)) ** 2
         shoulder = np.maximum(np.cos(around + 0.7), 0) ** 6
         relief += params.rib_height * crest[:, None] * (1 + params.spines * shoulder)
     if params.cords:
@@ -100,10 +101,11 @@ def _relief(turn: NDArray[np.float64], params: ShellParams) -> NDArray[np.float6
 
 
 def _rings(
-    turn: NDArray[np.float64], radius: NDArray[np.float64], params: ShellParams
+    winding: NDArray[np.float64], radius: NDArray[np.float64], params: ShellParams
 ) -> NDArray[np.float64]:
-    """Return points [rings, columns, 3] of the tube at `turn` [rings], 0 being the mouth."""
-    angle, size = 2 * np.pi * turn, params.growth**turn
+    """Return points [rings, columns, 3] of the tube at `winding` [rings]; 0 is the mouth."""
+    angle = 2 * np.pi * winding
+    size = params.growth**winding
     around = 2 * np.pi * np.arange(params.columns) / params.columns
     outwards = 1 + params.tube * radius * np.cos(around)
     height = -params.drop - params.tube * params.stretch * radius * np.sin(around)

@@ -1,7 +1,7 @@
-"""Closed parts that objects are put together from: lathed bodies, tubes, beams and balls.
+"""Closed components of objects: lathed bodies, tubes, beams and balls.
 
-Parts of one object may reach into each other, as the leg of a table into its top. They must not
-share a plane there, because what lies in the same place has no front.
+Components of one object may reach into each other, as the leg of a table into its top. They must
+not share a plane there: coincident faces have no visible front.
 """
 
 from collections.abc import Sequence
@@ -13,14 +13,14 @@ from pipeline.objects.builtin.grids import Mesh, sphere_faces
 
 
 def join(parts: Sequence[Mesh]) -> Mesh:
-    """Return one mesh with all parts, which keep their own vertices."""
+    """Return one mesh of all components; no vertices are welded."""
     starts = np.cumsum([0] + [len(positions) for positions, _ in parts])
     faces = [part[1] + start for part, start in zip(parts, starts, strict=False)]
     return np.concatenate([positions for positions, _ in parts]), np.concatenate(faces)
 
 
-def moved(mesh: Mesh, offset: ArrayLike, scale: ArrayLike = 1.0) -> Mesh:
-    """Return the mesh scaled (positive numbers) and then moved."""
+def scale_and_move(mesh: Mesh, offset: ArrayLike, scale: ArrayLike = 1.0) -> Mesh:
+    """Return the mesh scaled by positive numbers and then moved."""
     return mesh[0] * np.asarray(scale) + np.asarray(offset), mesh[1]
 
 
@@ -28,13 +28,13 @@ def lathe(outline: Sequence[tuple[float, float]], columns: int) -> Mesh:
     """Return a solid of revolution about z, of 2 len(outline) columns triangles.
 
     Args:
-        outline: radius (positive) and height of each ring; the ends are closed by flat discs. A
-            body that has the axis inside runs from the bottom to the top.
+        outline: radius (positive) and height of each ring; flat disks close the ends. The outline
+            of a body around the axis runs from the bottom to the top.
         columns: vertices of a ring.
     """
     rings = np.array(outline)
-    turn = 2 * np.pi * np.arange(columns) / columns
-    flat = rings[:, :1, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)[None]
+    azimuth = 2 * np.pi * np.arange(columns) / columns
+    flat = rings[:, :1, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)[None]
     grid = np.concatenate(
         [flat, np.broadcast_to(rings[:, 1:, None], (*flat.shape[:2], 1))], axis=2
     ).reshape(-1, 3)
@@ -45,26 +45,29 @@ def lathe(outline: Sequence[tuple[float, float]], columns: int) -> Mesh:
 def tube(path: NDArray[np.float64], radii: NDArray[np.float64], sides: int) -> Mesh:
     """Return a closed tube along `path` [N, 3] with `radii` [N], of 2 N sides triangles.
 
-    Bends must be wider than the tube is thick, or it folds.
+    The tube folds where a bend is narrower than its thickness.
     """
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     side = np.zeros_like(path)
-    # The axis that is furthest from the first tangent; carried along from there without turning.
+    # Start from the axis farthest from the first tangent; transport it along without rotation.
     last = np.eye(3)[np.abs(tangent[0]).argmin()]
     for index, direction in enumerate(tangent):
         last = last - direction * (last @ direction)
         last = last / np.linalg.norm(last)
         side[index] = last
     up = np.cross(tangent, side)
-    turn = 2 * np.pi * np.arange(sides) / sides
-    ring = np.cos(turn)[None, :, None] * side[:, None] + np.sin(turn)[None, :, None] * up[:, None]
+    azimuth = 2 * np.pi * np.arange(sides) / sides
+    ring = (
+        np.cos(azimuth)[None, :, None] * side[:, None]
+        + np.sin(azimuth)[None, :, None] * up[:, None]
+    )
     grid = (path[:, None] + radii[:, None, None] * ring).reshape(-1, 3)
     return np.concatenate([grid, path[[0, -1]]]), sphere_faces(len(path), sides)
 
 
 def box(centre: ArrayLike, half_sizes: ArrayLike, chamfer: float) -> Mesh:
-    """Return an upright box with bevelled edges, of 44 triangles.
+    """Return an upright box with beveled edges, of 44 triangles.
 
     `chamfer` is how far edges are cut back: more than 0, less than every half size.
     """
@@ -76,16 +79,17 @@ def box(centre: ArrayLike, half_sizes: ArrayLike, chamfer: float) -> Mesh:
 def beam(
     start: ArrayLike, end: ArrayLike, sizes: tuple[float, float], chamfer: float, taper: float = 1.0
 ) -> Mesh:
-    """Return a bevelled bar of 44 triangles between two points that are not above each other in y.
+    """Return a beveled bar of 44 triangles between two points that are not above each other in y.
 
     Args:
         start: middle of one end.
-        end: middle of the other.
+        end: middle of the other end.
         sizes: half widths, across (level or along x) and at right angles to that.
-        chamfer: as for a box.
-        taper: width at the end over that at the start.
+        chamfer: as in `box`.
+        taper: width at the end over the width at the start.
     """
-    first, last = np.asarray(start, np.float64), np.asarray(end, np.float64)
+    first = np.asarray(start, np.float64)
+    last = np.asarray(end, np.float64)
     length = float(np.linalg.norm(last - first))
     axis = (last - first) / length
     upright = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
@@ -102,7 +106,7 @@ def icosphere(frequency: int) -> Mesh:
     """Return the unit sphere of 20 frequency^2 even triangles."""
     golden = (1 + np.sqrt(5)) / 2
     flat = np.array([[0.0, a, b * golden] for a in (-1, 1) for b in (-1, 1)])
-    corners = np.concatenate([np.roll(flat, turn, axis=1) for turn in range(3)])
+    corners = np.concatenate([np.roll(flat, shift, axis=1) for shift in range(3)])
     distance = np.linalg.norm(corners[:, None] - corners[None], axis=2)
     near = np.abs(distance - 2) < 1e-9
     sides = np.array(
@@ -127,14 +131,14 @@ def icosphere(frequency: int) -> Mesh:
 
 
 def outward(positions: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return faces of a body that is star-shaped about the origin, turned to the outside."""
+    """Orient the faces of a body that is star-shaped about the origin outwards."""
     a, b, c = positions[faces].transpose(1, 0, 2)
     inside_out = np.einsum("ij,ij->i", np.cross(b - a, c - a), a + b + c) < 0
     return np.where(inside_out[:, None], faces[:, ::-1], faces)
 
 
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
-"""The corners of a box; vertex 3 i + a is that of corner i on the side across axis a."""
+"""Corners of a box; vertex 3 i + a is that of corner i on the side across axis a."""
 
 
 def _box_faces() -> NDArray[np.int64]:

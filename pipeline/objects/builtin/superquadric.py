@@ -1,7 +1,7 @@
 """Superquadrics (Barr 1981): from boxes over ellipsoids to octahedra and stars, tapered, twisted.
 
-Written in polar form, so that vertices stay evenly spread whatever the exponents; the textbook form
-crowds them at the edges of boxes.
+The polar form spreads vertices evenly for all exponents; the textbook form crowds them at the edges
+of boxes.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,8 @@ def superquadric(params: SuperquadricParams) -> Mesh:
     positions = unit * np.array(params.half_sizes)
     positions[:, :2] *= 1 + params.taper * unit[:, 2:]
     angle = params.twist_rad * unit[:, 2]
-    x, y = positions[:, 0].copy(), positions[:, 1].copy()
+    x = positions[:, 0].copy()
+    y = positions[:, 1].copy()
     positions[:, 0] = np.cos(angle) * x - np.sin(angle) * y
     positions[:, 1] = np.sin(angle) * x + np.cos(angle) * y
     return positions, sphere_faces(params.rings, params.columns)
@@ -64,7 +65,8 @@ def superquadric_rand(rng: np.random.Generator) -> Mesh:
 
 def _superellipse(angle: NDArray[np.float64], exponent: float) -> NDArray[np.float64]:
     """Return the points of |x|^(2/e) + |y|^(2/e) = 1 in the directions `angle`, [N, 2]."""
-    cosine, sine = np.cos(angle), np.sin(angle)
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
     power = 2 / exponent
     radius = (np.abs(cosine) ** power + np.abs(sine) ** power) ** (-1 / power)
     return np.stack([radius * cosine, radius * sine], axis=1)

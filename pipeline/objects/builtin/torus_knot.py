@@ -1,6 +1,6 @@
 """Tubes along torus knots: one closed strand, with ribs that wind around it.
 
-The tube is as thick as the knot allows: strands do not meet, bends do not fold.
+The thickness has a limit at which strands would meet or bends would fold.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class TorusKnotParams:
     """Shape of one knot."""
 
     windings: tuple[int, int]
-    """How often the strand runs around the axis, and through the hole; coprime."""
+    """Windings of the strand around the axis and through the hole; coprime."""
     minor_radius: float  # of the torus that the strand lies on, whose major radius is 1; in (0, 1)
     fill: float  # thickness as a share of the thickest tube that neither meets itself nor folds
     ribs: int  # ridges of the cross section; 0 is round
@@ -74,7 +74,8 @@ def _strand(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the points of the strand and the normals of its torus there, [N, 3] each."""
     around_axis, through_hole = params.windings
-    azimuth, tube = around_axis * along, through_hole * along
+    azimuth = around_axis * along
+    tube = through_hole * along
     radial = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)], axis=1)
     upright = np.array([0.0, 0.0, 1.0])
     normal = np.cos(tube)[:, None] * radial + np.sin(tube)[:, None] * upright
@@ -86,12 +87,12 @@ def _largest_radius(params: TorusKnotParams, points: int = 512) -> float:
     centre, _ = _strand(2 * np.pi * np.arange(points) / points, params)
     step = np.roll(centre, -1, axis=0) - centre
     length = np.linalg.norm(step, axis=1)
-    turn = np.linalg.norm(np.roll(step, -1, axis=0) - step, axis=1)
-    bend = float((length**2 / np.maximum(turn, 1e-12)).min())
+    change = np.linalg.norm(np.roll(step, -1, axis=0) - step, axis=1)
+    bend = float((length**2 / np.maximum(change, 1e-12)).min())
     chord = np.linalg.norm(centre[:, None] - centre[None], axis=2)
-    place = np.cumsum(length)
-    arc = np.abs(place[:, None] - place[None])
-    arc = np.minimum(arc, place[-1] - arc)
+    position = np.cumsum(length)
+    arc = np.abs(position[:, None] - position[None])
+    arc = np.minimum(arc, position[-1] - arc)
     other_strand = chord < 0.5 * arc
     gap = float(chord[other_strand].min()) if other_strand.any() else np.inf
     return min(bend, 0.5 * gap)

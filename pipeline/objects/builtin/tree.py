@@ -1,6 +1,6 @@
 """Trees: a trunk that branches, with crowns of leaf masses, tiers like a fir's, or bare.
 
-Many closed parts of very different size that hide and shade each other.
+Many closed components of very different size that hide and shade each other.
 """
 
 from dataclasses import dataclass
@@ -15,9 +15,9 @@ from storage.seeds import rng_for
 _GOLDEN = np.pi * (3 - np.sqrt(5))
 _SIDES = (9, 6, 5, 4)
 _RINGS = (9, 6, 4, 3)
-"""Of the branches of each order, the trunk's first."""
+"""Sides and rings of the branches of each order, from the trunk on."""
 _TAPER = 0.55
-"""What a branch loses of its radius towards its end."""
+"""Fraction of its radius that a branch loses towards its end."""
 _TIER = np.array([[0.2, 0.12], [0.7, 0.02], [1.0, -0.1], [0.62, 0.2], [0.3, 0.55], [0.08, 0.92]])
 """Radius and height of a tier's rings: inside, rim, and the cone above."""
 
@@ -28,7 +28,8 @@ class TreeParams:
 
     crown: str  # `masses`, `tiers` or `bare`
     children: tuple[int, ...]
-    """Branches of each branch: of the trunk, of its branches, and so on; at most three numbers."""
+    """Number of branches on the trunk, on each of its branches, and so on; at most three numbers.
+    """
     spread_rad: float  # angle between a branch and the one it grows from
     shrink: float  # length of a branch over that of the one it grows from
     thickness: float  # radius of the trunk's foot
@@ -40,7 +41,7 @@ class TreeParams:
 
 
 def tree(params: TreeParams) -> Mesh:
-    """Return closed parts: branches, and masses or tiers."""
+    """Return closed components: branches, and masses or tiers."""
     rng = rng_for(params.variant, "tree")
     if params.crown == "tiers":
         path = np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, 0.9], 6)
@@ -76,7 +77,7 @@ def tree_rand(rng: np.random.Generator) -> Mesh:
 
 @dataclass(frozen=True, kw_only=True)
 class _Branch:
-    """One branch before it has grown: foot [3], direction [3], length, radius and order."""
+    """Parameters of one branch: foot [3], direction [3], length, radius and order."""
 
     foot: NDArray[np.float64]
     direction: NDArray[np.float64]
@@ -88,7 +89,7 @@ class _Branch:
 def _branches(
     params: TreeParams, rng: np.random.Generator
 ) -> tuple[list[Mesh], list[NDArray[np.float64]]]:
-    """Return all branches as tubes, and the ends [3] of those that bear no others."""
+    """Return all branches as tubes, and the ends [3] of branches without children."""
     up = np.array([0.0, 0.0, 1.0])
     waiting = [_Branch(foot=0 * up, direction=up, length=1.0, radius=params.thickness, order=0)]
     parts: list[Mesh] = []
@@ -96,10 +97,12 @@ def _branches(
     while waiting:
         branch = waiting.pop()
         order = branch.order
-        share = np.linspace(0, 1, _RINGS[order])[:, None]
+        fraction = np.linspace(0, 1, _RINGS[order])[:, None]
         bend = rng.normal(size=3) * 0.12 + params.rise * (order > 0) * up
-        path = branch.foot + branch.length * (share * branch.direction + 0.5 * share**2 * bend)
-        radii = branch.radius * (1 - _TAPER * share[:, 0])
+        path = branch.foot + branch.length * (
+            fraction * branch.direction + 0.5 * fraction**2 * bend
+        )
+        radii = branch.radius * (1 - _TAPER * fraction[:, 0])
         radii[0] *= 1.0 if order else 1.5
         parts.append(tube(path, radii, _SIDES[order]))
         if order < len(params.children):
@@ -112,36 +115,41 @@ def _branches(
 def _children(
     parent: _Branch, path: NDArray[np.float64], params: TreeParams, rng: np.random.Generator
 ) -> list[_Branch]:
-    """Return what grows from a branch: up along the trunk, but near the ends of the others."""
-    count, trunk = params.children[parent.order], parent.order == 0
+    """Return the children of a branch: along the trunk, but near the ends of other branches."""
+    count = params.children[parent.order]
+    trunk = parent.order == 0
     first = rng.uniform(0, 2 * np.pi)
     branches = []
     for number in range(count):
-        place = 0.55 + 0.43 * number / max(count - 1, 1) if trunk else 0.98 - 0.05 * number
-        step = place * (len(path) - 1)
+        fraction = 0.55 + 0.43 * number / max(count - 1, 1) if trunk else 0.98 - 0.05 * number
+        step = fraction * (len(path) - 1)
         index = min(int(step), len(path) - 2)
         ahead = path[index + 1] - path[index]
-        turn = first + (_GOLDEN if trunk else 2 * np.pi / count) * number + rng.uniform(-0.3, 0.3)
+        azimuth = (
+            first + (_GOLDEN if trunk else 2 * np.pi / count) * number + rng.uniform(-0.3, 0.3)
+        )
         spread = params.spread_rad * rng.uniform(0.75, 1.2)
         branches.append(
             _Branch(
                 foot=path[index] + (step - index) * ahead,
-                direction=_turned(ahead, spread, turn),
+                direction=_branch_direction(ahead, spread, azimuth),
                 length=params.shrink * rng.uniform(0.85, 1.1) * parent.length,
-                # Thinner than the parent there, so that the foot is hidden in it.
-                radius=0.75 * parent.radius * (1 - _TAPER * place),
+                # Thinner than the parent there, which hides the foot.
+                radius=0.75 * parent.radius * (1 - _TAPER * fraction),
                 order=parent.order + 1,
             )
         )
     return branches
 
 
-def _turned(axis: NDArray[np.float64], spread: float, turn: float) -> NDArray[np.float64]:
-    """Return the direction at the angle `spread` from `axis`, turned about it."""
+def _branch_direction(
+    axis: NDArray[np.float64], spread: float, azimuth: float
+) -> NDArray[np.float64]:
+    """Return the direction at the angle `spread` from `axis`, rotated about it by `azimuth`."""
     axis = axis / np.linalg.norm(axis)
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     side /= np.linalg.norm(side)
-    across = np.cos(turn) * side + np.sin(turn) * np.cross(axis, side)
+    across = np.cos(azimuth) * side + np.sin(azimuth) * np.cross(axis, side)
     return np.cos(spread) * axis + np.sin(spread) * across
 
 
@@ -155,21 +163,22 @@ def _mass(centre: NDArray[np.float64], params: TreeParams, rng: np.random.Genera
 
 
 def _tiers(params: TreeParams, rng: np.random.Generator) -> list[Mesh]:
-    """Return cones with folds whose lower rim hangs, each reaching into the next."""
+    """Return folded cones with hanging rims, each of which reaches into the next."""
     columns = 4 * params.folds
-    turn = 2 * np.pi * np.arange(columns) / columns
-    reach, rim = _TIER[:, :1], _TIER[:, :1] > 0.9
+    azimuth = 2 * np.pi * np.arange(columns) / columns
+    reach = _TIER[:, :1]
+    rim = _TIER[:, :1] > 0.9
     parts = []
     for number in range(params.tiers):
-        share = number / params.tiers
-        size = (1 - share) ** 0.8 * (0.25 + params.mass)
-        height = 1.7 / params.tiers * (1.25 - 0.4 * share)
-        fold = 0.14 * np.cos(params.folds * turn + rng.uniform(0, 6))
+        fraction = number / params.tiers
+        size = (1 - fraction) ** 0.8 * (0.25 + params.mass)
+        height = 1.7 / params.tiers * (1.25 - 0.4 * fraction)
+        fold = 0.14 * np.cos(params.folds * azimuth + rng.uniform(0, 6))
         fold += rng.normal(size=columns) * 0.02
         radius = reach * (1 + fold * reach) * size
-        level = 0.3 + 1.4 * share
+        level = 0.3 + 1.4 * fraction
         upright = level + _TIER[:, 1:] * height - 0.12 * size * fold * rim
-        grid = np.stack([radius * np.cos(turn), radius * np.sin(turn), upright], axis=2)
+        grid = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), upright], axis=2)
         poles = [[0.0, 0.0, level + 0.14 * height], [0.0, 0.0, level + height]]
         faces = sphere_faces(len(_TIER), columns)
         parts.append((np.concatenate([grid.reshape(-1, 3), poles]), faces))

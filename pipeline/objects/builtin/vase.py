@@ -1,6 +1,6 @@
 """Lathed vases: a wall of even thickness around a smooth profile, plain, fluted or swirled.
 
-Open vessels show what closed bodies cannot: light that enters, and an inside that shades itself.
+Unlike closed bodies, open vessels let light in, and their inside shades itself.
 """
 
 from dataclasses import dataclass
@@ -34,12 +34,12 @@ def vase(params: VaseParams) -> Mesh:
     inner = _smooth(np.array(params.radii), inner_height / params.height) - params.wall
     radius = np.concatenate([outer, inner[::-1]])
     height = np.concatenate([params.height * level, inner_height[::-1]])
-    turn = 2 * np.pi * np.arange(params.columns) / params.columns
-    phase = params.flutes * (turn[None] + params.swirl_rad * height[:, None] / params.height)
+    azimuth = 2 * np.pi * np.arange(params.columns) / params.columns
+    phase = params.flutes * (azimuth[None] + params.swirl_rad * height[:, None] / params.height)
     fold = 1 - params.flute_depth * (0.5 - 0.5 * np.cos(phase)) * bool(params.flutes)
     rings = radius[:, None] * fold
     upright = np.broadcast_to(height[:, None], rings.shape)
-    grid = np.stack([rings * np.cos(turn), rings * np.sin(turn), upright], axis=-1)
+    grid = np.stack([rings * np.cos(azimuth), rings * np.sin(azimuth), upright], axis=-1)
     poles = [[0.0, 0.0, 0.0], [0.0, 0.0, params.wall]]
     positions = np.concatenate([grid.reshape(-1, 3), poles])
     return positions, sphere_faces(2 * params.rings, params.columns)
@@ -65,13 +65,13 @@ def vase_rand(rng: np.random.Generator) -> Mesh:
 
 
 def _smooth(values: NDArray[np.float64], where: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a Catmull-Rom curve through `values` at equal steps, at places in [0, 1].
+    """Evaluate a Catmull-Rom curve through equally spaced `values` at positions in [0, 1].
 
-    It may swing beyond them by an eighth of their differences; callers leave room for that.
+    The curve may overshoot the values by an eighth of their differences; callers leave a margin.
     """
     padded = np.concatenate([[2 * values[0] - values[1]], values, [2 * values[-1] - values[-2]]])
-    place = np.clip(where, 0, 1) * (len(values) - 1)
-    left = np.minimum(place.astype(np.int64), len(values) - 2)
-    step = (place - left)[:, None] ** np.arange(4)
+    position = np.clip(where, 0, 1) * (len(values) - 1)
+    segment = np.minimum(position.astype(np.int64), len(values) - 2)
+    step = (position - segment)[:, None] ** np.arange(4)
     basis = 0.5 * np.array([[0, 2, 0, 0], [-1, 0, 1, 0], [2, -5, 4, -1], [-1, 3, -3, 1]])
-    return np.einsum("nk,kj,nj->n", step, basis, padded[left[:, None] + np.arange(4)])
+    return np.einsum("nk,kj,nj->n", step, basis, padded[segment[:, None] + np.arange(4)])

@@ -1,7 +1,7 @@
 """Catalogues: `objects.jsonl` or `objects.csv`, a row per object with its file and its rights.
 
-A mistake in it stops the run, since it is the user's text; a file that it names and that is missing
-does not, since one lost download must not cost the others.
+A mistake in a catalogue stops the run, since the user wrote it. A missing file does not, since one
+lost download must not cost the others.
 """
 
 import csv
@@ -25,17 +25,17 @@ def only_catalogue(exists: Callable[[str], bool]) -> str | None:
     """Return the name of a folder's catalogue, or None where it has none.
 
     Args:
-        exists: returns whether the folder has a file of this name.
+        exists: returns True where the folder has a file of this name.
 
     Raises:
-        TrilightError: it has both.
+        TrilightError: the folder has both.
     """
-    found = [name for name in CATALOGUE_NAMES if exists(name)]
-    if len(found) > 1:
+    present = [name for name in CATALOGUE_NAMES if exists(name)]
+    if len(present) > 1:
         raise TrilightError(
-            f"objects: the folder has {' and '.join(found)}; expected one catalogue. Remove one."
+            f"objects: the folder has {' and '.join(present)}; expected one catalogue. Remove one."
         )
-    return found[0] if found else None
+    return present[0] if present else None
 
 
 def read_catalogue(path: Path) -> list[ObjectRecord]:
@@ -46,19 +46,19 @@ def read_catalogue(path: Path) -> list[ObjectRecord]:
     the name of the catalogue, `attribution` and `source_url` to nothing. Other fields are ignored.
 
     Raises:
-        TrilightError: a row is malformed, a field is missing or no text, a uid is empty, not
-            printable or used twice, or a path leads out of the folder; names file and line.
+        TrilightError: a row is malformed, a field is missing or not text, a uid is empty, not
+            printable or used twice, or a path leads out of the folder; with file and line.
     """
     root = Path(os.path.realpath(path.parent))
     records: list[ObjectRecord] = []
     line_of: dict[str, int] = {}
     rows = csv_rows(path) if path.suffix == ".csv" else jsonl_rows(path)
     for number, row in rows:
-        place = f"{path.name}:{number}"
-        record = _record(root, row, place, path.name)
+        location = f"{path.name}:{number}"
+        record = _record(root, row, location, path.name)
         if record.uid in line_of:
             raise TrilightError(
-                f"{place}: uid {record.uid!r} is already used in line {line_of[record.uid]}; "
+                f"{location}: uid {record.uid!r} is already used in line {line_of[record.uid]}; "
                 "expected one line per object. Rename or remove one of them."
             )
         line_of[record.uid] = number
@@ -66,48 +66,49 @@ def read_catalogue(path: Path) -> list[ObjectRecord]:
     return records
 
 
-def _record(root: Path, row: dict[str, Any], place: str, name: str) -> ObjectRecord:
-    uid, path = _text(row, "uid", place), _text(row, "path", place)
+def _record(root: Path, row: dict[str, Any], location: str, name: str) -> ObjectRecord:
+    uid = _text(row, "uid", location)
+    path = _text(row, "path", location)
     if uid != printable(uid) or not uid.strip():
         raise TrilightError(
-            f"{place}: uid is {printable(uid)!r}; expected printable text that is not blank."
+            f"{location}: uid is {printable(uid)!r}; expected printable text that is not blank."
         )
     return ObjectRecord(
         uid=uid,
-        path=str(_inside(root, path, place)),
+        path=str(_path_below(root, path, location)),
         root=str(root),
-        title=_published(row, "title", place, uid),
-        licence=_published(row, "licence", place, UNKNOWN),
-        licence_source=_published(row, "licence_source", place, name),
-        attribution=_published(row, "attribution", place, ""),
-        source_url=_published(row, "source_url", place, ""),
+        title=_public_field(row, "title", location, uid),
+        licence=_public_field(row, "licence", location, UNKNOWN),
+        licence_source=_public_field(row, "licence_source", location, name),
+        attribution=_public_field(row, "attribution", location, ""),
+        source_url=_public_field(row, "source_url", location, ""),
     )
 
 
-def _published(row: dict[str, Any], field: str, place: str, default: str) -> str:
-    """Return a text that stands in the dataset's documents: printable, without passwords."""
-    return printable(public_text(_text(row, field, place, default)))
+def _public_field(row: dict[str, Any], field: str, location: str, default: str) -> str:
+    """Return a field's text for the dataset's documents: printable, without passwords."""
+    return printable(public_text(_text(row, field, location, default)))
 
 
-def _text(row: dict[str, Any], field: str, place: str, default: str | None = None) -> str:
+def _text(row: dict[str, Any], field: str, location: str, default: str | None = None) -> str:
     value = row.get(field, default)
     if not isinstance(value, str):
-        found = f"a {type(value).__name__}" if field in row else "missing"
-        raise TrilightError(f"{place}: field {field!r} is {found}; expected text.")
+        actual = f"a {type(value).__name__}" if field in row else "missing"
+        raise TrilightError(f"{location}: field {field!r} is {actual}; expected text.")
     return value
 
 
-def _inside(root: Path, path: str, place: str) -> Path:
-    """Return the absolute place of a catalogue path; links are followed before it is judged."""
-    shown = printable(path)
+def _path_below(root: Path, path: str, location: str) -> Path:
+    """Return the absolute path of a catalogue path; links are followed before the check."""
+    display_path = printable(path)
     if not path or "\x00" in path or path != path.encode("utf-8", "ignore").decode():
-        raise TrilightError(f"{place}: path is {shown!r}; expected the name of a file.")
+        raise TrilightError(f"{location}: path is {display_path!r}; expected the name of a file.")
     target = Path(os.path.realpath(root / path))
     if "\\" in path and not target.exists():  # as a program on Windows writes it
         target = Path(os.path.realpath(root / path.replace("\\", "/")))
     if not target.is_relative_to(root) or target == root:
         raise TrilightError(
-            f"{place}: path {shown!r} leads out of the folder; expected a path below it. "
+            f"{location}: path {display_path!r} leads out of the folder; expected a path below it. "
             "Copy the file into the folder."
         )
     return target
@@ -117,7 +118,7 @@ def jsonl_rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield line numbers from 1 and JSON objects; blank lines are skipped.
 
     Raises:
-        TrilightError: the file is no UTF-8 text, or a line is no JSON object.
+        TrilightError: the file is not UTF-8 text, or a line is not a JSON object.
     """
     for number, line in enumerate(_file_text(path).split("\n"), start=1):
         if not line.strip():
@@ -138,10 +139,10 @@ def jsonl_rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def csv_rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield line numbers from 1 and the cells that are not blank, by the names of the first row.
+    """Yield line numbers from 1 and the cells that are not blank, by column name.
 
     Raises:
-        TrilightError: the file is no UTF-8 text or breaks the rules of CSV, the first row lacks
+        TrilightError: the file is not UTF-8 text or breaks the rules of CSV, the first row lacks
             `uid` or `path` or has a name twice, or a row has another number of cells.
     """
     names: list[str] = []
@@ -157,16 +158,16 @@ def csv_rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
         yield number, {name: cell for name, cell in zip(names, cells, strict=True) if cell.strip()}
 
 
-def _header(cells: list[str], place: str) -> list[str]:
+def _header(cells: list[str], location: str) -> list[str]:
     names = [cell.strip() for cell in cells]
-    shown = printable(", ".join(names))
+    columns = printable(", ".join(names))
     if not {"uid", "path"} <= set(names):
         raise TrilightError(
-            f"{place}: the columns are {shown!r}; expected uid and path among them, with commas "
-            "between them."
+            f"{location}: the columns are {columns!r}; expected uid and path among them, with "
+            "commas between them."
         )
     if len(set(names)) < len(names):
-        raise TrilightError(f"{place}: the columns are {shown!r}; expected each name once.")
+        raise TrilightError(f"{location}: the columns are {columns!r}; expected each name once.")
     return names
 
 
@@ -194,6 +195,6 @@ def _file_text(path: Path) -> str:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise TrilightError(
-            f"{path.name}: cannot be read ({reason}); expected a file of UTF-8 text. Mend or "
+            f"{path.name}: cannot be read ({reason}); expected a file of UTF-8 text. Fix or "
             "remove it."
         ) from error

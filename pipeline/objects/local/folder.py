@@ -1,13 +1,18 @@
-"""Objects of a folder of this machine: those of its catalogue, or else its object files."""
+"""Objects of a local folder: the rows of its catalogue, or else its object files."""
 
 import os
 from dataclasses import replace
 from pathlib import Path
 
+from pipeline.objects.file_filters import (
+    drop_copies,
+    drop_outputs,
+    drop_scenes,
+    warn_unread_formats,
+)
 from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
 from pipeline.objects.listing import SUFFIXES, Listing, assign_uids, failure, is_object_file
 from pipeline.objects.local.catalogue import only_catalogue, read_catalogue
-from pipeline.objects.selection import drop_copies, drop_outputs, drop_scenes, say_unread
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
 from storage.remote.safe_url import printable
@@ -17,19 +22,19 @@ def list_folder(folder: Path, licence: str | None) -> Listing:
     """Return the objects of a folder; nothing is loaded.
 
     Args:
-        folder: its catalogue is used where it has one, and its object files otherwise.
-        licence: of files without a statement, as the user states it.
+        folder: a folder with a catalogue, or with object files.
+        licence: the user's licence for files without a statement.
 
     Raises:
-        TrilightError: the folder is missing or is no folder, its catalogue is wrong, there are
-            two, or has a licence stated from outside.
+        TrilightError: the folder is missing or not a folder, its catalogue is wrong, it has two
+            catalogues, or a catalogue and a `licence`.
     """
-    shown = printable(str(folder))
+    display_path = printable(str(folder))
     if not folder.is_dir():
-        found = "is not a folder" if folder.exists() else "does not exist"
+        problem = "is not a folder" if folder.exists() else "does not exist"
         raise TrilightError(
-            f"objects {shown!r} {found}; expected a folder of {' '.join(SUFFIXES)} files, or "
-            "builtin: for built-in objects."
+            f"objects {display_path!r} {problem}; expected a folder of {' '.join(SUFFIXES)} "
+            "files, or builtin: for built-in objects."
         )
     catalogue = only_catalogue(lambda name: (folder / name).exists())
     if catalogue is None:
@@ -41,8 +46,8 @@ def list_folder(folder: Path, licence: str | None) -> Listing:
 def scan_folder(folder: Path, licence: StatedLicence) -> Listing:
     """Return a record for every object file below `folder`, at any depth.
 
-    Hidden files are left out (other systems leave `._name.obj` beside `name.obj`), and linked
-    folders are not entered. A link out of the folder is a failure `link_outside` of that object.
+    Hidden files are left out (macOS writes `._name.obj` next to `name.obj`), and linked folders are
+    not entered. A link out of the folder is a failure `link_outside` of that object.
 
     Raises:
         TrilightError: a folder cannot be read.
@@ -50,7 +55,7 @@ def scan_folder(folder: Path, licence: StatedLicence) -> Listing:
     root = Path(os.path.realpath(folder))
     names = drop_outputs(walk_files(root))
     files = [name for name in names if is_object_file(name)]
-    say_unread(names, files)
+    warn_unread_formats(names, files)
     uids, failures = assign_uids(drop_copies(drop_scenes(root, files)))
     records = []
     for name, uid in uids.items():
@@ -69,7 +74,7 @@ def scan_folder(folder: Path, licence: StatedLicence) -> Listing:
 def file_record(
     uid: str, path: str, licence: StatedLicence, *, source_url: str = ""
 ) -> ObjectRecord:
-    """Return the record of a file that nothing is said about."""
+    """Return the record of a file without a catalogue row."""
     return ObjectRecord(
         uid=uid,
         path=path,
@@ -93,12 +98,12 @@ def walk_files(root: Path) -> list[str]:
     def stop(error: OSError) -> None:
         raise TrilightError(
             f"{printable(str(error.filename))}: cannot be read ({error.strerror}); expected a "
-            "readable folder. Mend its permissions or move it away."
+            "readable folder. Fix its permissions or move it away."
         )
 
     names: list[str] = []
-    for place, folders, files in os.walk(root, onerror=stop):
+    for folder, folders, files in os.walk(root, onerror=stop):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        inner = Path(place).relative_to(root)
+        inner = Path(folder).relative_to(root)
         names += [(inner / name).as_posix() for name in files]
     return names

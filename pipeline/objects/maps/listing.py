@@ -1,8 +1,8 @@
-"""Folders of textures and of environment maps: what they hold, and whose it is.
+"""The textures or environment maps of a folder, with their rights.
 
 A folder has a catalogue, as a folder of objects may have one, or else all of its pictures count.
-Nothing is decoded here. The uid of a texture or map begins with its kind, so that it is no
-object's.
+Nothing is decoded here. The uid of a texture or map begins with its kind, so that it differs from
+every object's.
 """
 
 import os
@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 from pathlib import Path
 
+from pipeline.objects.file_filters import drop_outputs
 from pipeline.objects.licences import (
     StatedLicence,
     refuse_licences,
@@ -21,78 +22,80 @@ from pipeline.objects.listing import failure
 from pipeline.objects.local.catalogue import read_catalogue
 from pipeline.objects.local.folder import walk_files
 from pipeline.objects.maps.names import PICTURES, group_textures
-from pipeline.objects.selection import drop_outputs
 from storage.errors import TrilightError
 from storage.records.objects import SKY, TEXTURE, Failure, ObjectRecord
 from storage.remote.safe_url import printable
 
 SUFFIXES = {TEXTURE: PICTURES, SKY: (".exr", ".hdr", ".pic")}
-"""Of the files of each kind, compared in lower case."""
+"""Suffixes of the files of each kind, compared in lower case."""
 
 _UNREAD = {
     TEXTURE: "hdr psd psb dds ktx ktx2 tx jp2 j2k avif heic jxl gif svg sbsar zip 7z rar".split(),
     SKY: "png jpg jpeg tif tiff webp tga bmp psd dds ktx ktx2 tx jxl avif heic zip 7z rar".split(),
 }
-"""Suffixes of pictures, and of archives that may hold some, that are not read as such."""
+"""Suffixes of pictures in other formats, and of archives that may hold some."""
 
 PLURALS = {TEXTURE: "textures", SKY: "skies"}
-"""What folders and catalogues of each kind are called."""
+"""Names of folders and catalogues of each kind."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FoundMap:
-    """A texture or a map that may be used."""
+    """A texture or map with an allowed licence."""
 
     record: ObjectRecord
-    """Identity and rights."""
+    """Identity and rights of the texture or map."""
     files: Mapping[str, Path]
-    """Its pictures by part (pipeline.objects.maps.names); a map has one, "map"."""
+    """Picture files by component (pipeline.objects.maps.names); a map has one, "map"."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FoundMaps:
-    """What a folder of textures or maps has to offer."""
+    """The usable textures or maps of a folder, and the failures."""
 
     maps: tuple[FoundMap, ...]
-    """Those with an allowed licence, sorted by uid."""
+    """Textures or maps with an allowed licence, sorted by uid."""
     failures: tuple[Failure, ...]
-    """The other files, of the stage `objects`: licence_refused, no_base_colour, map_not_used,
-    unknown_map, unread_format, name_clash, link_outside."""
+    """Failures of the stage `objects` for the other files: licence_refused, no_base_colour,
+    map_not_used, unknown_map, unread_format, name_clash, link_outside."""
 
 
 def find_maps(
     kind: str, folder: str, *, licence: str | None, allowed_licences: Sequence[str]
 ) -> FoundMaps:
-    """Return the textures or maps of a folder of this machine that may be used.
+    """Return the usable textures or maps of a local folder.
 
     Args:
         kind: TEXTURE or SKY.
         folder: with a catalogue `textures.jsonl` or `.csv` (`skies.jsonl` or `.csv`), whose rows
-            are those of a catalogue of objects and name base colours; otherwise all pictures below
-            it count, each under the licence that the user states.
-        licence: of files without a catalogue; by default they are the user's own.
+            are as in a catalogue of objects and name base colors; otherwise all pictures below
+            it count, each under the user's licence.
+        licence: licence of files without a catalogue; by default user-provided.
         allowed_licences: SPDX identifiers, `LicenseRef-...`, or compound expressions.
 
     Raises:
         TrilightError: the folder is missing or holds nothing, or its catalogue has a mistake.
     """
-    root, shown, plural = Path(os.path.realpath(folder)), printable(folder), PLURALS[kind]
+    root = Path(os.path.realpath(folder))
+    display_path = printable(folder)
+    plural = PLURALS[kind]
     suffixes = " ".join(SUFFIXES[kind])
     if "://" in folder or not root.is_dir():
         raise TrilightError(
-            f"{plural} {shown!r}: no such folder on this machine; expected one with {suffixes} "
-            "files. Download them first where they are on a server."
+            f"{plural} {display_path!r}: no such folder on this machine; expected one with "
+            f"{suffixes} files. Download them first where they are on a server."
         )
-    stated, catalogue = stated_licence(licence), _only_catalogue(root, plural)
+    stated = stated_licence(licence)
+    catalogue = _only_catalogue(root, plural)
     failures: list[Failure] = []
     if catalogue is None:
-        records = _scanned(kind, root, stated, failures)
+        records = _scan_pictures(kind, root, stated, failures)
     else:
         require_unstated(licence, catalogue.name)
         records = [replace(row, uid=f"{kind}:{row.uid}") for row in read_catalogue(catalogue)]
     if not records and not failures:
         raise TrilightError(
-            f"{plural} {shown!r} holds none; expected {suffixes} files, or a catalogue "
+            f"{plural} {display_path!r} holds none; expected {suffixes} files, or a catalogue "
             f"{plural}.csv that lists some."
         )
     allowed, refused = refuse_licences(records, allowed_licences)
@@ -103,19 +106,19 @@ def find_maps(
 
 
 def _only_catalogue(root: Path, plural: str) -> Path | None:
-    found = [path for end in ("jsonl", "csv") if (path := root / f"{plural}.{end}").exists()]
-    if len(found) > 1:
+    present = [path for end in ("jsonl", "csv") if (path := root / f"{plural}.{end}").exists()]
+    if len(present) > 1:
         raise TrilightError(
-            f"{plural}: the folder has {found[0].name} and {found[1].name}; expected one "
+            f"{plural}: the folder has {present[0].name} and {present[1].name}; expected one "
             "catalogue. Remove one."
         )
-    return found[0] if found else None
+    return present[0] if present else None
 
 
 def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[FoundMap]:
-    """Return records with their files; those beside a base color that belong to it come too.
+    """Return records with their files, and the files that belong to each base color.
 
-    Links out of the folder do not.
+    Links out of the folder are left out.
     """
     if kind == SKY:
         return [FoundMap(record=row, files={"map": Path(row.path)}) for row in records]
@@ -130,15 +133,17 @@ def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[
     for row in records:
         base = Path(row.path)
         files = textures.get(base.relative_to(root).as_posix(), {})
-        beside = {part: root / name for part, name in files.items() if _is_below(root, root / name)}
-        maps.append(FoundMap(record=row, files={**beside, "base": base}))
+        companions = {
+            part: root / name for part, name in files.items() if _is_below(root, root / name)
+        }
+        maps.append(FoundMap(record=row, files={**companions, "base": base}))
     return maps
 
 
-def _scanned(
+def _scan_pictures(
     kind: str, root: Path, stated: StatedLicence, failures: list[Failure]
 ) -> list[ObjectRecord]:
-    """Return a record of each set of textures, or of each map, and add what is no part of one."""
+    """Return a record of each texture or map, and add a failure for each other picture."""
     every = [name for name in drop_outputs(walk_files(root)) if not _is_hidden(name)]
     names = sorted(name for name in every if name.lower().endswith(SUFFIXES[kind]))
     outside = {name for name in names if not _is_below(root, root / name)}
@@ -152,8 +157,9 @@ def _scanned(
     unused |= dict.fromkeys(sorted(outside), ("link_outside", message))
     bases = {name.rpartition(".")[0]: name for name in reversed(names)}
     if kind == TEXTURE:
-        textures, left = group_textures(names)
-        bases, unused = {stem: files["base"] for stem, files in textures.items()}, unused | left
+        textures, unused_pictures = group_textures(names)
+        bases = {stem: files["base"] for stem, files in textures.items()}
+        unused |= unused_pictures
     else:
         message = "another file of the same name is taken; rename one of them"
         twins = [name for name in names if bases[name.rpartition(".")[0]] != name]
@@ -182,7 +188,7 @@ def _is_hidden(name: str) -> bool:
 
 
 def _is_below(root: Path, path: Path) -> bool:
-    """Return whether a file is in a folder, wherever links lead; for links in a circle too."""
+    """Return True where a file is inside a folder after following links, circular ones too."""
     return Path(os.path.realpath(path)).is_relative_to(root)
 
 

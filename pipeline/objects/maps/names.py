@@ -1,8 +1,8 @@
-"""Which file of a folder is which part of which texture, by the words of its name.
+"""Assigns files of a folder to textures and their components, by the words of their names.
 
 The words are those of the large collections (ambientCG, Poly Haven, FreePBR, Poliigon, cgbookcase,
 ShareTextures, 3DTextures, TextureCan, Quixel, MatSynth) and of exports (Substance, Sketchfab, glTF,
-Unreal). A name without such a word is a color in a folder of such names alone; beside files whose
+Unreal). A name without such a word is a color in a folder of such names alone; next to files whose
 names have one, it is a color only where they belong to it, and otherwise it is unknown.
 """
 
@@ -37,7 +37,7 @@ _WORDS: Mapping[str, str] = {
     r"roughness|rough[-_ ]?ao",
     "preview": r"preview|thumb|thumbnail|thumbs|render|rendering",
 }
-"""Words of names by the part that they stand for."""
+"""Words in file names, by the component that they stand for."""
 
 _PACKED: Mapping[str, Mapping[str, int]] = {
     "orm": {"roughness": 1, "metallic": 2},
@@ -45,29 +45,30 @@ _PACKED: Mapping[str, Mapping[str, int]] = {
     "mra": {"metallic": 0, "roughness": 1},
     "ord": {"roughness": 1},
 }
-"""Channels of pictures that hold several parts, by the letters that name them."""
+"""Channels of pictures that hold several components, by the letters that name them."""
 
 TEXTURE_PARTS = ("base", "specular", "roughness", "metallic")
-"""Parts that a texture is made of."""
+"""Components of a texture that are read."""
 
 _READ = (*TEXTURE_PARTS, "gloss", *_PACKED)
 
 _LETTERS = {"b": "base", "c": "base", "d": "base", "n": "normal", "r": "roughness", "h": "height"}
 _UNCLEAR = ("a", "e", "g", "m", "o", "s")
-"""Last letters of names that mean one thing here and another there."""
+"""Last letters of names whose meaning differs between collections."""
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".tga", ".webp", ".exr")
-"""Suffixes of pictures, in lower case; of two pictures of one part, the earlier is taken."""
+"""Suffixes of pictures, in lower case; of two pictures of one component, the earlier suffix wins.
+"""
 
 _PLAIN = re.compile("(?i)metal|mask|alpha|depth|glow|emit|thickness|id")
-"""Words that are also whole names of colors."""
+"""Words that may also be the whole name of a color picture."""
 
 _LATER = (".webp", ".exr")
 
 _BETWEEN = "[-_. ]+"
 _SIZE = r"\d{1,2}k(?:[-_](?:jpe?g|png|tiff?|exr))?|\d{3,5}(?:x\d{3,5})?(?:px)?|(?:hi|low)[-_]?res"
 _NOTHING = r"tex(?:ture)?|map|v\d{1,3}|\(\d{1,3}\)|copy|final"
-"""Words behind that of a part that say nothing of it."""
+"""Words after that of a component which carry no meaning."""
 _TAIL = (
     rf"(?:{_BETWEEN}(?:srgb|raw|linear|acescg))?"
     rf"(?P<kind>(?:{_BETWEEN}(?:var)?\d{{1,2}})?)"
@@ -81,7 +82,7 @@ _FOLDERS = re.compile(
     r"metallic|metalness)|(?P<gloss>gloss|glossiness)|(?P<normal>normals?)|(?P<height>heights?|"
     r"displacement)|(?P<occlusion>ao|ambient[-_ ]?occlusion)|(?P<opacity>opacity))"
 )
-"""Folders of one part each, whose files have the names of textures."""
+"""Names of folders with one component each, whose files have the names of textures."""
 _CAMEL = re.compile(
     "(?<=[a-z0-9])(?=(?:Roughness|Normal|Albedo|BaseColou?r|Metallic|Metalness|Specular|Diffuse|"
     "Displacement|Height|AmbientOcclusion|Glossiness|Opacity|Emissive|Colou?r|Rough)(?![a-z]))"
@@ -91,49 +92,49 @@ _NO_COLOR = re.compile(
     r"ao|height(?:map)?|specular|glossiness|opacity|emissive|d3d|dx(?:9|11)?|directx|opengl)"
     r"(?:[-_. )].*)?"
 )
-"""Names that say somewhere that they are no color."""
+"""Names with a word that rules out a color picture."""
 
 
 @dataclass(frozen=True)
-class _Named:
-    """What the name of a file says."""
+class _ParsedName:
+    """The parsed name of a file."""
 
     key: str
-    """Name of the set: equal for all files of one, with their folder."""
+    """Folder and name of the set: equal for all files of one texture set."""
     stem: str
-    """Name of the texture where the file is its color: the set, and which of its colors."""
+    """Name of the texture where the file is its color: the set and the color variant."""
     part: str
     kind: str = ""
-    """Which of several colors of a set it is, or goes with."""
+    """Color variant of the set that the file is, or belongs to."""
 
 
 def packed_channels(part: str) -> Mapping[str, int]:
-    """Return the channels of a picture by the parts that they are; none of other parts."""
+    """Return the channels of a packed picture by component; empty for other components."""
     return _PACKED.get(part, {})
 
 
 def group_textures(
     names: Sequence[str],
 ) -> tuple[dict[str, dict[str, str]], dict[str, tuple[str, str]]]:
-    """Return the files of textures by texture and part, and why the other files are not used.
+    """Group picture files by texture and component; return reasons for the unused files too.
 
     Args:
         names: paths of pictures, with / between their parts.
 
     Returns:
-        Names by part of the textures, each with a part "base", by their names in order; reason and
-        message by name of file.
+        File names by component of each texture, each with a component "base", in order of the
+        textures' names; reason and message by name of each unused file.
     """
     names = sorted(names, key=lambda name: (name.lower().endswith(_LATER), name))
     stems = {name: name.rpartition(".")[0] for name in names}
-    named = {name: entry for name in names if (entry := _named(stems[name])) is not None}
+    named = {name: entry for name in names if (entry := _parse_name(stems[name])) is not None}
     _add_letters(stems, named)
-    bare = _Bare(stems, named)
+    bare = _UnlabeledFiles(stems, named)
     parts: dict[tuple[str, str], dict[str, str]] = defaultdict(dict)
     bases: dict[tuple[str, str], tuple[str, str]] = {}
     unused: dict[str, tuple[str, str]] = {}
     for name in (*named, *bare.colors):
-        entry = named.get(name) or _Named(bare.colors[name], bare.colors[name], "base")
+        entry = named.get(name) or _ParsedName(bare.colors[name], bare.colors[name], "base")
         at = entry.key, entry.kind
         if entry.part not in _READ:
             message = f"it is a map of {entry.part}; expected colors, metallic and roughness"
@@ -148,7 +149,8 @@ def group_textures(
         message = "its name says no part, beside names that do; end it in _color, or move it away"
         unused[name] = ("unknown_map", message)
     _drop_packed(parts.values(), unused)
-    textures, used = {}, set()
+    textures = {}
+    used = set()
     for (key, kind), (stem, name) in sorted(bases.items(), key=lambda item: item[1]):
         textures[stem] = {**parts.get((key, ""), {}), **parts.get((key, kind), {}), "base": name}
         used |= {(key, ""), (key, kind)}
@@ -161,16 +163,16 @@ def group_textures(
     return textures, unused
 
 
-class _Bare:
-    """Files whose names say no part: those that are colors all the same, and the others."""
+class _UnlabeledFiles:
+    """Files whose names state no component: colors by their context, and unknown ones."""
 
-    def __init__(self, stems: Mapping[str, str], named: Mapping[str, _Named]) -> None:
-        """Judge each by what is beside it."""
+    def __init__(self, stems: Mapping[str, str], named: Mapping[str, _ParsedName]) -> None:
+        """Classify each file by the files next to it."""
         with_color = {entry.key for entry in named.values() if entry.part == "base"}
         keys = {entry.key for entry in named.values()}
         folders = {stems[name].rpartition("/")[0] for name in named}
         self.colors: dict[str, str] = {}
-        """Stems by name."""
+        """Stems by file name."""
         self.unknown: list[str] = []
         for name, stem in stems.items():
             if name in named:
@@ -183,7 +185,7 @@ class _Bare:
                 self.unknown.append(name)
 
 
-def _named(path: str) -> _Named | None:
+def _parse_name(path: str) -> _ParsedName | None:
     folder, slash, name = path.rpartition("/")
     inner = f"{folder}{slash}"
     match = _NAME.fullmatch(_CAMEL.sub("_", name))
@@ -192,39 +194,39 @@ def _named(path: str) -> _Named | None:
         if match["set"] is not None:
             key = f"{inner}{match['set']}{match['tail']}"
             stem = f"{inner}{match['set']}{match['kind']}{match['tail']}"
-            return _Named(key, stem, part, match["kind"])
+            return _ParsedName(key, stem, part, match["kind"])
         if part not in ("other", "preview") and not _PLAIN.fullmatch(match[part]):
             # `oak/color.png`: the folder is the set
-            return _Named(f"{inner}{match['tail']}", path, part, match["kind"])
+            return _ParsedName(f"{inner}{match['tail']}", path, part, match["kind"])
     above, slash, last = folder.rpartition("/")
     within = _FOLDERS.fullmatch(last)
     if within is not None:
         part = next(part for part, word in within.groupdict().items() if word)
-        return _Named(f"{above}{slash}{name}", path, part)
+        return _ParsedName(f"{above}{slash}{name}", path, part)
     return None
 
 
-def _add_letters(stems: Mapping[str, str], named: dict[str, _Named]) -> None:
-    """Add files whose names end in a letter, where one set or the color beside it says what."""
+def _add_letters(stems: Mapping[str, str], named: dict[str, _ParsedName]) -> None:
+    """Add files whose names end in a letter, where their set or a color explains it."""
     letters: dict[str, dict[str, tuple[str, str]]] = defaultdict(dict)
     for name, stem in stems.items():
         match = _LETTER.fullmatch(stem) if name not in named else None
         if match is not None:
             key = f"{match['set']}{match['tail']}"
             letters[key][name] = match["letter"].lower(), f"{match['set']}{match['tail']}"
-    others = {entry.key for entry in named.values()}
+    parsed_keys = {entry.key for entry in named.values()}
     bare = {stem for name, stem in stems.items() if name not in named}
     for key, files in letters.items():
         said = {letter for letter, _ in files.values()}
         is_set = said <= {*_LETTERS, *_UNCLEAR} and len(said & {"b", "c", "d"}) == 1
         beside_color = key in bare and said <= {"n", "s", "r", "h", "e"}
-        if beside_color or (is_set and ("n" in said or key in others)):
+        if beside_color or (is_set and ("n" in said or key in parsed_keys)):
             for name, (letter, stem) in files.items():
-                named[name] = _Named(key, stem, _LETTERS.get(letter, "other"))
+                named[name] = _ParsedName(key, stem, _LETTERS.get(letter, "other"))
 
 
 def _drop_packed(parts: Iterable[dict[str, str]], unused: dict[str, tuple[str, str]]) -> None:
-    """Leave out pictures of several parts that are there as pictures of their own."""
+    """Leave out packed pictures whose components exist as separate pictures."""
     for files in parts:
         for part in [part for part in files if part in _PACKED]:
             if all(other in files for other in _PACKED[part]):

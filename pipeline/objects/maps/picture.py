@@ -1,4 +1,4 @@
-"""Picture files as values in [0, 1], as colors or numbers are encoded; only children come here."""
+"""Decodes picture files to values in [0, 1]; runs in child processes only."""
 
 import io
 
@@ -19,9 +19,9 @@ _MOST = {"I;16": 65535, "I;16L": 65535, "I;16B": 65535, "I": 65535}
 
 
 def picture_values(data: bytes, *, is_color: bool) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-    """Return a picture [H, W, 1 or 3], the top row first, and what of its file is not read.
+    """Return a picture [H, W, 1 or 3], the top row first, and notes on unread parts.
 
-    Alpha is left out. Floats are linear: where they are colors they are encoded here as sRGB.
+    Alpha is left out. Floats are linear; float colors are encoded to sRGB here.
 
     Raises:
         Rejected: load_error, not_hdr, not_a_number, too_many_pixels.
@@ -57,7 +57,7 @@ def _too_large(width: int, height: int) -> Rejected:
 
 
 def _plain_values(data: bytes) -> tuple[NDArray[np.float32], bool]:
-    """Return a picture of another format, and whether its values are linear floats."""
+    """Return a picture of another format, and True where its values are linear floats."""
     is_linear = False
     try:
         with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
@@ -66,7 +66,8 @@ def _plain_values(data: bytes) -> tuple[NDArray[np.float32], bool]:
             if image.mode in _MOST:
                 values = np.asarray(image, np.float32) / np.float32(_MOST[image.mode])
             elif image.mode == "F":
-                values, is_linear = _unit_values(np.asarray(image, np.float32)), True
+                values = _unit_values(np.asarray(image, np.float32))
+                is_linear = True
             else:
                 mode = "L" if image.mode in ("1", "L", "LA") else "RGB"
                 values = np.asarray(image.convert(mode), np.float32) / np.float32(255)

@@ -1,7 +1,7 @@
-"""Prepared textures and maps: what one file became, as scenes use it.
+"""Prepared textures and maps, as scenes use them.
 
-A file is read once, in a child, and its outcome is kept in the user's cache under a name that says
-what it depends on. A refusal is not kept: it costs little, and the file may be mended.
+A child process reads a file once, and the user's cache keeps the outcome under a key of all that it
+depends on. The cache keeps no refusal: it costs little, and the user may fix the file.
 """
 
 from collections.abc import Mapping
@@ -24,83 +24,83 @@ from storage.records.safe_read import read_safetensors
 from storage.records.texture import content_digest
 
 MOST_BYTES = 1 << 30
-"""Most bytes of one file."""
+"""Largest accepted size of one file, in bytes."""
 
 MOST_ROWS = 4096
-"""Most rows of a map, and half of its most columns."""
+"""Largest number of rows of a map; columns are at most twice as many."""
 
 _RECIPE = 2
-"""To be raised when what is made of a file changes."""
+"""Version of the outcomes; raise it when the result for a file changes."""
 
 _MOST_HEADER = 1 << 12
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapFiles:
-    """What a texture or map is made of, and how large it may be."""
+    """The files of a texture or map, and its largest size."""
 
     kind: str
-    """TEXTURE or SKY."""
+    """Kind of the map: TEXTURE or SKY."""
     files: Mapping[str, Path]
-    """By part; a map has one, "map"."""
+    """Picture files by component; a map has one, "map"."""
     size: int
     """Most texels along a side of a texture; most rows of a map."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PreparedMap:
-    """An outcome."""
+    """A prepared texture or map."""
 
     content_sha256: str
-    """Digest of what decides the split: the base colour, or the whole map, as it was read."""
+    """Digest that decides the split: of the base color, or of the whole map, as read."""
     arrays: Mapping[str, NDArray[np.float32]]
-    """Of a texture "diffuse", "specular" and perhaps "roughness"; of a map "radiance"."""
+    """Arrays: "diffuse", "specular" and optionally "roughness" of a texture; "radiance" of a map.
+    """
 
-    def encoded(self) -> bytes:
-        """Return the file of it."""
+    def encode(self) -> bytes:
+        """Return the bytes of its file."""
         return save(dict(self.arrays), {"content": self.content_sha256})
 
 
 def decode_prepared(data: bytes, name: str) -> PreparedMap:
-    """Return what `encoded` wrote; raises TrilightError where the file is damaged."""
+    """Decode the bytes of `encode`; raises TrilightError where the file is damaged."""
     arrays, metadata = read_safetensors(data, _MOST_HEADER, name=name)
     return PreparedMap(content_sha256=metadata["content"], arrays=arrays)
 
 
-def outcome_name(asked: MapFiles) -> str:
-    """Return the name of the outcome: of the bytes of the files, the size and the recipe.
+def map_cache_key(map_files: MapFiles) -> str:
+    """Return the cache key of the outcome: a digest of the files, the size and the recipe.
 
     Raises:
         Rejected: missing_file, too_large_bytes.
     """
-    digests = {part: sha256_hex(_read(path)) for part, path in asked.files.items()}
-    parts = [asked.kind, digests, asked.size, _RECIPE]
+    digests = {part: sha256_hex(_read(path)) for part, path in map_files.files.items()}
+    parts = [map_files.kind, digests, map_files.size, _RECIPE]
     return sha256_hex(canonical_json(parts))[:32]
 
 
-def prepare_map(asked: MapFiles) -> tuple[bytes, tuple[str, ...]]:
-    """Return the file of a texture or map, and what is not read; only children come here.
+def prepare_map(map_files: MapFiles) -> tuple[bytes, tuple[str, ...]]:
+    """Return the file of a texture or map, and notes on unread parts; for child processes.
 
     Raises:
-        Rejected: the reason, and what the user can do; see `usable_map`, `texture_set` and the
-            readers.
+        Rejected: the reason and a remedy; see `usable_map`, `texture_set` and the readers.
     """
-    if asked.kind == SKY:
-        return _prepare_sky(_read(asked.files["map"]), asked.size)
+    if map_files.kind == SKY:
+        return _prepare_sky(_read(map_files.files["map"]), map_files.size)
     pictures: dict[str, NDArray[np.float32]] = {}
     unread: list[str] = []
-    for part, path in sorted(asked.files.items()):
+    for part, path in sorted(map_files.files.items()):
         values, notes = _picture_of(part, path)
         unread += [f"{note} of its {part}" for note in notes]
         if packed_channels(part) and values.shape[2] < 3:
             unread.append(f"its {part}, which is grey: it has no channels")
         pictures[part] = values
-    made = texture_set(unpack_parts(pictures), asked.size)
-    maps = {"diffuse": made.diffuse_rgb, "specular": made.specular_rgb}
-    if made.roughness is not None:
-        maps["roughness"] = made.roughness
-    prepared = PreparedMap(content_sha256=made.content_sha256, arrays=maps)
-    return prepared.encoded(), tuple(unread)
+    result = texture_set(unpack_parts(pictures), map_files.size)
+    maps = {"diffuse": result.diffuse_rgb, "specular": result.specular_rgb}
+    if result.roughness is not None:
+        maps["roughness"] = result.roughness
+    prepared = PreparedMap(content_sha256=result.content_sha256, arrays=maps)
+    return prepared.encode(), tuple(unread)
 
 
 def _prepare_sky(data: bytes, rows: int) -> tuple[bytes, tuple[str, ...]]:
@@ -113,13 +113,13 @@ def _prepare_sky(data: bytes, rows: int) -> tuple[bytes, tuple[str, ...]]:
         content_sha256=content_digest("radiance", radiance),
         arrays={"radiance": np.ascontiguousarray(usable_map(radiance, rows))},
     )
-    return prepared.encoded(), picture.unread
+    return prepared.encode(), picture.unread
 
 
 def unpack_parts(
     pictures: Mapping[str, NDArray[np.float32]],
 ) -> Mapping[str, NDArray[np.float32]]:
-    """Return the parts that a texture is made of; those of pictures of their own come first."""
+    """Return the components of a texture; separate pictures win over packed channels."""
     parts = dict(pictures)
     for name, values in pictures.items():
         for part, channel in packed_channels(name).items():
@@ -131,7 +131,7 @@ def unpack_parts(
 
 
 def _picture_of(part: str, path: Path) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-    """Return the values of a picture, and what of it is not read; a rejection says which part."""
+    """Return a picture's values and notes on unread parts; a rejection names the component."""
     try:
         return picture_values(_read(path), is_color=part == "base")
     except Rejected as rejection:

@@ -1,8 +1,8 @@
-"""An environment map from outside: its laws, a stated repair, and its size.
+"""Checks a user's environment map, repairs small negative values, and resamples it.
 
-Radiance is linear. What is not a number, or infinite, stops a map: half floats end at 65,504, and a
-sun beyond was written as infinite and is gone. Small negative values, as conversions of colours
-leave them, become 0, where all together are a thousandth of the light at most.
+Radiance is linear. A NaN or infinite value rejects the map: half floats end at 65,504, so that a
+brighter sun was written as infinite and is lost. Small negative values, which color conversions
+leave, become 0 where together they are at most a thousandth of the light.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from storage.errors import Rejected
 from storage.records.environment import MAX_RADIANCE
 
 MOST_NEGATIVE = 1e-3
-"""Greatest share of the light of a map that its negative values may take away."""
+"""Largest fraction of a map's light that its negative values may take away."""
 
 
 def usable_map(radiance: NDArray[np.float32], height: int) -> NDArray[np.float32]:
@@ -21,7 +21,7 @@ def usable_map(radiance: NDArray[np.float32], height: int) -> NDArray[np.float32
 
     Args:
         radiance: [H, W, 3] linear, the top row first.
-        height: rows that are wanted; a smaller map stays as it is.
+        height: most rows of the result; a smaller map stays unchanged.
 
     Raises:
         Rejected: not_two_to_one, not_a_number, infinite_radiance, negative_radiance,
@@ -41,15 +41,16 @@ def usable_map(radiance: NDArray[np.float32], height: int) -> NDArray[np.float32
         "is infinite; write the map in 32 bits, or as .hdr: half floats end at 65504",
     )
     lawful = np.maximum(radiance, 0)
-    whole, negative = flux(lawful), flux(lawful - radiance)
-    if (negative > MOST_NEGATIVE * whole).any() and negative.any():
+    total = flux(lawful)
+    negative = flux(lawful - radiance)
+    if (negative > MOST_NEGATIVE * total).any() and negative.any():
         raise Rejected(
             "negative_radiance",
             f"negative values take more than {MOST_NEGATIVE:g} of the light of a channel; set them "
             "to 0 in a picture editor",
         )
     _refuse(lawful > MAX_RADIANCE, "too_bright", f"is over {MAX_RADIANCE:g}; scale the map down")
-    if not whole.sum() > 0:
+    if not total.sum() > 0:
         raise Rejected("black_map", "the map is black; expected some light")
     return lawful if rows <= height else solid_angle_means(lawful, height).astype(np.float32)
 

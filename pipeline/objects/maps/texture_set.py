@@ -1,8 +1,8 @@
-"""The pictures of a texture as albedos and roughness that repeat.
+"""Converts the pictures of a texture to albedos and roughness.
 
-The base colour is sRGB-encoded, all else is linear. Means are of linear values, and of roughness
-the mean is that of the GGX width, its square. There is no Fresnel term here: a surface with a
-metallic map, or with a base colour alone, gets albedos as storage.records.fresnel has them.
+The base color is sRGB-encoded, all else is linear. Means are of linear values; the mean of
+roughness is that of the GGX width, its square. There is no Fresnel term here: a surface with a
+metallic map, or with a base color alone, gets its albedos from storage.records.fresnel.
 """
 
 from collections.abc import Mapping
@@ -18,40 +18,40 @@ from storage.records.texture import content_digest
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TextureSet:
-    """A texture from outside, ready for scenes; the top row first."""
+    """A user's texture, ready for scenes; the top row first."""
 
     diffuse_rgb: NDArray[np.float32]
-    """[H, W, 3] linear."""
+    """[H, W, 3] linear diffuse albedo."""
     specular_rgb: NDArray[np.float32]
-    """[H, W, 3]; with the diffuse albedo at most 1 in each channel."""
+    """[H, W, 3] specular albedo; with the diffuse albedo at most 1 in each channel."""
     roughness: NDArray[np.float32] | None
-    """[H, W, 1]; None where no picture says it: scenes draw one number."""
+    """[H, W, 1] roughness; None without a picture of it: scenes then draw one number."""
     content_sha256: str
-    """Digest of the base colour as it was read: copies share it, whatever is beside them."""
+    """Digest of the base color as read: copies share it, whatever their other pictures."""
 
 
 def texture_set(pictures: Mapping[str, NDArray[np.float32]], size: int) -> TextureSet:
     """Return the maps of a texture.
 
     Args:
-        pictures: encoded values [H, W, 1 or 3] of the part "base", and of "specular", "roughness"
-            and "metallic" where there are such. They may differ in size.
-        size: most texels along a side of what is returned.
+        pictures: encoded values [H, W, 1 or 3] of the component "base", and of "specular",
+            "roughness" and "metallic" where present. They may differ in size.
+        size: most texels along a side of the result.
     """
     base = pictures["base"]
-    height, width = _fitting(base.shape[:2], size)
+    height, width = _fitting_size(base.shape[:2], size)
 
     def means(values: NDArray) -> NDArray[np.float64]:
         return area_means(values, height, width)
 
-    colour = _three(means(_linear(base)))
+    color = _three(means(_linear(base)))
     metallic = means(_grey(pictures["metallic"])) if "metallic" in pictures else np.zeros(1)
     if "specular" in pictures:
-        diffuse = colour * (1 - metallic)
+        diffuse = color * (1 - metallic)
         # where both are over 1, the lobe gives way
         specular = np.minimum(_three(means(pictures["specular"])), 1 - diffuse)
     else:
-        diffuse, specular = constant_albedos(colour, metallic)
+        diffuse, specular = constant_albedos(color, metallic)
         specular = np.broadcast_to(specular, diffuse.shape)
     roughness = None
     if "roughness" in pictures:
@@ -64,7 +64,7 @@ def texture_set(pictures: Mapping[str, NDArray[np.float32]], size: int) -> Textu
     )
 
 
-def _fitting(shape: tuple[int, ...], size: int) -> tuple[int, int]:
+def _fitting_size(shape: tuple[int, ...], size: int) -> tuple[int, int]:
     """Return height and width with the proportions of a picture and no side over `size`."""
     shrink = min(1.0, size / max(shape))
     height, width = (max(1, round(side * shrink)) for side in shape)

@@ -1,8 +1,8 @@
-"""The `objaverse` package, wrapped: one call at a time, bounded in time, silent.
+"""Wrapper of the `objaverse` package: one call at a time, with timeouts, silent.
 
-The package keeps its files in a place of its own (`~/.objaverse`), which other programs use too. It
-fetches metadata without a temporary name, so that a broken transfer leaves a broken file; waits for
-a dead server forever; prints; and reads its list of all objects anew for each object.
+The package keeps its files in its own folder (`~/.objaverse`), which other programs use too. It
+downloads metadata without a temporary name, so that a broken transfer leaves a broken file; waits
+for a dead server forever; prints; and reads its list of all objects again for each object.
 """
 
 import contextlib
@@ -27,13 +27,13 @@ _CATEGORIES = "lvis-annotations.json.gz"
 
 
 class ObjaversePackage:
-    """What we use of the package. Not safe to use from several threads."""
+    """The used part of the package; not safe for several threads."""
 
     def __init__(self) -> None:
         """Import the package.
 
         Raises:
-            TrilightError: it is not installed, or the list of all objects cannot be downloaded.
+            TrilightError: the package is missing, or the list of all objects cannot be downloaded.
         """
         try:
             self._package: ModuleType = importlib.import_module("objaverse")
@@ -45,7 +45,7 @@ class ObjaversePackage:
         self._paths: dict[str, str] = self._listing(_PATHS, self._package._load_object_paths)
 
     def __contains__(self, uid: str) -> bool:
-        """Return whether Objaverse has an object, in the place where the package looks for it."""
+        """Return True where Objaverse lists an object under a path of the usual form."""
         return bool(_PLACE.fullmatch(str(self._paths.get(uid))))
 
     def categories(self) -> dict[str, list[str]]:
@@ -60,7 +60,7 @@ class ObjaversePackage:
         return [groups[name] for name in sorted(groups)]
 
     def annotations(self, group: list[str]) -> dict[str, dict[str, Any]]:
-        """Return what is known of the uids of one group, by uid; some may be missing.
+        """Return the annotations of one group by uid; some may be missing.
 
         Raises:
             TransferFailed: the file that describes them cannot be downloaded.
@@ -69,15 +69,15 @@ class ObjaversePackage:
         return self._metadata(name, lambda: self._package.load_annotations(group))
 
     def fetch(self, uid: str) -> Path:
-        """Bring a known object here, unless it is here already.
+        """Download a known object, unless it is on this machine already.
 
         Raises:
-            TransferFailed: it cannot be downloaded.
+            TransferFailed: the object cannot be downloaded.
         """
 
         def load() -> Path:
-            with self._guarded():
-                # One process: with more, the package forks a pool that nobody can end.
+            with self._guard_package():
+                # One process: with more, the package forks a pool that cannot be ended.
                 return Path(self._package.load_objects([uid], download_processes=1)[uid])
 
         return with_tries(load).absolute()
@@ -92,11 +92,11 @@ class ObjaversePackage:
             ) from error
 
     def _metadata(self, name: str, load: Callable[[], Result]) -> Result:
-        """Load a metadata file; one that cannot be read is deleted, and fetched again."""
+        """Load a metadata file; an unreadable one is deleted and downloaded again."""
 
         def attempt() -> Result:
             try:
-                with self._guarded():
+                with self._guard_package():
                     return load()
             except TrilightError:
                 raise
@@ -111,18 +111,18 @@ class ObjaversePackage:
         return Path(self._package._VERSIONED_PATH)
 
     @contextlib.contextmanager
-    def _guarded(self) -> Iterator[None]:
-        """Lock the package's folder, silence its output and bound its waiting while it works.
+    def _guard_package(self) -> Iterator[None]:
+        """Lock the package's folder, silence its output and set a timeout while it works.
 
-        Only names of the package are replaced, not `sys.stdout`, so that a progress bar of ours
-        goes on. The limit of time holds for all sockets that are opened meanwhile.
+        Only names of the package are replaced, not `sys.stdout`, so that Trilight's progress bar
+        continues. The timeout holds for all sockets that open meanwhile.
         """
         before = socket.getdefaulttimeout()
         replaced: dict[str, Any] = {"print": _print_nothing, "tqdm": _iterate}
         if hasattr(self, "_paths"):
             replaced["_load_object_paths"] = lambda: self._paths
         missing = object()
-        kept = {name: self._package.__dict__.get(name, missing) for name in replaced}
+        originals = {name: self._package.__dict__.get(name, missing) for name in replaced}
         with hold_claim(self._root / ".trilight.lock", wait=True):
             socket.setdefaulttimeout(_SILENCE_S)
             self._package.__dict__.update(replaced)
@@ -130,7 +130,7 @@ class ObjaversePackage:
                 yield
             finally:
                 socket.setdefaulttimeout(before)
-                for name, value in kept.items():
+                for name, value in originals.items():
                     if value is missing:
                         del self._package.__dict__[name]
                     else:
@@ -138,9 +138,9 @@ class ObjaversePackage:
 
 
 def _print_nothing(*values: object, **options: object) -> None:
-    """Stand in for print."""
+    """Replace `print` of the package."""
 
 
 def _iterate(items: Result, *values: object, **options: object) -> Result:
-    """Stand in for a progress bar."""
+    """Replace the progress bar of the package."""
     return items

@@ -39,11 +39,11 @@ _FORMS = (
 
 
 def list_objaverse(source: str, allowed: Sequence[str]) -> Listing:
-    """Return the objects that a source names, with the rights that their annotations state.
+    """Return the objects that a source names, with the rights from their annotations.
 
     A category with `:N` gives the first N of its uids, sorted, whose licence is in `allowed`; the
-    refused ones that were passed over on the way are listed too. Whether an object is still
-    offered under the licence of then is not known: Objaverse froze its annotations.
+    refused ones before them are listed too. An object's present licence may differ: Objaverse froze
+    its annotations.
 
     Raises:
         TrilightError: the source is malformed, a category is unknown, the package is missing, or
@@ -55,7 +55,8 @@ def list_objaverse(source: str, allowed: Sequence[str]) -> Listing:
         package = ObjaversePackage()
         uids = _uids_of_categories(package.categories(), names)
     else:
-        uids, count = _uids(text, source), None
+        uids = _uids(text, source)
+        count = None
         package = ObjaversePackage()
     uids = sorted(set(uids))
     known = [uid for uid in uids if uid in package]
@@ -73,24 +74,24 @@ def _records(
 ) -> tuple[list[ObjectRecord], list[Failure]]:
     """Read annotations, file by file as they are needed, until `count` licences are allowed."""
     group_of = {uid: group for group in package.groups(uids) for uid in group}
-    found: dict[str, dict[str, Any]] = {}
+    known: dict[str, dict[str, Any]] = {}
     broken: dict[str, TransferFailed] = {}
     records: list[ObjectRecord] = []
     failures: list[Failure] = []
     usable = 0
     for uid in uids:
-        if uid not in found and uid not in broken:
+        if uid not in known and uid not in broken:
             group = group_of[uid]
             try:
                 annotations = package.annotations(group)
-                found |= {member: annotations.get(member) or {} for member in group}
+                known |= {member: annotations.get(member) or {} for member in group}
             except TransferFailed as error:
                 broken |= dict.fromkeys(group, error)
         if uid in broken:
             message = f"annotations: {broken[uid].message}"
             failures.append(failure(_name(uid), broken[uid].reason, message))
             continue
-        record = _record(uid, found[uid])
+        record = _record(uid, known[uid])
         records.append(record)
         usable += len(refuse_licences([record], allowed)[0])
         if usable == count:
@@ -99,7 +100,7 @@ def _records(
 
 
 def _record(uid: str, annotation: dict[str, Any]) -> ObjectRecord:
-    """Return the record of an object; its path is known once it is here."""
+    """Return the record of an object; its path is known after the download."""
     user = annotation.get("user")
     user = user if isinstance(user, dict) else {}
     title = _text(annotation, "name") or uid

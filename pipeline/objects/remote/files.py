@@ -1,8 +1,8 @@
-"""Files of a remote folder on this machine: fetched once, whole or not at all.
+"""Local copies of a remote folder's files: downloaded once, whole or not at all.
 
-A file lies below `files` under its own name, since the parts of a glTF name each other. Beside it,
-below `versions`, stands what the server said about it then: while the server says the same, the
-file is not fetched again. The files that a glTF names are fetched with it.
+A file lies below `files` under its own name, since the files of a glTF name each other. The
+server's version of it is stored below `versions`: while the server reports the same version, the
+file is not downloaded again. The files that a glTF names are downloaded with it.
 """
 
 import errno
@@ -38,15 +38,15 @@ _STALE_S = 24 * 3600.0
 
 
 class RemoteFiles:
-    """The local side of a remote folder. Safe to use from several threads."""
+    """The local copies of a remote folder's files; safe for several threads."""
 
     def __init__(self, folder: RemoteFolder, root: Path, max_bytes: int) -> None:
-        """Remember where files go.
+        """Open the local copies and remove leftovers of earlier runs.
 
         Args:
-            folder: where they come from.
-            root: where they go; belongs to this folder alone.
-            max_bytes: largest accepted object, with the buffers that it names.
+            folder: the remote folder.
+            root: local folder for this remote folder alone.
+            max_bytes: largest accepted object in bytes, with the buffers that it names.
         """
         self.files = Path(os.path.realpath(root)) / "files"
         self.stop = threading.Event()
@@ -55,11 +55,11 @@ class RemoteFiles:
         self._max_bytes = max_bytes
         self._lock = threading.Lock()
         self._outcomes: dict[str, _Outcome] = {}
-        # what is younger may belong to a run that is at work
+        # younger files may belong to a running process
         remove_leftovers(self.files, older_than_s=_STALE_S)
 
     def path(self, name: str) -> Path:
-        """Return where a file goes; raises TransferFailed `unsafe_name` for names that lead out."""
+        """Return the local path of a file; raises TransferFailed for unsafe names."""
         parts = name.split("/")
         encoded = [os.fsencode(part) for part in parts]
         if (
@@ -72,7 +72,7 @@ class RemoteFiles:
         return self.files / name
 
     def fetch_object(self, name: str) -> Path:
-        """Bring a file here, and the buffers of a `.gltf`; returns where it is.
+        """Download a file, and the buffers of a `.gltf`; return its local path.
 
         Raises:
             TransferFailed: unsafe_name, too_large_bytes, too_many_buffers, download_failed.
@@ -95,7 +95,7 @@ class RemoteFiles:
         return path
 
     def fetch(self, name: str) -> Path:
-        """Bring one file here, once in the life of this object; raises as `fetch_object` does."""
+        """Download one file once per instance; raises as `fetch_object`."""
         with self._lock:
             outcome = self._outcomes.setdefault(name, _Outcome())
         with outcome.lock:
@@ -112,7 +112,7 @@ class RemoteFiles:
         return outcome.path
 
     def _refresh(self, name: str, path: Path, limit: "_Limit") -> None:
-        """Fetch a file unless what is here is what the server has."""
+        """Download a file unless the local copy has the server's version."""
         facts = self._folder.facts(name)
         if facts.get("type") == "directory":
             raise TransferFailed("download_failed", "is a folder, not a file")
@@ -138,23 +138,24 @@ class RemoteFiles:
             raise
 
     def _fill(self, name: str, temporary: Path, size: int | None, limit: "_Limit") -> None:
-        """Write the bytes of a file to a temporary name, which is open for its last sync."""
-        limit.value = 0  # every try begins anew
-        driver, address = self._folder.driver, self._folder.address(name)
+        """Write the bytes of a file to a temporary path, which the caller holds open."""
+        limit.value = 0  # every try starts again
+        driver = self._folder.driver
+        address = self._folder.address(name)
         get = driver.get_file
-        if self._folder.url.is_http:  # `get_file` would take the limits for its own
+        if self._folder.url.is_http:  # `get_file` would apply its own limits
             get = partial(sync, driver.loop, partial(driver._get_file, timeout=transfer_timeout()))
         try:
             get(address, str(temporary), callback=limit)
         except OSError as error:
             if error.errno in _DISK_ERRORS:
                 raise
-            # Errors of the network are OSErrors too, and must not pass for those of the disk.
+            # Network errors are OSErrors too, and must not count as disk errors.
             raise Interrupted from error
-        found = temporary.stat().st_size
-        self._check_size(found)
-        if size is not None and found != size:
-            raise Interrupted from EOFError(f"got {found} of {size} bytes")
+        received = temporary.stat().st_size
+        self._check_size(received)
+        if size is not None and received != size:
+            raise Interrupted from EOFError(f"got {received} of {size} bytes")
 
     def _check_size(self, size: int) -> None:
         if size > self._max_bytes:
@@ -163,7 +164,7 @@ class RemoteFiles:
 
 
 class _Outcome:
-    """What became of one file; the lock is held while it is on its way."""
+    """The outcome of one file's download; its lock is held during the transfer."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
@@ -172,7 +173,7 @@ class _Outcome:
 
 
 class _Limit(Callback):
-    """Ends a transfer that grows too large, comes too slowly, or is not waited for any more."""
+    """Aborts a transfer that grows too large, is too slow, or belongs to an ended run."""
 
     def __init__(self, check: Any, stop: threading.Event) -> None:
         super().__init__()
@@ -187,7 +188,7 @@ class _Limit(Callback):
     def relative_update(self, inc: int = 1) -> None:
         super().relative_update(inc)
         self._check(self.value)
-        if self.value != self.size:  # what has come whole is not too slow
+        if self.value != self.size:  # a complete file is not too slow
             self._pace.require()
         if self._stop.is_set():
             raise TransferFailed("download_failed", "the run was ended")
@@ -204,10 +205,10 @@ def _is_here(path: Path, note: Path, version: dict[str, str]) -> bool:
 
 
 def buffer_names(path: Path, name: str) -> list[str]:
-    """Return the files that the buffers of a `.gltf` name, each once, in their order.
+    """Return the files that the buffers of a `.gltf` name, each once, in order.
 
-    Whatever is not a relative URI to below the folder of the file is left out, and so is everything
-    of a file that is not a glTF: the mesh stage reads it again, and says what is wrong.
+    Other URIs than relative ones below the file's folder are left out, and a file that is not a
+    glTF has none: the mesh stage reads it again and reports the error.
 
     Args:
         path: the file on this machine.
@@ -221,13 +222,13 @@ def buffer_names(path: Path, name: str) -> list[str]:
         return []
     buffers = tree.get("buffers") if isinstance(tree, dict) else None
     folder = posixpath.dirname(name)
-    found: dict[str, None] = {}
+    names: dict[str, None] = {}
     for buffer in buffers if isinstance(buffers, list) else ():
         uri = buffer.get("uri") if isinstance(buffer, dict) else None
         inner = _inner(uri) if isinstance(uri, str) else None
         if inner is not None:
-            found[posixpath.join(folder, inner)] = None
-    return list(found)
+            names[posixpath.join(folder, inner)] = None
+    return list(names)
 
 
 def _inner(uri: str) -> str | None:

@@ -1,4 +1,4 @@
-"""A folder on a server: what it holds, and facts about each file. Nothing is written here."""
+"""A folder on a server: its file names, and metadata of each file. Nothing is written here."""
 
 import html
 from functools import partial
@@ -11,11 +11,11 @@ from storage.remote.url import RemoteUrl, open_driver
 
 _MAX_FOLDERS = 10_000
 _MAX_DEPTH = 32
-"""Maximum depth; a server that answers every address with one page has no end otherwise."""
+"""Maximum depth of folders: a server may answer every address with the same page."""
 
 
 class RemoteFolder:
-    """Files by their names: paths below the folder, unquoted, with / between their parts."""
+    """Files of a remote folder by name: the unquoted path below it, with / between parts."""
 
     def __init__(self, url: RemoteUrl) -> None:
         """Open the driver; raises TrilightError where its package is missing."""
@@ -25,21 +25,21 @@ class RemoteFolder:
         self._facts: dict[str, dict[str, Any]] = {}
 
     def address(self, name: str) -> str:
-        """Return what the driver calls a file."""
+        """Return the driver's address of a file."""
         if name in self._addresses:
             return self._addresses[name]
-        # Bytes that are no UTF-8 are lone surrogates in `name`.
+        # Bytes that are not UTF-8 are lone surrogates in `name`.
         inner = quote(name, errors="surrogateescape") if self.url.is_http else name
         return f"{self.url.root}/{inner}"
 
     def facts(self, name: str) -> dict[str, Any]:
-        """Return what the server says about a file; raises what the driver raises."""
+        """Return the server's metadata of a file; raises the driver's errors."""
         if name in self._facts:
             return self._facts[name]
         return dict(self.driver.info(self.address(name)))
 
     def has(self, name: str) -> bool:
-        """Return whether a file exists; False also where the server denies access.
+        """Return True where a file exists; False also where the server denies access.
 
         Raises:
             TrilightError: the server gives no answer.
@@ -48,7 +48,7 @@ class RemoteFolder:
         def ask() -> bool:
             try:
                 return self.driver.info(self.address(name))["type"] == "file"
-            except Exception as error:  # drivers raise what they like
+            except Exception as error:  # drivers raise exceptions of any type
                 if is_absent(error):
                     return False
                 raise
@@ -80,22 +80,23 @@ class RemoteFolder:
 
     def _names_by_find(self) -> list[str]:
         start = f"{self.url.root}/"
-        found = with_tries(lambda: self.driver.find(self.url.root, detail=True))
-        for address, facts in found.items():
+        listing = with_tries(lambda: self.driver.find(self.url.root, detail=True))
+        for address, facts in listing.items():
             name = address.removeprefix(start)
             if address.startswith(start) and name:
-                self._addresses[name], self._facts[name] = address, facts
+                self._addresses[name] = address
+                self._facts[name] = facts
         return sorted(self._addresses)
 
     def _names_by_links(self) -> list[str]:
-        """Follow the links of the server's own listings; only those to below the folder."""
+        """Follow the links of the server's listings, only those below the folder."""
         names: dict[str, str] = {}
         folders = {f"{self.url.root}/"}
         waiting = list(folders)
         deepest = self.url.root.count("/") + _MAX_DEPTH
         while waiting:
-            place = waiting.pop()
-            for link in with_tries(partial(self.driver.ls, place, detail=False)):
+            folder = waiting.pop()
+            for link in with_tries(partial(self.driver.ls, folder, detail=False)):
                 address = html.unescape(link).replace("/./", "/")
                 inner = _below(address, self.url.root)
                 if inner is None or address in folders:
@@ -105,7 +106,7 @@ class RemoteFolder:
                     waiting.append(address)
                 else:
                     names[inner] = address
-            if len(folders) > _MAX_FOLDERS or place.count("/") > deepest:
+            if len(folders) > _MAX_FOLDERS or folder.count("/") > deepest:
                 raise TrilightError(
                     f"objects {self.url.display_url!r}: the listing has no end; expected at most "
                     f"{_MAX_FOLDERS} folders, {_MAX_DEPTH} deep. Give it objects.jsonl."
@@ -115,7 +116,7 @@ class RemoteFolder:
 
 
 def _below(address: str, root: str) -> str | None:
-    """Return the name of a link, or None where it leads elsewhere, or sorts the listing."""
+    """Return the file name of a link, or None where it leads elsewhere or sorts the page."""
     if not address.startswith(f"{root}/") or "?" in address or "#" in address:
         return None
     inner = unquote(address[len(root) + 1 :], errors="surrogateescape")

@@ -13,7 +13,7 @@ from model.weights import encode_weights
 from pipeline.exchange import convert as convert_scene
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5
-from pipeline.exchange.renderformer_json import described_files
+from pipeline.exchange.renderformer_json import describe_scene
 from storage.dataset.shard import write_shard
 from storage.records.passes.stored import decode_passes_exr, passes_exr
 from storage.records.profiles import Profile
@@ -131,7 +131,7 @@ def test_mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (tmp_path / name).touch()
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
     (tmp_path / "broken.usda").write_text("{")
-    described = described_files(tiny_scene(), "s").json.decode()
+    described = describe_scene(tiny_scene(), "s").json.decode()
     (tmp_path / "meshless.json").write_text(described.replace("templates/", "absent.obj/"))
     monkeypatch.chdir(tmp_path)
     before = set(tmp_path.iterdir())

@@ -1,7 +1,7 @@
-"""Work for children that goes wrong on purpose, a record of who was called, and the stage on it.
+"""Child calls that fail on purpose, a record of the calls, and the stage that runs them.
 
-`recorded_attempt` stands in for `stage.attempt_in_child`. It runs in another process, so it is told
-what to do by a file beside the source, and writes down its calls in another one.
+`recorded_attempt` replaces `stage.attempt_in_child`. It runs in another process, so a file next to
+the source holds its instructions, and it records its calls in another file.
 """
 
 import ctypes

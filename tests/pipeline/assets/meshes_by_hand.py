@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.assets.cleaning.clean import clean, normalise
+from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings
 from pipeline.foreign.mesh import TriangleMesh
@@ -53,7 +53,7 @@ def reason_of(
 
 
 def cleaned(mesh: TriangleMesh) -> TriangleMesh:
-    return clean(normalise(mesh))
+    return clean(normalize(mesh))
 
 
 def mesh_of(level: Level) -> TriangleMesh:

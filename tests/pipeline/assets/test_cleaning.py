@@ -30,7 +30,7 @@ from tests.pipeline.assets.meshes_by_hand import (
     write_glb,
     write_obj,
 )
-from tests.pipeline.assets.own.test_bad_pictures import OUTSIDE
+from tests.pipeline.assets.source_materials.test_bad_pictures import OUTSIDE
 
 BALL = sphere(rings=5, columns=8)
 
@@ -299,7 +299,7 @@ def test_each_of_several_bodies_is_turned_on_its_own() -> None:
     assert (outward > 0).all()
 
 
-def test_a_body_that_nobody_sees_is_turned_by_its_volume() -> None:
+def test_a_hidden_body_is_oriented_by_its_volume() -> None:
     outer, inner = sphere(), sphere(rings=5, columns=8)
     nested = TriangleMesh(
         positions=np.concatenate([outer.positions, 0.3 * inner.positions]),

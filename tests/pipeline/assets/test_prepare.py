@@ -69,7 +69,7 @@ def test_the_error_holds_on_other_points(asset: Asset) -> None:
     for level in asset.levels:
         assert level.record.quality.error_p99 <= SETTINGS.gate.max_error_p99
         deviation = surface.deviation(mesh_of(level))
-        for way in (deviation.there, deviation.back):
+        for way in (deviation.to_other, deviation.from_other):
             # The recorded percentile comes from 8192 points: its rank is known to 0.33 % (3 sigma).
             assert np.percentile(way, 98.6) <= level.record.quality.error_p99
 

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from pipeline.assets.quality.components import Components, label_components
 from pipeline.assets.quality.distance import Surface, sample_surface
-from pipeline.assets.quality.gate import check_level
+from pipeline.assets.quality.level_checks import check_level
 from pipeline.assets.quality.measure import MeasuredSource
-from pipeline.assets.quality.parts import Parts, label_parts
 from pipeline.assets.quality.silhouette import intersection_over_union, silhouette
 from pipeline.assets.quality.triangles import area_variation, count_edges, smallest_angles_deg
 from pipeline.assets.settings import GateSettings
@@ -183,7 +183,7 @@ def test_distances_count_both_ways_at_any_scale_as_in_the_slow_twin() -> None:
     grown = [TriangleMesh(positions=m.positions * 8, faces=m.faces) for m in (mesh, other)]
     assert p99(*grown) == pytest.approx(error, rel=1e-12)
     mesh, other = sphere(rings=5, columns=8), knot(segments=12, sides=4)
-    fast = Surface(mesh, FEWER[:40]).deviation(other).there
+    fast = Surface(mesh, FEWER[:40]).deviation(other).to_other
     points = sample_surface(mesh, FEWER[:40]).positions
     slow = np.array([slow_distance(point, other) for point in points]) / mesh.diagonal
     assert (fast <= slow + 1e-12).all()
@@ -298,8 +298,8 @@ def test_a_part_that_vanishes_is_named_lost_and_one_that_is_coarser_is_not() -> 
     assert 0 < MeasuredSource(both).quality(box).error_max
     assert MeasuredSource(both).quality(box).lost_area == 0
     three = cleaned(joined(knot(20, 6), moved(cube(), 1, 5), moved(cube(), 1, -5)))
-    assert len(np.unique(label_parts(three))) == 3
-    assert Parts(Surface(three, UNIFORM)).count == 3
+    assert len(np.unique(label_components(three))) == 3
+    assert Components(Surface(three, UNIFORM)).count == 3
 
 
 @pytest.mark.parametrize("slope_deg", [10.0, 30.0, 45.0])

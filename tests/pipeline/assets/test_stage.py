@@ -13,7 +13,7 @@ import pytest
 from pipeline.assets import stage
 from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings, GateSettings
-from pipeline.assets.stage import _rising, attempt_in_child, prepare_assets
+from pipeline.assets.stage import _drop_wasteful_levels, attempt_in_child, prepare_assets
 from pipeline.assets.store import AssetStore
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.isolation import is_transient
@@ -73,8 +73,8 @@ def test_a_level_that_wastes_its_budget_is_left_out(source: Path) -> None:
     assert [len(level.faces) for level in made] == [1000, 500, 340]
     wasteful = dataclasses.replace(made[0], faces=made[0].faces[:450])
     for levels in ([wasteful, *made[1:]], [*made[1:], wasteful]):
-        assert _rising(levels) == made[1:]
-    assert _rising(list(made)) == made
+        assert _drop_wasteful_levels(levels) == made[1:]
+    assert _drop_wasteful_levels(list(made)) == made
 
 
 def test_an_object_that_no_method_serves_is_refused_as_the_first_one_failed(

@@ -18,8 +18,14 @@ from tests.pipeline.assets.meshes_by_hand import (
     prepare,
     reason_of,
 )
-from tests.pipeline.assets.own.textured_kit import CORNERS, KEEP, UV_UP, lost, picture_bytes
-from tests.pipeline.assets.own.usd_kit import (
+from tests.pipeline.assets.source_materials.textured_kit import (
+    CORNERS,
+    KEEP,
+    UV_UP,
+    lost,
+    picture_bytes,
+)
+from tests.pipeline.assets.source_materials.usd_kit import (
     MESH,
     SHADER,
     TEXTURE,

@@ -10,7 +10,7 @@ from pxr import Usd, UsdValidation
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
-from pipeline.exchange.renderformer_json import described_files
+from pipeline.exchange.renderformer_json import describe_scene
 from pipeline.exchange.scene_files import build_scene
 from pipeline.exchange.usd.read import read_usd
 from pipeline.exchange.usd.write import write_usd
@@ -35,7 +35,7 @@ def errors_of(stage: Any) -> list[str]:
 
 def json_and_back(scene: Scene, folder: Path) -> tuple[Scene, tuple[str, ...]]:
     """Return the scene that our reader makes of its RenderFormer files, and what was lost."""
-    files = described_files(scene, "again")
+    files = describe_scene(scene, "again")
     for path, data in files.meshes.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_bytes(data)

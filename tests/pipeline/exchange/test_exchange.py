@@ -15,9 +15,9 @@ from infra.bench.workloads.cost_scene import cost_scene
 from pipeline.builds.named import named_build
 from pipeline.exchange import formats
 from pipeline.exchange.convert import convert_scene, write_scene
-from pipeline.exchange.formats import lost_members
+from pipeline.exchange.formats import list_lost_members
 from pipeline.exchange.open_scene import SceneSource, load_source, scene_source
-from pipeline.exchange.renderformer_json import described_files
+from pipeline.exchange.renderformer_json import describe_scene
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.layout_rand import scene_plan
@@ -177,7 +177,7 @@ def test_any_names_become_names_of_files(tmp_path: Path) -> None:
 def test_light_beyond_half_floats_is_said_to_be_cut_off() -> None:
     scene = tiny_scene()
     scene.materials[LIGHT, 7:] = 65505
-    assert any("cuts off" in text for text in described_files(scene, "a").lost)
+    assert any("cuts off" in text for text in describe_scene(scene, "a").lost)
 
 
 WARM, SCENES = 50, 200
@@ -263,8 +263,8 @@ def test_what_carries_everything_carries_new_columns(tmp_path: Path, form: str) 
     back = load_source(scene_source(str(path)))
     assert back.notes == ()
     assert np.array_equal(back.scene.materials, scene.materials)
-    assert lost_members(back.scene, ()) == lost_members(scene, ())
-    assert lost_members(back.scene, {field.name for field in dataclasses.fields(Scene)}) == ()
+    assert list_lost_members(back.scene, ()) == list_lost_members(scene, ())
+    assert list_lost_members(back.scene, {field.name for field in dataclasses.fields(Scene)}) == ()
 
 
 @for_each("form", EXACT)
@@ -326,7 +326,7 @@ def test_what_the_published_forms_lose_is_named(tmp_path: Path, form: str, lost:
     scene = dataclasses.replace(tiny_scene(), objects=ATTRIBUTED)
     assert write_scene(tmp_path / f"a.{form}", scene) == (lost,)
     scene.materials[LIGHT, 0] = 0.5
-    said = "what 1 emitting materials reflect" in write_scene(tmp_path / f"b.{form}", scene)
+    said = "albedos of 1 emitting materials" in write_scene(tmp_path / f"b.{form}", scene)
     assert said == (form == "h5")
 
 
@@ -377,4 +377,4 @@ def test_the_names_of_members_are_those_of_a_scene() -> None:
     known |= {field.name for field in dataclasses.fields(Scene)}
     for form in FORMATS.values():
         assert set(form.carried) <= known
-    assert formats.lost_members(tiny_scene(), known) == ()
+    assert formats.list_lost_members(tiny_scene(), known) == ()

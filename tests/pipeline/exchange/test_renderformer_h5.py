@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.exchange.convert import write_scene
-from pipeline.exchange.renderformer_cells import CELLS, cells_of, filled_cells
+from pipeline.exchange.renderformer_cells import CELLS, compute_cells, filled_cell_mask
 from pipeline.exchange.renderformer_h5 import (
     FAR,
     NEAR,
@@ -173,9 +173,9 @@ def test_what_other_tools_write_is_carried_over_or_named(tmp_path: Path) -> None
         "array or group 'depth'",
         "attribute 'export_metadata'",
         "normal textures of 1 triangles",
-        "alpha of pictures: they stand before black",
+        "alpha of pictures: composited over black",
         "lengths of 3 normals that were not 1",
-        "what emitters reflect: ours reflect nothing",
+        "albedos of emitters: emitters of a scene reflect nothing",
     )
     scene = read.scene
     # one of 559 cells is brighter: a texture, whose mean is that of its 8 bits
@@ -247,13 +247,13 @@ def test_a_ramp_has_the_means_of_its_cells(tmp_path: Path) -> None:
     scene = textured_scene(0, Texture(texels=along), Texture(texels=np.ascontiguousarray(rough)))
     corners = np.array([[0.98, 0.01], [0.01, 0.98], [0.01, 0.01]], np.float32)  # away from the seam
     scene = dataclasses.replace(scene, uv=np.tile(corners, (3, 1)))
-    (_, diffuse), (_, roughness) = cells_of(scene, 0)
+    (_, diffuse), (_, roughness) = compute_cells(scene, 0)
     x, y = np.meshgrid(np.arange(CELLS), np.arange(CELLS))
-    whole = filled_cells() & (x + y < CELLS - 1)  # others lie partly beyond the triangle
+    whole = filled_cell_mask() & (x + y < CELLS - 1)  # others lie partly beyond the triangle
     for found, place in ((diffuse[0], x), (roughness[0], y)):
         middle = (0.01 + 0.97 * (place + 0.5) / CELLS) / 2
         assert found[whole] == pytest.approx(middle[whole], abs=1e-4)
-    assert (diffuse[:, ~filled_cells()] == 0).all()
+    assert (diffuse[:, ~filled_cell_mask()] == 0).all()
 
 
 def test_a_fine_checker_is_grey_in_every_cell() -> None:
@@ -264,7 +264,7 @@ def test_a_fine_checker_is_grey_in_every_cell() -> None:
     corners = np.array([[4, 0], [0, 4], [0, 0]], np.float32)  # 8 texels a cell
     scene = dataclasses.replace(scene, uv=np.tile(corners, (3, 1)))
     x, y = np.meshgrid(np.arange(CELLS), np.arange(CELLS))
-    assert cells_of(scene, 0)[0][1][0][x + y < CELLS - 1] == pytest.approx(0.4, abs=0.01)
+    assert compute_cells(scene, 0)[0][1][0][x + y < CELLS - 1] == pytest.approx(0.4, abs=0.01)
 
 
 def test_a_smooth_texture_comes_back_as_an_atlas(tmp_path: Path) -> None:
@@ -273,7 +273,7 @@ def test_a_smooth_texture_comes_back_as_an_atlas(tmp_path: Path) -> None:
     notes = write_scene(tmp_path / "a.h5", scene)
     assert any("2 textured triangles than the means of 32 x 32" in note for note in notes)
     found = read_renderformer_h5(tmp_path / "a.h5")
-    assert not any("mean was taken" in text for text in found.lost)
+    assert not any("replaced by" in text for text in found.lost)
     back = found.scene
     rng = np.random.default_rng(3)
     for x, y in rng.uniform(-0.99, 0.99, (60, 2)):
@@ -289,7 +289,7 @@ def test_corners_have_the_colours_of_their_cells(tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         texture = file["texture"]
         for triangle, level in ((0, 0.25), (1, 0.75)):
-            cells = np.where(filled_cells(), np.float32(level), np.float32(0))
+            cells = np.where(filled_cell_mask(), np.float32(level), np.float32(0))
             cells[0, 0] = level - 0.125  # so that it varies
             texture[triangle, :3] = cells
             texture[triangle, 3:6] = 0

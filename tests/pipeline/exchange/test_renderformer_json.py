@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.exchange.renderformer_json import MAX_BYTES, described_files, read_description
+from pipeline.exchange.renderformer_json import MAX_BYTES, describe_scene, read_description
 from storage.errors import TrilightError
 from storage.records.scene import SceneObject
 from tests.for_each import for_each
@@ -148,7 +148,7 @@ def test_an_object_of_many_colours_and_odd_names(tmp_path: Path) -> None:
     assert [entry.name for entry in back.objects] == [
         "a_..__ü.material0", "a_..__ü.material2", "light",
     ]  # fmt: skip
-    assert lost == ("that 2 of its objects were 1, of several materials",)
+    assert lost == ("the grouping of 2 objects that were 1, of several materials",)
     written = [path.relative_to(tmp_path).parts[0] for path in tmp_path.rglob("*.obj")]
     assert set(written) == {"objects"}
 
@@ -158,10 +158,10 @@ def test_normals_that_no_reader_makes_are_said_to_be_lost(tmp_path: Path) -> Non
     normals = base.vertex_normals.copy()
     normals[0] = [0.6, 0, 0.8]
     _, lost = json_and_back(dataclasses.replace(base, vertex_normals=normals), tmp_path)
-    assert "floor: shading normals; readers make their own" in lost
+    assert "floor: shading normals, which readers compute again" in lost
 
 
 def test_too_many_objects(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.exchange.renderformer_json.MAX_OBJECTS", 1)
     with pytest.raises(TrilightError, match="2 objects of one material; a scene file holds at"):
-        described_files(tiny_scene(), "a")
+        describe_scene(tiny_scene(), "a")

@@ -14,15 +14,16 @@ from pipeline.exchange.scene_files import build_scene
 from pipeline.foreign.gltf.container import data_uri_bytes, local_path
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.load import load_mesh
+from pipeline.foreign.material import SourceMaterial
 from pipeline.foreign.mesh import FileMesh
-from pipeline.foreign.mesh_materials import read_parts
+from pipeline.foreign.mesh_materials import read_textured_mesh
 from pipeline.foreign.picture import Decoder
 from pipeline.foreign.polygons import triangulate
 from pipeline.foreign.source_file import SourceFile, read_source
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected
 from tests.for_each import case, for_each
-from tests.pipeline.assets.own import textured_kit as kit
+from tests.pipeline.assets.source_materials import textured_kit as kit
 from tests.pipeline.foreign.dialects import WRITERS, Polygons, Rng, draw_polygons
 
 KINDS = list(WRITERS)
@@ -304,17 +305,17 @@ def test_shades_of_public_reports(shared: Path) -> None:
             path = shared / "cases" / name
             root = shared / "cases" / name.partition("/")[0] / "in"
             read = read_source(path, ReadLimits(with_materials=True), root)
-            parts = read_parts(read, Decoder(1 << 20), emission=False)
+            parts = read_textured_mesh(read, Decoder(1 << 20), emission=False)
             area = np.linalg.norm(parts.mesh.double_area_vectors, axis=1) / 2
             found = Counter[tuple[float, ...]]()
             for face, share in enumerate(area / area.sum()):
-                material = parts.materials[parts.material[face]]
+                material: SourceMaterial = parts.materials[parts.material[face]]
                 color = np.array(material.base_rgb)
-                if parts.colour is not None:
-                    color = color * parts.colour[face].mean(axis=0)
+                if parts.color is not None:
+                    color = color * parts.color[face].mean(axis=0)
                 if material.base is not None:
                     middle = parts.uv[face, 0].mean(axis=0)[None]
-                    color = color * material.base.picture.at(middle, np.zeros(1, int))[0, :3]
+                    color = color * material.base.picture.sample(middle, np.zeros(1, int))[0, :3]
                 found[tuple(np.round(color, 3).tolist())] += share
             assert dict(found) == pytest.approx(shades)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.assets.own.skin import _parts
+from pipeline.assets.source_materials.skin import _parts
 from pipeline.exchange.renderformer_json import read_description
 from pipeline.foreign.light_pictures import read_linear_picture
 from pipeline.foreign.numbers import FINITE
@@ -16,8 +16,8 @@ from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected, TrilightError
 from tests.for_each import case
 from tests.pipeline.assets.meshes_by_hand import write_glb
-from tests.pipeline.assets.own import textured_kit as kit
-from tests.pipeline.assets.own.usd_kit import SHADER, TEXTURE, set_inputs, textured_usd
+from tests.pipeline.assets.source_materials import textured_kit as kit
+from tests.pipeline.assets.source_materials.usd_kit import SHADER, TEXTURE, set_inputs, textured_usd
 from tests.pipeline.exchange.test_renderformer_json import MATERIAL, TRANSFORM, changed
 
 NUMBERS = (math.nan, math.inf, -math.inf, 1e39, -1e39, 0.0, 0.25, 1e3, -7.0)
@@ -30,7 +30,7 @@ def look_at_parts(path: Path) -> str:
     for material in _parts(source, Decoder(1 << 20), emission=True).materials:
         colors = (*material.base_rgb, *material.specular_rgb, *material.emission_rgb)
         numbers = (material.metallic, material.roughness, material.f0, material.specular_strength)
-        moves = [[*slot.turn.flat, *slot.shift] for slot in material.slots]
+        moves = [[*slot.uv_matrix.flat, *slot.uv_offset] for slot in material.slots]
         assert np.isfinite([*colors, *numbers, *itertools.chain(*moves)]).all()
     return "; ".join(source.unread)
 

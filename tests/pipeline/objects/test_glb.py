@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.objects.glb import encode_glb
 from storage.records.asset import Level
 from tests.pipeline.assets.meshes_by_hand import geometry, prepare, write_glb
-from tests.pipeline.assets.own.textured_kit import (
+from tests.pipeline.assets.source_materials.textured_kit import (
     CORNERS,
     KEEP,
     QUARTERS,

@@ -31,10 +31,10 @@ from storage.seeds import SceneKey
 from tests.oracle.kernel_bsdf import exact_twin
 from tests.oracle.plugin_tracer import PluginTracer
 from tests.pipeline.assets.meshes_by_hand import prepare
-from tests.pipeline.assets.own.textured_kit import (
+from tests.pipeline.assets.source_materials.textured_kit import (
     CORNERS as PICTURE_CORNERS,
 )
-from tests.pipeline.assets.own.textured_kit import (
+from tests.pipeline.assets.source_materials.textured_kit import (
     KEEP,
     QUARTERS,
     picture_bytes,

@@ -14,7 +14,7 @@ from PIL import Image
 
 from model.scene_tensors import scene_tensors
 from pipeline.exchange.exports.export import FORMS
-from pipeline.exchange.exports.scenes import MOST_NOTES, PARTS, _told, picture_name
+from pipeline.exchange.exports.scenes import MOST_NOTES, WRITERS, _limit_notes, picture_name
 from pipeline.exchange.open_scene import load_source, scene_source
 from storage.conventions import in_camera, preview_srgb8
 from storage.dataset.dataset import open_dataset
@@ -150,10 +150,10 @@ def _same_scene(path: Path, sample: Sample) -> bool:
 
 
 def test_many_losses_are_counted_once_each_is_told() -> None:
-    assert _told("h5", ["a", "b"]) == ["h5 cannot hold a", "h5 cannot hold b"]
-    told = _told("json", [str(number) for number in range(MOST_NOTES + 3)])
+    assert _limit_notes("h5", ["a", "b"]) == ["h5 cannot hold a", "h5 cannot hold b"]
+    told = _limit_notes("json", [str(number) for number in range(MOST_NOTES + 3)])
     assert len(told) == MOST_NOTES + 1 and told[-1] == "json loses 3 more things of this kind"
-    assert set(PARTS) == {"h5", "json", "usd", "exr"}
+    assert set(WRITERS) == {"h5", "json", "usd", "exr"}
 
 
 SIZE = 16

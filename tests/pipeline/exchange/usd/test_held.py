@@ -121,7 +121,7 @@ def spoil(layer: Any) -> None:
 @for_each(
     "edit, albedos, said",
     [
-        (drop_shader, (0.5, 0.4, 0.3, 0.2, 0.2, 0.2), "what Trilight wrote on it taken"),
+        (drop_shader, (0.5, 0.4, 0.3, 0.2, 0.2, 0.2), "the values that Trilight wrote are used"),
         (to_metal, (0, 0, 0, 0.5, 0.4, 0.3), "became a metal"),
         (spoil, (0.5, 0.4, 0.3, 0.2, 0.2, 0.2), "changed since Trilight wrote it"),
     ],

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
-from pipeline.exchange.usd.read_ours import read_exact, scene_keys
+from pipeline.exchange.usd.read_exact_scene import read_exact, scene_keys
 from pipeline.exchange.usd.write import SUFFIXES, write_usd, write_usd_shard
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError

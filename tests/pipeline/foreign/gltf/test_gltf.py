@@ -11,11 +11,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.assets.own.skin import _parts
+from pipeline.assets.source_materials.skin import _parts
 from pipeline.exchange.gltf.read import GltfScene, read_gltf
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.load import load_mesh
-from pipeline.foreign.material import Seen, columns
+from pipeline.foreign.material import MaterialSamples, SourceMaterial, source_columns
 from pipeline.foreign.picture import Decoder
 from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected, TrilightError
@@ -41,16 +41,17 @@ def surface(path: Path) -> NDArray[np.float64]:
     assert np.array_equal(load_mesh(source).corners, corners)
     colors = np.zeros((len(corners), 3))
     for row in np.unique(parts.material):
-        chosen, material = np.flatnonzero(parts.material == row), parts.materials[row]
+        chosen = np.flatnonzero(parts.material == row)
+        material: SourceMaterial = parts.materials[row]
         base = np.ones((len(chosen), 4), np.float32)
         if (slot := material.base) is not None:
-            uv = parts.uv[chosen, slot.uv_set].mean(axis=1) @ slot.turn.T + slot.shift
-            base = slot.picture.at(uv, np.zeros(len(chosen), np.int64))
-        if parts.colour is not None:
-            base[:, :3] *= parts.colour[chosen].mean(axis=1)
-        seen = Seen(base=base, metallic=None, roughness=None, specular_colour=None,
+            uv = parts.uv[chosen, slot.uv_set].mean(axis=1) @ slot.uv_matrix.T + slot.uv_offset
+            base = slot.picture.sample(uv, np.zeros(len(chosen), np.int64))
+        if parts.color is not None:
+            base[:, :3] *= parts.color[chosen].mean(axis=1)
+        seen = MaterialSamples(base=base, metallic=None, roughness=None, specular_colour=None,
                     specular_strength=None, glossiness=None)  # fmt: skip
-        colors[chosen] = columns(material, seen, len(chosen))[:, :3]
+        colors[chosen] = source_columns(material, seen, len(chosen))[:, :3]
     return ordered(corners, colors)
 
 

@@ -12,12 +12,12 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
 from pipeline.exchange.usd.read import UsdScene, read_usd
 from pipeline.foreign.source_file import read_source
-from pipeline.foreign.usd.object_materials import usd_parts
+from pipeline.foreign.usd.object_materials import usd_textured_mesh
 from storage.errors import Rejected, TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
 from tests.for_each import for_each
-from tests.pipeline.assets.own.textured_kit import KEEP
-from tests.pipeline.assets.own.usd_kit import new_stage
+from tests.pipeline.assets.source_materials.textured_kit import KEEP
+from tests.pipeline.assets.source_materials.usd_kit import new_stage
 
 POINTS = ((0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3))
 SIDES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
@@ -51,9 +51,9 @@ def of_object(path: Path) -> Looks:
     """Return the triangles of an object with their colors and roughness."""
     usd = read_source(path, KEEP.read_limits).usd
     assert usd is not None
-    parts = usd_parts(usd, lambda data, name: np.zeros((1, 1, 4), np.uint8))
+    parts = usd_textured_mesh(usd, lambda data, name: np.zeros((1, 1, 4), np.uint8))
     base = np.array([material.base_rgb for material in parts.materials])[parts.material]
-    tint = 1.0 if parts.colour is None else parts.colour.mean(axis=1)
+    tint = 1.0 if parts.color is None else parts.color.mean(axis=1)
     rough = np.array([material.roughness for material in parts.materials])[parts.material]
     return looks_of(parts.mesh.positions[parts.mesh.faces], base * tint, rough)
 

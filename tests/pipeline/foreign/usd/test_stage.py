@@ -10,7 +10,7 @@ from pxr import Usd, UsdGeom
 from pipeline.exchange.usd.write import write_usd
 from pipeline.foreign.usd import composition, placed
 from pipeline.foreign.usd import stage as opening
-from pipeline.foreign.usd.stage import OpenedUsd, quietly
+from pipeline.foreign.usd.stage import OpenedUsd, read_quietly
 from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.errors import TrilightError
 from tests.for_each import for_each
@@ -20,7 +20,7 @@ HEAD = "#usda 1.0\n"
 
 
 def prims_of(path: Path) -> list[str]:
-    stage = quietly(path, OpenedUsd(path).compose)
+    stage = read_quietly(path, OpenedUsd(path).compose)
     return [str(prim.GetPath()) for prim in stage.Traverse()]
 
 
@@ -87,7 +87,7 @@ def test_brackets_in_the_name_of_a_folder_are_no_archive(tmp_path: Path, packed:
             (folder / name).write_text(text)
         assert asset_bytes(f"{folder}/lib.usda", 100) == layers["lib.usda"].encode()
     opened = OpenedUsd(folder / ("s.usdz" if packed else "s.usda"))
-    stage = quietly(opened.path, opened.compose)
+    stage = read_quietly(opened.path, opened.compose)
     assert [str(prim.GetPath()) for prim in stage.Traverse()] == ["/x", "/x/L"]
     assert opened.files == [opened.path, *([] if packed else [folder / "lib.usda"])]
 
@@ -110,7 +110,7 @@ def test_the_user_may_name_the_folder_and_the_stage_is_compared_with_it_at_last(
 def test_what_is_missing_is_noted(tmp_path: Path) -> None:
     (tmp_path / "a.usda").write_text(f'{HEAD}def "A" (references = @./no.usda@</A>) {{}}')
     opened = OpenedUsd(tmp_path / "a.usda")
-    quietly(opened.path, opened.compose)
+    read_quietly(opened.path, opened.compose)
     assert opened.lost == ["file './no.usda' is missing"]
 
 

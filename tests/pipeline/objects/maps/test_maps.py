@@ -9,7 +9,7 @@ from PIL import Image
 
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.maps.listing import FoundMaps, find_maps
-from pipeline.objects.maps.names import _named, group_textures
+from pipeline.objects.maps.names import _parse_name, group_textures
 from pipeline.objects.maps.prepared import MapFiles, decode_prepared, prepare_map
 from pipeline.objects.maps.radiance import usable_map
 from pipeline.objects.maps.resample import area_means, flux, solid_angle_means
@@ -90,7 +90,7 @@ def _find(folder: Path, kind: str = TEXTURE, licence: str | None = None) -> Foun
     ],
 )
 def test_the_words_of_a_name_are_its_part(stem: str, texture: str, part: str) -> None:
-    named = _named(stem)
+    named = _parse_name(stem)
     assert ((named.stem, named.part) if named else (stem, "base")) == (texture, part)
 
 

@@ -143,7 +143,7 @@ def test_a_bucket_is_listed_at_once(bucket: _Bucket, cache: Path) -> None:
 def test_what_is_not_wanted_stays_on_the_server(bucket: _Bucket, cache: Path) -> None:
     listed = list_objects("s3://bucket", work_dir=cache, allowed_licences=DEFAULT_ALLOWED)
     assert bucket.fetched == []
-    found = listed.found(lambda uid: uid == "b")
+    found = listed.fetch_selected(lambda uid: uid == "b")
     assert [record.uid for record in found.records] == ["b"]
     assert bucket.fetched == ["bucket/b.obj"]
     assert listed.num_found == 3

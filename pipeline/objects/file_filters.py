@@ -1,7 +1,7 @@
-"""What of a folder's files is not brought by its user as an object, a picture or a map.
+"""Filters of a folder's files: outputs of Trilight, and copies of an object.
 
-Two kinds are left out, each with one printed note: what Trilight wrote there itself, and copies of
-an object that collections keep beside it (for collisions, with less detail, in another file).
+Both are left out, each with one printed note. Copies are files that collections keep next to an
+object: for collisions, with less detail, or in another format.
 """
 
 import functools
@@ -21,20 +21,22 @@ _OUTPUTS = (
     ("leaderboard.md", "pairs.csv"),
     ("transforms.json", "images/0.png", "depths/0.npy"),
 )
-"""What is in folders of assets, datasets (finished or not), training, leaderboards, nerfstudio."""
+"""Files that mark folders of assets, datasets (finished or not), trainings, leaderboards and
+nerfstudio exports."""
 
 _OF_SCENE = re.compile(r"(?P<in>(?:.*/)?)(?:objects|templates/backgrounds)/(?P<scene>[^/]+)")
 _MESH_OF_SCENE = re.compile(r"\d+_.*_\d+\.obj")
-"""Folders beside a RenderFormer scene `SCENE.json`, and how `convert` and `export` call meshes."""
+"""Folders next to a RenderFormer scene `SCENE.json`, and mesh names of `convert` and `export`."""
 
 _SCENE = b"trilight:sceneSha256"
-"""What every USD file of a scene of ours holds."""
+"""Text in every USD file of a Trilight scene."""
 _GLB_SCENE = (b'"generator": "trilight"', b'"cameras": [')
-"""What every GLB of a scene of ours holds, and no object of ours."""
-_MOST_HEAD, _MOST_TAIL = 1 << 14, 1 << 20
+"""Texts in every GLB of a Trilight scene, and in no GLB of a Trilight object."""
+_MOST_HEAD = 1 << 14
+_MOST_TAIL = 1 << 20
 
 _MESH = re.compile(r".*-[0-9a-f]{8}\.(?:ply|glb)")
-"""How `assets` calls its meshes."""
+"""Mesh names of `assets`."""
 
 _UNREAD = frozenset(
     "fbx dae blend 3ds 3mf ma mb max abc x3d wrl ifc step stp iges skp vrm zip 7z rar".split()
@@ -48,7 +50,7 @@ _TWINS = (
     (re.compile(r"(?<![^/])(?:google_64k|google_512k|poisson|tsdf)/(?:non)?textured\.\w+$"),
      "google_16k/textured.obj"),
 )  # fmt: skip
-"""Files of one object by the file that is taken instead where it is there."""
+"""Files of known collections, and the file of the same object that is used instead."""
 
 _COLLISION = re.compile(
     r"(?i)(?:(?P<of>.*?)[-_. ])?(?:coll?ision|collider|coll|vhacd|coacd|"
@@ -60,35 +62,37 @@ log = logging.getLogger("trilight.objects")
 
 
 @functools.cache
-def say_once(message: str) -> None:
-    """Log a warning, once in a process."""
+def warn_once(message: str) -> None:
+    """Log a warning once per process."""
     log.warning("%s", message)
 
 
 def drop_outputs(names: Iterable[str]) -> list[str]:
-    """Return files of a folder without those in folders that Trilight wrote; one note names these.
+    """Return the files outside output folders of Trilight; one note names those folders.
 
-    The folder itself may be one: its user named it.
+    The folder itself may be an output: its user named it.
 
     Args:
-        names: of all files, with / between their parts.
+        names: paths of all files, with / between their parts.
     """
     names = list(names)
     inside: dict[str, set[str]] = defaultdict(set)
     for name in names:
         inside[_folder(name)].add(name.rpartition("/")[2])
-    ours = {folder for folder in inside if folder and _is_output(folder, inside)}
-    kept = [name for name in names if ours.isdisjoint(map(str, PurePosixPath(name).parents))]
-    if len(kept) < len(names):
-        shown = ", ".join(printable(folder) for folder in sorted(ours)[:3])
-        say_once(f"left out as outputs of Trilight: {shown}{_and_more(len(ours) - 3)}")
-    return kept
+    outputs = {folder for folder in inside if folder and _is_output(folder, inside)}
+    remaining = [
+        name for name in names if outputs.isdisjoint(map(str, PurePosixPath(name).parents))
+    ]
+    if len(remaining) < len(names):
+        examples = ", ".join(printable(folder) for folder in sorted(outputs)[:3])
+        warn_once(f"left out as outputs of Trilight: {examples}{_and_more(len(outputs) - 3)}")
+    return remaining
 
 
 def _is_output(folder: str, inside: Mapping[str, set[str]]) -> bool:
     meshes = inside.get(f"{folder}/meshes", set())
     if "assets.json" in inside[folder] and meshes and all(map(_MESH.fullmatch, meshes)):
-        return True  # `assets` that was broken off
+        return True  # an interrupted `assets`
     scene = _OF_SCENE.fullmatch(folder)
     if scene and f"{scene['scene']}.json" in inside.get(scene["in"].rstrip("/"), ()):
         return all(map(_MESH_OF_SCENE.fullmatch, inside[folder]))
@@ -100,27 +104,27 @@ def _is_output(folder: str, inside: Mapping[str, set[str]]) -> bool:
     )
 
 
-def say_unread(names: Sequence[str], objects: Sequence[str]) -> None:
-    """Name files of other formats for objects, and archives, that no object file stands beside."""
+def warn_unread_formats(names: Sequence[str], objects: Sequence[str]) -> None:
+    """Warn of archives and files of other formats that have no object file of the same name."""
     stems = {_stem(name) for name in objects}
     stems |= {stem for name in names if (stem := _stem(name)).startswith(".")}  # hidden
-    others = sorted(n for n in names if _suffix(n) in _UNREAD and _stem(n) not in stems)
-    if others:
-        shown = f"{printable(others[0])}{_and_more(len(others) - 1)}"
-        say_once(f"left out as formats that are not read: {shown}; convert or unpack them")
+    unread = sorted(n for n in names if _suffix(n) in _UNREAD and _stem(n) not in stems)
+    if unread:
+        example = f"{printable(unread[0])}{_and_more(len(unread) - 1)}"
+        warn_once(f"left out as formats that are not read: {example}; convert or unpack them")
 
 
 def drop_scenes(root: Path, names: Sequence[str]) -> list[str]:
-    """Return object files without USD and GLB files of whole scenes that Trilight wrote."""
+    """Return object files without USD and GLB files of whole Trilight scenes."""
     scenes = [name for name in names if _suffix(name) in (*_USD, "glb") and _is_scene(root / name)]
     if scenes:
-        shown = f"{printable(scenes[0])}{_and_more(len(scenes) - 1)}"
-        say_once(f"left out as scenes that Trilight wrote: {shown}")
+        example = f"{printable(scenes[0])}{_and_more(len(scenes) - 1)}"
+        warn_once(f"left out as scenes that Trilight wrote: {example}")
     return [name for name in names if name not in set(scenes)]
 
 
 def _is_scene(path: Path) -> bool:
-    """Return whether a text begins, or a crate ends, with what our scenes say of themselves."""
+    """Return True for a text that begins, or a crate that ends, with the marks of our scenes."""
     try:
         with path.open("rb") as file:
             head = file.read(_MOST_HEAD)
@@ -130,46 +134,47 @@ def _is_scene(path: Path) -> bool:
             file.seek(max(0, path.stat().st_size - _MOST_TAIL))
             return _SCENE in head or (not head.startswith(b"#usda") and _SCENE in file.read())
     except OSError:
-        return False  # the mesh stage says why
+        return False  # the mesh stage reports the reason
 
 
 def drop_copies(names: Sequence[str]) -> list[str]:
-    """Return object files without copies of objects that are there; one note counts them.
+    """Return object files without copies of other objects; one note counts the copies.
 
     Args:
-        names: of object files, with / between their parts.
+        names: paths of object files, with / between their parts.
     """
     rules: dict[str, Callable[[Sequence[str]], Iterator[str]]] = {
         "shapes for collisions": _collisions,
         "lower levels of detail": _levels,
         "other files of one object": _twins,
     }
-    notes, dropped = [], set[str]()
+    notes = []
+    dropped = set[str]()
     for what, rule in rules.items():
         copies = sorted(set(rule(names)) - dropped)
         dropped.update(copies)
         if copies:
             notes.append(f"{len(copies)} {what} (such as {printable(copies[0])})")
     if notes:
-        say_once(f"left out as copies of objects that are there: {'; '.join(notes)}")
+        warn_once(f"left out as copies of objects that are there: {'; '.join(notes)}")
     return [name for name in names if name not in dropped]
 
 
 def _collisions(names: Sequence[str]) -> Iterator[str]:
-    """Yield shapes for collisions where others, to look at, are beside them."""
+    """Yield collision shapes that have visual shapes next to them."""
     shapes = {name for name in names if _COLLISION.fullmatch(_stem(name))}
     seen = {_folder(name) for name in names if name not in shapes}
     for name in names:
         folder = _folder(name)
         above, _, last = folder.rpartition("/")
         twin = re.sub(r"(?i)collisions?", "visual", last)
-        beside = {f"{above}/{each}".lstrip("/") for each in (twin, f"{twin}s")}
-        if (name in shapes and folder in seen) or (twin != last and beside & seen):
+        visual_folders = {f"{above}/{each}".lstrip("/") for each in (twin, f"{twin}s")}
+        if (name in shapes and folder in seen) or (twin != last and visual_folders & seen):
             yield name
 
 
 def _levels(names: Sequence[str]) -> Iterator[str]:
-    """Yield all but the finest of files whose names differ in a number after LOD."""
+    """Yield all but the finest of files whose names differ only in a number after LOD."""
     levels: dict[str, list[tuple[int, str]]] = defaultdict(list)
     for name in names:
         if match := _LOD.fullmatch(name):
@@ -179,12 +184,12 @@ def _levels(names: Sequence[str]) -> Iterator[str]:
 
 
 def _twins(names: Sequence[str]) -> Iterator[str]:
-    """Yield further files of one object in the layouts of known collections."""
-    there = set(names)
+    """Yield other files of one object in the layouts of known collections."""
+    present = set(names)
     for name in names:
         for pattern, better in _TWINS:
             other = pattern.sub(better, name)
-            if other != name and other in there:
+            if other != name and other in present:
                 yield name
 
 

@@ -1,4 +1,4 @@
-"""The samples of a dataset that a user chooses, by split and by key."""
+"""Selects samples of a dataset by split and by key."""
 
 import os
 from collections.abc import Iterator
@@ -10,36 +10,36 @@ from storage.records.sample import Sample, sample_key
 
 
 def is_dataset(source: str) -> bool:
-    """Return whether what a user names is a dataset, rather than the file of a scene."""
+    """Return whether a source is a dataset (URL or folder) rather than a scene file."""
     return "://" in source or os.path.isdir(source)
 
 
-def chosen_samples(
+def select_samples(
     dataset: Dataset, *, split: str | None = None, scene: str | None = None
 ) -> Iterator[tuple[str, Sample]]:
     """Yield (split, sample) of a dataset in its order, with pictures.
 
     Args:
-        dataset: where they are.
+        dataset: the dataset to read.
         split: the only split; None for all.
         scene: key of the only scene, with or without the zeros before it; None for all.
 
     Raises:
-        TrilightError: there is no such split or scene, the dataset is empty, or as `read_samples`.
+        TrilightError: the split or scene does not exist, or the dataset is empty or damaged.
     """
     if split is not None and split not in SPLITS:
         raise TrilightError(f"split is {split!r}; expected one of {', '.join(SPLITS)}.")
-    wanted = sample_key(int(scene)) if scene is not None and scene.isdecimal() else scene
-    found = False
+    scene_key = sample_key(int(scene)) if scene is not None and scene.isdecimal() else scene
+    has_samples = False
     for shard in dataset.manifest.shards:
         if split not in (None, shard.split):
             continue
-        keys = [key for key in dataset.keys(shard) if wanted in (None, key)]
-        found = found or bool(keys)
+        keys = [key for key in dataset.keys(shard) if scene_key in (None, key)]
+        has_samples = has_samples or bool(keys)
         for sample in dataset.read_samples(shard, keys):
             yield shard.split, sample
-    if not found:
-        which = f"scene {wanted}" if wanted else "scene"
+    if not has_samples:
+        which = f"scene {scene_key}" if scene_key else "scene"
         where = "" if split is None else f" in split {split}"
         raise TrilightError(
             f"{dataset.display_name}: no {which}{where}; expected one of its "

@@ -1,34 +1,34 @@
-"""What the triangles of a level emit: the mean over each of what its source emits there."""
+"""Emission of a level's triangles: the mean of the source's emission over each."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.own.nearest import NearestPlaces
-from pipeline.assets.own.source_surface import SourceSurface
+from pipeline.assets.source_materials.nearest import SurfaceLookup
+from pipeline.assets.source_materials.source_surface import SourceSurface
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 
 _STEPS = 8
-"""Points along an edge of the grid over a triangle; (8 + 1) 8 / 2 of them in all."""
+"""Points along an edge of the grid over a triangle; (8 + 1) 8 / 2 points in all."""
 _LEAST = 0.05
-"""Share of the radiance of the brightest triangle below which one emits nothing."""
+"""Fraction of the brightest triangle's radiance below which a triangle emits nothing."""
 _MOST = 1e30
-"""Radiance from which on a number is no light."""
+"""Radiance from which on a number is refused."""
 
 
 def level_emission(
-    level: TriangleMesh, source: SourceSurface, nearest: NearestPlaces, reach: float
+    level: TriangleMesh, source: SourceSurface, nearest: SurfaceLookup, reach: float
 ) -> NDArray[np.float32] | None:
     """Return the radiance [F, 3] of a level's triangles; None where nothing emits.
 
     Args:
-        level: in the unit box.
-        source: what it was made from.
-        nearest: the places of that.
-        reach: how far the source may be away, in the unit box.
+        level: mesh in the unit box.
+        source: surface of the source.
+        nearest: lookup of points on that surface.
+        reach: largest distance to the source, in the unit box.
 
     Raises:
-        Rejected: materials_unreadable where that is no number, or too large for single precision.
+        Rejected: materials_unreadable where the radiance is not a number, or too large for float32.
     """
     if not source.emits:
         return None
@@ -38,9 +38,9 @@ def level_emission(
     normal = level.double_area_vectors
     areas = 0.5 * np.linalg.norm(normal, axis=1)
     normals = np.repeat(normal / (2 * areas[:, None]), len(weights), axis=0)
-    places = nearest.of(points.reshape(-1, 3), normals, reach)
+    locations = nearest.find(points.reshape(-1, 3), normals, reach)
     cell = float(np.sqrt(np.median(areas) / len(weights)))
-    seen = source.emission(places.faces, places.weights, cell).reshape(len(corners), -1, 3)
+    seen = source.emission(locations.faces, locations.weights, cell).reshape(len(corners), -1, 3)
     mean = seen.mean(axis=1)
     if not mean.max() < _MOST:  # or not a number
         raise Rejected("materials_unreadable", f"a surface emits {mean.max():.3g}; < {_MOST:g}")

@@ -12,8 +12,8 @@ from storage.conventions import linear_from_srgb8
 from storage.records.asset import Asset
 from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import geometry, prepare, sphere, write_glb
-from tests.pipeline.assets.own import textured_kit as kit
-from tests.pipeline.assets.own import usd_kit
+from tests.pipeline.assets.source_materials import textured_kit as kit
+from tests.pipeline.assets.source_materials import usd_kit
 
 
 @for_each("suffix", ["usda", "usdc", "usd", "usdz"])

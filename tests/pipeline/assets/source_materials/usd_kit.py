@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils
 
 from pipeline.foreign.mesh import TriangleMesh
-from tests.pipeline.assets.own.textured_kit import SQUARE, UV_UP
+from tests.pipeline.assets.source_materials.textured_kit import SQUARE, UV_UP
 
 Change = Callable[[Usd.Stage], object]
 TEXTURE, SHADER, MESH = "/W/mat/texture", "/W/mat/preview", "/W/mesh"

@@ -1,4 +1,4 @@
-"""`SkinMaker`: own materials of one object, from its file to the skins of its levels."""
+"""`SkinBaker`: source materials of one object, from its file to the skins of its levels."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -6,21 +6,21 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.own.bake import bake
-from pipeline.assets.own.glow import level_emission
-from pipeline.assets.own.measure import skin_quality
-from pipeline.assets.own.nearest import NearestPlaces
-from pipeline.assets.own.source_surface import SourceSurface, source_surface
 from pipeline.assets.settings import OwnMaterialSettings
+from pipeline.assets.source_materials.bake import bake
+from pipeline.assets.source_materials.emission import level_emission
+from pipeline.assets.source_materials.measure import skin_quality
+from pipeline.assets.source_materials.nearest import SurfaceLookup
+from pipeline.assets.source_materials.source_surface import SourceSurface, match_source_surface
 from pipeline.foreign.gltf.materials import GltfMaterials
-from pipeline.foreign.gltf.objects import gltf_parts
+from pipeline.foreign.gltf.objects import gltf_textured_mesh
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.mesh_materials import read_parts
+from pipeline.foreign.mesh_materials import read_textured_mesh
 from pipeline.foreign.numbers import FINITE
-from pipeline.foreign.parts import TexturedParts
 from pipeline.foreign.picture import Decoder
 from pipeline.foreign.source_file import SourceFile
-from pipeline.foreign.usd.object_materials import usd_parts
+from pipeline.foreign.textured_mesh import TexturedMesh
+from pipeline.foreign.usd.object_materials import usd_textured_mesh
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level
 from storage.records.packed_maps import pack_texture
@@ -28,24 +28,25 @@ from storage.records.skin import LevelSkin, OwnMaterials, SkinQuality
 from storage.records.texture import TEXTURED, Texture
 
 _LEAST_REACH = 1e-3
-"""How far rays look for the source at least, in the unit box; otherwise as far as the level is off.
-"""
+"""Least distance within which rays search the source, in the unit box; beyond it, 1.5 times the
+level's largest error."""
 
 
-class SkinMaker:
-    """Makes the skins of the levels of one source."""
+class SkinBaker:
+    """Bakes the skins of the levels of one source."""
 
     def __init__(self, surface: SourceSurface, settings: OwnMaterialSettings) -> None:
-        """Take a source with its colours."""
-        self._surface, self._settings = surface, settings
-        self._nearest = NearestPlaces(surface.mesh)
+        """Build the lookup of a source surface."""
+        self._surface = surface
+        self._settings = settings
+        self._nearest = SurfaceLookup(surface.mesh)
 
-    def skinned(self, level: Level) -> Level:
+    def add_skin(self, level: Level) -> Level:
         """Return a level with its skin.
 
         Raises:
-            Rejected: colours_changed or colours_missed where it is over a bound, or
-                materials_unreadable where no scene could hold it.
+            Rejected: colours_changed or colours_missed where an error is over its limit, or
+                materials_unreadable where no scene could hold the skin.
         """
         mesh = TriangleMesh(
             positions=level.positions.astype(np.float64), faces=level.faces.astype(np.int64)
@@ -86,15 +87,15 @@ def _require_lawful(textures: Sequence[Texture], emission: NDArray[np.float32] |
         raise Rejected("materials_unreadable", f"it emits {emission.max()}; expected {FINITE}")
 
 
-def skin_maker(
+def open_skin_baker(
     source: SourceFile, mesh: TriangleMesh, settings: OwnMaterialSettings
-) -> tuple[SkinMaker, OwnMaterials]:
-    """Return what makes the skins of a source, and what of its materials is lost.
+) -> tuple[SkinBaker, OwnMaterials]:
+    """Return the skin baker of a source, and the lost parts of its materials.
 
     Args:
-        source: the file with the pictures beside it.
-        mesh: its clean, oriented mesh.
-        settings: sizes and bounds.
+        source: the file, with the pictures next to it.
+        mesh: the clean, oriented mesh of that file.
+        settings: sizes and limits.
 
     Raises:
         Rejected: no_materials, materials_unreadable, texture_missing, texture_outside,
@@ -104,15 +105,17 @@ def skin_maker(
     parts = _parts(source, Decoder(settings.max_pixels), emission=settings.emission)
     lost = {word for material in parts.materials for word in material.lost}
     lost -= {"emission"} if settings.emission else set()
-    surface = source_surface(mesh, parts)
-    return SkinMaker(surface, settings), OwnMaterials(lost=tuple(sorted(lost)))
+    surface = match_source_surface(mesh, parts)
+    return SkinBaker(surface, settings), OwnMaterials(lost=tuple(sorted(lost)))
 
 
 def _parts(
     source: SourceFile, decode: Callable[[bytes, str], NDArray], *, emission: bool
-) -> TexturedParts:
+) -> TexturedMesh:
     if source.usd is not None:
-        return usd_parts(source.usd, decode, emission=emission)
+        return usd_textured_mesh(source.usd, decode, emission=emission)
     if source.gltf is not None:
-        return gltf_parts(source.gltf, GltfMaterials(source.gltf, decode, emission=emission))
-    return read_parts(source, decode, emission=emission)
+        return gltf_textured_mesh(
+            source.gltf, GltfMaterials(source.gltf, decode, emission=emission)
+        )
+    return read_textured_mesh(source, decode, emission=emission)

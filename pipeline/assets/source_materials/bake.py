@@ -1,41 +1,52 @@
-"""The skin of a level: an atlas of its triangles, coloured by the places that they show."""
+"""Bakes a level's textures: an atlas of its triangles, colored from the nearest source points."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.own.nearest import NearestPlaces
-from pipeline.assets.own.source_surface import SourceSurface
-from pipeline.assets.own.tiles import FLAT, Atlas, atlas, cells_of, tile_weights, turned
 from pipeline.assets.settings import OwnMaterialSettings
+from pipeline.assets.source_materials.nearest import SurfaceLookup
+from pipeline.assets.source_materials.source_surface import SourceSurface
+from pipeline.assets.source_materials.tiles import (
+    FLAT,
+    Atlas,
+    cells_per_side,
+    longest_edge_order,
+    pack_atlas,
+    tile_weights,
+)
 from pipeline.foreign.mesh import TriangleMesh
 from storage.conventions import linear_from_srgb8, srgb8
 from storage.records.texture import Texture
 
 _INSET = 0.02
-"""How far texels on an edge show places within their own triangle, as a share of the way to its
-centre: on the edge itself, the neighbour would be as near. At most a quarter of a cell."""
+"""Inset of texels on an edge, as a fraction of the way to their triangle's center: on the edge
+itself, the neighbor would be as near. At most a quarter of a cell."""
 
 _SHRINK = 0.9
+"""Factor on the texel density per attempt, until the atlas fits its largest size."""
 _BLOCK = 1 << 18
+"""Texels per lookup; it bounds memory."""
 
-DIFFUSE, SPECULAR, ROUGHNESS = slice(0, 3), slice(3, 6), slice(6, 7)
-"""Of the columns of a texel, as `source_material.columns` gives them."""
+DIFFUSE = slice(0, 3)
+SPECULAR = slice(3, 6)
+ROUGHNESS = slice(6, 7)
+"""Slices of a texel's seven columns, in the order of `material.source_columns`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Baked:
-    """What was baked, before it is measured."""
+class BakedTextures:
+    """The textures of a level, before their quality is measured."""
 
     uv: NDArray[np.float32]
-    """[F, 3, 2] v up."""
+    """[F, 3, 2] texture coordinates of the corners, v up."""
     textures: tuple[Texture, Texture, Texture]
-    """Diffuse, specular and roughness."""
+    """Textures for diffuse albedo, specular albedo and roughness."""
     missed: float
-    """Share of the texels that no surface nearby was found for."""
+    """Fraction of the texels without a source surface nearby."""
     density: float
-    """Texels for each unit of length."""
+    """Texels per unit of length."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,29 +62,29 @@ class _Texels:
 def bake(
     level: TriangleMesh,
     source: SourceSurface,
-    nearest: NearestPlaces,
+    nearest: SurfaceLookup,
     settings: OwnMaterialSettings,
     reach: float,
-) -> Baked:
-    """Return the colours of a level.
+) -> BakedTextures:
+    """Return the baked textures of a level.
 
     Args:
-        level: in the unit box.
-        source: what it was made from.
-        nearest: the places of that.
+        level: mesh in the unit box.
+        source: surface of the source.
+        nearest: lookup of points on that surface.
         settings: texels and greatest size.
-        reach: how far the source may be away, in the unit box.
+        reach: largest distance to the source, in the unit box.
     """
-    order = turned(level.corners)
+    order = longest_edge_order(level.corners)
     corners = np.take_along_axis(level.corners, order[..., None], axis=1)
     cells, density = _cells(corners, settings)
-    texels = _coloured(corners, cells, source, nearest, reach, density)
+    texels = _bake_texels(corners, cells, source, nearest, reach, density)
     tile_of, first_of = _tiles(cells, texels)
-    plan = atlas(np.where(_is_flat(texels), 0, cells)[first_of])
+    plan = pack_atlas(np.where(_is_flat(texels), 0, cells)[first_of])
     uv = np.zeros((len(corners), 3, 2))
     for face, tile in enumerate(tile_of):
         uv[face, order[face]] = plan.uv(int(tile))
-    return Baked(
+    return BakedTextures(
         uv=uv.astype(np.float32),
         textures=_textures(plan, first_of, texels),
         missed=texels.missed,
@@ -84,21 +95,21 @@ def bake(
 def _cells(
     corners: NDArray[np.float64], settings: OwnMaterialSettings
 ) -> tuple[NDArray[np.int64], float]:
-    """Return the cells of each tile, and the density at which the atlas is within its size."""
+    """Return the cells of each tile, and the density at which the atlas fits its size."""
     density = float(settings.texels)
     while True:
-        cells = cells_of(corners, density)
-        plan = atlas(cells)
+        cells = cells_per_side(corners, density)
+        plan = pack_atlas(cells)
         if max(plan.width, plan.height) <= settings.size or (cells == 1).all():
             return cells, density
         density *= _SHRINK
 
 
-def _coloured(
+def _bake_texels(
     corners: NDArray[np.float64],
     cells: NDArray[np.int64],
     source: SourceSurface,
-    nearest: NearestPlaces,
+    nearest: SurfaceLookup,
     reach: float,
     density: float,
 ) -> _Texels:
@@ -111,12 +122,13 @@ def _coloured(
         [weights_of[int(side)] @ corner for side, corner in zip(cells, corners, strict=True)]
     )
     normals = np.repeat(normal, counts, axis=0)
-    columns, missed = np.zeros((len(points), 7)), 0
+    columns = np.zeros((len(points), 7))
+    missed = 0
     for first in range(0, len(points), _BLOCK):
         part = slice(first, first + _BLOCK)
-        places = nearest.of(points[part], normals[part], reach)
-        columns[part] = source.columns(places.faces, places.weights, 1 / density)
-        missed += int(places.is_missed.sum())
+        locations = nearest.find(points[part], normals[part], reach)
+        columns[part] = source.columns(locations.faces, locations.weights, 1 / density)
+        missed += int(locations.is_missed.sum())
     codes = np.concatenate(
         [
             srgb8(columns[:, DIFFUSE]),
@@ -133,12 +145,11 @@ def _inset(weights: NDArray[np.float64], cells: np.integer) -> NDArray[np.float6
 
 
 def _is_flat(texels: _Texels) -> NDArray[np.bool_]:
-    """Return whether [F] all texels of a tile are stored as the same numbers."""
+    """Return [F] True where all texels of a tile have the same 8-bit codes."""
     starts = texels.start[:-1]
     low = np.minimum.reduceat(texels.codes, starts, axis=0)
     high = np.maximum.reduceat(texels.codes, starts, axis=0)
-    flat: NDArray[np.bool_] = (low == high).all(axis=1)
-    return flat
+    return (low == high).all(axis=1)
 
 
 def _tiles(
@@ -146,9 +157,10 @@ def _tiles(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the tile [F] of each triangle, and the first triangle [K] of each tile.
 
-    Triangles of one and the same colour share a tile.
+    Triangles of the same flat color share a tile.
     """
-    flat, count = _is_flat(texels), len(cells)
+    flat = _is_flat(texels)
+    count = len(cells)
     codes = texels.codes[texels.start[:-1]].astype(np.int64)
     number = np.where(flat, 0, 1 + np.arange(count))
     names = np.column_stack([number, np.where(flat[:, None], codes, 0)])
@@ -159,10 +171,11 @@ def _tiles(
 def _textures(
     plan: Atlas, first_of: NDArray[np.int64], texels: _Texels
 ) -> tuple[Texture, Texture, Texture]:
-    """Return the maps in 8 bits; what is the same everywhere is one texel in float32."""
+    """Return the maps in 8 bits; a constant map is one texel in float32."""
     constants = [_constant(texels, part) for part in _PARTS]
     values = np.zeros((plan.height, plan.width, 7))
-    values[:] = texels.columns[0]  # where no tile is, so that nothing there counts for a mean
+    # Texels without a tile get a color of the object, for means over the map.
+    values[:] = texels.columns[0]
     for tile, face in enumerate(first_of):
         mine = slice(texels.start[face], texels.start[face + 1])
         column, row = plan.corner[tile]
@@ -176,8 +189,8 @@ def _textures(
     stored = [srgb8(values[..., DIFFUSE])]
     stored += [np.round(values[..., part] * 255).astype(np.uint8) for part in _PARTS[1:]]
     if constants[0] is None:
-        shown = stored[1] / 255 if constants[1] is None else constants[1]
-        stored[0] = _lowered(stored[0], shown)
+        specular = stored[1] / 255 if constants[1] is None else constants[1]
+        stored[0] = _limit_diffuse(stored[0], specular)
     elif constants[1] is None:
         over = np.minimum(constants[0] + stored[1] / 255, 1) - constants[0]
         stored[1] = np.floor(over * 255 + 1e-6).astype(np.uint8)
@@ -194,16 +207,17 @@ _PARTS = (DIFFUSE, SPECULAR, ROUGHNESS)
 
 
 def _constant(texels: _Texels, part: slice) -> NDArray[np.float32] | None:
-    """Return what all texels say, where 8 bits could tell none of them from another."""
-    columns, codes = texels.columns[:, part], texels.codes[:, part]
+    """Return the value of a map whose texels all have equal 8-bit codes, or None."""
+    columns = texels.columns[:, part]
+    codes = texels.codes[:, part]
     if not (codes == codes[0]).all():
         return None
     same = (columns == columns[0]).all()
     return (columns[0] if same else columns.mean(axis=0)).astype(np.float32)
 
 
-def _lowered(diffuse: NDArray[np.uint8], specular: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Return sRGB codes that add up to at most 1 with the specular albedo after rounding."""
+def _limit_diffuse(diffuse: NDArray[np.uint8], specular: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return diffuse sRGB codes whose sum with the specular albedo is at most 1 after rounding."""
     table = linear_from_srgb8()
     room = 1 + 1e-6 - np.broadcast_to(specular, diffuse.shape)
     highest = np.maximum(np.searchsorted(table, room, side="right") - 1, 0)

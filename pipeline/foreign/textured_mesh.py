@@ -1,4 +1,4 @@
-"""The triangles of a file with their materials: the same ones that `load` gives."""
+"""The triangles of a file with their materials, the same triangles as those of `load`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,33 +11,30 @@ from pipeline.foreign.mesh import FileMesh, TriangleMesh
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TexturedParts:
+class TexturedMesh:
     """The triangles of a source, unwelded, in its own units, +Z up."""
 
     mesh: TriangleMesh
-    """Its triangles."""
     material: NDArray[np.int64]
-    """[F] row of `materials`."""
+    """[F] index into `materials` of each face."""
     materials: Sequence[SourceMaterial]
-    """What surfaces are made of."""
     uv: NDArray[np.float64]
-    """[F, S, 3, 2] coordinates of each set at each corner, v up; not a number where there are none.
-    """
-    colour: NDArray[np.float64] | None = None
-    """[F, 3, 3] linear colour of each corner, times the base colour; None where it is white."""
+    """[F, S, 3, 2] texture coordinates of corners by set S, v up; NaN where there are none."""
+    color: NDArray[np.float64] | None = None
+    """[F, 3, 3] linear tint of each corner, multiplied with the base color; None for white."""
 
 
-def build_parts(
+def build_textured_mesh(
     contents: FileMesh, materials: Sequence[SourceMaterial], default: SourceMaterial
-) -> TexturedParts:
-    """Return the triangles of a file, given its materials and that of faces without any."""
+) -> TexturedMesh:
+    """Return the triangles of a file with its materials; `default` is that of faces without one."""
     count = len(contents.mesh.faces)
     rows = np.full(count, -1) if contents.material is None else contents.material
     uv = np.full((count, 3, 2), np.nan) if contents.uv is None else contents.uv
-    return TexturedParts(
+    return TexturedMesh(
         mesh=contents.mesh,
         material=np.where(rows < 0, len(materials), rows),
         materials=(*materials, default),
         uv=uv[:, None],
-        colour=contents.color,
+        color=contents.color,
     )

@@ -1,8 +1,8 @@
-"""A scene that Trilight wrote, read back from its layer bit for bit, without composing a stage.
+"""Reads a scene that Trilight wrote from its layer, bit for bit, without composing a stage.
 
-After an edit - a mesh moved, a colour picked, a light added - the exact attributes of a file are
-stale. So everything that export writes is compared with the file, and the geometry with its digest;
-where anything differs, this reader returns None and the file is read as a foreign one
+After an edit (a mesh moved, a color changed, a light added) the exact attributes of a file are
+stale. So this reader compares the file with everything that export writes, and the geometry with
+its digest. Where anything differs, it returns None and the file is read as a foreign one
 (pipeline.exchange.usd.foreign_scene).
 """
 
@@ -13,19 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.usd import names
-from pipeline.exchange.usd.authoring import as_expected
-from pipeline.exchange.usd.dome import dome_as_written, dome_attributes, sky_attributes
+from pipeline.exchange.usd.authoring import has_attributes
+from pipeline.exchange.usd.dome import dome_attributes, read_exact_dome, sky_attributes
 from pipeline.exchange.usd.exact_layer import (
     Changed,
-    children_of,
+    children_by_row,
     drop_absent,
-    numbered,
+    read_integers,
+    read_vectors,
     require,
+    require_children,
     require_plain,
-    vectors,
-    whole_numbers,
 )
-from pipeline.exchange.usd.read_our_materials import materials_as_written
+from pipeline.exchange.usd.read_exact_materials import read_exact_materials
 from pipeline.exchange.usd.write import ENVIRONMENT, camera_attributes
 from pipeline.exchange.usd.write_meshes import (
     CENTER,
@@ -33,7 +33,7 @@ from pipeline.exchange.usd.write_meshes import (
     SUBSET,
     center_points,
     object_attributes,
-    place_attributes,
+    position_attributes,
     sum_positions,
 )
 from pipeline.exchange.usd.write_textures import ST
@@ -57,34 +57,34 @@ def scene_keys(layer: Any) -> list[str] | None:
     if names.VARIANT_SET not in root.variantSets or len(root.nameChildren):
         return None
     keys: list[str] = list(root.variantSets[names.VARIANT_SET].variants.keys())
-    ours = all(_root_of(layer, key) is not None for key in keys)
-    return keys if ours and keys else None
+    all_marked = all(_find_root(layer, key) is not None for key in keys)
+    return keys if all_marked and keys else None
 
 
 def is_marked(layer: Any, key: str | None = None) -> bool:
-    """Return whether a layer claims to be of Trilight's making."""
-    return _root_of(layer, key) is not None
+    """Return whether a layer has the marks of a scene that Trilight wrote."""
+    return _find_root(layer, key) is not None
 
 
 def read_exact(layer: Any, key: str | None = None, opened: OpenedUsd | None = None) -> Scene | None:
-    """Return the scene of a layer, or that under `key` of a shard; None where it is not as written.
+    """Read the scene of a layer or of a shard's key; return None where it was changed.
 
     Args:
-        layer: of one scene, or of a shard.
-        key: which of a shard.
-        opened: the way to files of maps; without it, a scene that has any is not read.
+        layer: the layer of one scene or of a shard.
+        key: key of the scene in a shard.
+        opened: the open file, which resolves map files; None refuses scenes with maps.
 
     Raises:
-        TrilightError: it was written by a Trilight that this one cannot read, has a material column
-            that is not declared here, or the scene breaks a law.
+        TrilightError: the file has an unsupported version or an undeclared material column, or the
+            scene breaks a law (`Scene.check`).
     """
-    root = _root_of(layer, key)
+    root = _find_root(layer, key)
     if root is None or len(layer.subLayerPaths) or len(layer.rootPrims) != 1:
         return None
     name = layer.GetDisplayName()
     require_readable(root.attributes[names.VERSION].default, name)
     try:
-        scene = _scene(root, opened)
+        scene = _read_scene(root, opened)
     except UndeclaredColumn as error:
         raise TrilightError(f"{name}: {error}") from error
     except (Changed, LookupError, TypeError, ValueError, AttributeError):
@@ -98,7 +98,7 @@ def read_exact(layer: Any, key: str | None = None, opened: OpenedUsd | None = No
     return scene
 
 
-def _root_of(layer: Any, key: str | None) -> Any:
+def _find_root(layer: Any, key: str | None) -> Any:
     path = names.ROOT
     if key is not None:
         path = f"{names.SHARD_ROOT}{{{names.VARIANT_SET}={key}}}{path.removeprefix('/')}"
@@ -107,20 +107,20 @@ def _root_of(layer: Any, key: str | None) -> Any:
     return root if root and all(mark in root.attributes for mark in marks) else None
 
 
-def _scene(root: Any, opened: OpenedUsd | None) -> Scene:
-    sky = _environment(root, opened)
+def _read_scene(root: Any, opened: OpenedUsd | None) -> Scene:
+    sky = _read_environment(root, opened)
     names_of = {"Materials", "Objects", "Cameras"}
-    folders = children_of(root, names_of if sky is None else {*names_of, ENVIRONMENT})
+    folders = require_children(root, names_of if sky is None else {*names_of, ENVIRONMENT})
     for folder in folders:
         if folder.name != ENVIRONMENT:
             require_plain(folder, set())
-    materials = materials_as_written(folders["Materials"], opened)
+    materials = read_exact_materials(folders["Materials"], opened)
     prims = sorted(folders["Objects"].nameChildren, key=lambda p: p.attributes[names.INDEX].default)
-    objects = tuple(_object(prim) for prim in prims)
+    objects = tuple(_read_object(prim) for prim in prims)
     meshes = [prim for prim in prims if prim.typeName == "Mesh"]
-    vertices, normals = _vertices(root, meshes, sky)
-    faces, material_index, object_index = _faces(meshes, len(materials.rows))
-    c2w, fov_deg = _cameras(folders["Cameras"])
+    vertices, normals = _read_vertices(root, meshes, sky)
+    faces, material_index, object_index = _read_faces(meshes, len(materials.rows))
+    c2w, fov_deg = _read_cameras(folders["Cameras"])
     scene = Scene(
         vertex_positions=vertices,
         vertex_normals=normals,
@@ -132,131 +132,135 @@ def _scene(root: Any, opened: OpenedUsd | None) -> Scene:
         fov_deg=fov_deg,
         objects=objects,
         provenance=scene_provenance(json.loads(root.attributes[names.PROVENANCE].default)),
-        uv=_coordinates(meshes, len(faces)) if materials.textures else None,
+        uv=_read_coordinates(meshes, len(faces)) if materials.textures else None,
         textures=materials.textures,
         material_textures=materials.material_textures,
         environment=sky,
     )
     for row, prim in enumerate(prims):
-        require(as_expected(prim, object_attributes(scene, row)))
+        require(has_attributes(prim, object_attributes(scene, row)))
         expected = {*object_attributes(scene, row)}
         if prim.typeName == "Mesh":
             expected |= {*MESH, *_ARRAYS, names.VERTEX_ROWS, names.FACE_ROWS, "material:binding"}
             expected |= {ST} if scene.textures else set()
             expected |= _PLACE if CENTER in prim.attributes else set()
-            require(as_expected(prim, MESH))
+            require(has_attributes(prim, MESH))
         require_plain(prim, expected)
     return scene
 
 
-def _environment(root: Any, opened: OpenedUsd | None) -> Environment | None:
+def _read_environment(root: Any, opened: OpenedUsd | None) -> Environment | None:
     prim = root.nameChildren.get(ENVIRONMENT)
     if prim is None:
         return None
     require(opened is not None and prim.typeName == "DomeLight")
     assert opened is not None
-    sky = dome_as_written(prim, root.layer, opened)
-    require(as_expected(prim, dome_attributes(sky)))
+    sky = read_exact_dome(prim, root.layer, opened)
+    require(has_attributes(prim, dome_attributes(sky)))
     require_plain(prim, set(dome_attributes(sky)))
     return sky
 
 
-def _object(prim: Any) -> SceneObject:
+def _read_object(prim: Any) -> SceneObject:
     texts = {field: prim.attributes[name].default for field, name in names.OBJECT_TEXTS.items()}
     require(texts["kind"] in OBJECT_KINDS)
     return SceneObject(**texts)
 
 
-def _vertices(
+def _read_vertices(
     root: Any, meshes: list[Any], sky: Environment | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return positions and normals [V, 3] from the rows that meshes and root say are theirs."""
-    own = {names.VERSION, names.DIGEST, names.PROVENANCE}
-    own |= {names.UNUSED_ROWS, names.UNUSED_POSITIONS, names.UNUSED_NORMALS}
+    """Return positions and normals [V, 3], placed by the vertex rows of meshes and root."""
+    expected = {names.VERSION, names.DIGEST, names.PROVENANCE}
+    expected |= {names.UNUSED_ROWS, names.UNUSED_POSITIONS, names.UNUSED_NORMALS}
     attributes = drop_absent(root, sky_attributes(sky), {names.SKY_SOURCE})
-    require_plain(root, own | set(attributes))
-    require(as_expected(root, attributes))
+    require_plain(root, expected | set(attributes))
+    require(has_attributes(root, attributes))
     kinds = [(root, names.UNUSED_ROWS, names.UNUSED_NORMALS)]
     kinds += [(mesh, names.VERTEX_ROWS, "normals") for mesh in meshes]
-    rows = np.concatenate([whole_numbers(prim, name) for prim, name, _ in kinds])
+    rows = np.concatenate([read_integers(prim, name) for prim, name, _ in kinds])
     require(len(rows) > 0 and rows.min() >= 0)
     count = int(rows.max()) + 1
     require(count <= len(rows) and len(np.unique(rows)) == count)
-    positions, normals = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
-    unused = vectors(root, names.UNUSED_POSITIONS)
-    positions[rows] = np.concatenate([unused, *(_positions(mesh) for mesh in meshes)])
-    normals[rows] = np.concatenate([vectors(prim, name) for prim, _, name in kinds])
+    positions = np.zeros((count, 3), np.float32)
+    normals = np.zeros((count, 3), np.float32)
+    unused = read_vectors(root, names.UNUSED_POSITIONS)
+    positions[rows] = np.concatenate([unused, *(_read_positions(mesh) for mesh in meshes)])
+    normals[rows] = np.concatenate([read_vectors(prim, name) for prim, _, name in kinds])
     return positions, normals
 
 
-def _positions(mesh: Any) -> NDArray[np.float32]:
-    """Return where the vertices [V, 3] of a mesh are; meshes of old files stand at the origin."""
-    points = vectors(mesh, "points")
+def _read_positions(mesh: Any) -> NDArray[np.float32]:
+    """Return the positions [V, 3] of a mesh's vertices; meshes of old files have no center."""
+    points = read_vectors(mesh, "points")
     if CENTER not in mesh.attributes:
         return points
     center = np.array(mesh.attributes[CENTER].default, np.float64)
     positions = sum_positions(center, points)
-    positions[whole_numbers(mesh, names.EXACT_ROWS)] = vectors(mesh, names.EXACT_POSITIONS)
+    positions[read_integers(mesh, names.EXACT_ROWS)] = read_vectors(mesh, names.EXACT_POSITIONS)
     expected_center, expected_points = center_points(positions)
     require(np.array_equal(center, expected_center))
     require(np.array_equal(points.view(np.uint32), expected_points.view(np.uint32)))
-    require(as_expected(mesh, place_attributes(center, points, positions)))
+    require(has_attributes(mesh, position_attributes(center, points, positions)))
     return positions
 
 
-def _faces(
+def _read_faces(
     meshes: list[Any], num_materials: int
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint16], NDArray[np.uint16]]:
-    rows = np.concatenate([whole_numbers(mesh, names.FACE_ROWS) for mesh in meshes])
+    rows = np.concatenate([read_integers(mesh, names.FACE_ROWS) for mesh in meshes])
     count = len(rows)
     require(np.array_equal(np.sort(rows), np.arange(count)))
     faces = np.zeros((count, 3), np.uint32)
-    material_index, object_index = np.zeros(count, np.uint16), np.zeros(count, np.uint16)
+    material_index = np.zeros(count, np.uint16)
+    object_index = np.zeros(count, np.uint16)
     for mesh in meshes:
-        own, vertices = whole_numbers(mesh, names.FACE_ROWS), whole_numbers(mesh, names.VERTEX_ROWS)
-        require(np.array_equal(whole_numbers(mesh, "faceVertexCounts"), np.full(len(own), 3)))
-        faces[own] = vertices[whole_numbers(mesh, "faceVertexIndices").reshape(-1, 3)]
-        object_index[own] = mesh.attributes[names.INDEX].default
-        index = np.full(len(own), -1)
+        face_rows = read_integers(mesh, names.FACE_ROWS)
+        vertex_rows = read_integers(mesh, names.VERTEX_ROWS)
+        require(np.array_equal(read_integers(mesh, "faceVertexCounts"), np.full(len(face_rows), 3)))
+        faces[face_rows] = vertex_rows[read_integers(mesh, "faceVertexIndices").reshape(-1, 3)]
+        object_index[face_rows] = mesh.attributes[names.INDEX].default
+        index = np.full(len(face_rows), -1)
         for subset in mesh.nameChildren:
-            require(as_expected(subset, SUBSET))
+            require(has_attributes(subset, SUBSET))
             require_plain(subset, {*SUBSET, "indices", "material:binding"})
-            material = _bound(subset)
+            material = _bound_material_row(subset)
             require(material < num_materials)
-            index[whole_numbers(subset, "indices")] = material
-        require(len(index) > 0 and index.min() >= 0 and _bound(mesh) == index.min())
-        material_index[own] = index
+            index[read_integers(subset, "indices")] = material
+        require(len(index) > 0 and index.min() >= 0 and _bound_material_row(mesh) == index.min())
+        material_index[face_rows] = index
     return faces, material_index, object_index
 
 
-def _coordinates(meshes: list[Any], count: int) -> NDArray[np.float32]:
+def _read_coordinates(meshes: list[Any], count: int) -> NDArray[np.float32]:
     """Return the texture coordinates [3T, 2] of all corners."""
     uv = np.zeros((count, 3, 2), np.float32)
     for mesh in meshes:
         attribute = mesh.attributes[ST]
         require(attribute.GetInfo("interpolation") == "faceVarying")
         require(attribute.typeName == "texCoord2f[]" and not attribute.HasInfo("timeSamples"))
-        own = np.array(attribute.default, np.float32)
-        uv[whole_numbers(mesh, names.FACE_ROWS)] = own.reshape(-1, 3, 2)
+        corner_uv = np.array(attribute.default, np.float32)
+        uv[read_integers(mesh, names.FACE_ROWS)] = corner_uv.reshape(-1, 3, 2)
     return uv.reshape(-1, 2)
 
 
-def _bound(prim: Any) -> int:
-    """Return the row of the material that is bound to a prim, if it is one of the same scene."""
+def _bound_material_row(prim: Any) -> int:
+    """Return the row of the material that is bound to a prim; require the same scene."""
     (target,) = prim.relationships["material:binding"].targetPathList.explicitItems
-    own = str(prim.path.StripAllVariantSelections()).partition("/Objects/")[0]
+    scene_path = str(prim.path.StripAllVariantSelections()).partition("/Objects/")[0]
     row = int(target.name.rpartition("_")[2])
-    require(str(target) == f"{own}/Materials/{names.material_name(row)}")
+    require(str(target) == f"{scene_path}/Materials/{names.material_name(row)}")
     return row
 
 
-def _cameras(folder: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    prims = numbered(folder, names.camera_name)
-    c2w, fov_deg = np.zeros((len(prims), 4, 4), np.float32), np.zeros(len(prims), np.float32)
+def _read_cameras(folder: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    prims = children_by_row(folder, names.camera_name)
+    c2w = np.zeros((len(prims), 4, 4), np.float32)
+    fov_deg = np.zeros(len(prims), np.float32)
     for row, prim in enumerate(prims):
         c2w[row] = np.array(prim.attributes["xformOp:transform"].default).T
         fov_deg[row] = prim.attributes[names.FOV_DEG].default
         expected = camera_attributes(c2w[row], float(fov_deg[row]))
-        require(as_expected(prim, expected))
+        require(has_attributes(prim, expected))
         require_plain(prim, set(expected))
     return c2w, fov_deg

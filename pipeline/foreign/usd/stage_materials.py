@@ -1,4 +1,4 @@
-"""What the materials of a USD stage state, by mesh and polygon, with the bytes of pictures."""
+"""The materials of a USD stage, by mesh and polygon, with the bytes of their pictures."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.material_files import MaterialFiles
 from pipeline.foreign.usd.object_stage import UsdStage
-from pipeline.foreign.usd.placed import Placed
+from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.shaders import StatedMaterial, read_bindings, read_material
 from pipeline.foreign.usd.stage import OutsideFile
 from pipeline.foreign.usd.texture_nodes import TextureNode, asset_bytes
@@ -25,31 +25,31 @@ _LOST = {
     "displacement": "displacement",
     "normal": "normal map",
 }
-"""Words for inputs without a place here, by how those begin."""
+"""Words for unsupported inputs, by the beginnings of their names."""
 
 
 Binding = tuple[int, NDArray[np.int64] | None]
-"""Row of a material, or -1 for none, and the polygons of a mesh that have it; None for all."""
+"""Index of a material, or -1 for none, and the polygons of a mesh that have it; None for all."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StageLooks:
+class StageMaterials:
     """The materials of a stage."""
 
     materials: tuple[StatedMaterial, ...]
-    """Each once."""
+    """Distinct materials in the order of their first use."""
     bindings: tuple[tuple[Binding, ...], ...]
-    """Of each mesh; later ones stand before earlier ones."""
+    """Bindings of each mesh; later ones override earlier ones."""
     pictures: MaterialFiles
-    """Bytes by where they were found."""
+    """Contents of pictures by resolved path."""
 
 
-def stage_looks(stage: UsdStage, max_bytes: int) -> StageLooks:
-    """Return the materials of what is seen of a stage.
+def read_stage_materials(stage: UsdStage, max_bytes: int) -> StageMaterials:
+    """Return the materials of the visible meshes of a stage.
 
     Args:
         stage: the open stage.
-        max_bytes: bound of all pictures together.
+        max_bytes: maximum bytes of all pictures together.
 
     Raises:
         Rejected: texture_outside, materials_unreadable.
@@ -61,9 +61,11 @@ def stage_looks(stage: UsdStage, max_bytes: int) -> StageLooks:
         raise Rejected("texture_outside", f"{error!s:.200}") from error
     except TrilightError as error:
         raise Rejected("materials_unreadable", f"{error!s:.200}") from error
-    materials = tuple(reader.found)
+    materials = tuple(reader.materials)
     nodes = [node for material in materials for node in material.textures.values()]
-    return StageLooks(materials=materials, bindings=bindings, pictures=_pictures(nodes, max_bytes))
+    return StageMaterials(
+        materials=materials, bindings=bindings, pictures=_read_pictures(nodes, max_bytes)
+    )
 
 
 class _Reader:
@@ -72,9 +74,9 @@ class _Reader:
     def __init__(self, stage: UsdStage) -> None:
         self._stage = stage
         self._rows: dict[str, int] = {}
-        self.found: list[StatedMaterial] = []
+        self.materials: list[StatedMaterial] = []
 
-    def bindings(self, placed: Placed) -> Iterator[Binding]:
+    def bindings(self, placed: PlacedPrim) -> Iterator[Binding]:
         for material, polygons in read_bindings(placed.prim, self._stage.time):
             yield self._row(material), polygons
 
@@ -83,11 +85,11 @@ class _Reader:
             return -1
         name = str(material.GetPath())
         if name not in self._rows:
-            self._rows[name] = len(self.found)
-            self.found.append(self._stated(material))
+            self._rows[name] = len(self.materials)
+            self.materials.append(self._read(material))
         return self._rows[name]
 
-    def _stated(self, material: Any) -> StatedMaterial:
+    def _read(self, material: Any) -> StatedMaterial:
         lost = self._stage.opened.lost
         stated = read_material(material, self._stage.time, self._stage.opened)
         if stated is None:
@@ -99,31 +101,33 @@ class _Reader:
         return dataclasses.replace(stated, textures=textures)
 
 
-def name_losses(stated: StatedMaterial) -> tuple[str, ...]:
-    """Return the words for what a material states and has no place for."""
+def name_unsupported(stated: StatedMaterial) -> tuple[str, ...]:
+    """Return words for the unsupported inputs that a material states."""
     words = {
         word for name in stated.lost for start, word in _LOST.items() if name.startswith(start)
     }
     return tuple(sorted(words | {"networks of shaders"} if stated.has_networks else words))
 
 
-def _pictures(nodes: Sequence[TextureNode], left: int) -> MaterialFiles:
-    data, refused = dict[str, bytes](), dict[str, Rejected]()
+def _read_pictures(nodes: Sequence[TextureNode], bytes_left: int) -> MaterialFiles:
+    data: dict[str, bytes] = {}
+    refused: dict[str, Rejected] = {}
     for node in nodes:
-        place = node.resolved or node.named
-        if place in data or place in refused:
+        path = node.resolved or node.named
+        if path in data or path in refused:
             continue
         try:
-            found = None if node.resolved is None else asset_bytes(node.resolved, left)
+            picture = None if node.resolved is None else asset_bytes(node.resolved, bytes_left)
         except TrilightError as error:
-            refused[place] = Rejected("texture_too_large", f"{error!s:.200}")
+            refused[path] = Rejected("texture_too_large", f"{error!s:.200}")
             continue
-        if found is None:
+        if picture is None:
             why = f"{node.named!r:.80} is not beside the object"
-            refused[place] = Rejected("texture_missing", why)
+            refused[path] = Rejected("texture_missing", why)
             if "<UDIM>" in node.named:
                 why = f"{node.named!r:.80} has UDIM tiles, which are not read"
-                refused[place] = Rejected("texture_unreadable", why)
+                refused[path] = Rejected("texture_unreadable", why)
         else:
-            data[place], left = found, left - len(found)
+            data[path] = picture
+            bytes_left -= len(picture)
     return MaterialFiles(data=data, refused=refused)

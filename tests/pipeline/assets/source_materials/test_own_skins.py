@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdShade
 
-from pipeline.assets.cleaning.clean import clean, normalise
+from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.own.skin import skin_maker
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
+from pipeline.assets.source_materials.skin import open_skin_baker
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
@@ -27,7 +27,7 @@ from tests.pipeline.assets.meshes_by_hand import (
     write_glb,
     write_obj,
 )
-from tests.pipeline.assets.own.textured_kit import (
+from tests.pipeline.assets.source_materials.textured_kit import (
     CORNERS,
     KEEP,
     OWN,
@@ -45,7 +45,7 @@ from tests.pipeline.assets.own.textured_kit import (
     textured_obj,
     textured_tree,
 )
-from tests.pipeline.assets.own.usd_kit import SHADER, TEXTURE, textured_usd
+from tests.pipeline.assets.source_materials.usd_kit import SHADER, TEXTURE, textured_usd
 
 FILES: dict[str, Callable[[Path], Path]] = {
     "glb": lambda folder: textured_glb(folder / "a.glb", picture_bytes(CORNERS)),
@@ -176,7 +176,7 @@ def test_a_texture_may_be_as_large_as_is_said_and_no_larger(tmp_path: Path) -> N
     assert side(wanted - 1) < wanted
 
 
-def test_materials_change_no_triangle_and_nothing_where_nobody_asks(tmp_path: Path) -> None:
+def test_materials_change_no_triangle_and_nothing_where_they_are_off(tmp_path: Path) -> None:
     path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS))
     own, plain = prepare(path, KEEP), prepare(path)
     assert geometry(own) == geometry(plain) and own.geometry_sha256 == plain.geometry_sha256
@@ -236,12 +236,12 @@ def test_a_level_that_lies_nowhere_near_its_source_is_told(tmp_path: Path) -> No
     uv = ball.positions[:, [0, 2]]
     path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS), uv, ball)
     source = read_source(path, KEEP.read_limits)
-    mesh, _ = orient_outward(clean(normalise(load_mesh(source))))
-    maker, _ = skin_maker(source, mesh, dataclasses.replace(OWN, max_colour_error=1.0))
+    mesh, _ = orient_outward(clean(normalize(load_mesh(source))))
+    maker, _ = open_skin_baker(source, mesh, dataclasses.replace(OWN, max_colour_error=1.0))
     level = prepare(path, KEEP).levels[0]
-    assert maker.skinned(level).skin is not None
+    assert maker.add_skin(level).skin is not None
     with pytest.raises(Rejected, match="colours_missed"):
-        maker.skinned(dataclasses.replace(level, positions=0.8 * level.positions))
+        maker.add_skin(dataclasses.replace(level, positions=0.8 * level.positions))
 
 
 GLOW = AssetSettings(own_materials=dataclasses.replace(OWN, emission=True))
@@ -325,7 +325,7 @@ def test_what_is_far_darker_than_the_brightest_triangle_emits_nothing(tmp_path: 
 
 
 @pytest.mark.parametrize("kind", GLOWING)
-def test_nobody_pays_who_does_not_ask(tmp_path: Path, kind: str) -> None:
+def test_materials_that_are_off_cost_nothing(tmp_path: Path, kind: str) -> None:
     """And what is lost is named; a missing picture of it costs no material."""
     path = GLOWING[kind](tmp_path)
     plain, glows = prepare(path, KEEP), prepare(path, GLOW)

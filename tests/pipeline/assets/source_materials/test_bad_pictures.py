@@ -17,7 +17,7 @@ from storage.conventions import linear_from_srgb8
 from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import geometry, prepare, reason_of, write_glb, write_ply
 from tests.pipeline.assets.meshes_by_hand import prepare as prepare_asset
-from tests.pipeline.assets.own import textured_kit as kit
+from tests.pipeline.assets.source_materials import textured_kit as kit
 
 TOLERANCE = 0.02
 """JPEG and a palette of few colours are off by a few of 255 steps, near white a hundredth each."""

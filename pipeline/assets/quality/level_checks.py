@@ -1,4 +1,4 @@
-"""The gate at the end: what a level must fulfil whatever made it. Cheap checks come first."""
+"""Quality checks of a level, whichever method made it. Cheap checks come first."""
 
 import numpy as np
 
@@ -20,11 +20,11 @@ def check_level(
     """Return the cleaned result of a decimation with its measures.
 
     Args:
-        result: what a decimation returned, unchecked.
-        source: what it was made from.
+        result: the unchecked result of a decimation.
+        source: the cleaned source.
         budget: most faces.
         gate: the other limits.
-        max_error_p99: the limit on the error, at most that of `gate`.
+        max_error_p99: limit on the error, at most that of `gate`.
 
     Raises:
         Rejected: budget_missed, nonfinite_result, bbox_escaped, area_changed, error_over_bound,
@@ -59,7 +59,8 @@ def _check_vertices(result: TriangleMesh, source: TriangleMesh, max_outside: flo
         raise Rejected("budget_missed", "no face is left")
     if not np.isfinite(used).all():
         raise Rejected("nonfinite_result", "a vertex of the result is not finite")
-    low, high = source.positions.min(axis=0), source.positions.max(axis=0)
+    low = source.positions.min(axis=0)
+    high = source.positions.max(axis=0)
     outside = float(np.maximum(low - used, used - high).max()) / source.diagonal
     if outside > max_outside:
         raise Rejected("bbox_escaped", f"a vertex is {outside:.2%} of the diagonal outside the box")

@@ -1,9 +1,9 @@
-"""The levels of an asset with their own materials, where settings keep those."""
+"""Adds source materials to the levels of an asset, where settings keep them."""
 
 from collections.abc import Mapping
 
-from pipeline.assets.own.skin import SkinMaker, skin_maker
 from pipeline.assets.settings import AssetSettings
+from pipeline.assets.source_materials.skin import SkinBaker, open_skin_baker
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import SourceFile
 from storage.errors import Rejected
@@ -13,53 +13,56 @@ from storage.records.skin import OwnMaterials
 Missed = dict[int, tuple[str, str]]
 
 
-def with_own_materials(
+def add_source_materials(
     levels: tuple[Level, ...],
     missed: Mapping[int, tuple[str, str]],
     source: SourceFile,
     mesh: TriangleMesh,
     settings: AssetSettings,
 ) -> tuple[tuple[Level, ...], Missed, OwnMaterials | None]:
-    """Return levels with skins, reasons of those that are missing, and what is known of materials.
+    """Return levels with skins, reasons of missing levels, and the state of the materials.
 
     Args:
-        levels: without skins.
+        levels: levels without skins.
         missed: reason and message by budget.
-        source: the file.
-        mesh: its clean, oriented mesh.
-        settings: whether materials are kept, and what becomes of an object whose own are lost.
+        source: the object's file.
+        mesh: the clean, oriented mesh of that file.
+        settings: `own_materials` keeps materials, and says what happens where they are lost.
 
     Raises:
-        Rejected: as `skin_maker`, where such objects are refused.
+        Rejected: as `open_skin_baker`, where `if_lost` is `reject`.
     """
-    asked = settings.own_materials
-    if not asked.keep:
+    material_settings = settings.own_materials
+    if not material_settings.keep:
         return levels, dict(missed), None
     try:
-        maker, materials = skin_maker(source, mesh, asked)
+        baker, materials = open_skin_baker(source, mesh, material_settings)
     except Rejected as lost:
-        if asked.if_lost == "reject":
+        if material_settings.if_lost == "reject":
             raise
         return levels, dict(missed), OwnMaterials(reason=lost.reason, message=lost.message)
-    return _skinned(levels, missed, maker, materials, refuse=asked.if_lost == "reject")
+    return _add_skins(
+        levels, missed, baker, materials, refuse=material_settings.if_lost == "reject"
+    )
 
 
-def _skinned(
+def _add_skins(
     levels: tuple[Level, ...],
     missed: Mapping[int, tuple[str, str]],
-    maker: SkinMaker,
+    baker: SkinBaker,
     materials: OwnMaterials,
     *,
     refuse: bool,
 ) -> tuple[tuple[Level, ...], Missed, OwnMaterials]:
-    found, reasons = list[Level](), dict(missed)
+    with_skins = list[Level]()
+    reasons = dict(missed)
     for level in levels:
         try:
-            found.append(maker.skinned(level))
+            with_skins.append(baker.add_skin(level))
         except Rejected as lost:
             if refuse:
                 reasons[level.record.budget] = (lost.reason, lost.message)
                 continue
-            found.append(level)
+            with_skins.append(level)
             materials = OwnMaterials(reason=lost.reason, message=lost.message, lost=materials.lost)
-    return tuple(found), reasons, materials
+    return tuple(with_skins), reasons, materials

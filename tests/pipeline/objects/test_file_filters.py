@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.objects.file_filters import drop_copies, drop_outputs, drop_scenes, warn_once
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.local.folder import list_folder
 from pipeline.objects.maps.listing import find_maps
-from pipeline.objects.selection import drop_copies, drop_outputs, drop_scenes, say_once
 from storage.records.objects import TEXTURE
 from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_scene
@@ -30,7 +30,7 @@ def test_outputs_of_ours_are_left_out_with_a_note(
     names: str, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     mine = ["y.json", "chair.obj", "sub/table.ply", "sub/meshes/a.ply", "wood.png"]
-    say_once.cache_clear()
+    warn_once.cache_clear()
     caplog.clear()
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
@@ -63,7 +63,7 @@ def test_the_named_folder_may_be_an_output_and_scenes_of_ours_are_no_objects(
 def test_other_formats_without_a_twin_are_named_once(
     caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
-    say_once.cache_clear()
+    warn_once.cache_clear()
     for name in ("a.obj", "a.fbx", "b.fbx", "c.zip", "d.txt"):
         (tmp_path / name).write_bytes(b"x")
     assert [row.uid for row in list_folder(tmp_path, None).records] == ["a"]

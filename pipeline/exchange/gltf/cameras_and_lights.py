@@ -1,8 +1,8 @@
-"""Cameras and lights of a glTF scene.
+"""Converts cameras and lights of a glTF scene.
 
-Its lights are points without an area, or directions; ours are surfaces and skies. A point becomes a
-small octahedron of as many candela, and a direction a spot in the sky of as many lux, both counted
-in the units of our radiance.
+glTF lights are points without an area, or directions; a `Scene` has surfaces and skies. A point
+becomes a small octahedron of equal candela, and a direction a spot in the sky of equal lux, both in
+the units of a scene's radiance.
 """
 
 import math
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.dressed import PLAIN, DressedTriangles
+from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles
 from pipeline.exchange.usd.foreign_cameras import rigid_pose
 from pipeline.foreign.gltf.nodes import PlacedNode
 from pipeline.foreign.numbers import read_number, read_numbers
@@ -23,39 +23,40 @@ from storage.records.texture import MapSource
 
 DIRECTIONAL = "directional"
 _SUN_ROWS = 256
-"""Rows of the sky that holds directional lights: a sun is 0.7 degrees wide."""
+"""Number of rows of the sky of directional lights: a sun is 0.7 degrees wide."""
 
 _HALF_TEXEL = np.array([0.25, 0.5]) / _SUN_ROWS
 
 _SIZE = 0.01
-"""Radius of a light as a share of the diagonal of the scene."""
+"""Radius of a light as a fraction of the diagonal of the scene."""
 
 
-def camera_of(
+def read_camera(
     tree: dict[str, Any], placed: PlacedNode, lost: list[str]
 ) -> tuple[NDArray[np.float64], float] | None:
-    """Return pose [4, 4] and full angle in degrees of a camera; None where it has neither."""
-    camera, pose = tree["cameras"][placed.node["camera"]], rigid_pose(placed.to_world)
+    """Return pose [4, 4] and full angle in degrees of a camera; None without a perspective."""
+    camera = tree["cameras"][placed.node["camera"]]
+    pose = rigid_pose(placed.to_world)
     lens = camera.get("perspective", {})
     angle = math.degrees(read_number(lens.get("yfov", 0), "yfov"))
     if camera.get("type") != "perspective" or pose is None or not 0 < angle < 180:
         lost.append("a camera without perspective")
         return None
     if not math.isclose(read_number(lens.get("aspectRatio", 1), "aspectRatio"), 1, rel_tol=1e-3):
-        lost.append("pictures are square here: the vertical angle of a camera was taken")
+        lost.append("pictures are square: the vertical angle of a camera was used")
     return pose, angle
 
 
 def light_triangles(
     light: dict[str, Any], placed: PlacedNode, reach: float, lost: list[str]
-) -> DressedTriangles | None:
-    """Return what stands for a punctual light; None where nothing can.
+) -> TexturedTriangles | None:
+    """Return an octahedron for a punctual light; None for other lights and dark ones.
 
     Args:
-        light: its JSON.
-        placed: its node.
-        reach: diagonal of the scene in metres.
-        lost: receives what cannot be carried over.
+        light: JSON of the light.
+        placed: node of the light.
+        reach: diagonal of the scene in meters.
+        lost: receives a sentence for each loss.
     """
     kind = light.get("type")
     if kind not in ("point", "spot"):
@@ -70,57 +71,59 @@ def light_triangles(
     positions = (placed.to_world[:3, 3] + radius * _octahedron()).astype(np.float32)
     cross = np.cross(positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0])
     length = np.linalg.norm(cross, axis=1, keepdims=True)
-    shown = float(length.sum()) / 8  # half of the cross products are areas, a quarter is seen
+    visible_area = (
+        float(length.sum()) / 8
+    )  # half of a cross product is an area; a quarter of all area is visible
     rows = default_rows(len(positions))
     rows[:, ROUGHNESS] = 1
-    rows[:, EMISSION] = np.clip(_read_light(light) / shown, 0, 1e9)
+    rows[:, EMISSION] = np.clip(_read_light(light) / visible_area, 0, 1e9)
     if not rows[:, EMISSION].any() or not np.isfinite(positions).all():
-        lost.append("lights that shine no light")
+        lost.append("lights without emission")
         return None
-    return DressedTriangles(
+    return TexturedTriangles(
         positions=positions,
         normals=np.repeat((cross / length)[:, None], 3, axis=1).astype(np.float32),
         rows=rows,
         uv=np.zeros((len(positions), 3, 2), np.float32),
-        worn=np.zeros(len(positions), np.int64),
-        wardrobe=(PLAIN,),
+        texture_set_index=np.zeros(len(positions), np.int64),
+        texture_sets=(NO_TEXTURES,),
     )
 
 
 def _read_light(light: dict[str, Any]) -> NDArray[np.float64]:
-    """Return color x intensity [3]; raises Malformed."""
+    """Return color x intensity [3] of a light; raises Malformed."""
     color = np.array(read_numbers(light.get("color", (1, 1, 1)), 3, "color of a light"))
     return color * read_number(light.get("intensity", 1), "intensity of a light")
 
 
-def sky_with_suns(
+def build_sun_sky(
     suns: Sequence[tuple[dict[str, Any], NDArray[np.float64]]], lost: list[str]
 ) -> Environment | None:
-    """Return a sky that is black but for directional lights; None where none of them shines.
+    """Return a black sky with the directional lights; None where none of them shines.
 
     Args:
-        suns: JSON of each, and the place [4, 4] of its node, along whose -z it shines.
-        lost: receives what cannot be carried over.
+        suns: JSON of each light, and the pose [4, 4] of its node; it shines along -z.
+        lost: receives a sentence for each loss.
     """
     radiance = np.zeros((_SUN_ROWS, 2 * _SUN_ROWS, 3), np.float64)
-    turn = np.eye(3)
+    rotation = np.eye(3)
     for number, (light, to_world) in enumerate(suns):
         towards = to_world[:3, 2]
         if not np.linalg.norm(towards) > 0:
             continue
-        if number == 0:  # it lies in the middle of a texel at the map's equator
-            turn = _frame(towards) @ _frame(latlong_direction(0.5 + _HALF_TEXEL)).T
-        u, v = latlong_uv(towards @ turn)
+        if number == 0:  # the first sun is in the middle of a texel at the map's equator
+            rotation = _frame(towards) @ _frame(latlong_direction(0.5 + _HALF_TEXEL)).T
+        u, v = latlong_uv(towards @ rotation)
         row = min(int((1 - v) * _SUN_ROWS), _SUN_ROWS - 1)
         angle = np.square(np.pi / _SUN_ROWS) * np.sin(np.pi * (row + 0.5) / _SUN_ROWS)
         radiance[row, int(u * 2 * _SUN_ROWS) % (2 * _SUN_ROWS)] += _read_light(light) / angle
     if not np.isfinite(radiance).all() or not (radiance > 0).any():
-        lost.extend(["lights that shine no light"] if suns else [])
+        lost.extend(["lights without emission"] if suns else [])
         return None
     lost.append("directional lights: suns of 0.7 degrees with their lux, in units of radiance")
     return Environment(
         radiance_rgb=np.clip(radiance, 0, 1e9).astype(np.float32),
-        rotation=turn.astype(np.float32),
+        rotation=rotation.astype(np.float32),
         source=MapSource(name="directional lights"),
     )
 
@@ -134,7 +137,7 @@ def _frame(first: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def even_sky() -> Environment:
-    """Return a sky of radiance 1, which cameras do not see."""
+    """Return a uniform sky of radiance 1, invisible to cameras."""
     return Environment(
         radiance_rgb=np.ones((1, 2, 3), np.float32), source=MapSource(name="even light")
     )
@@ -143,8 +146,8 @@ def even_sky() -> Environment:
 def _octahedron() -> NDArray[np.float64]:
     """Return the triangles [8, 3, 3] of an octahedron of radius 1, counter-clockwise."""
     axes = np.eye(3)
-    found = []
+    triangles = []
     for x, y, z in np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T:
         corners = axes * np.array([x, y, z])
-        found.append(corners if x * y * z > 0 else corners[::-1])
-    return np.stack(found)
+        triangles.append(corners if x * y * z > 0 else corners[::-1])
+    return np.stack(triangles)

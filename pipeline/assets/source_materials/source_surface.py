@@ -1,0 +1,228 @@
+"""The cleaned source with its materials: each clean face is matched to a face of the file."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.assets.cleaning.clean import cell_keys, normalize
+from pipeline.foreign.material import MaterialSamples, Slot, SourceMaterial, source_columns
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.textured_mesh import TexturedMesh
+from storage.errors import Rejected
+
+_LEAST_FOUND = 0.999
+"""Fraction of the cleaned faces that must match one of the file: all but those that rounding split.
+"""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SourceSurface:
+    """The clean, outward oriented mesh of a source, with its materials."""
+
+    mesh: TriangleMesh
+    """Clean mesh in the unit box."""
+    parts: TexturedMesh
+    """Faces of the file, with texture coordinates and materials."""
+    source_face: NDArray[np.int64]
+    """[F] face of the file for each clean face."""
+    source_corner: NDArray[np.int64]
+    """[F, 3] corner of that face for each corner."""
+
+    def columns(
+        self, faces: NDArray[np.int64], weights: NDArray[np.float64], cell: float
+    ) -> NDArray[np.float64]:
+        """Return diffuse rgb, specular rgb and roughness [N, 7] at points on faces.
+
+        Args:
+            faces: [N] clean faces.
+            weights: [N, 3] barycentric coordinates in them.
+            cell: width in the unit box over which pictures are averaged.
+        """
+        source_face = self.source_face[faces]
+        source_weights = np.zeros((len(faces), 3))  # weights of the corners in the file's order
+        np.put_along_axis(source_weights, self.source_corner[faces], weights, axis=1)
+        result = np.zeros((len(faces), 7))
+        material = self.parts.material[source_face]
+        for row in np.unique(material):
+            chosen = np.flatnonzero(material == row)
+            result[chosen] = self._material_columns(
+                self.parts.materials[row], source_face[chosen], source_weights[chosen], cell
+            )
+        return result
+
+    @property
+    def emits(self) -> bool:
+        """True where any material emits light."""
+        return any(material.emits for material in self.parts.materials)
+
+    def emission(
+        self, faces: NDArray[np.int64], weights: NDArray[np.float64], cell: float
+    ) -> NDArray[np.float64]:
+        """Return the radiance [N, 3] at points on faces; arguments as in `columns`."""
+        source_face = self.source_face[faces]
+        source_weights = np.zeros((len(faces), 3))
+        np.put_along_axis(source_weights, self.source_corner[faces], weights, axis=1)
+        result = np.zeros((len(faces), 3))
+        for row, material in enumerate(self.parts.materials):
+            chosen = np.flatnonzero(self.parts.material[source_face] == row)
+            if not material.emits or not len(chosen):
+                continue
+            result[chosen] = material.emission_rgb
+            if material.emission is not None:
+                result[chosen] *= self._sample_picture(
+                    material.emission, source_face[chosen], source_weights[chosen], cell
+                )[:, :3]
+        return result
+
+    def _material_columns(
+        self,
+        material: SourceMaterial,
+        source_face: NDArray[np.int64],
+        source_weights: NDArray[np.float64],
+        cell: float,
+    ) -> NDArray[np.float64]:
+        known: dict[tuple[object, ...], NDArray[np.float32]] = {}
+
+        def sample(slot: Slot | None) -> NDArray[np.float32] | None:
+            if slot is None:
+                return None
+            key = (
+                id(slot.picture),
+                slot.uv_set,
+                slot.uv_matrix.tobytes(),
+                slot.uv_offset.tobytes(),
+            )
+            if key not in known:  # one picture often holds several numbers
+                known[key] = self._sample_picture(slot, source_face, source_weights, cell)
+            return known[key]
+
+        base = sample(material.base)
+        if self.parts.color is not None:
+            tint = np.einsum("nc,ncd->nd", source_weights, self.parts.color[source_face])
+            base = np.ones((len(source_face), 4), np.float32) if base is None else base
+            base = np.concatenate([base[:, :3] * tint, base[:, 3:]], axis=1).astype(np.float32)
+        seen = MaterialSamples(
+            base=base,
+            metallic=sample(material.metallic_map),
+            roughness=sample(material.roughness_map),
+            specular_colour=sample(material.specular_colour),
+            specular_strength=sample(material.specular_strength_map),
+            glossiness=sample(material.glossiness),
+        )
+        return source_columns(material, seen, len(source_face))
+
+    def _sample_picture(
+        self,
+        slot: Slot,
+        source_face: NDArray[np.int64],
+        source_weights: NDArray[np.float64],
+        cell: float,
+    ) -> NDArray[np.float32]:
+        corners = self.parts.uv[source_face, slot.uv_set] @ slot.uv_matrix.T + slot.uv_offset
+        uv = np.einsum("nc,ncd->nd", source_weights, corners)
+        return slot.picture.sample(uv, _halvings(slot, corners, self._areas[source_face], cell))
+
+    @cached_property
+    def _areas(self) -> NDArray[np.float64]:
+        """Area [R] of each face of the file, in the unit box."""
+        vectors = normalize(self.parts.mesh).double_area_vectors
+        return 0.5 * np.linalg.norm(vectors, axis=1)
+
+
+def _halvings(
+    slot: Slot, corners: NDArray[np.float64], areas: NDArray[np.float64], cell: float
+) -> NDArray[np.int64]:
+    """Return the number of halvings [N] of a picture at which texels are as wide as a cell."""
+    height, width = slot.picture.values.shape[:2]
+    steps = corners[:, 1:] - corners[:, :1]
+    on_picture = 0.5 * np.abs(steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0])
+    texels = on_picture * width * height * cell**2 / np.maximum(areas, 1e-30)
+    halvings = np.floor(0.5 * np.log2(np.maximum(texels, 1.0))).astype(np.int64)
+    return np.minimum(halvings, slot.picture.max_halvings)
+
+
+def match_source_surface(mesh: TriangleMesh, parts: TexturedMesh) -> SourceSurface:
+    """Match the faces of a clean mesh to those of its file.
+
+    Args:
+        mesh: the cleaned and oriented mesh.
+        parts: the faces of the same file.
+
+    Raises:
+        Rejected: materials_unreadable where many faces do not match, no_texture_coordinates or
+            texture_coordinates_not_finite where a textured face has none.
+    """
+    raw = normalize(parts.mesh)
+    known = cell_keys(mesh.positions)
+    order = np.argsort(known)
+    keys = cell_keys(raw.positions)
+    position = np.minimum(np.searchsorted(known[order], keys), len(known) - 1)
+    vertex = np.where(known[order][position] == keys, order[position], -1)
+    corners = vertex[raw.faces]
+    source_face = np.full(len(mesh.faces), -1)
+    for candidate in (corners, corners[:, [0, 2, 1]]):  # matches of the same orientation come first
+        matched = _first_matches(mesh.faces, candidate)
+        source_face = np.where(source_face < 0, matched, source_face)
+    missing = source_face < 0
+    if missing.mean() > 1 - _LEAST_FOUND:
+        raise Rejected(
+            "materials_unreadable",
+            f"{missing.mean():.1%} of the faces are not found again beside their materials",
+        )
+    source_face = np.where(missing, _nearest_matched(mesh, missing, source_face), source_face)
+    source_corner = (corners[source_face][:, None, :] == mesh.faces[:, :, None]).argmax(axis=2)
+    source_corner[missing] = np.arange(3)
+    _require_coordinates(parts, source_face)
+    return SourceSurface(
+        mesh=mesh, parts=parts, source_face=source_face, source_corner=source_corner
+    )
+
+
+def _first_matches(faces: NDArray[np.int64], candidates: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the first candidate equal to each face up to rotation of its corners, or -1."""
+    rows = np.concatenate([_start_at_lowest(candidates), _start_at_lowest(faces)])
+    _, number = np.unique(rows, axis=0, return_inverse=True)
+    first = np.full(int(number.max()) + 1, len(candidates))
+    np.minimum.at(first, number.ravel()[: len(candidates)], np.arange(len(candidates)))
+    first_match = first[number.ravel()[len(candidates) :]]
+    return np.where(first_match < len(candidates), first_match, -1)
+
+
+def _start_at_lowest(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    corner_order = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    return np.take_along_axis(faces, corner_order, axis=1)
+
+
+def _nearest_matched(
+    mesh: TriangleMesh, missing: NDArray[np.bool_], source_face: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Fill in each missing face with the match of the face whose center is nearest."""
+    if not missing.any():
+        return source_face
+    centres = mesh.corners.mean(axis=1)
+    known = np.flatnonzero(~missing)
+    filled = source_face.copy()
+    for row in np.flatnonzero(missing):
+        squared = np.square(centres[known] - centres[row]).sum(axis=1)
+        filled[row] = source_face[known[squared.argmin()]]
+    return filled
+
+
+def _require_coordinates(parts: TexturedMesh, source_face: NDArray[np.int64]) -> None:
+    used = np.unique(source_face)
+    for row in np.unique(parts.material[used]):
+        mine = used[parts.material[used] == row]
+        for slot in parts.materials[row].slots:
+            uv = parts.uv[mine, slot.uv_set]
+            if np.isnan(uv).all(axis=(1, 2)).any():
+                raise Rejected(
+                    "no_texture_coordinates",
+                    f"{int(np.isnan(uv).all(axis=(1, 2)).sum())} textured faces have none",
+                )
+            if not (np.abs(uv) < 1e6).all():
+                raise Rejected(
+                    "texture_coordinates_not_finite",
+                    "a textured face has a coordinate that is not finite, or beyond a million",
+                )

@@ -1,0 +1,171 @@
+"""Joins triangles with materials and textures into the objects of a Scene.
+
+Each triangle has three separate corners. Corners of equal position and normal become one vertex,
+and equal materials one row. Textures of one color become constants.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
+from pipeline.scenes.shading import ShadedMesh
+from storage.records.material import EMISSION, distinct_rows, laid_out
+from storage.records.retextured import AnyScene, with_textures
+from storage.records.scene import ObjectKind, Scene, SceneObject
+from storage.records.texture import CONSTANT, TEXTURED, Texture
+
+TextureSet = tuple[Texture | None, Texture | None, Texture | None]
+"""Textures in the order of TEXTURED; None where the material column is the value."""
+
+NO_TEXTURES: TextureSet = (None, None, None)
+
+_SMALLEST_DOUBLE_AREA = 1e-12
+"""Twice the area of a triangle, in square meters, below which it counts as empty."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TexturedTriangles:
+    """Triangles, each with a material and texture coordinates."""
+
+    positions: NDArray[np.float32]
+    """[T, 3, 3] corners in world space, in meters."""
+    normals: NDArray[np.float32]
+    """[T, 3, 3] unit normals at the corners."""
+    rows: NDArray[np.float32]
+    """[T, 10 or more] material columns; values of textured columns are ignored."""
+    uv: NDArray[np.float32]
+    """[T, 3, 2] texture coordinates of the corners; unused where nothing is textured."""
+    texture_set_index: NDArray[np.int64]
+    """[T] index of each triangle into `texture_sets`."""
+    texture_sets: Sequence[TextureSet]
+    """Distinct texture sets of the triangles."""
+
+    def select(self, mask: NDArray[np.bool_]) -> "TexturedTriangles":
+        """Return the triangles that a mask [T] selects."""
+        return TexturedTriangles(
+            positions=self.positions[mask],
+            normals=self.normals[mask],
+            rows=self.rows[mask],
+            uv=self.uv[mask],
+            texture_set_index=self.texture_set_index[mask],
+            texture_sets=self.texture_sets,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TexturedPiece:
+    """An object of a scene with its textures."""
+
+    piece: ScenePiece
+    """Geometry and material rows of the object."""
+    uv: NDArray[np.float32]
+    """[T, 3, 2] texture coordinates of the corners."""
+    texture_sets: tuple[TextureSet, ...]
+    """Texture set of each material row of `piece`."""
+
+
+def have_areas(corners: NDArray[np.floating], cross: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return a mask [T] of the triangles [T, 3, 3] with an area.
+
+    `cross` [T, 3] are the cross products of their edges. In a mesh smaller than a meter the limit
+    shrinks with its size: triangles of a watch are small.
+    """
+    size = min(float(np.ptp(corners.reshape(-1, 3), axis=0).max()), 1.0) if corners.size else 1.0
+    return np.asarray(np.linalg.norm(cross, axis=1) > _SMALLEST_DOUBLE_AREA * size**2)
+
+
+def split_by_kind(triangles: TexturedTriangles) -> list[tuple[ObjectKind, TexturedTriangles]]:
+    """Split triangles into those that reflect and those that emit; empty kinds are left out."""
+    emits = (triangles.rows[:, EMISSION] > 0).any(axis=1)
+    kinds: list[tuple[ObjectKind, NDArray[np.bool_]]] = [
+        ("object", np.logical_not(emits)),
+        ("emitter", np.asarray(emits)),
+    ]
+    return [(kind, triangles.select(mask)) for kind, mask in kinds if mask.any()]
+
+
+def build_piece(entry: SceneObject, triangles: TexturedTriangles) -> TexturedPiece:
+    """Build an object of a scene from its triangles."""
+    corners = np.concatenate([triangles.positions, triangles.normals], axis=2).reshape(-1, 6)
+    first, index = distinct_rows(corners)
+    vertices = corners[first]
+    faces = index.reshape(-1, 3).astype(np.uint32)
+    rows = _with_means(triangles)
+    appearance = np.column_stack([rows, triangles.texture_set_index.astype(np.float32)])
+    palette, material_index = distinct_rows(appearance)
+    mesh = ShadedMesh(
+        positions=vertices[:, :3].copy(),
+        normals=vertices[:, 3:].copy(),
+        faces=faces,
+        groups=np.zeros(len(faces), np.int64),
+    )
+    return TexturedPiece(
+        piece=ScenePiece(
+            entry=entry, mesh=mesh, materials=rows[palette], material_index=material_index
+        ),
+        uv=triangles.uv,
+        texture_sets=tuple(
+            _drop_constant_textures(triangles.texture_sets[row])
+            for row in triangles.texture_set_index[palette]
+        ),
+    )
+
+
+def join_arrays(pieces: Sequence[TexturedPiece]) -> dict[str, Any]:
+    """Return the geometry and material arrays of a Scene, without textures."""
+    return concatenate_pieces([each.piece for each in pieces])
+
+
+def with_texture_sets(scene: AnyScene, pieces: Sequence[TexturedPiece]) -> AnyScene:
+    """Return the scene of these pieces, in their order, with their textures."""
+    textures: dict[str, Texture] = {}
+    index: list[list[int]] = []
+    order: dict[str, int] = {}
+    for texture_set in (row for each in pieces for row in each.texture_sets):
+        for texture in texture_set:
+            if texture is not None and texture.sha256 not in textures:
+                order[texture.sha256] = len(textures)
+                textures[texture.sha256] = texture
+        index.append(
+            [CONSTANT if texture is None else order[texture.sha256] for texture in texture_set]
+        )
+    if not textures:
+        return scene
+    uv = np.concatenate([each.uv.reshape(-1, 2) for each in pieces]).astype(np.float32)
+    rows = np.array(index, np.int32).reshape(-1, len(TEXTURED))
+    return with_textures(scene, uv, tuple(textures.values()), rows)
+
+
+def _with_means(triangles: TexturedTriangles) -> NDArray[np.float32]:
+    """Return the rows with the means of textures, so that equal materials have equal rows."""
+    rows = triangles.rows.copy()
+    column_slices = {column.name: part for column, part in laid_out()}
+    for number, texture_set in enumerate(triangles.texture_sets):
+        chosen = np.flatnonzero(triangles.texture_set_index == number)
+        for name, texture in zip(TEXTURED, texture_set, strict=True):
+            if texture is not None and len(chosen):
+                same = texture.constant
+                rows[chosen, column_slices[name]] = texture.mean if same is None else same
+    return rows
+
+
+def _drop_constant_textures(textures: TextureSet) -> TextureSet:
+    """Replace textures of one color by None; the material columns hold their values."""
+    one, two, three = (
+        None if texture is None or texture.constant is not None else texture for texture in textures
+    )
+    return one, two, three
+
+
+def build_textured_scene(
+    arrays: dict[str, Any], pieces: Sequence[TexturedPiece], **more: Any
+) -> Scene:
+    """Build and check the scene of joined arrays, textures and further members."""
+    scene = Scene(**arrays, objects=tuple(each.piece.entry for each in pieces), **more)
+    scene = with_texture_sets(scene, pieces)
+    scene.check()
+    return scene
