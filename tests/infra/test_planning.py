@@ -127,9 +127,9 @@ def test_what_a_run_will_make_is_said_before_it_begins(
 FACTS = {"denoiser": "2.5.1", "denoiser_device": "CPU", "threads": "2", "view_s": "0.04"}
 
 
-def _responds(name: str, code: str, *, found: str, **_: str) -> doctor.Finding:
+def _responds(name: str, code: str, *, summary: str, **_: str) -> doctor.Finding:
     compile(code, name, "exec")
-    return doctor.Finding(name=name, state="ok", found=found)
+    return doctor.Finding(name=name, state="ok", found=summary)
 
 
 @pytest.fixture(scope="module")
