@@ -9,7 +9,7 @@ from storage.errors import TrilightError
 _CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
 
 _MOST_CHILDREN = 4
-"""Children of a GPU. One that only renders fills an H200 (96,700 views an hour, four 98,200), but a
+"""Children of a GPU. One that only renders fills an H200 (60,700 views an hour, four 58,500), but a
 child also composes, checks and encodes on the CPU meanwhile."""
 
 _CHILD_BYTES = 1 << 30
