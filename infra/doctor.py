@@ -1,6 +1,5 @@
 """Checks of this machine: what is missing, its consequence, and the command that fixes it."""
 
-import contextlib
 import importlib.util
 import os
 import platform
@@ -18,8 +17,9 @@ from typing import Literal
 from pipeline.isolation.confinement import VARIABLE, confinement_mode, missing_features
 from pipeline.isolation.landlock import landlock_version
 from pipeline.isolation.seccomp import seccomp_works
-from pipeline.renders.facts import render_facts
+from pipeline.renders.facts import VIEW_PX, VIEW_SPP, render_facts
 from pipeline.renders.variant import choose_variant
+from pipeline.renders.visible_gpus import query_gpus
 from storage.cache import cache_folder
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.installation import IMPORT_ROOT, child_environment, module_name
@@ -137,7 +137,7 @@ def _renderer() -> Finding:
     if finding.state == "missing":
         return finding
     try:
-        variant = choose_variant()
+        variant = choose_variant("auto")
     except EnvironmentFailure:
         raise
     except TrilightError as error:
@@ -153,7 +153,7 @@ def _renderer() -> Finding:
 
 
 def _denoiser() -> Finding:
-    variant = choose_variant()
+    variant = choose_variant("auto")
     facts = render_facts(variant)
     if "denoiser" not in facts:
         return Finding(
@@ -163,7 +163,10 @@ def _denoiser() -> Finding:
             consequence="pictures cannot be denoised",
             mend="make setup",
         )
-    text = f"OIDN {facts['denoiser']}, {facts['denoiser_device']}, {facts['threads']} threads"
+    text = (
+        f"OIDN {facts['denoiser']}, {facts['denoiser_device']}, {facts['threads']} threads; a view "
+        f"of {VIEW_PX} pixels and {VIEW_SPP} samples takes {facts['view_s']} s"
+    )
     if variant.note:
         return Finding(
             name="denoiser",
@@ -253,24 +256,27 @@ def _learning() -> Finding:
 
 
 def _accelerator() -> Finding:
-    smi = shutil.which("nvidia-smi")
-    names = ""
-    if smi is not None:
-        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
-            command = [smi, "--query-gpu=name", "--format=csv,noheader"]
-            result = subprocess.run(
-                command, capture_output=True, text=True, timeout=_PROBE_S, check=False
-            )
-            names = ", ".join(result.stdout.split("\n")).strip(", ")
-    if names:
-        return Finding(name="GPU", state="ok", found=names)
-    return Finding(
-        name="GPU",
-        state="slower",
-        found="none",
-        consequence="rendering and training use the processor",
-        mend="run on a machine with an NVIDIA GPU",
-    )
+    rows = query_gpus("name,driver_version")
+    if not rows:
+        return Finding(
+            name="GPU",
+            state="slower",
+            found="none",
+            consequence="rendering and training use the processor",
+            mend="run on a machine with an NVIDIA GPU",
+        )
+    text = "; ".join(row.replace(", ", ", driver ") for row in rows)
+    try:
+        choose_variant(device="gpu")
+    except TrilightError as error:
+        return Finding(
+            name="GPU",
+            state="slower",
+            found=f"{text}; {error}",
+            consequence="rendering uses the processor",
+            mend="a driver with OptiX; in a container NVIDIA_DRIVER_CAPABILITIES=all",
+        )
+    return Finding(name="GPU", state="ok", found=f"{text}; renders with the driver's OptiX")
 
 
 def _cache() -> Finding:

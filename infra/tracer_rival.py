@@ -9,7 +9,7 @@ import copy
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -206,7 +206,8 @@ def _middle(seconds: Sequence[float]) -> float:
 
 def tracing_child(variant: Variant) -> IsolatedChild:
     """Return a child that traces on one thread; the caller closes it."""
-    return IsolatedChild(limits=_LIMITS, factory=set_up_child, args=(variant,))
+    limits = replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
+    return IsolatedChild(limits=limits, factory=set_up_child, args=(variant,))
 
 
 def set_up_child(variant: Variant) -> None:

@@ -135,7 +135,7 @@ def render_views(
             split_lobes=split_lobes,
         ),
         seed=seed,
-        variant=choose_variant(),
+        variant=choose_variant("auto"),
         threads=threads or os.cpu_count() or 1,
         on_samples=lambda now: None,
     )

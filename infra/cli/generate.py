@@ -10,7 +10,6 @@ from infra.cli.generate_report import report
 from infra.cli.options import OutputOptions, command
 from pipeline.executors.registry import find_executor
 from pipeline.generation.dataset_order import DatasetOrder
-from pipeline.renders.variant import choose_variant
 from storage.dataset.layout import dataset_folder
 from storage.settings.described import checked
 
@@ -41,10 +40,11 @@ def make(order: DatasetOrder, runner: ExecutorOptions, output: OutputOptions) ->
     first_words(f"Making {folder.display_name} with the build {order.build}", silent=output.json)
     executor = find_executor(runner.runner, runner.address, order.workers)
     from infra.planning import describe_run  # slow: every stage
+    from pipeline.generation.run import choose_dataset_variant
 
     if not output.json and (text := describe_run(order, folder)):
         first_words(text)
-    if (text := choose_variant().note) and not output.json:
+    if (text := choose_dataset_variant(order, folder).note) and not output.json:
         note(f"{text}; see trilight doctor")
     with show_progress(folder, silent=output.json):
         outcome = executor.make(order, runner.address)

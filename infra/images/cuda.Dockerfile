@@ -1,10 +1,11 @@
-# Trilight with torch for graphics cards: trains, and renders where TRILIGHT_VARIANT=cuda_ad_rgb.
+# Trilight for NVIDIA GPUs: renders and trains (docs/how-to/gpu.md).
 #   docker build --file infra/images/cuda.Dockerfile --tag trilight:cuda .
 # What the GPU here does, as one file to send back (docs/how-to/measure.md):
 #   docker run --name gpu --gpus all --ipc=host trilight:cuda \
 #       trilight bench gpu --out /data/gpu.jsonl
 #   docker cp gpu:/data/gpu.jsonl .
-# The driver comes from the host (nvidia-container-toolkit); torch brings CUDA's libraries itself.
+# The driver comes from the host (nvidia-container-toolkit), and OptiX with it; torch brings CUDA's
+# libraries itself.
 FROM python:3.11.13-slim-bookworm@sha256:86adf8dbadc3d6e82ee5dd2c74bec2e1c2467cdad47886280501df722372d2e1 AS build
 WORKDIR /opt/trilight
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]

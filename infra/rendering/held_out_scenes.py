@@ -16,7 +16,7 @@ from pipeline.generation.environment import environment
 from pipeline.generation.object_options import ObjectOptions
 from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
 from pipeline.isolation import ChildLimits, IsolatedChild
-from pipeline.renders.variant import choose_variant
+from pipeline.renders.variant import Variant, choose_variant
 from scene_templates.settings import SceneSettings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.splits import JUDGED_SPLIT
@@ -35,7 +35,11 @@ _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=4 * 3600, calls_per_child=10
 
 
 def composing_child(
-    build: BuildSettings, objects: str, folder: Path, threads: int | None = None
+    build: BuildSettings,
+    objects: str,
+    folder: Path,
+    threads: int | None = None,
+    variant: Variant | None = None,
 ) -> IsolatedChild:
     """Return a child that composes and renders the scenes of a preset; the caller closes it.
 
@@ -44,8 +48,9 @@ def composing_child(
         objects: source of the objects.
         folder: empty folder for the record of the objects.
         threads: CPU threads of Mitsuba and the denoiser; None for all cores.
+        variant: Mitsuba variant; None for that of the CPU, or of TRILIGHT_VARIANT.
     """
-    variant = choose_variant()
+    variant = variant or choose_variant()
     workers = threads or os.cpu_count() or 1
     publication = begin(
         DatasetFolder(folder), build, environment(variant), 1, accept_environment=False
@@ -55,7 +60,8 @@ def composing_child(
     )
     accepted = accept_objects(objects_order)
     recipe = SceneRecipe(settings=build, variant=variant, threads=workers, pool=accepted.pool)
-    return IsolatedChild(limits=_LIMITS, factory=SceneWorker, args=(recipe,))
+    limits = dataclasses.replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
+    return IsolatedChild(limits=limits, factory=SceneWorker, args=(recipe,))
 
 
 def held_out_build() -> BuildSettings:

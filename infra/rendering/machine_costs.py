@@ -44,8 +44,9 @@ PartSeconds = dict[tuple[int, int], Mapping[str, float]]
 def measure_costs(table: WayTable) -> PictureCosts:
     """Return the costs of the parts here; takes less than a minute on an idle machine."""
     cores = os.cpu_count() or 1
+    variant = choose_variant("auto")
     with tempfile.TemporaryDirectory() as name:
-        child = composing_child(held_out_build(), BENCHMARK, Path(name))
+        child = composing_child(held_out_build(), BENCHMARK, Path(name), variant=variant)
         with contextlib.closing(child):
             scenes = [held_out_scene(child, index) for index in PROBES]
             timed = [_time_scene(child, scene, cores) for scene in scenes]
@@ -53,7 +54,7 @@ def measure_costs(table: WayTable) -> PictureCosts:
         key: {part: float(np.mean([one[key][part] for one in timed])) for part in timed[0][key]}
         for key in timed[0]
     }
-    return costs_of(table, mean, cores, machine_name(choose_variant()))
+    return costs_of(table, mean, cores, machine_name(variant))
 
 
 def costs_of(table: WayTable, timed: PartSeconds, cores: int, machine: str) -> PictureCosts:

@@ -188,7 +188,7 @@ def _mitsuba(options: RenderOptions, settings: RenderSettings | PreviewSettings)
         settings=settings,
         seed=options.seed,
         threads=options.threads or os.cpu_count() or 1,
-        variant=choose_variant(),
+        variant=choose_variant("auto"),
     )
 
 
@@ -209,7 +209,7 @@ def _choice(
     if options.seconds is None and options.error_db is None:
         return None
     table = shipped_table()
-    known = known_costs(choose_variant())
+    known = known_costs(choose_variant("auto"))
     cores = os.cpu_count() or 1
     candidates = priced_ways(
         table,

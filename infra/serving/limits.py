@@ -7,7 +7,7 @@ not exist limits nothing, so infra.serving.deployments creates them first.
 from collections.abc import Mapping
 
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
-from pipeline.generation.machine import visible_gpus
+from pipeline.renders.visible_gpus import visible_gpus
 from storage.errors import TrilightError
 
 _DISK_SLOTS = 2

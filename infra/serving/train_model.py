@@ -16,7 +16,7 @@ from infra.train_options import TrainOptions
 from pipeline.flows.forms import PublicUrl, changed_values, changes_form, parameters_of
 from pipeline.flows.limits import GPU_LIMIT
 from pipeline.flows.process import run_to_end
-from pipeline.generation.machine import visible_gpus
+from pipeline.renders.visible_gpus import visible_gpus
 from storage.errors import TrilightError
 from train.runs import RUNS, smoke
 from train.settings import TrainSettings

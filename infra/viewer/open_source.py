@@ -41,4 +41,4 @@ def open_handlers(source: str, *, checkpoint: str | None, threads: int | None) -
 
 
 def _tracer(threads: int | None) -> ProgressiveTracer:
-    return ProgressiveTracer(variant=choose_variant(), threads=threads or os.cpu_count() or 1)
+    return ProgressiveTracer(variant=choose_variant("auto"), threads=threads or os.cpu_count() or 1)

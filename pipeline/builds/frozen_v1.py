@@ -78,6 +78,7 @@ BUILD_V1 = BuildSettings(
         per_light=False,
         split=False,
         split_lobes=False,
+        arithmetic="numpy",
     ),
     splits=SplitSettings(
         scenes_per_shard=256,

@@ -61,16 +61,18 @@ def benchmark_v1() -> BuildSettings:
 
 
 JUDGING_BUILDS = {
-    "out-of-range": NamedBuild(settings=out_of_range, num_scenes=148),
-    "out-of-range-2": NamedBuild(settings=out_of_range_2, num_scenes=196),
+    "out-of-range": NamedBuild(settings=out_of_range, num_scenes=148, device="cpu"),
+    "out-of-range-2": NamedBuild(settings=out_of_range_2, num_scenes=196, device="cpu"),
     "benchmark-v1": NamedBuild(
         settings=benchmark_v1,
         num_scenes=200,
+        device="cpu",
         scene_digest="5c77fcc0c9a5cb2859a0433befce8ae15d7cd4ad6fd26b8775494fde4fd8c14f",
     ),
     "benchmark-v1-mini": NamedBuild(
         settings=benchmark_v1,
         num_scenes=20,
+        device="cpu",
         scene_digest="c2d2baa3de32b89bc0b1eca3588ffe9d841ec5881879cf97bc69340abb3ebc49",
     ),
 }

@@ -86,12 +86,16 @@ def _suffix(policy: Policy) -> str:
 
 
 RENDERFORMER_BUILDS = {
-    "renderformer-v1-256": NamedBuild(settings=renderformer_v1_256, num_scenes=65_536),
-    "renderformer-v1-512": NamedBuild(settings=renderformer_v1_512, num_scenes=16_384),
+    "renderformer-v1-256": NamedBuild(
+        settings=renderformer_v1_256, num_scenes=65_536, device="cpu"
+    ),
+    "renderformer-v1-512": NamedBuild(
+        settings=renderformer_v1_512, num_scenes=16_384, device="cpu"
+    ),
     "renderformer-v1-256-original": NamedBuild(
-        settings=functools.partial(renderformer_v1_256, "original"), num_scenes=65_536
+        settings=functools.partial(renderformer_v1_256, "original"), num_scenes=65_536, device="cpu"
     ),
     "renderformer-v1-512-original": NamedBuild(
-        settings=functools.partial(renderformer_v1_512, "original"), num_scenes=16_384
+        settings=functools.partial(renderformer_v1_512, "original"), num_scenes=16_384, device="cpu"
     ),
 }

@@ -10,6 +10,7 @@ import pydantic
 from pipeline.assets.settings import AssetSettings
 from pipeline.builds.revisit import RevisitSettings
 from pipeline.renders.settings import RenderSettings
+from pipeline.renders.variant import Device
 from scene_templates.settings import SceneSettings
 from storage.dataset.settings import SplitSettings, StorageSettings
 from storage.digests import canonical_json, sha256_hex
@@ -92,6 +93,8 @@ class NamedBuild:
     scene_digest: str | None = None
     """Expected digest of the scenes of a frozen set (storage.dataset.statistics), checked when the
     dataset has `num_scenes` scenes."""
+    device: Device = "auto"
+    """Device that renders a new dataset by default: `cpu` where a digest of pictures is known."""
 
 
 def differences(

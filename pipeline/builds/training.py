@@ -41,7 +41,9 @@ def smoke() -> BuildSettings:
         allowed_licences=DEFAULT_ALLOWED,
         assets=AssetSettings(budgets=(1400, 1000, 700, 500, 340, 240)),
         scenes=SceneSettings(families=DEFAULT_FAMILIES, max_triangles=1536, num_views=4),
-        renders=RenderSettings(resolution=256, noise_floor_db=38.0, min_spp=64, max_spp=256),
+        renders=RenderSettings(
+            resolution=256, noise_floor_db=38.0, min_spp=64, max_spp=256, arithmetic="device"
+        ),
         splits=SplitSettings(scenes_per_shard=4),
     )
 
@@ -88,7 +90,7 @@ def sky_256() -> BuildSettings:
 
 
 TRAINING_BUILDS = {
-    "smoke": NamedBuild(settings=smoke, num_scenes=24),
+    "smoke": NamedBuild(settings=smoke, num_scenes=24, device="cpu"),
     "pretrain-256": NamedBuild(settings=pretrain_256, num_scenes=65_536),
     "finetune-512": NamedBuild(settings=finetune_512, num_scenes=16_384),
     "textured-256": NamedBuild(settings=textured_256, num_scenes=16_384),

@@ -20,7 +20,6 @@ from pipeline.generation.pipeline import make_task
 from pipeline.generation.run import ShardJob, TaskResult
 from pipeline.generation.runner import in_window
 from pipeline.generation.tasks import Piece
-from pipeline.renders.variant import choose_variant
 from storage.dataset.statistics import Statistics
 from storage.errors import EnvironmentFailure
 
@@ -54,7 +53,7 @@ def make_scenes(first: str, work: "OpaqueWork") -> TaskResult:
 
     If pictures are rendered on a GPU, GPU_LIMIT limits the tasks that run at the same time.
     """
-    with _gpu_slot():
+    with _gpu_slot(work.job):
         return make_task(work.job, work.pieces)
 
 
@@ -116,8 +115,8 @@ class OpaqueCall:
         self.call = call
 
 
-def _gpu_slot() -> contextlib.AbstractContextManager[None]:
-    if choose_variant().name != "cuda_ad_rgb":
+def _gpu_slot(job: ShardJob) -> contextlib.AbstractContextManager[None]:
+    if job.device == "cpu":
         return contextlib.nullcontext()
     return concurrency(GPU_LIMIT, occupy=1, strict=False)
 

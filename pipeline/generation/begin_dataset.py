@@ -5,6 +5,7 @@ from typing import Any
 
 from pipeline.builds.settings import BuildSettings, differences
 from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.renders.variant import device_of
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, read_head, write_manifest
@@ -69,6 +70,14 @@ def _require_same_dataset(
     stored = from_record(BuildSettings, manifest.settings).as_json()  # fields may come later
     _require_same(folder, "setting", stored, settings.as_json(), "choose another --out")
     if not accept_environment:
+        before = device_of(manifest.environment)
+        now = device_of(environment)
+        if before != now:
+            raise TrilightError(
+                f"{folder.display_name}: this dataset was begun on a {before.upper()} and would "
+                f"go on with a {now.upper()}; choose --device {before} or another --out, or accept "
+                "pictures that agree only within their noise floors with --accept-environment."
+            )
         _require_same(
             folder,
             "environment",

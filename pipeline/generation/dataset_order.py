@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from pipeline.builds.named import BUILDS
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.renders.settings import NoiseFloor, Resolution
+from pipeline.renders.variant import Device
 from storage.dataset.layout import dataset_folder
 from storage.dataset.settings import MOST_SCENES
 from storage.errors import TrilightError
@@ -66,12 +67,16 @@ class DatasetOrder:
     """Licence of textures and maps of folders without a catalogue; by default such files count as
     your own work."""
     workers: Annotated[int | None, Within(1, 1024, unit="processes")] = None
-    """Number of render processes, which share the cores; by default one, or one for each graphics
-    card."""
+    """Number of render processes, which share the cores; by default one, or four for each GPU, or
+    as many as its memory holds."""
+    device: Device | None = None
+    """Device that renders: cpu, gpu, or auto, a GPU where one gives the right picture of a small
+    scene. It is chosen when a dataset begins and stands in its manifest; by default cpu for smoke
+    and the frozen builds, auto for others."""
     failure_budget: Share = 0.1
     """Share of scenes that may fail for good before the run stops."""
     accept_environment: bool = False
-    """Continue a dataset that was started with other library versions."""
+    """Continue a dataset that was started with other library versions or on another device."""
     scenes_from: str | None = None
     """Folder of scene files (RenderFormer JSON) to render; by default scenes are composed of
     objects. Scene k is the k-th *.json, all scenes belong to the split test, and the build's limits

@@ -62,7 +62,7 @@ def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene
             from pipeline.documents.png import encode_png
 
             scene = call_with_retries(child, load_source, source).scene
-            sheet = call_with_retries(renderer, _turntable, scene, choose_variant())
+            sheet = call_with_retries(renderer, _turntable, scene, choose_variant(device="cpu"))
             write_atomically(turntable, encode_png(sheet))
     except ChildFailed as failure:
         raise TrilightError(f"{source.name}: cannot be inspected ({failure}).") from failure

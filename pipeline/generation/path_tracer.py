@@ -4,6 +4,7 @@ This process requests one pass of samples after another, so that it can report p
 """
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,8 @@ class PathTracer:
         }
         """Everything beside scene and camera that decides a picture, as JSON values."""
         self._is_open = False
-        self._child = IsolatedChild(limits=_LIMITS, factory=_ChildRenderer, args=(variant, threads))
+        limits = replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
+        self._child = IsolatedChild(limits=limits, factory=_ChildRenderer, args=(variant, threads))
 
     def wake(self, name: str) -> None:
         """Start the child and load the renderer, if needed; raises TrilightError as `open`."""

@@ -62,6 +62,7 @@ from pipeline.generation.run import (
     TaskResult,
     Watcher,
     begin_or_resume_dataset,
+    choose_dataset_variant,
     resolve_settings,
 )
 from pipeline.generation.runner import Runner
@@ -118,7 +119,8 @@ def _begin_run(order: DatasetOrder) -> Iterator[Run]:
     )  # refuses an order before anything is written
     with hold_membership(folder):
         user_folders = map_folders(order, settings)
-        writer = begin_or_resume_dataset(order, settings, folder)
+        variant = choose_dataset_variant(order, folder)
+        writer = begin_or_resume_dataset(order, settings, folder, variant)
         if listed or order.revisits:
             with folder.mutex("objects"):
                 writer.refresh()
@@ -136,6 +138,7 @@ def _begin_run(order: DatasetOrder) -> Iterator[Run]:
             scene_folder=listed,
             publication=writer,
             accepted=accepted,
+            device=variant.device,
         )
 
 

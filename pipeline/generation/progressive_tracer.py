@@ -6,6 +6,7 @@ changes scene, camera, width and depth between two pictures.
 
 import threading
 from collections.abc import Callable, Hashable, Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,8 @@ class ProgressiveTracer:
 
     def __init__(self, *, variant: Variant, threads: int) -> None:
         """Configure the child: Mitsuba's variant, and the number of CPU threads."""
-        self._child = IsolatedChild(limits=_LIMITS, factory=_ChildRenderer, args=(variant, threads))
+        limits = replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
+        self._child = IsolatedChild(limits=limits, factory=_ChildRenderer, args=(variant, threads))
         self._one_at_a_time = threading.Lock()
 
     def render(

@@ -7,6 +7,7 @@ reads these, confined to their folder (pipeline.isolation.confinement).
 import contextlib
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 from pipeline.assets.settings import AssetSettings
@@ -14,12 +15,13 @@ from pipeline.builds.settings import differences
 from pipeline.exchange.scene_files import SceneFiles
 from pipeline.generation.child_pool import ChildPool
 from pipeline.generation.environment import environment
-from pipeline.generation.machine import available_cores, visible_gpus
+from pipeline.generation.machine import available_cores
 from pipeline.generation.prepare_isolated import asset_child
 from pipeline.generation.run import ShardJob
 from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
 from pipeline.isolation import ChildLimits, IsolatedChild, call_with_retries, reach
 from pipeline.renders.variant import choose_variant
+from pipeline.renders.visible_gpus import visible_gpus
 from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions
 from storage.records.scene import Scene
@@ -28,8 +30,6 @@ _RENDER_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child
 """A scene at 4096 samples and 512 pixels takes minutes, and a render child holds below 1 GiB: the
 limits on memory and wall time end only a child that leaks or hangs. After 200 calls a fresh child
 starts, so that leaks stay bounded."""
-_GPU_LIMITS = ChildLimits(memory_bytes=1 << 46, wall_s=3600, calls_per_child=200)
-"""CUDA reserves addresses for all memory of GPU and machine."""
 
 _pools: dict[tuple[str, ...], ChildPool] = {}
 _pools_lock = threading.Lock()
@@ -98,7 +98,7 @@ def scene_of_file(
 def _borrow_child(
     kind: tuple[str, ...], job: ShardJob, make: Callable[[ShardJob], ChildPool]
 ) -> Iterator[IsolatedChild]:
-    of_job = (str(job.folder.root), job.settings.digest, job.lock_sha256)
+    of_job = (str(job.folder.root), job.settings.digest, job.lock_sha256, job.device)
     key = (*of_job, *kind)
     with _pools_lock:
         if key not in _pools:
@@ -123,11 +123,11 @@ def _reading_pool(job: ShardJob) -> ChildPool:
 
 def _render_pool(job: ShardJob) -> ChildPool:
     require_same_extensions("this worker: the dataset", job.extensions, extension_digests("data"))
-    variant = choose_variant()
+    variant = choose_variant(device=job.device)
     if job.environment:
         require_environment(job.environment, environment(variant))
-    on_gpu = variant.name == "cuda_ad_rgb"
-    gpus = visible_gpus() if on_gpu else ()
+    gpus = visible_gpus() if variant.device == "gpu" else ()
+    memory_bytes = variant.address_space(_RENDER_LIMITS.memory_bytes)
 
     def new_child(number: int) -> IsolatedChild:
         recipe = SceneRecipe(
@@ -140,7 +140,7 @@ def _render_pool(job: ShardJob) -> ChildPool:
             revisited=job.accepted.revisited,
             folder=job.folder,
         )
-        limits = _GPU_LIMITS if on_gpu else _RENDER_LIMITS
+        limits = replace(_RENDER_LIMITS, memory_bytes=memory_bytes)
         return IsolatedChild(limits=limits, factory=SceneWorker, args=(recipe,))
 
     return ChildPool(new_child, job.num_at_once)

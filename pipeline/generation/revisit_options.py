@@ -11,6 +11,7 @@ from pipeline.builds.revisit import MOST_CAMERAS, GivenCamera, RevisitSettings
 from pipeline.exchange.open_scene import load_cameras, scene_source
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.renders.settings import NoiseFloor, Resolution
+from pipeline.renders.variant import Device
 from pipeline.shards.finished_dataset import open_finished
 from scene_templates.templates import TEMPLATES
 from storage.errors import TrilightError
@@ -61,12 +62,14 @@ class RevisitOptions:
     """Build that fills in settings which the dataset does not state, since it was merged; by
     default the dataset's own."""
     workers: Annotated[int | None, Within(1, 1024, unit="processes")] = None
-    """Number of render processes, which share the cores; by default one, or one for each graphics
-    card."""
+    """Number of render processes, which share the cores; by default one, or four for each GPU, or
+    as many as its memory holds."""
+    device: Device | None = None
+    """Device that renders: cpu, gpu or auto; by default as `trilight generate` with its build."""
     failure_budget: Share = 0.1
     """Share of scenes that may fail for good before the run stops."""
     accept_environment: bool = False
-    """Continue a dataset that was started with other library versions."""
+    """Continue a dataset that was started with other library versions or on another device."""
     shards: str | None = None
     """Range A:B of the shards to make, from A up to but not including B; by default all."""
     changes: Mapping[str, Any] = field(default_factory=dict)
@@ -97,6 +100,7 @@ def revisit_order(options: RevisitOptions) -> DatasetOrder:
         noise_floor_linear_db=options.noise_floor_linear_db,
         noise_floor_objects_db=options.noise_floor_objects_db,
         workers=options.workers,
+        device=options.device,
         failure_budget=options.failure_budget,
         accept_environment=options.accept_environment,
         shards=options.shards,

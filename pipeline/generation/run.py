@@ -14,11 +14,12 @@ from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.environment import environment
 from pipeline.generation.freeze_objects import AcceptedObjects
-from pipeline.generation.machine import visible_gpus
+from pipeline.generation.machine import children_of_gpu
 from pipeline.objects.sources import check_source
-from pipeline.renders.variant import choose_variant
+from pipeline.renders.variant import Device, Variant, choose_variant, device_of
+from pipeline.renders.visible_gpus import gpu_memory_bytes, visible_gpus
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, ShardEntry
+from storage.dataset.manifest import Manifest, ShardEntry, read_head
 from storage.dataset.splits import lacks_validation
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
@@ -39,6 +40,8 @@ class Run:
     """Writes the manifest and publishes finished shards."""
     accepted: AcceptedObjects
     """The frozen objects, textures, skies or scene files that scenes are made of."""
+    device: Device = "cpu"
+    """Device that renders, `cpu` or `gpu`."""
 
     def missing_shards(self) -> list[int]:
         """Return the numbers of the requested shards that are not finished."""
@@ -48,7 +51,10 @@ class Run:
         """Return the number of parallel tasks of one process; an executor may set another."""
         if self.order.workers is not None:
             return self.order.workers
-        return max(1, len(visible_gpus())) if choose_variant().name == "cuda_ad_rgb" else 1
+        if self.device == "cpu":
+            return 1
+        num_gpus = max(1, len(visible_gpus()))
+        return num_gpus * children_of_gpu(self.settings.renders.resolution, gpu_memory_bytes())
 
     def job(self, num_at_once: int) -> "ShardJob":
         """Return the job that all tasks of this run share; one process runs `num_at_once` tasks."""
@@ -61,6 +67,7 @@ class Run:
             lock_sha256=manifest.objects_lock_sha256,
             num_at_once=num_at_once,
             extensions=manifest.extensions,
+            device=self.device,
         )
 
     def outcome(self, finished: Manifest | None, statistics: Statistics | None) -> "Outcome":
@@ -126,6 +133,8 @@ class ShardJob:
     """Tasks at a time in one process; they share its cores."""
     extensions: Mapping[str, str]
     """Extensions of the dataset's first run, required of every worker (storage.extensions)."""
+    device: Device = "cpu"
+    """Device that renders on every worker, `cpu` or `gpu`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,8 +209,22 @@ def resolve_settings(
     return settings_for_files(settings, listed, order.views), listed
 
 
+def choose_dataset_variant(order: DatasetOrder, folder: DatasetFolder) -> Variant:
+    """Return the variant that renders a dataset.
+
+    It is that of the device which the dataset was begun on, unless the options or TRILIGHT_VARIANT
+    name another one. A new dataset takes its build's device. Raises as `choose_variant`.
+    """
+    default = BUILDS[order.build].device
+    device = order.device
+    if folder.manifest.exists():
+        default = device_of(read_head(folder.manifest).environment)
+        device = default if device == "auto" else device
+    return choose_variant(default, device=device)
+
+
 def begin_or_resume_dataset(
-    order: DatasetOrder, settings: BuildSettings, folder: DatasetFolder
+    order: DatasetOrder, settings: BuildSettings, folder: DatasetFolder, variant: Variant
 ) -> DatasetWriter:
     """Begin a dataset, or resume the one in its folder.
 
@@ -209,7 +232,6 @@ def begin_or_resume_dataset(
         TrilightError: the dataset was begun with other options, lacks the requested shards, or
             cannot be rendered here.
     """
-    variant = choose_variant()
     writer = begin_dataset(
         folder,
         settings,

@@ -1,8 +1,9 @@
-"""What the render stage runs on, for people and for logs; asked in a process of its own."""
+"""Facts of what renders here, for people and for logs; asked in a process of its own."""
 
 import json
 import subprocess
 import sys
+import time
 from importlib import metadata
 from pathlib import Path
 
@@ -12,9 +13,14 @@ from storage.installation import IMPORT_ROOT, child_environment
 
 _ASK_S = 120
 
+VIEW_PX = 256
+"""Width of the picture that is timed, pixels."""
+VIEW_SPP = 128
+"""Its samples per pixel."""
+
 
 def render_facts(variant: Variant) -> dict[str, str]:
-    """Return versions, device and threads by name; what cannot be asked is left out."""
+    """Return versions, devices, threads and seconds of a view by name, as far as known."""
     facts = {name: metadata.version(name) for name in ("mitsuba", "drjit", "pyoidn")}
     facts |= {"variant": variant.name, "llvm": Path(variant.libllvm).name}
     result = subprocess.run(
@@ -38,7 +44,31 @@ def _answer(variant: Variant) -> dict[str, str]:
         "threads": str(drjit.thread_count()),
         "denoiser": f"{version // 10000}.{version // 100 % 100}.{version % 100}",
         "denoiser_device": variant.denoiser,
+        "view_s": f"{_view_seconds():.2g}",
     }
+
+
+def _view_seconds() -> float:
+    """Return the wall-clock seconds of a view of the probe's scene, once kernels are compiled."""
+    from pipeline.renders.renderer import SceneRenderer
+    from pipeline.renders.settings import RenderSettings
+    from pipeline.renders.variant_probe import probe_scene
+
+    scene = probe_scene()
+    settings = RenderSettings(
+        resolution=VIEW_PX,
+        noise_floor_db=90,
+        min_spp=VIEW_SPP,
+        max_spp=VIEW_SPP,
+        arithmetic="device",
+    )
+    renderer = SceneRenderer(scene, settings)
+    seconds = []
+    for seed in range(3):
+        began = time.perf_counter()
+        renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), seed)
+        seconds.append(time.perf_counter() - began)
+    return min(seconds)
 
 
 if __name__ == "__main__":

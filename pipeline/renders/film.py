@@ -33,6 +33,11 @@ class Film:
         right, up = self._right * (x - self._half), self._up * (self._half - y)
         return mi.Ray3f(self.origin, dr.normalize(right + up - self._backward * self._focal))
 
+    def corners(self, pixel: Any) -> tuple[Any, Any]:
+        """Return column and row (Float) of pixels (UInt32)."""
+        row = pixel // self._width
+        return mi.Float(pixel - row * self._width), mi.Float(row)
+
     def pixel(self, point: Any) -> tuple[Any, Any]:
         """Return the pixel (UInt32) in which a point shows, and whether the picture contains it."""
         local = point - self.origin

@@ -39,18 +39,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.conventions import log10_radiance
 from storage.metrics import MAX_DB
 
-_BLOCK_PX = 8
+BLOCK_PX = 8
 """Pixels across the blocks of the standard error: errors of a denoised picture are correlated over
 a few pixels."""
 
-_SMALLEST_STEP = 1e-4
+SMALLEST_STEP = 1e-4
 """Radiance, relative to 1 + radiance, over which a secant is taken at least: below it, differences
 of float32 values are rounding."""
 
-_LINEAR_STANDARD_ERRORS = 2.0
+LINEAR_STANDARD_ERRORS = 2.0
 """Of one, 3 to 10 % of the linear floors of 16 scenes were more than 1 dB too good (study S16)."""
 
 Curve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -69,79 +68,32 @@ class MeasuredFloor:
     """As object_psnr_log_db: over the pixels that show geometry."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Half:
-    """One half of the samples of a view."""
-
-    raw_rgb: NDArray[np.float32]
-    """[R, R, 3] mean of the samples."""
-    denoised_rgb: NDArray[np.float32]
-    """[R, R, 3] the same, denoised."""
-
-
-def measure_floor(a: Half, b: Half, hits: NDArray[np.bool_]) -> MeasuredFloor:
-    """Return the floor of the picture made from both halves.
+def floor_db(
+    mean_error: float,
+    surprise: float,
+    error_sums: NDArray[np.float64],
+    counts: NDArray[np.float64],
+    standard_errors: float = 1.0,
+) -> float:
+    """Return the floor of a picture in dB.
 
     Args:
-        a, b: halves that share no sample, denoised apart.
-        hits: [R, R] pixels that show geometry.
+        mean_error: of the estimates of all pixels.
+        surprise: the largest of the picture's.
+        error_sums: [T] of the estimates over the blocks of the picture.
+        counts: [T] pixels of each block; where there are none at all, the floor is the highest.
+        standard_errors: so many are added to the mean.
     """
-    everywhere = np.ones_like(hits)
-    return MeasuredFloor(
-        log_db=_floor_db(a, b, log10_radiance, everywhere),
-        linear_db=_floor_db(a, b, clamped_radiance, everywhere, _LINEAR_STANDARD_ERRORS),
-        object_log_db=_floor_db(a, b, log10_radiance, hits),
-    )
-
-
-def squared_error(a: Half, b: Half, curve: Curve) -> NDArray[np.float64]:
-    """Return an estimate of the squared error of the mean of both denoised halves, [R, R].
-
-    It is the mean over the channels. Single pixels may be far below 0; the mean over many pixels
-    is what it is for.
-    """
-    raw_a, raw_b = a.raw_rgb.astype(np.float64), b.raw_rgb.astype(np.float64)
-    if np.array_equal(a.denoised_rgb, a.raw_rgb):
-        of_half: NDArray[np.float64] = 0.5 * np.square(curve(raw_a) - curve(raw_b)).mean(axis=-1)
-        return of_half
-    of_halves = 0.5 * (np.square(a.denoised_rgb - raw_b) + np.square(b.denoised_rgb - raw_a))
-    noise = 0.5 * np.square(raw_a - raw_b)
-    apart = 0.25 * np.square(a.denoised_rgb - b.denoised_rgb, dtype=np.float64)
-    slope = secant_slope(curve, *_means(a, b))
-    estimate = of_halves - noise - apart
-    mean: NDArray[np.float64] = (np.square(slope) * estimate).mean(axis=-1)
-    return mean
-
-
-def surprises(a: Half, b: Half, curve: Curve) -> NDArray[np.float64]:
-    """Return the squared difference that the denoiser made in each pixel of the mean, [R, R]."""
-    denoised, raw = _means(a, b)
-    squared: NDArray[np.float64] = np.square(curve(raw) - curve(denoised)).mean(axis=-1)
-    return squared
-
-
-def _means(a: Half, b: Half) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the means of both halves, denoised and raw."""
-    denoised = 0.5 * (a.denoised_rgb.astype(np.float64) + b.denoised_rgb)
-    return denoised, 0.5 * (a.raw_rgb.astype(np.float64) + b.raw_rgb)
-
-
-def _floor_db(
-    a: Half, b: Half, curve: Curve, pixels: NDArray[np.bool_], standard_errors: float = 1.0
-) -> float:
-    count = int(pixels.sum())
+    count = counts.sum()
     if not count:
         return MAX_DB
-    error = squared_error(a, b, curve) * pixels
-    surprise = float((surprises(a, b, curve) * pixels).max()) / count
-    bound = max(error.sum() / count, 0.0) + surprise
-    bound += standard_errors * _standard_error(error, pixels)
+    bound = max(mean_error, 0.0) + surprise / count
+    bound += standard_errors * _standard_error(error_sums, counts)
     return MAX_DB if bound <= 10 ** (-MAX_DB / 10) else float(-10 * np.log10(bound))
 
 
-def _standard_error(error: NDArray[np.float64], pixels: NDArray[np.bool_]) -> float:
-    """Return that of the mean of `error` over the pixels, from its sums over blocks."""
-    sums, counts = _block_sums(error), _block_sums(pixels.astype(np.float64))
+def _standard_error(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> float:
+    """Return that of the mean error over the pixels, from its sums over blocks."""
     total = counts.sum()
     apart = sums - counts * (sums.sum() / total)
     blocks = np.count_nonzero(counts)
@@ -149,19 +101,12 @@ def _standard_error(error: NDArray[np.float64], pixels: NDArray[np.bool_]) -> fl
     return float(np.sqrt(spread) / total)
 
 
-def _block_sums(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    across = len(values) // _BLOCK_PX
-    blocks = values.reshape(across, _BLOCK_PX, across, _BLOCK_PX)
-    sums: NDArray[np.float64] = blocks.sum(axis=(1, 3)).ravel()
-    return sums
-
-
 def secant_slope(
     curve: Curve, first: NDArray[np.float64], second: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the slope of the line through two points of a curve, or its own where they are one."""
     step = second - first
-    least = _SMALLEST_STEP * (1 + np.abs(first))
+    least = SMALLEST_STEP * (1 + np.abs(first))
     step = np.where(np.abs(step) < least, least, step)
     slope: NDArray[np.float64] = (curve(first + step) - curve(first)) / step
     return slope

@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.renderer import representable, require_bounded, require_surfaces
+from pipeline.renders.renderer import representable, require_surfaces
 from pipeline.renders.results import Sampling
 from pipeline.renders.settings import PASS_SPP, Depth, Filtered, RenderSettings, Resolution
 from pipeline.renders.tracer import Tracer
+from pipeline.renders.view_pictures import require_bounded
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
 from storage.seeds import seed_for
@@ -107,7 +108,7 @@ class PreviewRenderer:
         if not np.isfinite(mean).all():
             broken = int((~np.isfinite(mean)).any(axis=-1).sum())
             raise Rejected("nonfinite_radiance", f"{broken} pixels of raw samples")
-        require_bounded(mean)
+        require_bounded(float(mean.max()))
         picture = denoised(self._tracer, camera, mean, done, settings.denoiser)
         return Preview(radiance_rgb=representable(picture), spp=done)
 

@@ -14,14 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.renders.camera import Camera
 from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.preview import denoised, samples_sum, usual_filter
-from pipeline.renders.renderer import (
-    SceneRenderer,
-    finished,
-    representable,
-    require_bounded,
-)
+from pipeline.renders.renderer import SceneRenderer, finished, representable
 from pipeline.renders.results import GrowingPicture, RenderedView, Sampling
 from pipeline.renders.settings import RenderSettings
+from pipeline.renders.view_pictures import require_bounded
 from storage.errors import Rejected
 from storage.records.scene import Scene
 
@@ -93,7 +89,7 @@ class ProgressiveRenderer:
         mean: NDArray[np.float32] = (total / done).astype(np.float32)
         if not np.isfinite(mean).all():
             raise Rejected("nonfinite_radiance", "raw samples are not finite")
-        require_bounded(mean)
+        require_bounded(float(mean.max()))
         picture = representable(denoised(tracer, camera, mean, done, usual_filter(done)))
         return GrowingPicture(
             spp=done,

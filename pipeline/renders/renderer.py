@@ -13,28 +13,24 @@ picture is their sum; with `split` direct and indirect light are kept apart, and
 Mitsuba is imported inside functions only: `activate` must come first.
 """
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.camera import Camera
-from pipeline.renders.denoiser import Quality, denoise, set_denoiser_threads
-from pipeline.renders.kept_light import (
-    Pictures,
-    keep_converged,
-    keep_in_halves,
-    with_mean_of,
-)
+from pipeline.renders.denoiser import set_denoiser_threads
+from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans, HostPictures
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.noise_floor import Half, MeasuredFloor, measure_floor
+from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.results import GrowingPicture, RenderedView, Sampling, UsedTime
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.stopping import Floors, Goal, expected_spp, gaps_db, next_spp
 from pipeline.renders.tiles import TileChoice
-from pipeline.renders.tracer import Features, Tracer
+from pipeline.renders.tracer import Tracer
+from pipeline.renders.view_pictures import MeasuredLook, ViewPictures
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import Rejected, TrilightError
 from storage.records.lights import light_rows, rounded_to_half, sum_of_lights
@@ -42,12 +38,6 @@ from storage.records.parts import MAX_PICTURES
 from storage.records.scene import Scene
 
 Result = TypeVar("Result")
-
-
-_MAX_RAW = 1e13
-"""Raw pixels from this radiance on are refused: half floats could not hold the picture even if the
-denoiser spread one of them over 8192 x 8192 pixels. From about 5e36 on the denoiser returns black,
-which would hide the overflow."""
 
 
 _FAST_HALVES_SPP = 256
@@ -83,7 +73,9 @@ class SceneRenderer:
             TrilightError: with `per_light`, where an environment lights the scene too.
         """
         require_surfaces(scene)
-        self._settings, self._shows_looks, self._used = settings, shows_looks, UsedTime()
+        self._settings = settings
+        self._shows_looks = shows_looks
+        self._used = UsedTime()
         self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
         if settings.part_names:
             self._tracer = self._tracer.apart(bounces=settings.split, lobes=settings.split_lobes)
@@ -124,7 +116,8 @@ class SceneRenderer:
         self, c2w: ArrayLike, fov_deg: float, seed: int
     ) -> Generator[Sampling, None, RenderedView]:
         """Do what `render_view` does, yielding after each pass of one half."""
-        settings, self._used = self._settings, UsedTime()
+        settings = self._settings
+        self._used = UsedTime()
         pose = np.asarray(c2w, np.float64)
         camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
         settled = settings.first_spp
@@ -137,25 +130,35 @@ class SceneRenderer:
         self._refuse_black(samples)
         for _ in samples.passes_to(settled):
             yield Sampling(spp=samples.spp, expected_spp=settled, missing_db=None)
-        features = self._tracer.features(camera, spp=settings.aux_spp)
-        hits = self._tracer.hits(camera)
-        floor, part_floors = yield from self._sample_to_targets(samples, features, hits)
+        pictures = self._pictures(samples, camera)
+        if not self._sees_sky:
+            samples.count_over(pictures.shown)
+        look = yield from self._sample_to_targets(samples, pictures)
+        floor = look.floor
         self._refuse_noisy(floor)
-        stored = self._stored(self._picture(samples, features))
+        stored = self._stored(pictures.finish())
         return RenderedView(
             spp=samples.spp,
             noise_floor_db=floor.log_db,
             noise_floor_linear_db=floor.linear_db,
             object_noise_floor_db=floor.object_log_db,
             at_cap=bool(gaps_db(settings.targets_db, _by_metric(floor))),
-            hits=hits,
-            part_floors=part_floors or None,
+            hits=pictures.hits,
+            part_floors=look.part_floors or None,
             **stored,
         )
 
+    def _pictures(self, samples: HalfSamples, camera: Camera) -> ViewPictures:
+        if self._settings.arithmetic == "numpy":
+            return HostPictures(samples, self._tracer, camera, self._settings)
+        from pipeline.renders.device_pictures import DevicePictures  # imports mitsuba
+
+        return DevicePictures(samples, self._tracer, camera, self._settings)
+
     def _stored(self, pictures: NDArray[np.float32]) -> dict[str, Any]:
         """Return the pictures of a view by their fields: the sum of what is apart, as stored."""
-        per_light, names = self._settings.per_light, self._settings.part_names
+        per_light = self._settings.per_light
+        names = self._settings.part_names
         if not (per_light or names):
             return {"radiance_rgb": representable(pictures[0])}
         parts = _by_part(rounded_to_half(representable(pictures)), max(1, len(names)))
@@ -168,13 +171,19 @@ class SceneRenderer:
         }
 
     def _refuse_black(self, samples: HalfSamples) -> None:
-        mean = float(samples.mean().sum(axis=0).mean(dtype=np.float64))
+        if self._settings.arithmetic == "numpy":
+            mean = float(HostMeans(samples).mean().sum(axis=0).mean(dtype=np.float64))
+        else:
+            from pipeline.renders.device_pictures import mean_radiance  # imports mitsuba
+
+            mean = mean_radiance(samples)
         bound = self._settings.min_mean_radiance
         if mean < bound:
             raise Rejected("black_view", f"mean radiance {mean:.2g} is below {bound:.2g}")
 
     def _refuse_noisy(self, floor: MeasuredFloor) -> None:
-        targets_db, floors_db = self._settings.targets_db, _by_metric(floor)
+        targets_db = self._settings.targets_db
+        floors_db = _by_metric(floor)
         missed = [
             f"{metric} is {floors_db[metric]:.1f} dB; expected {targets_db[metric]:g}"
             for metric in gaps_db(targets_db, floors_db)
@@ -183,26 +192,26 @@ class SceneRenderer:
             raise Rejected("floor_not_reached", ", ".join(missed))
 
     def _sample_to_targets(
-        self, samples: HalfSamples, features: Features, hits: NDArray[np.bool_]
-    ) -> Generator[Sampling, None, tuple[MeasuredFloor, dict[str, MeasuredFloor]]]:
-        targets_db, max_spp = self._settings.targets_db, self._settings.max_spp
+        self, samples: HalfSamples, pictures: ViewPictures
+    ) -> Generator[Sampling, None, MeasuredLook]:
+        targets_db = self._settings.targets_db
+        max_spp = self._settings.max_spp
         measured: list[tuple[int, Floors]] = []
-        samples.counted = np.ones(hits.shape, bool) if self._sees_sky else _shown(features)
-        tiles = TileChoice(samples.counted)
+        shown = np.ones_like(pictures.shown) if self._sees_sky else pictures.shown
+        tiles = TileChoice(shown)
         while True:
             quality = self._filter_of_halves(samples.spp)
-            pairs = [(raw, self._denoised(raw, features, quality)) for raw in samples.half_means()]
-            kept = self._as_the_picture(pairs, samples)
-            floor = measure_floor(_half(*kept[0]), _half(*kept[1]), hits)
-            tiles.learn([_half(*pair) for pair in pairs], samples, quality)
-            measured.append((samples.spp, _by_metric(floor)))
-            gaps = gaps_db(targets_db, _by_metric(floor))
+            look = pictures.look(quality)
+            tiles.learn(look.changes, samples, quality)
+            measured.append((samples.spp, _by_metric(look.floor)))
+            gaps = gaps_db(targets_db, _by_metric(look.floor))
             if not gaps or samples.spp >= max_spp:
-                return floor, self._part_floors(kept, hits)
+                return look
             goal = Goal(targets_db=targets_db, step=2 * samples.pass_spp, max_spp=max_spp)
-            expected, missing_db = expected_spp(measured, goal), max(gaps.values())
+            expected = expected_spp(measured, goal)
+            missing_db = max(gaps.values())
             if self._shows_looks:
-                yield self._look(samples, features, floor, expected, missing_db)
+                yield self._growing(samples, pictures, look.floor, expected, missing_db)
             if expected >= _GUIDED_SPP:
                 samples.guide()
             spp = next_spp(measured, goal)
@@ -211,16 +220,16 @@ class SceneRenderer:
             for _ in passes:
                 yield Sampling(spp=samples.spp, expected_spp=expected, missing_db=missing_db)
 
-    def _look(
+    def _growing(
         self,
         samples: HalfSamples,
-        features: Features,
+        pictures: ViewPictures,
         floor: MeasuredFloor,
         expected_spp: int,
         missing_db: float,
     ) -> GrowingPicture:
         before_s = self._used.core_s()
-        picture = self._stored(self._picture(samples, features))["radiance_rgb"]
+        picture = self._stored(pictures.finish())["radiance_rgb"]
         core_s = self._used.core_s()
         self._used.leave_out(core_s - before_s)
         return GrowingPicture(
@@ -236,75 +245,6 @@ class SceneRenderer:
         quality = self._settings.denoiser
         return "fast" if quality == "high" and spp <= _FAST_HALVES_SPP else quality
 
-    def _part_floors(
-        self,
-        halves: Sequence[tuple[Pictures, Pictures]],
-        hits: NDArray[np.bool_],
-    ) -> dict[str, MeasuredFloor]:
-        """Return the floor of each part from the raw and the denoised pictures of both halves."""
-        floors = {}
-        for part, name in enumerate(names := self._settings.part_names):
-            a, b = (
-                _half(*(_by_part(pictures, len(names))[part] for pictures in pair))
-                for pair in halves
-            )
-            floors[name] = measure_floor(a, b, hits)
-        return floors
-
-    def _as_the_picture(
-        self, halves: Sequence[tuple[Pictures, Pictures]], samples: HalfSamples
-    ) -> Sequence[tuple[Pictures, Pictures]]:
-        error = samples.standard_error()
-        if error is None or self._settings.denoiser == "off":
-            return halves
-        return keep_in_halves(halves, error)
-
-    def _picture(self, samples: HalfSamples, features: Features) -> NDArray[np.float32]:
-        """Return the parts of the picture that all samples make, [P, R, R, 3]."""
-        raw, error = samples.mean(), samples.standard_error()
-        parts = self._denoised(raw, features, self._settings.denoiser)
-        if error is None or self._settings.denoiser == "off":
-            return parts
-        kept = keep_converged(parts, raw, error)
-        return np.stack([with_mean_of(*pair) for pair in zip(kept, raw, strict=True)])
-
-    def _denoised(
-        self, pictures_rgb: NDArray[np.float32], features: Features, quality: Filtered
-    ) -> NDArray[np.float32]:
-        """Return pictures [P, R, R, 3] without noise; raises Rejected("radiance_overflow").
-
-        Parts are denoised apart, each as a picture of its own. In five scenes direct light, whose
-        shadows the noise of all other light would hide, was 4 dB better on average than its share
-        of one denoised picture, indirect light 0.2 dB worse, and the sum 0.4 dB better (study S9).
-        """
-        require_bounded(pictures_rgb)
-        if quality == "off":
-            return pictures_rgb
-        names = self._settings.part_names or ("",)
-        denoised = [
-            _denoised_lights(lights, features.of_part(name), quality)
-            for name, lights in zip(names, _by_part(pictures_rgb, len(names)), strict=True)
-        ]
-        return np.stack(denoised, axis=1).reshape(pictures_rgb.shape)
-
-
-def _denoised_lights(
-    lights_rgb: NDArray[np.float32], features: Features, quality: Quality
-) -> NDArray[np.float32]:
-    """Return the lights [L, R, R, 3] without noise.
-
-    Lights apart are shares of one denoised picture, pixel by pixel and channel by channel: of all
-    light together, in proportion to what each is when it is denoised alone. The sum of pictures
-    that were denoised alone carries the bias of each: in four scenes it was 1.7 to 5.2 dB worse
-    than this one, and claimed a floor up to 5.9 dB better than the truth (study S8).
-    """
-    raw = lights_rgb.sum(axis=0)
-    together = with_mean_of(denoise(raw, features, quality), raw)
-    if len(lights_rgb) == 1:
-        return together[None]
-    alone = np.stack([denoise(light, features, quality) for light in lights_rgb])
-    return together * _shares_of(alone)
-
 
 def _by_metric(floor: MeasuredFloor) -> Floors:
     return {
@@ -312,19 +252,6 @@ def _by_metric(floor: MeasuredFloor) -> Floors:
         "psnr_linear_db": floor.linear_db,
         "object_psnr_log_db": floor.object_log_db,
     }
-
-
-def _shown(features: Features) -> NDArray[np.bool_]:
-    """Return the pixels that show anything, or all of them if none does."""
-    shown: NDArray[np.bool_] = np.any(features.normal != 0, axis=-1)
-    if not shown.any():
-        shown[:] = True
-    return shown
-
-
-def _half(raw_rgb: NDArray[np.float32], denoised_rgb: NDArray[np.float32]) -> Half:
-    """Return a half from its pictures [P, R, R, 3], which are added."""
-    return Half(raw_rgb=raw_rgb.sum(axis=0), denoised_rgb=denoised_rgb.sum(axis=0))
 
 
 def _by_part(pictures_rgb: NDArray[np.float32], count: int) -> NDArray[np.float32]:
@@ -347,13 +274,6 @@ def _refuse_sky(scene: Scene) -> None:
         )
 
 
-def _shares_of(parts_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return what share of their sum each of P parts [P, ...] is: equal ones where all are 0."""
-    total = parts_rgb.sum(axis=0, dtype=np.float64)
-    equal = np.full(parts_rgb.shape, 1 / len(parts_rgb))
-    return np.divide(parts_rgb, total, out=equal, where=total > 0).astype(np.float32)
-
-
 def finished(steps: Generator[Any, None, Result]) -> Result:
     """Run steps to their end, whatever they say of their progress, and return what they return."""
     while True:
@@ -368,12 +288,6 @@ def require_surfaces(scene: Scene) -> None:
     """Raise Rejected("no_surfaces") where all triangles emit: every picture would be black."""
     if scene.triangle_emits.all():
         raise Rejected("no_surfaces", f"all {scene.num_triangles} triangles are emitters")
-
-
-def require_bounded(raw_rgb: NDArray[np.float32]) -> None:
-    """Raise Rejected("radiance_overflow") where the denoiser would hide what is too bright."""
-    if raw_rgb.max() >= _MAX_RAW:
-        raise Rejected("radiance_overflow", f"a raw pixel of radiance {raw_rgb.max():.3g}")
 
 
 def representable(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:

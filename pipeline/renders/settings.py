@@ -51,11 +51,15 @@ _METRICS = {
 }
 """The metric of each target (storage.metrics)."""
 
+Arithmetic = Literal["numpy", "device"]
+"""Where the pictures of a view are worked out."""
+
 _LATER = {
     "noise_floor_linear_db": None,
     "noise_floor_objects_db": None,
     "split": False,
     "split_lobes": False,
+    "arithmetic": "numpy",
 }
 """Settings that no record holds at these values, so that digests of earlier builds stay."""
 
@@ -113,6 +117,10 @@ class RenderSettings:
     split_lobes: bool = False
     """Store what the diffuse and what the specular lobe of the visible surface reflects apart as
     well; with `split` there are four parts."""
+
+    arithmetic: Arithmetic = "numpy"
+    """Where means, corrections and stated errors are worked out: `device` keeps pictures where they
+    are traced; `numpy` keeps the bytes of sets from before there was a choice."""
 
     def __post_init__(self) -> None:
         _require(
@@ -204,6 +212,7 @@ def one_picture(
         min_mean_radiance=0.0,
         split=split,
         split_lobes=split_lobes,
+        arithmetic="device",
     )
 
 

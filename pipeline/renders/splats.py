@@ -24,6 +24,16 @@ _SMALLEST_EXPONENT = -90
 """Least exponent of the brightest emitter's radiance: units must stay normal float32 numbers."""
 
 
+class SplatUnit:
+    """The radiance of one unit, as kernels read it."""
+
+    def __init__(self, radiance: float) -> None:
+        self.radiance = dr.opaque(mi.Float64, radiance)
+        """Float64."""
+        self.per_radiance = dr.opaque(mi.Float, 1 / radiance)
+        """Float: units of radiance 1."""
+
+
 def splat_unit(scene: Scene) -> float:
     """Return the radiance of one unit."""
     emission = scene.materials[scene.material_index[scene.triangle_emits], EMISSION]
@@ -34,23 +44,18 @@ def splat_unit(scene: Scene) -> float:
 class Splats:
     """Sums of one picture. Not a dataclass: Dr.Jit would take its arrays for variables of loops."""
 
-    def __init__(self, resolution: int, unit: float) -> None:
-        """Begin with nothing.
-
-        Args:
-            resolution: width and height in pixels.
-            unit: from `splat_unit`.
-        """
+    def __init__(self, resolution: int, unit: SplatUnit) -> None:
+        """Begin with nothing, in a picture of `resolution` pixels each way."""
         self._unit = unit
-        self._per_unit = dr.opaque(mi.Float, 1 / unit)
         self._sums = [dr.zeros(mi.UInt64, resolution**2) for _ in range(3)]
         self._broken = dr.zeros(mi.UInt32, resolution**2)
 
     def add(self, value: Any, pixel: Any, active: Any) -> None:
         """Add colours of at least 0 (Color3f) to pixels (UInt32)."""
         # Atomic. By default each thread would sum a picture of its own, in a separate kernel.
-        add, direct = dr.ReduceOp.Add, dr.ReduceMode.Direct
-        units = value * self._per_unit
+        add = dr.ReduceOp.Add
+        direct = dr.ReduceMode.Direct
+        units = value * self._unit.per_radiance
         fits = dr.max(units) < _LARGEST
         fits &= dr.all(dr.isfinite(units))  # dr.max passes over NaN
         for channel, total in zip(units, self._sums, strict=True):
@@ -65,5 +70,5 @@ class Splats:
         """
         dr.eval(self._sums, self._broken)
         sums: Any = mi.Color3d(*self._sums)
-        sums *= dr.opaque(mi.Float64, self._unit)
+        sums *= self._unit.radiance
         return dr.select(self._broken > 0, dr.nan, sums)

@@ -18,10 +18,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.noise_floor import Half
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import PASS_SPP, Filtered
-from storage.conventions import log10_radiance
 
 TILE_PX = 8
 """Pixels across a tile; the widths of pictures are multiples of it."""
@@ -49,24 +47,27 @@ class TileChoice:
             shown: [R, R] pixels that may have light at all.
         """
         self._weight = tile_means(shown.astype(np.float64))
-        self._seen: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
+        self._seen: list[NDArray[np.int64]] = []
         self._variance: list[NDArray[np.float64]] = []
         self._filter: Filtered | None = None
 
-    def learn(self, halves: Sequence[Half], samples: HalfSamples, quality: Filtered) -> None:
+    def learn(
+        self, changes: Sequence[NDArray[np.float64]], samples: HalfSamples, quality: Filtered
+    ) -> None:
         """Look at both halves as they are now, denoised by a filter of this quality.
 
-        What changes with the filter says nothing of the samples: after that nothing new is known.
+        Args:
+            changes: of each half, [T, T] mean squared change of its log radiance since the look
+                before; anything at the first.
+            samples: what is there.
+            quality: of the filter. What changes with it says nothing of the samples: after that
+                nothing new is known.
         """
-        seen = [
-            (log10_radiance(half.denoised_rgb.astype(np.float64)), spp_of_tiles(samples, number))
-            for number, half in enumerate(halves)
-        ]
+        seen = [spp_of_tiles(samples, half) for half in range(len(changes))]
         if self._seen and quality == self._filter:
             known = self._variance or [np.zeros_like(self._weight)] * 2
             self._variance = [
-                _variance(before, now, noise)
-                for before, now, noise in zip(self._seen, seen, known, strict=True)
+                _variance(*each) for each in zip(changes, self._seen, seen, known, strict=True)
             ]
         self._seen, self._filter = seen, quality
 
@@ -78,26 +79,25 @@ class TileChoice:
             mean_spp: samples per pixel that are wanted, both halves together.
         """
         more = mean_spp - samples.spp
-        started = self._variance and self._seen[0][1].min() >= _PASS
+        started = self._variance and self._seen[0].min() >= _PASS
         if not started or more < 2 * _PASS:
             return None
         return [
             of_pixels(passes_of_tiles(others, spp, self._weight, more / 2))
-            for others, (_, spp) in zip(self._variance[::-1], self._seen, strict=True)
+            for others, spp in zip(self._variance[::-1], self._seen, strict=True)
         ]
 
 
 def _variance(
-    before: tuple[NDArray[np.float64], NDArray[np.int64]],
-    now: tuple[NDArray[np.float64], NDArray[np.int64]],
+    change: NDArray[np.float64],
+    spp_before: NDArray[np.int64],
+    spp: NDArray[np.int64],
     known: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return that of one sample, [T, T], from two looks; the known one where nothing came."""
-    (log_before, spp_before), (log, spp) = before, now
-    changed = _smoothed(tile_means(np.square(log - log_before).mean(axis=-1)))
     grown = spp > spp_before
     less = np.where(grown, 1 / spp_before - 1 / spp, 1)
-    return np.where(grown, changed / less, known)
+    return np.where(grown, _smoothed(change) / less, known)
 
 
 def passes_of_tiles(

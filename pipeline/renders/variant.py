@@ -5,9 +5,8 @@ compiles (LLVM 15 does, "Cannot select: fminimum"). So each candidate renders a 
 process of its own, without any kernel that another library compiled, and must meet the stored one
 within its noise. The answer is remembered.
 
-A graphics card is used only where the user asks for it (TRILIGHT_VARIANT=cuda_ad_rgb), and only
-after the same probe: no figure of this project was measured on one. It denoises as well if Open
-Image Denoise gives the same picture on it as on the processor.
+A GPU is used only after the same probe; its answer is remembered for this driver. It denoises as
+well if Open Image Denoise gives the same picture on it as on the CPU.
 
 Nothing here imports mitsuba, except `activate`.
 """
@@ -19,14 +18,16 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal
 
 from pipeline.renders import probe_picture
 from pipeline.renders.denoiser import DenoiserDevice, set_denoiser_device
 from pipeline.renders.llvm_libraries import llvm_libraries
+from pipeline.renders.visible_gpus import gpu_identity, visible_gpus
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.digests import canonical_json, sha256_hex
@@ -44,7 +45,11 @@ _RAYS_LEFT_OUT = "Disabling this ray tracing operation"
 
 VariantName = Literal["llvm_ad_rgb", "cuda_ad_rgb"]
 
+Device = Literal["cpu", "gpu", "auto"]
+"""What traces pictures; `auto` is a GPU where one passes the probe, or else the CPU."""
+
 _ASK = "TRILIGHT_VARIANT"
+_DEVICES: Mapping[str, Device] = {"llvm_ad_rgb": "cpu", "cuda_ad_rgb": "gpu"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,43 +59,86 @@ class Variant:
     name: VariantName
     """Mitsuba's name for it."""
     libllvm: str
-    """The LLVM library that it compiles with; empty on a graphics card."""
+    """The LLVM library that it compiles with; empty on a GPU."""
     note: str
     """What the user should know of this choice; empty if nothing."""
     denoiser: DenoiserDevice = "CPU"
     """What Open Image Denoise runs on."""
 
+    @property
+    def device(self) -> Device:
+        """`cpu` or `gpu`."""
+        return _DEVICES[self.name]
 
-def choose_variant() -> Variant:
-    """Return the variant with the newest LLVM library that works, or the one that the user names.
+    def address_space(self, num_bytes: int) -> int:
+        """Return the limit of a child: `num_bytes`, or far more for CUDA, which maps all memory."""
+        return num_bytes if self.device == "cpu" else 1 << 46
+
+
+def device_of(environment: Mapping[str, Any]) -> Device:
+    """Return the device of a dataset by its environment (pipeline.generation.environment)."""
+    return _DEVICES.get(str(environment.get("mitsuba_variant")), "cpu")
+
+
+def named_device() -> Device | None:
+    """Return the device that TRILIGHT_VARIANT names; raises TrilightError if it names none."""
+    name = os.environ.get(_ASK, "")
+    if name not in ("", *_DEVICES):
+        raise TrilightError(f"{_ASK} is {name!r}; expected one of {', '.join(_DEVICES)}, or none.")
+    return _DEVICES.get(name)
+
+
+def choose_variant(default: Device = "cpu", *, device: Device | None = None) -> Variant:
+    """Return the variant of a device, on a CPU with the newest LLVM library that works.
 
     Later calls read the remembered probes.
 
+    Args:
+        default: device where neither `device` nor TRILIGHT_VARIANT names one.
+        device: device of an option or a dataset, before which TRILIGHT_VARIANT does not count.
+
     Raises:
-        TrilightError: no LLVM library works here; TRILIGHT_VARIANT names no variant, or one that
-            cannot render here.
+        TrilightError: no LLVM library works here; TRILIGHT_VARIANT names no variant; a GPU is named
+            and renders no right picture.
         EnvironmentFailure: a probe gave no answer, which says nothing about its library: with
             another one, the same dataset would be of other bytes.
     """
-    asked = os.environ.get(_ASK, "")
-    if asked not in ("", *get_args(VariantName)):
-        names = ", ".join(get_args(VariantName))
-        raise TrilightError(f"{_ASK} is {asked!r}; expected one of {names}, or nothing.")
-    return _on_graphics_card() if asked == "cuda_ad_rgb" else _on_processor()
-
-
-def _on_graphics_card() -> Variant:
-    card = Variant(name="cuda_ad_rgb", libllvm="", note="", denoiser="CUDA")
-    found = _probe(card)
-    if found.problem:
-        raise TrilightError(
-            f"{_ASK} is {card.name!r}, but no right picture could be rendered with it here "
-            f"({found.problem}); unset it to render on the processor."
+    chosen = device or named_device() or default
+    if chosen == "cpu" or (chosen == "auto" and not visible_gpus()):
+        return _on_processor()
+    probed = _probe_gpu(retry_failed=chosen == "gpu")
+    if not probed.problem:
+        note = (
+            probed.denoiser_problem and f"{probed.denoiser_problem}, so the CPU denoises pictures"
         )
-    if not found.denoiser_problem:
-        return card
-    note = f"{found.denoiser_problem}, so pictures are denoised on the processor"
-    return dataclasses.replace(card, denoiser="CPU", note=note)
+        return dataclasses.replace(_GPU, denoiser="CPU" if note else "CUDA", note=note)
+    if chosen == "auto":
+        note = f"the GPU renders no right picture ({probed.problem}), so the CPU renders"
+        return dataclasses.replace(_on_processor(), note=note)
+    raise TrilightError(
+        f"rendering on a GPU: no right picture could be rendered with it here ({probed.problem}); "
+        f"expected one of CUDA with OptiX. Choose --device cpu, or unset {_ASK}."
+    )
+
+
+def _probe_gpu(*, retry_failed: bool) -> "_Probed":
+    """Return what a probe of the GPU found, from memory where it may be.
+
+    Args:
+        retry_failed: whether a remembered problem is probed again: its cause may be fixed.
+    """
+    memory = cache_folder("gpu_probes.json")
+    identity = _gpu_identity()
+    known = _remembered(memory)
+    for text in known:
+        name, problem, denoiser_problem = json.loads(text)
+        if name == identity and not (problem and retry_failed):
+            return _Probed(problem=problem, denoiser_problem=denoiser_problem)
+    probed = _probe(_GPU)
+    other_rows = [text for text in known if json.loads(text)[0] != identity]
+    row = json.dumps([identity, probed.problem, probed.denoiser_problem])
+    _remember(memory, [*other_rows, row])
+    return probed
 
 
 def _on_processor() -> Variant:
@@ -138,19 +186,22 @@ def _works(library: Path) -> bool:
     known = _remembered(memory)
     if identity in known:
         return True
-    found = _probe(Variant(name="llvm_ad_rgb", libllvm=str(library), note=""))
-    if found.is_silent:
+    probed = _probe(Variant(name="llvm_ad_rgb", libllvm=str(library), note=""))
+    if probed.is_silent:
         raise EnvironmentFailure(
-            f"{library}: the probe of this LLVM library gave {found.problem}, at {len(_PROBE_S)} "
+            f"{library}: the probe of this LLVM library gave {probed.problem}, at {len(_PROBE_S)} "
             "tries; expected a small picture within seconds. Run again when the machine is less "
             "busy; if the library hangs, name another one by DRJIT_LIBLLVM_PATH."
         )
-    if found.problem:
+    if probed.problem:
         return False
-    with contextlib.suppress(TrilightError):  # remembered next time, or probed again
-        recent = [*known, identity][-_REMEMBERED_TRIES:]
-        write_atomically(memory, json.dumps(recent).encode())
+    _remember(memory, [*known, identity])
     return True
+
+
+def _remember(memory: Path, known: list[str]) -> None:
+    with contextlib.suppress(TrilightError):  # remembered next time, or probed again
+        write_atomically(memory, json.dumps(known[-_REMEMBERED_TRIES:]).encode())
 
 
 def _remembered(memory: Path) -> list[str]:
@@ -168,6 +219,12 @@ def _identity(library: Path) -> str:
     return sha256_hex(canonical_json([str(library), status.st_mtime_ns, status.st_size, *versions]))
 
 
+def _gpu_identity() -> str:
+    """Return a name that changes whenever the GPUs, their driver, or what renders does."""
+    versions = [metadata.version(name) for name in ("mitsuba", "drjit", "pyoidn")]
+    return sha256_hex(canonical_json([gpu_identity(), *versions, probe_picture.TABLE]))
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Probed:
     """What a probe found."""
@@ -177,7 +234,10 @@ class _Probed:
     is_silent: bool = False
     """Whether the problem is that there was no answer in time, which a busy machine may cause."""
     denoiser_problem: str = ""
-    """Why its card cannot denoise; empty where it can, or where there is no card."""
+    """Why its GPU cannot denoise; empty where it can, or where there is no GPU."""
+
+
+_GPU = Variant(name="cuda_ad_rgb", libllvm="", note="", denoiser="CUDA")
 
 
 def _probe(variant: Variant) -> _Probed:

@@ -94,6 +94,7 @@ def probe_blocks(
         max_spp=512,
         denoiser=denoiser,
         min_mean_radiance=0,
+        arithmetic="device",
     )
     scene = probe_scene()
     view = SceneRenderer(scene, settings).render_view(scene.c2w[0], float(scene.fov_deg[0]), seed)

@@ -8,6 +8,7 @@ so that raw samples are at hand before denoising.
 import copy
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -28,9 +29,10 @@ from pipeline.renders.kernel_scene import KernelScene
 from pipeline.renders.light_kernel import trace_light
 from pipeline.renders.path_kernel import trace
 from pipeline.renders.photon_kernel import PhotonRecords, trace_photons
+from pipeline.renders.recorded_calls import KernelInputs, recorded
 from pipeline.renders.sky_share import shining_sky, sky_share
 from pipeline.renders.sky_table import SkyTable
-from pipeline.renders.splats import Splats, splat_unit
+from pipeline.renders.splats import Splats, SplatUnit, splat_unit
 from pipeline.renders.textured_table import surface_table
 from pipeline.renders.tracer import Chosen, Features, split_triangles
 from storage.records.scene import Scene
@@ -57,8 +59,11 @@ class VectorTracer:
         """Load a scene that is `scale` times as large as cameras take it for."""
         surfaces, emitters = split_triangles(scene)
         order = np.concatenate([surfaces, emitters])
-        self._record, self._emitters, self._scale = scene, emitters, scale
-        seen, sky = _load(scene, surfaces), shining_sky(scene)
+        self._record = scene
+        self._emitters = emitters
+        self._scale = scale
+        seen = _load(scene, surfaces)
+        sky = shining_sky(scene)
         self._scene = KernelScene(
             surfaces=seen,
             everything=_load(scene, order, beside=seen),
@@ -70,8 +75,10 @@ class VectorTracer:
             rr_depth=rr_depth,
             sky=None if sky is None else SkyTable(sky, sky_share(scene, sky)),
         )
+        for _ in range(2):  # which arrays of Mitsuba's are one is settled by the first replay
+            _settle(KernelInputs(self._scene))
         self._parts = KernelParts(bounces=False, lobes=False)
-        self._unit = splat_unit(scene)
+        self._unit = SplatUnit(splat_unit(scene))
         self._guide = functools.cache(functools.partial(_learnt, scene, self._scene))
 
     def only_light(self, row: int) -> "VectorTracer":
@@ -101,113 +108,211 @@ class VectorTracer:
     def radiance(
         self, camera: Camera, *, seed: int, spp: int, chosen: Chosen = None
     ) -> NDArray[np.float32]:
-        pixels, picture = _pixels(camera, chosen), dr.zeros(mi.Color3f, camera.resolution**2)
-        dr.scatter(picture, sum(self._one_pass(camera, pixels, seed=seed, spp=spp)), pixels)
+        pixels = _pixels(camera, chosen)
+        picture = dr.zeros(mi.Color3f, camera.resolution**2)
+        means = _means(*self._pass(camera, self._film(camera), pixels, seed, spp))
+        dr.scatter(picture, sum(means), pixels)
         return _picture(camera, picture)
 
-    def pass_sum(self, camera: Camera) -> "_DeviceSum":
-        return _DeviceSum(self, camera)
+    def pass_sum(self, camera: Camera) -> "DeviceSum":
+        return DeviceSum(self, camera)
 
     def _film(self, camera: Camera) -> Film:
         return Film(camera.scaled(self._scale))
 
-    def _one_pass(self, camera: Camera, pixels: Any, *, seed: int, spp: int) -> list[Any]:
-        """Return the means of some pixels (Color3f) of each part.
+    @property
+    def _light_paths(self) -> float:
+        """Light paths for each camera path, as weights have it."""
+        return LIGHT_PATHS
 
-        Light paths are as many as for the whole picture, so that the weights of the strategies stay
-        the same; what lands in other pixels is dropped. In proportion to the chosen pixels they
-        saved 10 to 25 % of the time and lost 0.7 to 1.0 dB in hard views.
+    @property
+    def _traced(self) -> Any:
+        """What traces a pass."""
+        return trace_pass
+
+    def _num_light_paths(self, camera: Camera, spp: int) -> int:
+        """Return the light paths of a pass.
+
+        They are as many as for the whole picture, so that the weights of the strategies stay the
+        same; what lands in other pixels is dropped. In proportion to the chosen pixels they saved
+        10 to 25 % of the time and lost 0.7 to 1.0 dB in hard views.
         """
-        light_paths = LIGHT_PATHS * camera.resolution**2
-        traced = self._traced(camera, pixels, light_paths, seed=seed, spp=spp)
-        landed = self._landed(camera, light_paths, seed=seed, count=int(light_paths * spp))
-        pairs = zip(traced, landed, strict=True)
-        return [part + dr.gather(mi.Color3f, light, pixels) for part, light in pairs]
+        return int(LIGHT_PATHS * camera.resolution**2 * spp)
 
-    def _traced(
-        self, camera: Camera, pixels: Any, light_paths: float, *, seed: int, spp: int
-    ) -> list[Any]:
-        """Return the camera paths' share of the light (Color3f), beside so many light paths."""
-        sampler = _sampler(pixels, seed, spp)
-        film, beside = self._film(camera), dr.opaque(mi.Float, light_paths)
-        ray = film.rays(*_jittered(camera, pixels, sampler, spp))
-        traced = trace(self._scene, film, self._parts, beside, sampler, ray)
-        dr.eval(traced)  # all parts in one kernel
-        return [_pixel_means(spp, part) for part in traced]
-
-    def _landed(self, camera: Camera, light_paths: float, *, seed: int, count: int) -> list[Any]:
-        """Return the share of the light (Color3f) that `count` light paths find."""
-        splats = [Splats(camera.resolution, self._unit) for _ in range(self._parts.num_lobes)]
-        beside = dr.opaque(mi.Float, light_paths)
-        u = even_numbers(count, seed)
-        emitter = self._scene.emitters.sample(mi.Point2f(u[0], u[1]), mi.Bool(True))
-        to = mi.Point2f(u[2], u[3])
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(seed_for(seed, "light paths"), count)
-        film, parts = self._film(camera), self._parts
-        trace_light(self._scene, film, parts, beside, emitter, to, sampler, splats)
-        share = dr.opaque(mi.Float64, light_paths / count)
-        return parts.of_indirect([mi.Color3f(total.picture() * share) for total in splats])
+    def _pass(
+        self, camera: Camera, film: Film, pixels: Any, seed: int, spp: int
+    ) -> tuple[Any, ...]:
+        """Return the arguments of `_means` and `_sums` for a pass."""
+        count = self._num_light_paths(camera, spp)
+        numbers = _PassNumbers(seed, self._light_paths * camera.resolution**2, count)
+        inputs = KernelInputs(self._scene, film, self._parts, self._unit, numbers)
+        return inputs, pixels, self._traced, camera.resolution, spp, count
 
     def features(self, camera: Camera, *, spp: int) -> Features:
-        ray = self._film(camera).rays(*_on_a_grid(camera, spp))
-        hit = self._scene.surfaces.ray_intersect_preliminary(ray, coherent=True)
-        active = hit.is_valid()
-        normal, lobes = self._scene.table.shading(hit.prim_index, hit.prim_uv, active)
-        albedo = dr.select(active, lobes.diffuse + lobes.specular, 0)
-        apart = ("diffuse", "specular") if self._parts.num_lobes == 2 else ()
-
-        def mean(values: Any) -> NDArray[np.float32]:
-            return _picture(camera, _pixel_means(spp, dr.select(active, values, 0)))
-
+        named = self.feature_arrays(camera, spp=spp)
         return Features(
-            albedo=_picture(camera, _pixel_means(spp, albedo)),
-            normal=mean(normal),
-            lobes={name: mean(getattr(lobes, name)) for name in apart},
+            albedo=_picture(camera, named.pop("albedo")),
+            normal=_picture(camera, named.pop("normal")),
+            lobes={name: _picture(camera, values) for name, values in named.items()},
         )
 
+    def feature_arrays(self, camera: Camera, *, spp: int) -> dict[str, Any]:
+        """Return the pictures of `features` by name, in the memory of the device (Color3f)."""
+        inputs = KernelInputs(self._scene, self._film(camera), self._parts)
+        arrays: dict[str, Any] = _features(inputs, camera.resolution, spp)
+        return arrays
+
     def hits(self, camera: Camera) -> NDArray[np.bool_]:
-        ray = self._film(camera).rays(*_on_a_grid(camera, 1))
-        found = self._scene.surfaces.ray_intersect_preliminary(ray, coherent=True).is_valid()
-        return read_back(found).reshape(camera.resolution, camera.resolution)
+        return read_back(self.hit_array(camera)).reshape(camera.resolution, camera.resolution)
+
+    def hit_array(self, camera: Camera) -> Any:
+        """Return `hits` in the memory of the device (Bool)."""
+        return _hits(KernelInputs(self._scene, self._film(camera)), camera.resolution)
 
 
-class _DeviceSum:
+class _PassNumbers:
+    """The numbers of a pass, as kernels read them: seeds, and how many light paths there are."""
+
+    def __init__(self, seed: int, light_paths: float, count: int) -> None:
+        self.camera_seed = dr.opaque(mi.UInt32, seed)
+        self.light_seed = dr.opaque(mi.UInt32, seed_for(seed, "light paths"))
+        self.shifts = even_shifts(seed)
+        self.light_paths = dr.opaque(mi.Float, light_paths)
+        self.share = dr.opaque(mi.Float64, light_paths / count)
+
+
+def trace_pass(objects: Any, pixels: Any, resolution: int, spp: int, count: int) -> list[Any]:
+    """Return the means of some pixels (Color3f) of each part."""
+    traced = trace_camera_paths(objects, pixels, resolution, spp, count)
+    landed = trace_light_paths(objects, pixels, resolution, spp, count)
+    return [part + light for part, light in zip(traced, landed, strict=True)]
+
+
+def trace_camera_paths(
+    objects: Any, pixels: Any, resolution: int, spp: int, count: int
+) -> list[Any]:
+    """Return the camera paths' share of the light of some pixels (Color3f), of each part."""
+    scene, film, parts, _, numbers = objects
+    pixel = dr.gather(mi.UInt32, pixels, dr.arange(mi.UInt32, len(pixels) * spp) // spp)
+    dr.eval(pixel)  # from its size a replay reads how many lanes there are
+    sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
+    sampler.set_samples_per_wavefront(spp)
+    sampler.seed(numbers.camera_seed, len(pixels) * spp)
+    jitter = sampler.next_2d()
+    (column, row) = film.corners(pixel)
+    ray = film.rays(column + jitter.x, row + jitter.y)
+    traced = trace(scene, film, parts, numbers.light_paths, sampler, ray)
+    dr.eval(traced)  # all parts in one kernel
+    return [_pixel_means(spp, part) for part in traced]
+
+
+def trace_light_paths(
+    objects: Any, pixels: Any, resolution: int, spp: int, count: int
+) -> list[Any]:
+    """Return the share of the light of some pixels (Color3f) that `count` light paths find."""
+    scene, film, parts, unit, numbers = objects
+    splats = [Splats(resolution, unit) for _ in range(parts.num_lobes)]
+    u = even_numbers(count, numbers.shifts)
+    emitter = scene.emitters.sample(mi.Point2f(u[0], u[1]), mi.Bool(True))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(numbers.light_seed, count)
+    to = mi.Point2f(u[2], u[3])
+    trace_light(scene, film, parts, numbers.light_paths, emitter, to, sampler, splats)
+    landed = parts.of_indirect([mi.Color3f(total.picture() * numbers.share) for total in splats])
+    return [dr.gather(mi.Color3f, part, pixels) for part in landed]
+
+
+@recorded
+def _means(objects: Any, pixels: Any, traced: Any, resolution: int, spp: int, count: int) -> Any:
+    return traced(objects, pixels, resolution, spp, count)
+
+
+@recorded
+def _sums(
+    objects: Any, pixels: Any, traced: Any, resolution: int, spp: int, count: int, sums: list[Any]
+) -> list[Any]:
+    """Return the sums with those of a pass."""
+    means: list[Any] = [
+        mi.Color3d(part) for part in traced(objects, pixels, resolution, spp, count)
+    ]
+    mean: Any = sum(means)
+    square = dr.square((mean.x + mean.y + mean.z) / 3)
+    new = [*(part * spp for part in means), square * spp, mi.Float64(spp), mi.Float64(1)]
+    for total, values in zip(sums, new, strict=True):
+        _add(total, values, pixels)
+    dr.eval(sums)
+    return sums
+
+
+@recorded
+def _settle(objects: Any) -> Any:
+    return objects[0].num_surfaces + 1
+
+
+@recorded
+def _features(objects: Any, resolution: int, spp: int) -> dict[str, Any]:
+    scene, film, parts = objects
+    hit = _first_hit(scene, film, resolution, spp)
+    active = hit.is_valid()
+    normal, lobes = scene.table.shading(hit.prim_index, hit.prim_uv, active)
+    named = {"albedo": lobes.diffuse + lobes.specular, "normal": normal}
+    if parts.num_lobes == 2:
+        named |= {"diffuse": lobes.diffuse, "specular": lobes.specular}
+    return {name: _pixel_means(spp, dr.select(active, values, 0)) for name, values in named.items()}
+
+
+@recorded
+def _hits(objects: Any, resolution: int) -> Any:
+    scene, film = objects
+    return _first_hit(scene, film, resolution, 1).is_valid()
+
+
+def _first_hit(scene: Any, film: Film, resolution: int, spp: int) -> Any:
+    """Return the hits of camera rays on a regular grid in every pixel."""
+    across = math.isqrt(spp)
+    lane = dr.arange(mi.UInt32, resolution**2 * spp)
+    sample = lane % spp
+    (column, row) = film.corners(lane // spp)
+    grid_row = sample // across
+    within = mi.Float(sample - grid_row * across), mi.Float(grid_row)
+    cell = 1 / across  # a power of two
+    ray = film.rays(column + (within[0] + 0.5) * cell, row + (within[1] + 0.5) * cell)
+    return scene.surfaces.ray_intersect_preliminary(ray, coherent=True)
+
+
+class DeviceSum:
     """A `PassSum` in float64 in the memory of the device, so that no pass waits for Python."""
 
     def __init__(self, tracer: VectorTracer, camera: Camera) -> None:
-        self._tracer, self._camera = tracer, camera
-        number = tracer._parts.count
-        self._totals = [dr.opaque(mi.Color3d, 0, camera.resolution**2) for _ in range(number)]
-        self._squares = dr.opaque(mi.Float64, 0, camera.resolution**2)
+        self._tracer = tracer
+        self._camera = camera
+        self._film = tracer._film(camera)
+        kinds = [*[mi.Color3d] * tracer._parts.count, *[mi.Float64] * 3]
+        self.sums: list[Any] = [dr.opaque(kind, 0, camera.resolution**2) for kind in kinds]
+        """Of each part (Color3d); the squares of `read_squares`; samples; passes (Float64)."""
 
     def add(self, *, seed: int, spp: int, chosen: Chosen = None) -> None:
         pixels = _pixels(self._camera, chosen)
-        traced = self._tracer._one_pass(self._camera, pixels, seed=seed, spp=spp)
-        means: list[Any] = [mi.Color3d(part) for part in traced]
-        samples = dr.opaque(mi.Float64, spp)
-        for total, part in zip(self._totals, means, strict=True):
-            _add(total, part * samples, pixels)
-        mean: Any = sum(means)
-        _add(self._squares, dr.square((mean.x + mean.y + mean.z) / 3) * samples, pixels)
-        dr.eval(self._totals, self._squares)
+        arguments = self._tracer._pass(self._camera, self._film, pixels, seed, spp)
+        self.sums = _sums(*arguments, self.sums)
 
     def guide(self) -> None:
         self._tracer = self._tracer.guided()
 
     def read(self) -> NDArray[np.float64]:
-        return np.stack([_picture(self._camera, total) for total in self._totals])
+        return np.stack([_picture(self._camera, total) for total in self.sums[:-3]])
 
     def read_squares(self) -> NDArray[np.float64]:
-        return read_back(self._squares).reshape(self._camera.resolution, self._camera.resolution)
+        return read_back(self.sums[-3]).reshape(self._camera.resolution, self._camera.resolution)
 
 
 def _learnt(record: Scene, scene: KernelScene) -> GuideTable | None:
     """Return the guide of a scene: None where no mirror lights a rough surface."""
     order = np.concatenate(split_triangles(record))
     corners = record.vertex_positions[record.faces[order]]
-    cells, records = GuideCells(corners.astype(np.float64)), PhotonRecords(PHOTON_PATHS)
-    u = even_numbers(PHOTON_PATHS, _PHOTON_SEED)
+    cells = GuideCells(corners.astype(np.float64))
+    records = PhotonRecords(PHOTON_PATHS)
+    u = even_numbers(PHOTON_PATHS, even_shifts(_PHOTON_SEED))
     emitter = scene.emitters.sample(mi.Point2f(u[0], u[1]), mi.Bool(True))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed_for(_PHOTON_SEED, "photons"), PHOTON_PATHS)
@@ -215,19 +320,23 @@ def _learnt(record: Scene, scene: KernelScene) -> GuideTable | None:
     return learn(cells, records.photons())
 
 
-def even_numbers(count: int, seed: int) -> list[Any]:
+def even_shifts(seed: int) -> list[Any]:
+    """Return the shifts (UInt32) of `even_numbers` that go with a seed."""
+    return [dr.opaque(mi.UInt32, 2 * seed_for(seed, "light paths", axis)) for axis in range(4)]
+
+
+def even_numbers(count: int, shifts: Sequence[Any]) -> list[Any]:
     """Return 4 arrays of `count` uniform numbers (Float, [0, 1)): points that fill 4 dimensions.
 
-    Multiples of the 4 inverse powers of a generalised golden ratio (Roberts 2018), shifted by the
-    seed. Any first part of them is spread evenly, so that any count will do.
+    Multiples of the 4 inverse powers of a generalised golden ratio (Roberts 2018), each shifted by
+    a number (UInt32). Any first part of them is spread evenly, so that any count will do.
     """
     lane = dr.arange(mi.UInt32, count)
-    numbers = []
-    for axis in range(4):
-        stride = round(2**32 / _GOLDEN ** (axis + 1))
-        shift = dr.opaque(mi.UInt32, 2 * seed_for(seed, "light paths", axis))
-        numbers.append(mi.Float((lane * stride + shift) >> 8) * 2.0**-24)
-    return numbers
+    strides = [round(2**32 / _GOLDEN ** (axis + 1)) for axis in range(4)]
+    return [
+        mi.Float((lane * stride + shift) >> 8) * 2.0**-24
+        for stride, shift in zip(strides, shifts, strict=True)
+    ]
 
 
 def _load(scene: Scene, triangles: NDArray[np.intp], beside: Any = None) -> Any:
@@ -240,7 +349,7 @@ def _load(scene: Scene, triangles: NDArray[np.intp], beside: Any = None) -> Any:
     mesh = mi.Mesh("triangles", len(scene.vertex_positions), len(triangles))
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = own_floats(scene.vertex_positions)
-    parameters["faces"] = scene.faces[triangles].ravel()
+    parameters["faces"] = own_integers(scene.faces[triangles])
     parameters.update()
     children = {"mesh": mesh} if beside is None else {"mesh": mesh, "beside": beside}
     return mi.load_dict({"type": "scene", **children})
@@ -251,47 +360,16 @@ def _pixels(camera: Camera, chosen: Chosen = None) -> Any:
 
     They are in memory even where they are all: one kernel serves any choice.
     """
-    number = camera.resolution**2
-    numbers = np.arange(number) if chosen is None else np.flatnonzero(chosen)
-    return own_integers(numbers)
+    if chosen is not None:
+        return own_integers(np.flatnonzero(chosen))
+    numbers = dr.arange(mi.UInt32, camera.resolution**2)
+    dr.eval(numbers)
+    return numbers
 
 
 def _add(total: Any, values: Any, pixels: Any) -> None:
     """Add to some pixels of an array, each of them once: in no order that could matter."""
     dr.scatter(total, dr.gather(type(total), total, pixels) + values, pixels)
-
-
-def _sampler(pixels: Any, seed: int, spp: int) -> Any:
-    sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
-    sampler.set_samples_per_wavefront(spp)
-    sampler.seed(seed, len(pixels) * spp)
-    return sampler
-
-
-def _pixel_corners(camera: Camera, pixels: Any, spp: int) -> tuple[Any, Any]:
-    """Return column and row of each lane's pixel; the samples of a pixel are neighbours."""
-    lane = dr.arange(mi.UInt32, len(pixels) * spp)
-    pixel = dr.gather(mi.UInt32, pixels, lane // dr.opaque(mi.UInt32, spp))
-    width = dr.opaque(mi.UInt32, camera.resolution)
-    row = pixel // width
-    return mi.Float(pixel - row * width), mi.Float(row)
-
-
-def _jittered(camera: Camera, pixels: Any, sampler: Any, spp: int) -> tuple[Any, Any]:
-    column, row = _pixel_corners(camera, pixels, spp)
-    jitter = sampler.next_2d()
-    return column + jitter.x, row + jitter.y
-
-
-def _on_a_grid(camera: Camera, spp: int) -> tuple[Any, Any]:
-    """Return column and row of each lane's sample: a regular grid in every pixel."""
-    across = dr.opaque(mi.UInt32, math.isqrt(spp))
-    sample = dr.arange(mi.UInt32, camera.resolution**2 * spp) % (across * across)
-    cell = dr.rcp(mi.Float(across))
-    grid_row = sample // across
-    column, row = _pixel_corners(camera, _pixels(camera), spp)
-    within = mi.Float(sample - grid_row * across), mi.Float(grid_row)
-    return column + (within[0] + 0.5) * cell, row + (within[1] + 0.5) * cell
 
 
 def _pixel_means(spp: int, samples: Any) -> Any:

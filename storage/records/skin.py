@@ -1,8 +1,9 @@
 """`LevelSkin`: what a level of an asset looks like in its own colours, and how well that is known.
 
-The textures are an atlas of the level's own triangles, baked from the source (pipeline.assets.source_materials),
-so that they need no charts and survive any change of the triangles. Each is packed as in a shard
-(storage.records.packed_maps), since a run holds many objects and shows few of them at a time.
+The textures are an atlas of the level's own triangles, baked from the source
+(pipeline.assets.source_materials), so that they need no charts and survive any change of the
+triangles. Each is packed as in a shard (storage.records.packed_maps), since a run holds many
+objects and shows few of them at a time.
 """
 
 import dataclasses

@@ -124,18 +124,20 @@ def test_what_a_run_will_make_is_said_before_it_begins(
     assert "; 6 of them are still to make: 0.0 (0.0 to 0.0) minutes on" in said
 
 
-def _responds(name: str, code: str, *, found: str, **_: str) -> doctor.Finding:
+FACTS = {"denoiser": "2.5.1", "denoiser_device": "CPU", "threads": "2", "view_s": "0.04"}
+
+
+def _responds(name: str, code: str, *, summary: str, **_: str) -> doctor.Finding:
     compile(code, name, "exec")
-    return doctor.Finding(name=name, state="ok", found=found)
+    return doctor.Finding(name=name, state="ok", found=summary)
 
 
 @pytest.fixture(scope="module")
 def findings() -> list[doctor.Finding]:
     """What is found where every probe ends well: each would take seconds in its process."""
-    facts = {"denoiser": "2.5.1", "denoiser_device": "CPU", "threads": "2"}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(doctor, "_probe", _responds)
-        patch.setattr(doctor, "render_facts", lambda variant: facts)
+        patch.setattr(doctor, "render_facts", lambda variant: FACTS)
         return list(doctor.examine())
 
 
@@ -211,18 +213,27 @@ def test_no_llvm_is_missing_and_says_what_to_install(monkeypatch: pytest.MonkeyP
     assert "no LLVM library found" in finding.found and "libllvm19" in finding.found
 
 
-@pytest.mark.parametrize("note", ["", "the card is too old, so pictures are denoised elsewhere"])
-def test_a_graphics_card_is_well_or_says_what_it_lacks(
-    note: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("note", ["", "the GPU is too old, so the CPU denoises pictures"])
+def test_a_gpu_is_well_or_says_what_it_lacks(note: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from pipeline.renders.variant import Variant
 
-    card = Variant(name="cuda_ad_rgb", libllvm="", note=note, denoiser="CPU" if note else "CUDA")
-    facts = {"denoiser": "2.5.1", "denoiser_device": card.denoiser, "threads": "2"}
-    monkeypatch.setattr(doctor, "choose_variant", lambda: card)
+    gpu = Variant(name="cuda_ad_rgb", libllvm="", note=note, denoiser="CPU" if note else "CUDA")
+    monkeypatch.setattr(doctor, "choose_variant", lambda default="cpu", device=None: gpu)
+    monkeypatch.setattr(doctor, "query_gpus", lambda fields: ["NVIDIA H200, 580.95"])
     monkeypatch.setattr(doctor, "_probe", _responds)
-    monkeypatch.setattr(doctor, "render_facts", lambda variant: facts)
+    monkeypatch.setattr(
+        doctor, "render_facts", lambda variant: {**FACTS, "denoiser_device": variant.denoiser}
+    )
     assert doctor._renderer().state == "ok"
     finding = doctor._denoiser()
     assert (finding.state, finding.consequence) == ("slower" if note else "ok", note)
-    assert card.denoiser in finding.found
+    assert f"{gpu.denoiser}, 2 threads; a view of 256 pixels" in finding.found
+    finding = doctor._accelerator()
+    assert (finding.state, finding.found[:31]) == ("ok", "NVIDIA H200, driver 580.95; ren")
+
+
+def test_a_gpu_that_renders_nothing_right_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    monkeypatch.setattr(doctor, "query_gpus", lambda fields: ["NVIDIA H200, 580.95"])
+    finding = doctor._accelerator()
+    assert finding.state == "slower" and "no right picture" in finding.found

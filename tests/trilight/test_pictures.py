@@ -24,7 +24,7 @@ def test_every_camera_is_rendered_but_where_some_are_named(monkeypatch: pytest.M
             return fov_deg, name
 
     monkeypatch.setattr("pipeline.generation.path_tracer.PathTracer", Tracer)
-    monkeypatch.setattr("pipeline.renders.variant.choose_variant", lambda: None)
+    monkeypatch.setattr("pipeline.renders.variant.choose_variant", lambda default: None)
     scene = tiny_scene(fov_deg=np.array([45, 50], np.float32))
     first, second = (45, "view 0"), (50, "view 1")
     found: list[object] = [*render_views(scene)]

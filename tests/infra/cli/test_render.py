@@ -137,7 +137,7 @@ def test_the_picture_says_how_it_was_made(source: Path, tmp_path: Path) -> None:
     # no target that was not asked for: pictures made before there were others are kept
     assert set(settings) == {
         "resolution", "noise_floor_db", "min_spp", "max_spp", "reject_at_cap", "max_depth",
-        "rr_depth", "aux_spp", "denoiser", "min_mean_radiance", "per_light",
+        "rr_depth", "aux_spp", "denoiser", "min_mean_radiance", "per_light", "arithmetic",
     }  # fmt: skip
     assert "mitsuba_variant" in json.loads(header["trilight.environment"])
     assert str(tmp_path) not in str(header)

@@ -71,9 +71,9 @@ def test_wrong_numbers_of_runs_are_named(given: dict[str, Any], message: str) ->
         dataset_in_runs(_parameters(**given))
 
 
-@for_each(("variant", "held"), [("cuda_ad_rgb", [1]), ("llvm_ad_rgb", [])])
-def test_rendering_on_a_card_takes_its_limit(
-    monkeypatch: pytest.MonkeyPatch, variant: str, held: list[int]
+@for_each(("device", "held"), [("gpu", [1]), ("cpu", [])])
+def test_rendering_on_a_gpu_takes_its_limit(
+    monkeypatch: pytest.MonkeyPatch, device: str, held: list[int]
 ) -> None:
     taken: list[int] = []
 
@@ -84,10 +84,9 @@ def test_rendering_on_a_card_takes_its_limit(
         yield
 
     monkeypatch.setattr(runner, "concurrency", limit)
-    monkeypatch.setattr(runner, "choose_variant", lambda: SimpleNamespace(name=variant))
     monkeypatch.setattr(runner, "make_task", lambda job, pieces: (job, pieces, list(taken)))
-    work = SimpleNamespace(job="job", pieces=())
-    assert cast(Any, runner.make_scenes).fn("0", work) == ("job", (), held)
+    work = SimpleNamespace(job=SimpleNamespace(device=device), pieces=())
+    assert cast(Any, runner.make_scenes).fn("0", work) == (work.job, (), held)
 
 
 def test_documents_are_tried_again_where_that_can_help() -> None:

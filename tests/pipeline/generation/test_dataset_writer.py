@@ -9,8 +9,12 @@ from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.generation import dataset_writer
 from pipeline.generation.begin_dataset import begin
+from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.generation.environment import environment
+from pipeline.generation.run import choose_dataset_variant
 from pipeline.objects.generated import generate_objects
+from pipeline.renders.variant import Device, Variant, _Probed, device_of
 from pipeline.shards.pack import pack_shard
 from storage.dataset import layout
 from storage.dataset.dataset import open_dataset
@@ -107,6 +111,58 @@ def test_other_settings_and_another_environment_are_refused_by_name(tmp_path: Pa
     with pytest.raises(TrilightError, match="mitsuba_variant was 'llvm_ad_rgb', now 'scalar_rgb'"):
         _begin(tmp_path, _build(), mitsuba_variant="scalar_rgb")
     elsewhere = {**ENVIRONMENT, "mitsuba_variant": "scalar_rgb"}
+    begin(DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True)
+
+
+@for_each(
+    ("build", "begun", "device", "named", "chosen"),
+    [
+        ("smoke", "", None, "", "cpu"),
+        ("benchmark-v1", "", None, "", "cpu"),
+        ("pretrain-256", "", None, "", "gpu"),
+        ("pretrain-256", "", "cpu", "", "cpu"),
+        ("smoke", "", None, "cuda_ad_rgb", "gpu"),
+        ("smoke", "cuda_ad_rgb", None, "", "gpu"),
+        ("pretrain-256", "llvm_ad_rgb", None, "", "cpu"),
+        ("pretrain-256", "llvm_ad_rgb", "auto", "", "cpu"),
+        ("pretrain-256", "llvm_ad_rgb", "gpu", "", "gpu"),
+        ("pretrain-256", "llvm_ad_rgb", None, "cuda_ad_rgb", "gpu"),
+    ],
+)
+def test_a_dataset_stays_on_the_device_that_it_began_on(
+    build: str,
+    begun: str,
+    device: Device | None,
+    named: str,
+    chosen: Device,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """This machine has a GPU that renders well, and smoke and frozen builds have digests."""
+    folder = DatasetFolder(tmp_path)
+    if begun:
+        _begin(tmp_path, _build(), mitsuba_variant=begun)
+    monkeypatch.setenv("TRILIGHT_VARIANT", named)
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    monkeypatch.setattr("pipeline.renders.variant._probe", lambda variant: _Probed())
+    on_cpu = Variant(name="llvm_ad_rgb", libllvm="", note="")
+    monkeypatch.setattr("pipeline.renders.variant._on_processor", lambda: on_cpu)
+    order = DatasetOrder(build=build, device=device)
+    variant = choose_dataset_variant(order, folder)
+    assert variant.device == device_of(environment(variant)) == chosen
+
+
+@for_each(("before", "now"), [("llvm_ad_rgb", "cuda_ad_rgb"), ("cuda_ad_rgb", "llvm_ad_rgb")])
+def test_a_dataset_goes_on_with_another_device_only_where_that_is_accepted(
+    before: str, now: str, tmp_path: Path
+) -> None:
+    _begin(tmp_path, _build(), mitsuba_variant=before)
+    first, second = ("cpu", "gpu") if before == "llvm_ad_rgb" else ("gpu", "cpu")
+    said = f"begun on a {first.upper()} and would go on with a {second.upper()}; choose --device"
+    with pytest.raises(TrilightError, match=f"{said} {first} or another --out, or .*--accept-env"):
+        _begin(tmp_path, _build(), mitsuba_variant=now)
+    elsewhere = {**ENVIRONMENT, "mitsuba_variant": now}
     begin(DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True)
 
 

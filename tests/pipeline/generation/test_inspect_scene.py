@@ -19,7 +19,7 @@ from pipeline.generation import inspect_scene as inspecting
 from pipeline.generation.inspect_scene import ROWS, VIEWS, inspect_scene, seen_into, turntable_poses
 from pipeline.generation.path_tracer import PathTracer
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.variant import Variant, choose_variant
+from pipeline.renders.variant import Device, Variant, choose_variant
 from storage.conventions import look_at_c2w
 from storage.dataset.shard import write_shard
 from storage.errors import TrilightError
@@ -155,9 +155,9 @@ def test_converting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_inspecting(source: SceneSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The child is killed between the facts and the pictures."""
 
-    def kill_and_choose() -> Variant:
+    def kill_and_choose(device: Device) -> Variant:
         assert kill_children()
-        return choose_variant()
+        return choose_variant(device=device)
 
     monkeypatch.setattr(inspecting, "choose_variant", kill_and_choose)
     monkeypatch.setattr(inspecting, "_turntable", _grey)

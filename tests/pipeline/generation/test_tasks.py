@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 
 from infra.cli.changes import parse_changes
 from pipeline.generation.dataset_order import DatasetOrder, generate_words
-from pipeline.generation.machine import available_cores, visible_gpus
+from pipeline.generation.machine import available_cores, children_of_gpu
 from pipeline.generation.runner import in_window
 from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece, TaskBudget, TaskSizes, cut_tasks
+from pipeline.renders.visible_gpus import visible_gpus
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure, TrilightError
@@ -198,3 +199,13 @@ def test_cards_are_those_that_are_visible(
 ) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", value)
     assert visible_gpus() == cards
+
+
+@for_each(
+    ("resolution", "memory_gib", "children"),
+    [(256, 80, 4), (512, 8, 4), (512, 4, 2), (2048, 24, 2), (2048, 141, 4), (256, 0, 1)],
+)
+def test_a_card_has_as_many_children_as_keep_it_busy_and_fit(
+    resolution: int, memory_gib: int, children: int
+) -> None:
+    assert children_of_gpu(resolution, memory_gib << 30) == children

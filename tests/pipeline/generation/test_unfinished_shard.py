@@ -344,7 +344,8 @@ def test_only_children_that_nobody_uses_are_closed(monkeypatch: pytest.MonkeyPat
         return ChildPool(lambda number: cast(IsolatedChild, child), 1)
 
     job = cast(Any, SimpleNamespace(
-        folder=DatasetFolder(Path("a")), settings=SimpleNamespace(digest="d"), lock_sha256="l"
+        folder=DatasetFolder(Path("a")), settings=SimpleNamespace(digest="d"), lock_sha256="l",
+        device="cpu",
     ))  # fmt: skip
     monkeypatch.setattr(render_children, "_pools", {("b", "d", "l"): pool("other")})
     monkeypatch.setattr(render_children, "_render_pool", lambda job: pool("ours"))

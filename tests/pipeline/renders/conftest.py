@@ -1,5 +1,7 @@
 """Mitsuba is activated once for all render tests, as a render child does it."""
 
+from collections.abc import Iterator
+
 import pytest
 
 from pipeline.renders.renderer import set_threads
@@ -20,3 +22,12 @@ def llvm(variant: Variant) -> None:
     """Skips where no LLVM library works."""
     if variant.name != "llvm_ad_rgb":
         pytest.skip(variant.note)
+
+
+@pytest.fixture
+def unrecorded(llvm: None) -> Iterator[None]:
+    """Every pass is traced: for tests that put another kernel in."""
+    import drjit as dr
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+        yield

@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 
 from pipeline.renders import denoiser, variant_probe
 from pipeline.renders.denoiser import denoise, load_oidn, set_denoiser_device
-from pipeline.renders.kept_light import (
-    LEAST_PASSES,
+from pipeline.renders.frozen_arithmetic.halves import Half, measure_floor
+from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans
+from pipeline.renders.frozen_arithmetic.kept_light import (
     Pictures,
     keep_converged,
     keep_in_halves,
     with_mean_of,
 )
+from pipeline.renders.kept_light import LEAST_PASSES
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.noise_floor import Half, measure_floor
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tiles import TileChoice
@@ -229,17 +230,17 @@ def test_the_standard_error_is_that_between_passes() -> None:
     camera = camera_of(scene, 16)
     asked: list[tuple[int, int]] = []
     samples = HalfSamples([tracer], camera, 3, first_spp=32, max_spp=256)
-    add = type(samples._sums[0][0]).add
+    add = type(samples.sums[0][0]).add
 
     def remembered(part: object, *, seed: int, spp: int, chosen: Chosen = None) -> None:
         asked.append((seed, spp))
         add(part, seed=seed, spp=spp, chosen=chosen)  # type: ignore[arg-type]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(type(samples._sums[0][0]), "add", remembered)
+        patch.setattr(type(samples.sums[0][0]), "add", remembered)
         for _ in samples.passes_to(128):
             pass
-        few = samples.standard_error()
+        few = HostMeans(samples).standard_error()
         assert few is not None and np.isinf(few).all(), "8 passes are too few"
         for _ in samples.passes_to(256):
             pass
@@ -250,7 +251,7 @@ def test_the_standard_error_is_that_between_passes() -> None:
     weights = np.array([spp for _, spp in asked], np.float64)
     mean = np.tensordot(weights / weights.sum(), greys, 1)
     variance = np.tensordot(weights, np.square(greys - mean), 1) / (len(asked) - 1) / weights.sum()
-    found = samples.standard_error()
+    found = HostMeans(samples).standard_error()
     assert found is not None
     # Differences of sums lose 7 of 16 digits: 1e-4 of the pixel's value is far below its noise.
     np.testing.assert_allclose(found, np.sqrt(variance), rtol=1e-3, atol=1e-4 * mean.max())

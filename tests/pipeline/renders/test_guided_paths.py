@@ -39,6 +39,7 @@ def _guided(tracer: VectorTracer) -> VectorTracer:
     return guided
 
 
+@pytest.mark.usefixtures("unrecorded")
 @pytest.mark.parametrize(
     ("scene", "share"),
     [(mirrors(), 0.95), (lit_by_a_mirror(0.1), 0.5)],

@@ -1,7 +1,6 @@
 """Light tracing, its parts, and beside the path tracer: alone and together the same light."""
 
 import dataclasses
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,8 +13,14 @@ from pipeline.renders.device_memory import read_back
 from pipeline.renders.emission_cone import EmissionCone
 from pipeline.renders.film import Film
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.splats import Splats, splat_unit
-from pipeline.renders.vector_tracer import VectorTracer, even_numbers
+from pipeline.renders.splats import Splats, SplatUnit, splat_unit
+from pipeline.renders.vector_tracer import (
+    VectorTracer,
+    even_numbers,
+    even_shifts,
+    trace_camera_paths,
+    trace_light_paths,
+)
 from storage.conventions import camera_rays
 from storage.records.scene import Scene
 from tests.pipeline.renders.sampling import (
@@ -31,35 +36,36 @@ from tests.pipeline.renders.test_ggx import kernel_lobes, seen_at
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-_ALMOST_ALL = 2.0**40
+_ALMOST_ALL = 2.0**30
 """Light paths for each camera path, of which weights leave a millionth to the other strategies."""
 
 
 class CameraPathsOnly(VectorTracer):
     """The path tracer as it is without light paths."""
 
-    def _one_pass(self, camera: Camera, pixels: Any, *, seed: int, spp: int) -> list[Any]:
-        return self._traced(camera, pixels, 0.0, seed=seed, spp=spp)
+    _light_paths = 0.0
+    _traced = staticmethod(trace_camera_paths)
 
 
-class CameraPathsLeft(VectorTracer):
+class CameraPathsLeft(CameraPathsOnly):
     """What weights leave to camera paths beside light paths without number."""
 
-    def _one_pass(self, camera: Camera, pixels: Any, *, seed: int, spp: int) -> list[Any]:
-        return self._traced(camera, pixels, _ALMOST_ALL, seed=seed, spp=spp)
+    _light_paths = _ALMOST_ALL
 
 
 class LightPathsOnly(VectorTracer):
     """All light but the direct one from light paths alone, with a weight of 1."""
 
+    _light_paths = _ALMOST_ALL
+    _traced = staticmethod(trace_light_paths)
+
     def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int) -> None:
         super().__init__(scene, max_depth=max_depth, rr_depth=rr_depth)
-        self._unit /= 2.0**32  # each of so many paths counts for so much less
+        # each of so many paths counts for so much less
+        self._unit = SplatUnit(splat_unit(scene) / 2.0**32)
 
-    def _one_pass(self, camera: Camera, pixels: Any, *, seed: int, spp: int) -> list[Any]:
-        count = camera.resolution**2 * spp
-        landed = self._landed(camera, _ALMOST_ALL, seed=seed, count=count)
-        return [dr.gather(mi.Color3f, part, pixels) for part in landed]
+    def _num_light_paths(self, camera: Camera, spp: int) -> int:
+        return camera.resolution**2 * spp
 
 
 LAMP = [[0.8, 0.3, 1.6], [1.1, 0.3, 1.6], [0.9, 0.6, 1.7]]
@@ -215,7 +221,7 @@ def test_splats_add_up_in_any_order() -> None:
     pixels = rng.integers(0, 16, 5000).astype(np.uint32)
     pictures = []
     for order in (np.arange(5000), rng.permutation(5000)):
-        splats = Splats(4, splat_unit(_scene()))
+        splats = Splats(4, SplatUnit(splat_unit(_scene())))
         colour = mi.Color3f(*(channel[order].astype(np.float32) for channel in values))
         splats.add(colour, mi.UInt32(pixels[order]), mi.Bool(True))
         pictures.append(read_back(splats.picture()))
@@ -229,7 +235,7 @@ def test_splats_add_up_in_any_order() -> None:
 def test_a_splat_counts_to_the_nearest_unit() -> None:
     """Cut off instead, dim light would be lost: 0.75 of a unit would be none, a thousand times."""
     unit = splat_unit(_scene())
-    splats = Splats(1, unit)
+    splats = Splats(1, SplatUnit(unit))
     for units in (0.25, 0.75):
         colour = mi.Color3f(*(np.full(1000, units * unit, np.float32) for _ in range(3)))
         splats.add(colour, mi.UInt32(np.zeros(1000, np.uint32)), mi.Bool(True))
@@ -242,7 +248,7 @@ def test_a_splat_that_no_sum_can_hold_shows(value: float) -> None:
     for channel in range(3):
         colour = [0.25, 0.25, 0.25]
         colour[channel] = value
-        splats = Splats(2, splat_unit(_scene()))
+        splats = Splats(2, SplatUnit(splat_unit(_scene())))
         splats.add(mi.Color3f(*colour), mi.UInt32([1]), mi.Bool(True))
         splats.add(mi.Color3f(value), mi.UInt32([2]), mi.Bool(False))
         splats.add(mi.Color3f(0.5), mi.UInt32([0]), mi.Bool(True))
@@ -265,7 +271,7 @@ def test_directions_into_the_scene_have_the_density_that_is_claimed(position: li
     """The mean of g / density is the integral of g over what is drawn, for any g."""
     cone = EmissionCone(_scene())
     count, normal = 1 << 16, dr.normalize(mi.Vector3f(0.3, 0.5, 1.0))
-    u = even_numbers(count, 7)
+    u = even_numbers(count, even_shifts(7))
     drawn = cone.sample(mi.Point3f(*position), normal, mi.Point2f(u[2], u[3]))
     density = np.array(cone.density(mi.Point3f(*position), normal, drawn), np.float64)
     directions = np.array(drawn).T.astype(np.float64)
@@ -291,7 +297,7 @@ def test_directions_into_the_scene_have_the_density_that_is_claimed(position: li
 
 def test_light_starts_are_even_and_their_shift_goes_with_the_seed() -> None:
     count = 4096
-    first, second = (np.array(even_numbers(count, seed)) for seed in (1, 2))
+    first, second = (np.array(even_numbers(count, even_shifts(seed))) for seed in (1, 2))
     assert first.shape == (4, count) and 0 <= first.min() and first.max() < 1
     assert (np.abs(first - second).max(axis=1) > 1e-3).all()
     for a in range(4):

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.renders import renderer as renderer_module
 from pipeline.renders.denoiser import Quality, denoise
-from pipeline.renders.kept_light import with_mean_of
+from pipeline.renders.frozen_arithmetic import host_pictures
+from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans
+from pipeline.renders.frozen_arithmetic.kept_light import with_mean_of
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import RenderedView
@@ -121,13 +122,13 @@ def test_a_view_says_how_far_it_is() -> None:
 
 def test_halves_of_many_samples_have_the_best_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     filtered: list[str] = []
-    denoise = renderer_module.denoise
+    denoise = host_pictures.denoise
 
     def noted(raw: NDArray[np.float32], features: Features, quality: Quality) -> Any:
         filtered.append(quality)
         return denoise(raw, features, quality)
 
-    monkeypatch.setattr(renderer_module, "denoise", noted)
+    monkeypatch.setattr(host_pictures, "denoise", noted)
     settings = dataclasses.replace(GROWING, noise_floor_db=95.0, min_spp=64, max_spp=512)
     render_view(simple_scene(), settings)
     # Two halves at 256 and at 512 samples, and the picture.
@@ -258,7 +259,7 @@ def test_lights_apart_add_up_to_one_denoised_picture() -> None:
     samples = HalfSamples(parts, camera_of(scene, 32), 0, first_spp=32, max_spp=32)
     assert len(list(samples.passes_to(SETTINGS.max_spp))) == 2
     features = tracer.features(camera_of(scene, 32), spp=SETTINGS.aux_spp)
-    raw = samples.mean().sum(axis=0)
+    raw = HostMeans(samples).mean().sum(axis=0)
     expected = with_mean_of(denoise(raw, features, "high"), raw)
     # rounded to half floats four times, each light and their sum: 2^-11 of each
     np.testing.assert_allclose(

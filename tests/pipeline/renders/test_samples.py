@@ -9,7 +9,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
-from pipeline.renders.noise_floor import Half, measure_floor, squared_error, surprises
+from pipeline.renders.frozen_arithmetic.halves import (
+    Half,
+    measure_floor,
+    squared_error,
+    surprises,
+)
+from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings, one_picture
 from pipeline.renders.stopping import Goal, expected_spp, gaps_db, next_spp, slope_db
@@ -66,8 +72,9 @@ def test_the_mean_weighs_passes_by_their_samples() -> None:
     samples, asked = _passes(32, 256, 4096)
     assert len({seed for _, seed in asked}) == len(asked), "no two passes have the same seed"
     expected = (4 * 16 * 16 + 64 * 64) / 128
-    assert samples.mean().max() == samples.mean().min() == expected
-    assert [float(half.mean()) for half in samples.half_means()] == [expected, expected]
+    means = HostMeans(samples)
+    assert means.mean().max() == means.mean().min() == expected
+    assert [float(half.mean()) for half in means.half_means()] == [expected, expected]
 
 
 GOOD: dict[str, Any] = {

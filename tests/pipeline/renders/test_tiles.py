@@ -11,8 +11,9 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
+from pipeline.renders.frozen_arithmetic.halves import Half
+from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans, LogChanges
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.noise_floor import Half
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
@@ -52,7 +53,7 @@ class RareLight:
 
 
 def _halves(samples: HalfSamples) -> list[Half]:
-    raws = [raw[0] for raw in samples.half_means()]
+    raws = [raw[0] for raw in HostMeans(samples).half_means()]
     return [Half(raw_rgb=raw, denoised_rgb=raw) for raw in raws]
 
 
@@ -63,13 +64,13 @@ def _adapted(
     counted: NDArray[np.bool_] = EVERYWHERE,
 ) -> HalfSamples:
     samples = HalfSamples([tracer], CAMERA, seed, first_spp=32, max_spp=4096)  # type: ignore[list-item]
-    samples.counted = counted
-    tiles = TileChoice(samples.counted)
+    samples.count_over(counted)
+    tiles, changes = TileChoice(counted), LogChanges()
     for spp in measured_at:
         more = tiles.passes(samples, spp) if samples.spp else None
         for _ in samples.passes_to(spp) if more is None else samples.passes_over(more):
             pass
-        tiles.learn(_halves(samples), samples, "off")
+        tiles.learn(changes.since(_halves(samples)), samples, "off")
     return samples
 
 
@@ -83,7 +84,7 @@ def test_the_mean_stays_unbiased_where_tiles_are_chosen_by_rare_light() -> None:
     means, spread = [], []
     for seed in range(1000):
         samples = _adapted(RareLight(), seed, [32, 128, 512])
-        means.append(samples.mean().mean())
+        means.append(HostMeans(samples).mean().mean())
         spread.append(samples.spp_of(0).max() > samples.spp_of(0).min())
     assert np.mean(spread) > 0.9, "the samples are spread unevenly"
     error = np.std(means, ddof=1) / np.sqrt(len(means))

@@ -14,16 +14,20 @@ import numpy as np
 import pytest
 
 from pipeline.generation.environment import environment
+from pipeline.generation.path_tracer import PathTracer
+from pipeline.generation.progressive_tracer import ProgressiveTracer
 from pipeline.renders import denoiser, variant_probe, vector_tracer
 from pipeline.renders import variant as variant_module
 from pipeline.renders.facts import render_facts
 from pipeline.renders.llvm_libraries import llvm_libraries
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
-from pipeline.renders.variant import Variant, _Probed, activate, choose_variant
+from pipeline.renders.settings import RenderSettings
+from pipeline.renders.variant import Device, Variant, _Probed, activate, choose_variant
 from pipeline.renders.variant_probe import BLOCK, probe_scene, wrong_picture
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.records.scene_file import encode_scene
 from tests.command_line import trilight
+from tests.for_each import for_each
 from tests.oracle.kernel_bsdf import exact_twin
 from tests.pipeline.renders.sampling import (
     Estimate,
@@ -137,16 +141,98 @@ def test_the_user_may_name_the_variant(monkeypatch: pytest.MonkeyPatch, variant:
         choose_variant()
 
 
-def test_a_graphics_card_is_used_only_after_a_probe(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_is_used_only_after_a_probe(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # hides the cards of a machine that has some
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # hides the GPUs of a machine that has some
     with pytest.raises(
         TrilightError, match=r"no right picture could be rendered with it here \(.+\)"
     ):
         choose_variant()
 
 
-def test_a_picture_without_some_of_its_rays_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+CPU, GPU = "llvm_ad_rgb", "cuda_ad_rgb"
+ON_CPU = Variant(name="llvm_ad_rgb", libllvm="libLLVM.so", note="")
+
+
+@for_each(
+    ("named", "default", "device", "visible", "problem", "chosen"),
+    [
+        ("", "cpu", None, "0", "", CPU),
+        ("", "auto", None, "0", "", GPU),
+        ("", "auto", None, "0", "no OptiX", CPU),
+        ("", "auto", None, "", "must not be probed", CPU),
+        ("", "cpu", "gpu", "", "", GPU),
+        ("", "cpu", "gpu", "0", "no OptiX", "no OptiX.*Choose --device cpu"),
+        (GPU, "cpu", None, "0", "", GPU),
+        (GPU, "cpu", "cpu", "0", "", CPU),
+        (CPU, "auto", None, "0", "", CPU),
+        (CPU, "auto", "gpu", "0", "", GPU),
+    ],
+)
+def test_an_option_names_the_device_before_the_variable_and_the_default(
+    named: str,
+    default: Device,
+    device: Device | None,
+    visible: str,
+    problem: str,
+    chosen: str,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path))
+    monkeypatch.setenv("TRILIGHT_VARIANT", named)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    monkeypatch.setattr(variant_module, "_on_processor", lambda: ON_CPU)
+    monkeypatch.setattr(variant_module, "_probe", lambda variant: _Probed(problem=problem))
+    if chosen not in (CPU, GPU):
+        with pytest.raises(TrilightError, match=chosen):
+            choose_variant(default, device=device)
+        return
+    variant = choose_variant(default, device=device)
+    assert variant.name == chosen
+    assert bool(variant.note) == (problem == "no OptiX")
+    assert (variant.address_space(1) == 1) == (chosen == CPU)
+
+
+def test_children_on_a_gpu_may_map_what_cuda_reserves() -> None:
+    """CUDA maps the memory of GPU and machine: with 16 GiB of addresses it does not start."""
+    settings = RenderSettings(resolution=8, noise_floor_db=30, min_spp=8, max_spp=8)
+    for variant in (variant_module._GPU, ON_CPU):
+        path_tracer = PathTracer(
+            settings, seed=0, variant=variant, threads=1, on_samples=lambda now: None
+        )
+        for tracer in (path_tracer, ProgressiveTracer(variant=variant, threads=1)):
+            is_wide = tracer._child._limits.memory_bytes > 16 << 30
+            assert is_wide == (variant.device == "gpu")
+
+
+def test_a_probe_of_a_gpu_is_remembered_for_its_driver(
+    own_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A problem is remembered for `auto` alone: its cause may be fixed before `gpu` is named."""
+    probes: list[str] = []
+    results = iter(["no OptiX", "", ""])
+
+    def probe(variant: Variant) -> _Probed:
+        probes.append(variant.name)
+        return _Probed(problem=next(results))
+
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    monkeypatch.setattr(variant_module, "_probe", probe)
+    monkeypatch.setattr(variant_module, "_on_processor", lambda: ON_CPU)
+    assert [choose_variant("auto").device for _ in range(2)] == ["cpu", "cpu"]
+    assert len(probes) == 1
+    assert [choose_variant(device="gpu").device for _ in range(2)] == ["gpu", "gpu"]
+    assert choose_variant("auto").device == "gpu"
+    assert len(probes) == 2
+    monkeypatch.setattr(variant_module, "gpu_identity", lambda: ("another driver",))
+    assert choose_variant("auto").device == "gpu"
+    assert len(probes) == 3
+
+
+def test_a_picture_without_some_of_its_rays_is_refused(
+    own_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Dr.Jit warns of it once, while it compiles, and goes on."""
     warning = "jit_eval(): more than one OptiX shader binding table. Disabling this ray tracing op"
     monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
@@ -161,8 +247,8 @@ def test_a_picture_without_some_of_its_rays_is_refused(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("problem", ["", "Open Image Denoise: out of memory (on CUDA)"])
-def test_pictures_are_denoised_on_the_card_or_it_is_said(
-    problem: str, monkeypatch: pytest.MonkeyPatch
+def test_pictures_are_denoised_on_the_gpu_or_it_is_said(
+    problem: str, own_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ended = subprocess.CompletedProcess([], 0, stdout=problem + "\n", stderr="")
     monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
@@ -196,6 +282,7 @@ def test_facts_name_versions_device_and_threads(variant: Variant) -> None:
     assert facts["denoiser_device"] == "CPU"
     assert int(facts["threads"]) >= 1
     assert {"mitsuba", "drjit", "pyoidn", "llvm", "denoiser"} <= facts.keys()
+    assert float(facts["view_s"]) > 0
 
 
 class _Blind:
@@ -223,6 +310,7 @@ def test_the_right_picture_passes() -> None:
     assert wrong_picture() == ""
 
 
+@pytest.mark.usefixtures("unrecorded")
 @pytest.mark.parametrize("blind", ["surfaces", "everything"])
 @pytest.mark.parametrize("kernel", ["trace", "trace_light"])
 def test_a_kernel_that_misses_one_scene_is_found(

@@ -1,0 +1,173 @@
+"""`HostPictures`: the arithmetic of a view in numpy, on sums that are read back."""
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.renders.camera import Camera
+from pipeline.renders.denoiser import denoise
+from pipeline.renders.frozen_arithmetic.halves import Half, measure_floor
+from pipeline.renders.frozen_arithmetic.kept_light import (
+    Pictures,
+    keep_converged,
+    keep_in_halves,
+    with_mean_of,
+)
+from pipeline.renders.kept_light import LEAST_PASSES
+from pipeline.renders.samples import HalfSamples
+from pipeline.renders.settings import Filtered, RenderSettings
+from pipeline.renders.tiles import tile_means
+from pipeline.renders.tracer import Features, Tracer
+from pipeline.renders.view_pictures import (
+    MeasuredLook,
+    put_together,
+    require_bounded,
+    require_finite,
+    to_filter,
+)
+from storage.conventions import log10_radiance
+
+
+class HostPictures:
+    """See `ViewPictures` for the meaning of its methods."""
+
+    def __init__(
+        self, samples: HalfSamples, tracer: Tracer, camera: Camera, settings: RenderSettings
+    ) -> None:
+        self._samples = samples
+        self._settings = settings
+        self._features = tracer.features(camera, spp=settings.aux_spp)
+        self.hits = tracer.hits(camera)
+        self.shown = _shown(self._features)
+        self._changes = LogChanges()
+
+    def look(self, quality: Filtered) -> MeasuredLook:
+        names = self._settings.part_names
+        self._means = means = HostMeans(self._samples)
+        pairs = [(raw, self._denoised(raw, quality)) for raw in means.half_means()]
+        error = means.standard_error()
+        kept = pairs
+        if error is not None and self._settings.denoiser != "off":
+            kept = keep_in_halves(pairs, error)
+        first, second = map(_half, kept)
+        floors = [measure_floor(first, second, self.hits)]
+        for part in range(len(names)):
+            parts = [
+                _half((raw[part :: len(names)], rest[part :: len(names)])) for raw, rest in kept
+            ]
+            floors.append(measure_floor(parts[0], parts[1], self.hits))
+        return MeasuredLook(
+            floor=floors[0],
+            part_floors=dict(zip(names, floors[1:], strict=True)),
+            changes=self._changes.since([_half(pair) for pair in pairs]),
+        )
+
+    def finish(self) -> NDArray[np.float32]:
+        raw = self._means.mean()
+        error = self._means.standard_error()
+        parts = self._denoised(raw, self._settings.denoiser)
+        if error is None or self._settings.denoiser == "off":
+            return parts
+        kept = keep_converged(parts, raw, error)
+        return np.stack([with_mean_of(*pair) for pair in zip(kept, raw, strict=True)])
+
+    def _denoised(self, pictures: Pictures, quality: Filtered) -> Pictures:
+        require_bounded(float(pictures.max()))
+        if quality == "off":
+            return pictures
+        names = self._settings.part_names
+        filtered = [
+            denoise(picture, self._features.of_part(name), quality)
+            for picture, name in to_filter(list(pictures), names)
+        ]
+        return np.stack(put_together(list(pictures), filtered, names, _with_means_of, _shares_of))
+
+
+class HostMeans:
+    """Means of the samples of a view as they are now, read back once."""
+
+    def __init__(self, samples: HalfSamples) -> None:
+        self._samples = samples
+        self._totals = [np.concatenate([each.read() for each in sums]) for sums in samples.sums]
+        require_finite(int((~np.isfinite(self._totals).all(axis=(0, 1, -1))).sum()))
+
+    def half_means(self) -> list[Pictures]:
+        """Return the mean of each half, [P, R, R, 3]."""
+        return [mean.astype(np.float32) for mean in self._means()]
+
+    def mean(self) -> Pictures:
+        """Return the mean of both halves, [P, R, R, 3].
+
+        They weigh the same even where one has more samples: what one half is given goes by the
+        other's, and weights by it would make the sum depend on itself (pipeline.renders.tiles).
+        """
+        first, second = self._means()
+        return ((first + second) / 2).astype(np.float32)
+
+    def standard_error(self) -> NDArray[np.float64] | None:
+        """Return that of the grey value of `mean`, [R, R], from the spread between all passes.
+
+        It is infinite where there are fewer than LEAST_PASSES. None if there are several tracers,
+        whose passes are not added.
+        """
+        samples = self._samples
+        if len(samples.sums[0]) > 1:
+            return None
+        greys = np.stack([mean.sum(axis=0).mean(axis=-1) for mean in self._means()])
+        spp = np.stack([samples.spp_of(half) for half in range(2)])
+        mean = greys.mean(axis=0)
+        count = samples.count_of(0) + samples.count_of(1)
+        # Passes of n samples have the variance v / n, and the mean of a half of N has v / N.
+        spread = (self._squares - spp * mean * (2 * greys - mean)).sum(axis=0)
+        variance = np.maximum(spread, 0) / (count - 1)
+        error = np.sqrt(variance * (1 / spp).sum(axis=0) / 4)
+        return np.where(count < LEAST_PASSES, np.inf, error)
+
+    @functools.cached_property
+    def _squares(self) -> NDArray[np.float64]:
+        return np.stack([tracers[0].read_squares() for tracers in self._samples.sums])
+
+    def _means(self) -> list[NDArray[np.float64]]:
+        spp = [self._samples.spp_of(half)[..., None] for half in range(2)]
+        return [total / each for total, each in zip(self._totals, spp, strict=True)]
+
+
+class LogChanges:
+    """How much the halves change from look to look, as `MeasuredLook.changes`."""
+
+    def __init__(self) -> None:
+        self._before: Sequence[NDArray[np.float64]] = []
+
+    def since(self, halves: Sequence[Half]) -> list[NDArray[np.float64]]:
+        """Return the changes of halves since the last call."""
+        logs = [log10_radiance(half.denoised_rgb.astype(np.float64)) for half in halves]
+        pairs = zip(logs, self._before or logs, strict=True)
+        self._before = logs
+        return [tile_means(np.square(log - before).mean(axis=-1)) for log, before in pairs]
+
+
+def _half(pair: tuple[Pictures, Pictures]) -> Half:
+    """Return a half from its pictures [P, R, R, 3], raw and denoised, which are added."""
+    return Half(raw_rgb=pair[0].sum(axis=0), denoised_rgb=pair[1].sum(axis=0))
+
+
+def _shown(features: Features) -> NDArray[np.bool_]:
+    shown: NDArray[np.bool_] = np.any(features.normal != 0, axis=-1)
+    if not shown.any():
+        shown[:] = True
+    return shown
+
+
+def _with_means_of(pairs: Sequence[tuple[Pictures, Pictures]]) -> list[Pictures]:
+    return [with_mean_of(*pair) for pair in pairs]
+
+
+def _shares_of(parts: Sequence[Pictures]) -> Sequence[Pictures]:
+    """Return what share of their sum each of P parts [R, R, 3] is: equal ones where all are 0."""
+    parts_rgb = np.stack(parts)
+    total = parts_rgb.sum(axis=0, dtype=np.float64)
+    equal = np.full(parts_rgb.shape, 1 / len(parts_rgb))
+    shares = np.divide(parts_rgb, total, out=equal, where=total > 0).astype(np.float32)
+    return list(shares)

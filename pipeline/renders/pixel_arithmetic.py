@@ -1,0 +1,156 @@
+"""The formulas of a look as kernels: arithmetic of pixels, and sums over tiles and over all.
+
+They are those of pipeline.renders.noise_floor and pipeline.renders.kept_light. Sums are taken over
+tiles of 64 pixels, then over rows of tiles: in an order of their own, but always the same one.
+Pictures are Color3f, what is worked out of them is Float64, pixel by pixel.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from pipeline.renders.kept_light import DARKER, GLINT, MOST_APART, STANDARD_ERRORS, STANDS_OUT
+from pipeline.renders.noise_floor import BLOCK_PX, SMALLEST_STEP
+from pipeline.renders.tiles import TILE_PX
+from pipeline.renders.view_pictures import add_up
+
+assert BLOCK_PX == TILE_PX  # one order of pixels serves both
+TILE = TILE_PX * TILE_PX
+"""Pixels of a tile."""
+
+_INV_LN_10 = 0.4342944819032518
+
+
+def clean(picture: Any, raw: Any, normal: Any) -> Any:
+    """Return a picture that is at least 0, and black where no ray met anything."""
+    met = dr.any(dr.unravel(mi.Color3f, normal) != 0) | dr.any(raw != 0)
+    return dr.select(met, dr.maximum(picture, 0), 0)
+
+
+def with_means_of(pairs: Sequence[tuple[Any, Any]], resolution: int) -> list[Any]:
+    """Return pictures with the mean brightness of raw ones, as kept_light says: (denoised, raw)."""
+    bright = [channel_mean(denoised) > GLINT for denoised, _ in pairs]
+    values = [
+        dr.select(part, channel_sum(mi.Color3d(picture)), 0)
+        for glints, pair in zip(bright, pairs, strict=True)
+        for part in (glints, ~glints)
+        for picture in pair
+    ]
+    sums = totals(values, resolution)
+    pictures = []
+    for row, (glints, (denoised, _)) in enumerate(zip(bright, pairs, strict=True)):
+        is_now, was, rest_is, rest_was = (
+            dr.gather(mi.Float64, sums, 4 * row + each) for each in range(4)
+        )
+        factors = [_factor(is_now, was), _factor(rest_is, rest_was)]
+        least = dr.minimum(*factors)
+        most = dr.maximum(*factors)
+        apart = (least < 1 / MOST_APART) | (most > MOST_APART)
+        whole = _factor(is_now + rest_is, was + rest_was)
+        factor = dr.select(apart, whole, dr.select(glints, *factors))
+        pictures.append(mi.Color3f(mi.Color3d(denoised) * factor))
+    return pictures
+
+
+def _factor(is_now: Any, was: Any) -> Any:
+    return dr.select(is_now > 0, was / is_now, 1)
+
+
+def shares_of(parts: Sequence[Any]) -> list[Any]:
+    """Return what share of their sum each of some pictures is: equal ones where all are 0."""
+    total = add_up([mi.Color3d(part) for part in parts])
+    return [
+        mi.Color3f(dr.select(total > 0, mi.Color3d(part) / total, 1 / len(parts))) for part in parts
+    ]
+
+
+def converged(denoised: list[Any], raw: list[Any], squared_error: Any, resolution: int) -> Any:
+    """Return which pixels of the raw picture are right (Bool), as numpy's `converged`."""
+    is_now, was = (channel_mean(mi.Color3d(add_up(parts))) for parts in (denoised, raw))
+    dr.eval(squared_error)  # eight neighbours of each pixel read it
+    row, column = _rows_and_columns(resolution)
+    around = mi.Float64(0)
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            y = mi.UInt32(dr.clip(mi.Int32(row) + down, 0, resolution - 1))
+            x = mi.UInt32(dr.clip(mi.Int32(column) + right, 0, resolution - 1))
+            around += dr.gather(mi.Float64, squared_error, y * resolution + x)
+    bright = was - is_now > STANDARD_ERRORS * dr.sqrt(squared_error)
+    dark = is_now - was > STANDARD_ERRORS * dr.sqrt(around / 9)
+    return (bright & (was > STANDS_OUT * is_now)) | (dark & (is_now > DARKER * was))
+
+
+def choose(right: Any, raw: list[Any], denoised: list[Any]) -> list[Any]:
+    return [dr.select(right, *pair) for pair in zip(raw, denoised, strict=True)]
+
+
+def estimates(
+    a: Any, b: Any, denoised_a: Any, denoised_b: Any, hit: Any, is_filtered: bool
+) -> tuple[list[Any], list[Any]]:
+    """Return the squared errors and the surprises of pixels (Float64): log, linear, of objects.
+
+    The pictures (Color3d) are those of `Half`.
+    """
+    raw = (a + b) / 2
+    denoised = (denoised_a + denoised_b) / 2
+    estimate = dr.square(denoised_a - b) + dr.square(denoised_b - a) - dr.square(a - b)
+    estimate = estimate / 2 - dr.square(denoised_a - denoised_b) / 4
+    errors = []
+    surprises = []
+    for curve in (log10, _clamp):
+        if is_filtered:
+            least = SMALLEST_STEP * (1 + dr.abs(denoised))
+            step = raw - denoised
+            step = dr.select(dr.abs(step) < least, least, step)
+            slope = (curve(denoised + step) - curve(denoised)) / step
+            errors.append(channel_mean(dr.square(slope) * estimate))
+        else:
+            errors.append(channel_mean(dr.square(curve(a) - curve(b))) / 2)
+        surprises.append(channel_mean(dr.square(curve(raw) - curve(denoised))))
+    of_objects = [dr.select(hit, values[0], 0) for values in (errors, surprises)]
+    return [*errors, of_objects[0]], [*surprises, of_objects[1]]
+
+
+def log10(radiance: Any) -> Any:
+    return dr.log(1 + radiance) * _INV_LN_10
+
+
+def _clamp(radiance: Any) -> Any:
+    return dr.clip(radiance, 0, 1)
+
+
+def channel_sum(color: Any) -> Any:
+    return color.x + color.y + color.z
+
+
+def channel_mean(color: Any) -> Any:
+    return channel_sum(color) / 3
+
+
+def where_any(mask: Any, values: Any) -> Any:
+    return dr.select(dr.any(mask != 0), values, 0)
+
+
+def _rows_and_columns(resolution: int) -> tuple[Any, Any]:
+    pixel = dr.arange(mi.UInt32, resolution**2)
+    return pixel // resolution, pixel % resolution
+
+
+def reduce_tiles(values: Sequence[Any], reduction: Any, resolution: int) -> Any:
+    """Return values of pixels (Float64) reduced over tiles, those of one value after another's."""
+    row, column = _rows_and_columns(resolution)
+    tile = row // TILE_PX * (resolution // TILE_PX) + column // TILE_PX
+    place = tile * TILE + row % TILE_PX * TILE_PX + column % TILE_PX
+    packed = dr.zeros(mi.Float64, len(values) * resolution**2)
+    for number, value in enumerate(values):
+        dr.scatter(packed, mi.Float64(value), place + number * resolution**2)
+    return dr.block_reduce(reduction, packed, TILE)
+
+
+def totals(values: Sequence[Any], resolution: int) -> Any:
+    """Return the sum over all pixels of each of some values (Float64)."""
+    sums = reduce_tiles(values, dr.ReduceOp.Add, resolution)
+    across = resolution // TILE_PX
+    return dr.block_sum(dr.block_sum(sums, across), across)
