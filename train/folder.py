@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from model.checkpoint_format import FOLDER_NAME
 from storage.claims import describe_holder, hold_claim
 from storage.errors import TrilightError
 
@@ -23,8 +22,8 @@ class RunFolder:
 
     @property
     def checkpoints(self) -> Path:
-        """Folder of the checkpoints (loop.checkpoints), one file per saved step."""
-        return self.root / FOLDER_NAME
+        """Folder of the checkpoints, one file per saved step; model.checkpoint_format reads it."""
+        return self.root / "checkpoints"
 
     @property
     def weights(self) -> Path:

@@ -179,16 +179,10 @@ def _prepare_file(map_files: MapFiles, child: IsolatedChild) -> Path:
 
 def _lock_entry(kind: str, user_map: FoundMap, path: Path, settings: BuildSettings) -> LockedObject:
     data = path.read_bytes()
-    record = user_map.record
     return LockedObject(
-        uid=record.uid,
+        **user_map.record.identity,
         asset_sha256=sha256_hex(data),
         split=split_of_object(decode_prepared(data, path.name).content_sha256, settings.splits),
-        licence=record.licence,
-        licence_source=record.licence_source,
-        title=record.title,
-        attribution=record.attribution,
-        source_url=record.source_url,
         kind=kind,
     )
 

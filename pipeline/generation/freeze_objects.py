@@ -144,16 +144,10 @@ def read_frozen_objects(writer: DatasetWriter) -> dict[str, LockedObject] | None
 
 
 def _lock_entry(asset: PreparedObject, settings: BuildSettings) -> LockedObject:
-    record = asset.record
     return LockedObject(
-        uid=record.uid,
+        **asset.record.identity,
         asset_sha256=asset.asset_sha256,
         split=split_of_object(asset.geometry_sha256, settings.splits),
-        licence=record.licence,
-        licence_source=record.licence_source,
-        title=record.title,
-        attribution=record.attribution,
-        source_url=record.source_url,
     )
 
 

@@ -211,13 +211,8 @@ def _row(prepared: PreparedAsset, level: Level) -> AssetRow:
     record = prepared.record
     asset = decode_asset(prepared.path.read_bytes())
     return AssetRow(
-        uid=record.uid,
+        **record.identity,
         path=f"meshes/{_file_name(record.uid, '.ply' if level.skin is None else '.glb')}",
-        title=record.title,
-        licence=record.licence,
-        licence_source=record.licence_source,
-        attribution=record.attribution,
-        source_url=record.source_url,
         num_faces=len(level.faces),
         method=level.record.method,
         quality=level.record.quality,

@@ -35,6 +35,11 @@ class NamedObject:
     source_url: str
     """Where the object came from."""
 
+    @property
+    def identity(self) -> dict[str, str]:
+        """Identity and rights as keywords, for another row about this object."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(NamedObject)}
+
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectRecord(NamedObject):

@@ -261,7 +261,7 @@ def test_a_run_reads_files_in_a_confined_child(
     )
     job = cast(Any, SimpleNamespace(
         folder=DatasetFolder(tmp_path / "set"), settings=settings, lock_sha256="",
-        accepted=SimpleNamespace(files=files), num_at_once=1,
+        accepted=SimpleNamespace(files=files), num_at_once=1, device="",
     ))  # fmt: skip
     try:
         with render_children.scene_reader(job) as read:
