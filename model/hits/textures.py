@@ -22,9 +22,9 @@ class SurfaceTextures:
     rows_T3: NDArray[np.int32]
     """Rows of `textures` for diffuse, specular and roughness, or CONSTANT."""
     textures: tuple[Texture, ...]
-    """The textures."""
+    """Textures that `rows_T3` points to."""
     channels: tuple[int, ...] = (0, 1, 2)
-    """Which channel of a colour is red, green and blue here."""
+    """Channels of a color that are red, green and blue here."""
 
     @cached_property
     def is_textured(self) -> NDArray[np.bool_]:
@@ -65,7 +65,7 @@ class SurfaceTextures:
         return dataclasses.replace(self, uv_T32=uv_T32)
 
     def with_channels(self, order: NDArray[np.integer]) -> "SurfaceTextures":
-        """Return them with the colour channels in another order."""
+        """Return them with the color channels in another order."""
         return dataclasses.replace(
             self, channels=tuple(self.channels[int(channel)] for channel in order)
         )

@@ -26,7 +26,7 @@ from storage.records.environment import Environment
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
 
 MOST_LAMPS = 256
-"""Emitting triangles with which a scene's rays are traced by a card: each takes its kernels."""
+"""Emitting triangles with which a scene's rays are traced by a GPU: each takes its kernels."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,7 +41,7 @@ class TracedScene:
     """The scene's mean light (model.hits.radiosity)."""
 
     def on(self, device: torch.device) -> "TracedScene":
-        """Return the scene on a card that traces its rays; itself where none does.
+        """Return the scene on a GPU that traces its rays; itself where none does.
 
         Scenes with a sky, or with hundreds of lamps, stay with the CPU.
         """
@@ -126,19 +126,19 @@ def traced_scene(lit: LitScene) -> TracedScene:
 def lit_scenes(batch: SceneBatch) -> tuple[LitScene, ...]:
     """Return the surfaces of the scenes of a batch, without their padding."""
     materials = batch.material_of(PUBLISHED_COLUMNS)
-    found = []
+    scenes = []
     for row in range(len(materials)):
-        there = slice(None) if batch.is_triangle_BT is None else batch.is_triangle_BT[row]
-        found.append(
+        rows = slice(None) if batch.is_triangle_BT is None else batch.is_triangle_BT[row]
+        scenes.append(
             lit_scene(
-                batch.triangles_BT33[row][there],
-                batch.normals_BT33[row][there],
-                materials[row][there],
+                batch.triangles_BT33[row][rows],
+                batch.normals_BT33[row][rows],
+                materials[row][rows],
                 None if batch.textures is None else batch.textures[row],
                 None if batch.skies is None else batch.skies[row],
             )
         )
-    return tuple(found)
+    return tuple(scenes)
 
 
 def with_traced(
@@ -161,7 +161,7 @@ def with_traced(
         ready = ready.on(device)
     cameras = [each.to(ready.unit_3.device) for each in (scene.c2w_V44, scene.fov_deg_V)]
     traced = traced_views(ready, cameras[0], cameras[1], resolution, config, seed)
-    traced = traced.converted(lambda each: each.to(scene.c2w_V44.device))
+    traced = traced.convert_tensors(lambda each: each.to(scene.c2w_V44.device))
     return dataclasses.replace(scene, traced=traced)
 
 
@@ -182,14 +182,16 @@ def traced_cameras(
 
     It is where the cameras are, and of their type.
     """
-    found = [
+    traced = [
         traced_views(scene, c2w_V44, fov_deg_V, resolution, config)
         for scene, c2w_V44, fov_deg_V in zip(
             scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True
         )
     ]
     longest = max(scene.lit.num_triangles for scene in scenes)
-    return stack_traced(found, longest).converted(lambda each: like(each, cameras.fov_deg_BV))
+    return stack_traced(traced, longest).convert_tensors(
+        lambda each: like(each, cameras.fov_deg_BV)
+    )
 
 
 def like(numbers: Tensor, other: Tensor) -> Tensor:

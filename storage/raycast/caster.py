@@ -1,4 +1,4 @@
-"""`RayCaster`: which triangles rays meet, on the processor or on a card.
+"""`RayCaster`: which triangles rays meet, on the CPU or on a GPU.
 
 Embree is its form for numpy (storage.raycast.embree); a kernel of model.hits is that for tensors.
 """
