@@ -190,7 +190,7 @@ class HitDecoder(nn.Module):
     def keys_values(
         self, context_BNW: Tensor, places: TokenPositions, packing: Packing | None = None
     ) -> tuple[KeysValues, ...]:
-        """Return keys and values of a context for each layer, keys rotated in the world: once a scene."""
+        """Return each layer's keys and values of a context, keys rotated to world space."""
         rotation_BND = world_rotation(self.rotary, places)
         if packing is not None:
             rotation_BND = packed_rotation(rotation_BND, packing)
@@ -321,7 +321,7 @@ class HitDecoder(nn.Module):
 def _blocks(features: Tensor, parts: int) -> Iterator[slice]:
     """Yield the parts, of all views, that are computed together.
 
-    A GPU computes all at once in training: one view at a time would launch as many times its kernels.
+    A GPU computes all at once in training: view by view would launch its kernels for each view.
     A CPU computes one view at a time, whose numbers stay in its cache, and less in rendering.
     """
     count = features.shape[0] * features.shape[1]

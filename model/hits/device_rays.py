@@ -1,4 +1,4 @@
-"""Rays that a card traces: a tree of boxes, built by torch, and a kernel that walks through it.
+"""Rays that a GPU traces: a tree of boxes, built by torch, and a kernel that walks through it.
 
 A node has four children: its triangles are halved twice, each time where the surface of the halves'
 boxes, weighed by their triangles, is least (binned, Wald 2007). Whether a ray meets a triangle is
@@ -251,19 +251,19 @@ def _boxes(
 
 @functools.cache
 def compiled_kernel(device: torch.device) -> Any | None:
-    """Return the kernel for a card; None where it cannot be compiled, and rays stay on the CPU."""
+    """Return the kernel for a GPU; None where it cannot be compiled, and rays stay on the CPU."""
     if device.type != "cuda":
         return None
     try:
         with torch.cuda.device(device):
             return torch.cuda._compile_kernel(SOURCE, "trace")
     except (AttributeError, OSError, RuntimeError) as error:
-        warnings.warn(f"the card's rays stay with the processor: {error}", stacklevel=2)
+        warnings.warn(f"the GPU cannot trace rays, so the CPU does: {error}", stacklevel=2)
         return None
 
 
 class DeviceTriangles:
-    """Some triangles of many, as rays on a card meet them: a `RayCaster` of `DeviceArray`s."""
+    """Some triangles of many, as rays on a GPU meet them: a `RayCaster` of `DeviceArray`s."""
 
     def __init__(
         self, corners_T33: NDArray[np.float32], rows: NDArray[np.intp], place: DevicePlace

@@ -1,4 +1,4 @@
-"""`DeviceTextures`: the textures of a scene's triangles on a card, all in one row of texels."""
+"""`DeviceTextures`: the textures of a scene's triangles on a GPU, all in one row of texels."""
 
 import numpy as np
 import torch

@@ -29,7 +29,7 @@ _DARKEST = 1e-4
 """Specular albedo that a mixture is divided by at least."""
 
 _ROWS = 32
-"""Rows of a picture that are mixed at a time while rendering: they stay in the processor's cache.
+"""Rows of a picture that are mixed at a time while rendering: they stay in the CPU's cache.
 """
 
 _MOST_DOUBT = 30.0

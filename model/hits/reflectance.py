@@ -74,7 +74,7 @@ def stretched_length(cosine: Floats, alpha: Floats) -> Floats:
 def lobe(
     gloss: Gloss, points: Points, to_light: Floats, cos_light: Floats
 ) -> tuple[Floats, Floats]:
-    """Return D G2 / (4 cos_i cos_o) cos_o without color, and the density of `sample_lobe`, [P] each.
+    """Return D G2 / (4 cos_i cos_o) cos_o without color, and `sample_lobe`'s density, [P] each.
 
     Args:
         gloss, points: of the points.

@@ -2,7 +2,7 @@
 
 So light of any number of diffuse bounces arrives by one ray. A ray that meets a mirror goes on.
 Lamps are small: of rays that spread, one in thousands is mirrored onto one, and is then a thousand
-times too bright. So lamps are asked for at every surface, whose lobe counts as wider than it is
+times too bright. So lamps are sampled at every surface, whose lobe counts as wider than it is
 (Kaplanyan and Dachsbacher 2013): reflected light of lamps is blurred, and does not flicker. Rays
 that hardly spread, since a mirror sent them, show lamps in the next mirror as sharply as it does.
 """
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from model.hits.direct_light import chosen_lamp_light, lamp_chances, lobe_ray_weight
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
-from model.hits.reflectance import sample_lobe, gloss_at, lobe
+from model.hits.reflectance import gloss_at, lobe, sample_lobe
 from model.hits.vectors import Floats, brightest, dot
 
 WIDENED_ALPHA = np.float32(0.4)
@@ -32,7 +32,7 @@ MIRRORS = 2
 """Mirrors after each other through which a ray is followed."""
 
 BLOCK = 2**13
-"""Points that are computed at a time: their numbers stay in the processor's cache."""
+"""Points that are computed at a time: their numbers stay in the CPU's cache."""
 
 DEVICE_BLOCK = 2**18
 """Points that a GPU computes at a time: as many as fit its memory."""

@@ -31,7 +31,7 @@ MOST_LAMPS = 256
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TracedScene:
-    """A scene that can be asked for any view."""
+    """A scene whose views can be traced."""
 
     lit: LitScene
     light: SceneLight

@@ -18,7 +18,7 @@ from model.hits.device_arrays import DeviceArray, MaskedRows
 from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
-from model.hits.reflectance import Gloss, sample_lobe, gloss_at, lobe
+from model.hits.reflectance import Gloss, gloss_at, lobe, sample_lobe
 from model.hits.second_hits import DIMMEST, SMOOTH_ALPHA, blocks, outgoing_radiance
 from model.hits.sky_light import add_sky_light, escaped_light
 from model.hits.vectors import Floats, brightest, dot, spread
@@ -264,7 +264,7 @@ class _Block:
     """[pixels] on a GPU: the point of each pixel that stands for all in what one ray brings."""
 
     def with_own_sums(self) -> "_Block":
-        """Return the same points with sums of their own, to which those of another block may be added later."""
+        """Return the same points with new sums, to be added to those of this block later."""
         return replace(self, sums=np.zeros_like(self.sums))
 
     def add(
@@ -340,7 +340,7 @@ def _add_lobe_rays(
     shading: NDArray[np.float32],
     sky_rays: int,
 ) -> None:
-    """Add what rays drawn by the lobe meet: lamps, by their share of what finds them, and surfaces.
+    """Add what rays drawn by the lobe meet: lamps, weighed by multiple importance, and surfaces.
 
     Those that meet nothing bring their share of the sky. What surfaces send back takes a shadow ray
     each, so one ray of a pixel stands for all.
@@ -348,7 +348,7 @@ def _add_lobe_rays(
     Args:
         block, scene, light: where.
         u: [5, P] uniform numbers.
-        shading: [P] rays of the pixel that a ray counts for as to surfaces; 0: none is asked.
+        shading: [P] rays of the pixel that a ray counts for as to surfaces; 0: it counts for none.
         sky_rays: as in `view_inputs`.
     """
     some = np.flatnonzero(brightest(block.gloss.color) > DIMMEST)
@@ -370,9 +370,8 @@ def _add_lobe_rays(
         along = direction[:, lamps]
         _, density = lobe(gloss.only(lamps), glossy_points, along, dot(glossy_points.normal, along))
         mis_weight = lobe_ray_weight(scene, lamp_points, glossy_points.position, density)
-        emitted = (
-            arrives[:, lamps] * np.take(scene.emission, lamp_points.triangle, axis=1) * mis_weight
-        )
+        emission = np.take(scene.emission, lamp_points.triangle, axis=1)
+        emitted = arrives[:, lamps] * emission * mis_weight
         block.add(Channel.DIRECT_SPECULAR, emitted, some[lamps])
         block.add(Channel.OPEN_SPECULAR, emitted, some[lamps])
     if scene.sky is not None:

@@ -2,7 +2,7 @@
 
 Embree finds the triangle, in single precision (storage.raycast.embree); where on it, is then
 computed in double precision from the triangle's stored corners. Emitters are hidden from cameras,
-so rays pass through them. Each quantity is computed when it is first asked for.
+so rays pass through them. Each quantity is computed on first use.
 """
 
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ class SeenFrom:
 
     @cached_property
     def corners(self) -> NDArray[np.float64]:
-        """[T + 1, 3, 3] positions in metres."""
+        """[T + 1, 3, 3] positions in meters."""
         return corner_table(self.scene, self.scene.vertex_positions)
 
     @cached_property
@@ -127,7 +127,7 @@ class FirstHits:
 
     @cached_property
     def position(self) -> NDArray[np.float64]:
-        """[..., 3] in world space, metres; NaN where nothing is met."""
+        """[..., 3] in world space, meters; NaN where nothing is met."""
         return self.interpolate(self.seen.corners)
 
     @cached_property
@@ -187,7 +187,7 @@ def first_hits(
         scene: passes `Scene.check`.
         view: row of `scene.c2w`.
         resolution: width and height of the picture in pixels.
-        pixel: row from the top and column from the left of the only one that is asked for.
+        pixel: row from the top and column from the left of the only one that is computed.
 
     Raises:
         TrilightError: there is no such view or pixel.

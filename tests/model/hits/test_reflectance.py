@@ -17,7 +17,7 @@ from model.hits.light_filter import (
 )
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import BOUNCES, scene_light
-from model.hits.reflectance import sample_lobe, gloss_at, lobe
+from model.hits.reflectance import gloss_at, lobe, sample_lobe
 from model.hits.vectors import dot, unit
 from model.hits.view_inputs import Channel
 from storage.optics.multiscatter import directional_albedo

@@ -8,7 +8,7 @@ import pytest
 from model.hits.direct_light import no_light
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import scene_light
-from model.hits.reflectance import sample_lobe, gloss_at
+from model.hits.reflectance import gloss_at, sample_lobe
 from model.hits.sky_light import add_sky_light, escaped_light, sees_sky
 from model.hits.view_inputs import Channel
 from scene_templates.rotations import uniform_rotation
