@@ -82,12 +82,12 @@ class NeuralRenderer:
 
     @property
     def trained(self) -> TrainedRange:
-        """What the network was trained on, as far as that is known."""
+        """Ranges that the network was trained on, as far as they are known."""
         return self._trained
 
     @property
     def device(self) -> torch.device:
-        """Where the network is."""
+        """Device of the network's parameters."""
         return next(self._model.parameters()).device
 
     @functools.cached_property
@@ -282,7 +282,7 @@ def _decode(
 
 
 def _free_bytes(device: torch.device) -> int | None:
-    """Return how much memory can still be taken there, or None where it is unknown."""
+    """Return the free memory of a device in bytes, or None where it is unknown."""
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
     try:

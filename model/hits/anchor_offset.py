@@ -26,8 +26,7 @@ class AnchorOffset:
     """Offsets of pixels to nine anchors, as fractions of the pixels' distance to the camera."""
 
     unlike: tuple[Tensor, Tensor, Tensor]
-    """[M, P, 9] how far the anchor is, how far from the pixel's plane, and how the normals differ.
-    """
+    """[M, P, 9] distance to the anchor, its distance to the pixel's plane, change of normal."""
     anchors_M93: Tensor
     """Positions of the anchors relative to the central one, meters."""
     pixels_MP3: Tensor

@@ -1,4 +1,4 @@
-"""What the rays of a camera see first: the triangle of each, and where on it."""
+"""First hits of a camera's rays: the triangle of each, and the position on it."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ class CameraHits:
     """[2, K, P] weights of its second and third corner."""
 
     def only(self, part: slice) -> "CameraHits":
-        """Return those of some pixels."""
+        """Return the hits of some pixels."""
         return CameraHits(
             along=self.along[:, :, part], triangle=self.triangle[:, part], uv=self.uv[:, :, part]
         )
@@ -36,7 +36,7 @@ class CameraHits:
 
 
 def camera_hits(scene: LitScene, rays: Rays) -> CameraHits:
-    """Return what all rays of a camera see first; emitters are hidden from them."""
+    """Return the first hits of all rays of a camera; emitters are hidden from them."""
     along = np.stack([rays.direction(number) for number in range(rays.rays_per_pixel)])
     triangle: list[NDArray] = []
     uv: list[Floats] = []

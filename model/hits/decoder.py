@@ -62,8 +62,8 @@ PIXEL_DIM = _SURFACE + 3 * (len(_LIGHTS) + 1) + len(INPUTS)
 """Number of features of a pixel; an anchor has three more, its gathered light."""
 
 _START = -3.0
-"""Of the light that is learned, before softplus: a twentieth of the scene's mean at the start, so
-that the first picture is what was traced, with dim shadows."""
+"""First value of the learned light, before softplus: a twentieth of the scene's mean, so that the
+first picture is what was traced, with dim shadows."""
 
 _GAINED = 3
 """Lights that are multiplied by a learned gain: gathered, direct, mirrored."""
@@ -144,7 +144,7 @@ class PixelHead(nn.Module):
         self.last = nn.Linear(width, 3 * (_GAINED + 2))
 
     def rounded_parts(self) -> list[nn.Module]:
-        """Return what a precision rounds: nothing. Light is added up here, and steps would show."""
+        """Return the modules that a precision rounds: none, since steps would show in the sum."""
         return []
 
     def forward(

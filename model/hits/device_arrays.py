@@ -63,7 +63,7 @@ class MaskedRows:
 
     @property
     def counts(self) -> Tensor:
-        """[A] which of the requested rows count."""
+        """[A] True for the requested rows that count."""
         return self.mask if self.within is None else self.mask[self.within]
 
     def zero_others(self, values: "DeviceArray") -> "DeviceArray":

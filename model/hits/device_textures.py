@@ -12,7 +12,7 @@ from storage.records.texture import CONSTANT, TEXTURED
 
 
 class DeviceTextures:
-    """What `SurfaceTextures` says, in the same precision."""
+    """`SurfaceTextures` as tensors, in the same precision."""
 
     def __init__(self, textures: SurfaceTextures, place: DevicePlace) -> None:
         self.is_textured = place.array(textures.is_textured)

@@ -225,7 +225,7 @@ def chosen_lamp_light(
 def _is_free(
     scene: LitScene, points: Points, place: Floats, to_lamp: Floats, rows: NDArray[np.intp]
 ) -> NDArray[np.bool_]:
-    """Return whether nothing stands between some of the points and their places on lamps."""
+    """Return True for those of some points whose segment to their place on a lamp is free."""
     if not len(rows):
         return np.zeros(0, np.bool_)
     position, plane, place, to_lamp = (

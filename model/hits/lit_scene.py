@@ -23,13 +23,13 @@ from storage.records.environment import Environment
 from storage.records.material import EMISSION, ROUGHNESS
 
 _OFFSET = np.float32(1500 * 2.0**-24)
-"""How far rays start off a surface, as a share of 1 m plus their distance from the origin: the
-renderer's own (pipeline.renders.kernel_scene)."""
+"""Distance from a surface at which rays start, as a fraction of 1 m plus their distance from the
+origin: as in the renderer (pipeline.renders.kernel_scene)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Reflectance:
-    """How each of N triangles or points reflects; all float32."""
+    """Reflectance of N triangles or points; all float32."""
 
     diffuse: Floats
     """[3, N] diffuse albedo, linear, 0 to 1."""
@@ -48,7 +48,7 @@ class Reflectance:
 
 
 def reflectance_of(materials: NDArray[np.float32]) -> Reflectance:
-    """Return how material rows [N, 10] reflect."""
+    """Return the reflectance of material rows [N, 10]."""
     lobes = lobes_of(materials)
     multiscatter = scattered_again(lobes.specular, lobes.alpha, "correlated")
     return Reflectance(
@@ -73,14 +73,14 @@ class Points:
     geometric_normal: Floats
     """[3, P] unit normal of the triangle, on the side of the shading normal."""
     to_viewer: Floats
-    """[3, P] unit vector to where the point is seen from."""
+    """[3, P] unit vector from the point to its viewer."""
     edge: Floats
     """[3, P] an edge of the triangle: what frames are built on, so that they turn with the world.
     """
     back: NDArray[np.bool_]
-    """[P] whether the triangle is seen from the side from which its corners run clockwise."""
+    """[P] True: the viewer is on the side from which the triangle's corners run clockwise."""
     reflectance: Reflectance | None = None
-    """How the points reflect, in textured scenes; None: as their triangles do in the mean."""
+    """Reflectance of the points in textured scenes; None: the mean one of their triangles."""
 
     def only(self, rows: NDArray[np.intp] | None) -> "Points":
         """Return some of the points; of None, all of them with an axis before that of points."""
@@ -98,12 +98,12 @@ class Points:
         )
 
     def start(self, direction: Floats) -> Floats:
-        """Return where rays [3, P] that leave the surface begin."""
+        """Return the starts of rays [3, P] that leave the surface."""
         return off_surface(self.position, self.geometric_normal, direction)
 
 
 def off_surface(position: Floats, plane: Floats, direction: Floats) -> Floats:
-    """Return where rays [3, P] along `direction` begin, off the surface on their side."""
+    """Return the starts of rays [3, P] along `direction`, off the surface on their side."""
     off = (1 + brightest(np.abs(position))) * _OFFSET
     start: Floats = plane * np.copysign(off, dot(plane, direction))
     start += position
@@ -114,7 +114,7 @@ class LitScene:
     """Tables of T triangles, components first: [3, T] and [T]."""
 
     place: DevicePlace | None = None
-    """Where its tables are, as `DeviceArray`s; None: on the CPU."""
+    """Device that holds its tables, as `DeviceArray`s; None: the CPU."""
 
     def __init__(
         self,
@@ -191,12 +191,12 @@ class LitScene:
 
     @cached_property
     def seen(self) -> RayCaster:
-        """What cameras see: all but emitters, which are hidden from them."""
+        """The triangles that cameras see: all but emitters, which are hidden from them."""
         return Triangles(self._corner_rows, np.flatnonzero(~self.emits))
 
     @cached_property
     def everything(self) -> RayCaster:
-        """What blocks light and reflects it."""
+        """All triangles, which block and reflect light."""
         return Triangles(self._corner_rows, np.arange(self.num_triangles))
 
     def diffuse_at(self, points: Points) -> Floats:
@@ -264,7 +264,7 @@ class LitScene:
         return reflectance_of(self.textures.materials(triangle, weights, self._materials_TM))
 
     def first_hits(self, origin: Floats, direction: Floats) -> RayHits:
-        """Return what rays [3, P] from one camera [3] see first."""
+        """Return the first hits of rays [3, P] from one camera [3]."""
         start = np.broadcast_to(origin, (direction.shape[1], 3))
         return self.seen.intersect(start.copy(), as_rows(direction))
 

@@ -32,7 +32,7 @@ _BLOCK = 2**13
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneLight:
-    """What the two sides of T triangles receive, as irradiance over pi: front, then back."""
+    """Light that the two sides of T triangles receive, as irradiance over pi: front, then back."""
 
     direct_2T3: Floats
     """[2, T, 3] from lamps and the sky."""

@@ -30,7 +30,7 @@ class Gloss:
     stretch_seen: Floats
     """[P] length of the viewer's direction on stretched facets."""
     faces: NDArray[np.bool_]
-    """[P] whether the viewer is above the shading normal's horizon: below there is no lobe."""
+    """[P] True: the viewer is above the shading normal's horizon; below there is no lobe."""
 
     def only(self, rows: NDArray[np.intp] | None) -> "Gloss":
         """Return some of the points, as `Points.only`."""

@@ -1,4 +1,4 @@
-"""What rays bring from the surfaces that they meet: direct light there, and radiosity for the rest.
+"""Radiance from the surfaces that rays meet: direct light there, and radiosity for the rest.
 
 So light of any number of diffuse bounces arrives by one ray. A ray that meets a mirror goes on.
 Lamps are small: of rays that spread, one in thousands is mirrored onto one, and is then a thousand
@@ -93,7 +93,7 @@ def _mirrored_radiance(
     is_sharp: NDArray[np.bool_],
     mirrors: int,
 ) -> Floats:
-    """Return what some points, which are mirrors, send on of what they see [3, rows]."""
+    """Return the radiance [3, rows] that some points, which are mirrors, reflect."""
     u_lamp = u[0][rows]
     on_lamp = u[1][:, rows]
     mirror_points = points.only(rows)

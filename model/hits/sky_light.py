@@ -87,7 +87,7 @@ def _add(
 def sky_density(
     scene: LitScene, direction: Floats, cosine: Floats, by_map: int, by_surface: int
 ) -> Floats:
-    """Return how many rays [P] `add_sky_light` sends along directions, per steradian."""
+    """Return the number of rays [P] that `add_sky_light` sends along directions, per steradian."""
     density: Floats = by_map * scene.drawn_sky.pdf(direction)
     density += by_surface * _INV_PI * np.maximum(cosine, 0)
     return np.maximum(density, _LEAST)
@@ -96,9 +96,9 @@ def sky_density(
 def escaped_light(
     scene: LitScene, points: Points, gloss: Gloss, direction: Floats, weight: Floats, rays: int
 ) -> Floats:
-    """Return what directions [3, P] that the lobe has drawn bring of the sky, without shadows.
+    """Return the sky's light along directions [3, P] that the lobe has drawn, without shadows.
 
-    It is their share of what `add_sky_light` brings with so many rays and one by the lobe.
+    It is weighed for use with `add_sky_light` of so many rays and one by the lobe.
 
     Args:
         scene: has a sky.
@@ -116,7 +116,7 @@ def escaped_light(
 
 
 def sees_sky(scene: LitScene, points: Points, direction: Floats) -> NDArray[np.bool_]:
-    """Return whether rays from points meet nothing, lamps included."""
+    """Return True [P] for rays from points that meet nothing, lamps included."""
     start = off_surface(points.position, points.geometric_normal, direction)
     far = np.full(direction.shape[1], _FAR_M, np.float32)
     return scene.everything.is_free(as_rows(start), as_rows(direction), far)

@@ -1,4 +1,4 @@
-"""`Traced`: what was traced of scenes and views, as the tensors that a network of hits reads."""
+"""`Traced`: traced inputs of scenes and views, as the tensors that a network of hits reads."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -9,7 +9,7 @@ from torch import Tensor
 from model.hits.view_inputs import Channel
 
 INPUTS = ("open", "direct", "mirrored", "gathered", "tokens")
-"""What a network of hits may be without: light from lamps as if nothing stood between, with its
+"""Inputs that a network of hits may lack: light from lamps as if nothing stood between, with its
 shadows, light that one mirrored ray brings, light that anchors gather, and the scene's tokens."""
 
 CHANNELS = {
@@ -22,7 +22,7 @@ CHANNELS = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Traced:
-    """What was traced of a scene and of V of its views; of a batch, B comes first everywhere."""
+    """Traced inputs of a scene and of V of its views; in a batch, B comes first everywhere."""
 
     sides_T12: Tensor
     """Direct and indirect irradiance over pi of the front, then of the back, of each triangle."""

@@ -1,4 +1,4 @@
-"""Scenes as the network has them -> what is traced of them and of their views."""
+"""Scenes as the network has them -> traced inputs of them and of their views."""
 
 import dataclasses
 from collections.abc import Callable
@@ -66,7 +66,7 @@ class TracedScene:
     def view(
         self, c2w_44: Tensor, fov_deg: Tensor, resolution: int, config: ModelConfig, seed: int
     ) -> ViewInputs:
-        """Return what is traced for one view."""
+        """Trace the inputs of one view."""
         place = self.lit.place
         c2w: Any = c2w_44.detach().cpu().numpy() if place is None else DeviceArray(c2w_44, place)
         angle: Any = float(fov_deg) if place is None else DeviceArray(fov_deg, place)
@@ -85,7 +85,7 @@ class TracedScene:
 
 
 def anchors_a_side(config: ModelConfig, resolution: int) -> int:
-    """Return how many anchors a picture has along a side: a divisor of its width."""
+    """Return the number of anchors along a side of a picture: a divisor of its width."""
     return int(np.gcd(config.hit_anchors, resolution))
 
 
@@ -148,7 +148,7 @@ def with_traced(
     seed: int = 0,
     device: torch.device | None = None,
 ) -> SceneTensors:
-    """Return a scene with what is traced of its views: what a trainer's threads do ahead.
+    """Return a scene with the traced inputs of its views; a trainer's threads do this ahead.
 
     Args:
         scene, resolution, config: of the views.
@@ -178,7 +178,7 @@ def lit_scene_of(scene: SceneTensors) -> LitScene:
 def traced_cameras(
     scenes: tuple[TracedScene, ...], cameras: Cameras, resolution: int, config: ModelConfig
 ) -> Traced:
-    """Return what is traced of any cameras of the scenes of a batch.
+    """Trace the inputs of any cameras of the scenes of a batch.
 
     It is where the cameras are, and of their type.
     """

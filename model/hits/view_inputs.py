@@ -1,4 +1,4 @@
-"""`ViewInputs`: what the rays of each pixel find, and what anchors gather; numbers for a network.
+"""`ViewInputs`: results of the rays of each pixel and of anchors, as numbers for a network.
 
 A pixel has rays_a_side^2 rays, whose findings are averaged after shading, as the film does. Light
 from other surfaces is smooth but where it is mirrored. So it is gathered by many rays at few
@@ -27,7 +27,7 @@ from storage.seeds import rng_for
 
 
 class Channel:
-    """Where in `ViewInputs.pixels` each quantity stands."""
+    """Position of each quantity in the last axis of `ViewInputs.pixels`."""
 
     COVERAGE = slice(0, 1)
     """Share of the pixel's rays that meet something."""
@@ -91,7 +91,7 @@ def view_inputs(
     sky_rays: int = 0,
     seed: int = 0,
 ) -> ViewInputs:
-    """Return what is traced for a view; equal arguments give equal numbers.
+    """Trace the inputs of a view; equal arguments give equal numbers.
 
     Args:
         scene, light: the scene.
@@ -148,7 +148,7 @@ class _Noise:
     """[2, P] for rays to the sky; None without a sky."""
 
     def only(self, part: slice) -> "_Noise":
-        """Return those of some pixels."""
+        """Return the numbers of some pixels."""
         to_sky = None if self.to_sky is None else self.to_sky[:, part]
         return _Noise(
             on_lamps=self.on_lamps[:, :, part], chance=self.chance[:, part], to_sky=to_sky
@@ -205,11 +205,11 @@ class _ShadingPoints:
 
     points: Points
     pixel: NDArray[np.intp]
-    """[P] which pixel of the block."""
+    """[P] number of its pixel in the block."""
     ray_index: NDArray[np.intp]
-    """[P] which of the pixel's rays it is."""
+    """[P] number of its ray among those of the pixel."""
     weight: NDArray[np.float32]
-    """[P] how many of the pixel's rays it stands for."""
+    """[P] number of the pixel's rays that it stands for."""
     of_pixels: Floats
     """[pixels] of all rays of the block, counted ray by ray: the one drawn of each pixel."""
     chosen: NDArray[np.float32]
@@ -257,9 +257,9 @@ class _Block:
     sums: Floats
     """[40, pixels of the block]"""
     pixel: NDArray[np.intp]
-    """[P] which of the block's pixels the points belong to."""
+    """[P] number of each point's pixel in the block."""
     weight: NDArray[np.float32]
-    """[P] how many rays each stands for."""
+    """[P] number of rays that each stands for."""
     of_pixels: Floats
     """[pixels] on a GPU: the point of each pixel that stands for all in what one ray brings."""
 
@@ -280,7 +280,7 @@ class _Block:
             self.sums[row] += np.bincount(pixel, weighed[number], self.sums.shape[1])
 
     def _add_all(self, channel: slice, values: Any, rows: Any) -> None:
-        """Add those of all rays of the block, ray after ray; where none count, nothing."""
+        """Add the values of all rays of the block, ray after ray; where none count, nothing."""
         counts: Any = np.flatnonzero(self.weight)
         rows = counts if rows is None else counts[rows]
         weighed = rows.zero_others(values * self.weight[rows])

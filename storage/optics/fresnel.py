@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 DIELECTRIC_F0 = 0.04
-"""What glass, plastic, wood and stone reflect head-on, about."""
+"""Typical reflectance of glass, plastic, wood and stone head-on."""
 
 _MEAN_OF_SCHLICK = 1 / 21
 """Mean of (1 - cos)^5 over cosine-weighted directions: 2 B(2, 6)."""

@@ -1,4 +1,4 @@
-"""What a rough mirror of GGX facets returns after one reflection, and what all others add.
+"""Light that rough GGX facets return after one reflection, and that all further ones add.
 
 A facet may send light to another facet. Single scattering loses that light: 59 % of it in a white
 furnace at roughness 1. As Cycles does for its "Multiscatter GGX", the lobe is scaled so that it
@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Smith = Literal["correlated", "separable"]
-"""Whether the masking of both directions depends on the same height of a facet (our kernel, as
-Cycles) or not (Mitsuba's `roughconductor`, in the tests). Each needs a table of its own."""
+"""Masking of both directions that depends on the same height of a facet (our kernel, as Cycles) or
+not (Mitsuba's `roughconductor`, in the tests). Each needs a table of its own."""
 
 X_STEPS = 64
 ROUGHNESS_STEPS = 32
@@ -37,7 +37,7 @@ _OUTER = 8
 
 _SMALLEST_X = 1e-4
 _SMALLEST_ALPHA = 1e-6
-"""What the table's entries at 0 are computed at."""
+"""Values at which the table's entries at 0 are computed."""
 
 
 def directional_albedo(

@@ -15,7 +15,7 @@ from storage.records.scene import Scene
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MetSurfaces(RayHits):
-    """What N rays meet first, in Embree's own precision."""
+    """First hits of N rays, in Embree's precision."""
 
     distance_m: NDArray[np.float32]
     """[N] along the ray, in lengths of its direction; beyond all measure where nothing is met."""
@@ -50,7 +50,7 @@ class Triangles:
     def intersect(
         self, origins: NDArray[np.float32], directions: NDArray[np.float32]
     ) -> MetSurfaces:
-        """Return what rays [N, 3] from `origins` [N, 3] meet first, from either side."""
+        """Return the first hits of rays [N, 3] from `origins` [N, 3], from either side."""
         hits = self._embree.run(origins, directions, output=True)
         return MetSurfaces(
             triangle=self._rows[hits["primID"]],

@@ -1,4 +1,4 @@
-"""What the pixels of a camera see first: triangle, object, depth, position, normals, material.
+"""First hits of a camera's pixels: triangle, object, depth, position, normals, material.
 
 Embree finds the triangle, in single precision (storage.raycast.embree); where on it, is then
 computed in double precision from the triangle's stored corners. Emitters are hidden from cameras,
@@ -31,7 +31,7 @@ class SeenFrom:
         self.surfaces = Surfaces(scene)
 
     def hits(self, directions: NDArray[np.float64]) -> "FirstHits":
-        """Return what rays along unit `directions` [..., 3] meet first."""
+        """Return the first hits of rays along unit `directions` [..., 3]."""
         toward = directions.reshape(-1, 3).astype(np.float32)
         start = np.tile(self.origin.astype(np.float32), (len(toward), 1))
         triangle = self.surfaces.intersect(start, toward).triangle
@@ -102,7 +102,7 @@ class FirstHits:
 
     @property
     def met(self) -> NDArray[np.bool_]:
-        """[...] whether a ray meets anything."""
+        """[...] True for rays that meet a surface."""
         is_met: NDArray[np.bool_] = np.asarray(self.triangle != MISS)
         return is_met
 
@@ -179,7 +179,7 @@ class FirstHits:
 def first_hits(
     scene: Scene, *, view: int = 0, resolution: int = 256, pixel: tuple[int, int] | None = None
 ) -> FirstHits:
-    """Return what a camera of a scene sees, in all pixels of its picture or in one.
+    """Return the first hits of a camera of a scene, in all pixels of its picture or in one.
 
     Rays go through the centers of pixels, as those of the renderer's own `hits`.
 
