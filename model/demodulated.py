@@ -88,7 +88,7 @@ def first_albedo(
     nothing = np.zeros((6, 1), np.float32)  # the last column, which a miss picks
     table = np.concatenate([np.concatenate([scene.diffuse, scene.specular]), nothing], axis=1)
     total = np.zeros((6, resolution**2), np.float32)
-    for jitter in range(rays.turns):
+    for jitter in range(rays.rays_per_pixel):
         total += table[:, scene.first_hits(rays.origin, rays.direction(jitter)).triangle]
-    mean: NDArray[np.float32] = total.T / np.float32(rays.turns)
+    mean: NDArray[np.float32] = total.T / np.float32(rays.rays_per_pixel)
     return mean.reshape(resolution, resolution, 6)

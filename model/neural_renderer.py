@@ -40,13 +40,13 @@ class PreparedScene:
     groups: tuple[tuple[EncodedScene, float], ...]
     """Each group of lights and its share of the picture (model.light_groups)."""
     notes: tuple[str, ...]
-    """What a person should know of this scene and this network."""
+    """Sentences on what this network cannot render of this scene, for `warnings`."""
     views: dict[int, Callable[[Tensor, Tensor], Tensor]] = field(default_factory=dict)
     """Functions from camera and angle to a picture on the network's device, by resolution."""
 
 
 class NeuralRenderer:
-    """A network in evaluation mode, on a processor or a graphics card."""
+    """A network in evaluation mode, on a CPU or a GPU."""
 
     def __init__(self, model: RenderFormer, trained: TrainedRange | None = None) -> None:
         """Take a network, which stays where it is; `load` reads one.
@@ -70,24 +70,24 @@ class NeuralRenderer:
 
         Args:
             checkpoint: as `model.open.find_network`.
-            device: of torch; by default the graphics card where there is one.
+            device: of torch; by default the GPU where there is one.
             precision: a name of model.precision.PRECISIONS.
 
         Raises:
             TrilightError: no such file, or no network.
         """
-        found = find_network(checkpoint)
+        network = find_network(checkpoint)
         place = device or ("cuda" if torch.cuda.is_available() else "cpu")
-        return cls(set_precision(found.open().to(place), precision), found.trained)
+        return cls(set_precision(network.open().to(place), precision), network.trained)
 
     @property
     def trained(self) -> TrainedRange:
-        """What the network was trained on, as far as that is known."""
+        """Ranges that the network was trained on, as far as they are known."""
         return self._trained
 
     @property
     def device(self) -> torch.device:
-        """Where the network is."""
+        """Device of the network's parameters."""
         return next(self._model.parameters()).device
 
     @functools.cached_property
@@ -142,7 +142,8 @@ class NeuralRenderer:
             TrilightError: the scene is larger than memory.
         """
         self._require_memory(scene.num_triangles)
-        below_sky, scene = scene, self._with_known_sky(scene)
+        below_sky = scene
+        scene = self._with_known_sky(scene)
         by_hits = self._model.config.view_stage == "hits"
         all_lights = [LightGroup(scene=scene, fraction=1.0)]
         groups = [
@@ -193,7 +194,7 @@ class NeuralRenderer:
             )
 
     def resolution_notes(self, resolution: int) -> tuple[str, ...]:
-        """Return what a person should know of pictures of this width by this network."""
+        """Return sentences on what pictures of this width by this network lack."""
         trained = self.trained.resolution
         by_pixel = self._model.config.view_stage == "hits"
         if trained is None or resolution == trained or by_pixel:
@@ -281,7 +282,7 @@ def _decode(
 
 
 def _free_bytes(device: torch.device) -> int | None:
-    """Return how much memory can still be taken there, or None where it is unknown."""
+    """Return the free memory of a device in bytes, or None where it is unknown."""
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
     try:

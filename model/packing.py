@@ -138,7 +138,7 @@ def attend_packed(
 
         starts = queries.starts_S1, keys.starts_S1
         attended: Any = varlen_attn(q_QHD, k_PHD, v_PHD, *starts, queries.longest, keys.longest)
-        return attended  # one tensor, where nothing else is asked for
+        return attended  # one tensor, where nothing else is requested
     parts = []
     spans = zip(_spans(queries.starts_S1), _spans(keys.starts_S1), strict=True)
     for (first, end), (low, high) in spans:

@@ -1,4 +1,4 @@
-"""`Replayed`: a function of tensors that a card repeats as one recorded graph.
+"""`Replayed`: a function of tensors that a GPU repeats as one recorded graph.
 
 A view of `hits` is four thousand small kernels; submitting them one by one takes longer than they.
 """
@@ -14,7 +14,7 @@ class Replayed:
     """A function, which is run the first time, recorded the second, and repeated from then on.
 
     It may read nothing back and use no array of the host that its first run has not brought to the
-    card. What it returns is overwritten by the next call.
+    GPU. What it returns is overwritten by the next call.
     """
 
     def __init__(self, function: Callable[..., Tensor]) -> None:
@@ -24,7 +24,7 @@ class Replayed:
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self, *inputs: Tensor) -> Tensor:
-        """Return what the function does of tensors of always the same shapes, on one card."""
+        """Return what the function does of tensors of always the same shapes, on one GPU."""
         self._calls += 1
         if self._calls == 1:
             return self._function(*inputs)

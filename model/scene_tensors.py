@@ -169,7 +169,7 @@ def map_tensors(scenes: Scenes, convert: Callable[[Tensor], Tensor]) -> Scenes:
     """Return the same scenes with each tensor converted, such as moved to a device."""
     fields: dict[str, Any] = {name: convert(each) for name, each in tensors_of(scenes).items()}
     if scenes.traced is not None:
-        fields["traced"] = scenes.traced.converted(convert)
+        fields["traced"] = scenes.traced.convert_tensors(convert)
     return dataclasses.replace(scenes, **fields)
 
 

@@ -59,8 +59,8 @@ if TYPE_CHECKING:
     from trilight.scenes import write_scene as write_scene
 
 _HOME = offered_names(__file__)
-"""Module of this package for each name. No name equals a package of the checkout: an installed
-wheel has `trilight.train` and the other packages as subpackages."""
+"""Module of this package and name there, for each name. No name equals a package of the checkout:
+an installed wheel has `trilight.train` and the other packages as subpackages."""
 
 __all__ = sorted(["__version__", *_HOME])  # noqa: PLE0605
 
@@ -70,7 +70,8 @@ def __getattr__(name: str) -> Any:
         return import_module("importlib.metadata").version("trilight")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(_HOME[name]), name)
+    module, name_there = _HOME[name]
+    value = getattr(import_module(module), name_there)
     globals()[name] = value
     return value
 

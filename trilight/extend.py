@@ -87,7 +87,8 @@ __all__ = sorted(_HOME)  # noqa: PLE0605
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOME[name]), name)
+    module, name_there = _HOME[name]
+    return getattr(import_module(module), name_there)
 
 
 def __dir__() -> list[str]:

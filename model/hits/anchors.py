@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from model.hits.camera_hits import CameraHits
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
-from model.hits.second_hits import blocks, brought
+from model.hits.second_hits import blocks, outgoing_radiance
 from model.hits.vectors import Floats, cosine_direction, spread
 from storage.seeds import rng_for
 
@@ -28,7 +28,7 @@ def anchor_pixels(coverage_RR: NDArray[np.float32], anchors_a_side: int) -> NDAr
     width = len(coverage_RR)
     step = width // anchors_a_side
     offset = np.arange(step) - (step - 1) / 2
-    # the centre of an even part lies between pixels: the tie is broken, the same way everywhere
+    # the center of an even part lies between pixels: the tie is broken, the same way everywhere
     central = np.hypot(offset[:, None] - 0.1, offset[None] - 0.05)
     prefers = (central.max() - central) / (1000 * max(central.max(), 1))
     parts = coverage_RR.reshape(anchors_a_side, step, anchors_a_side, step).swapaxes(1, 2)
@@ -66,17 +66,17 @@ def gathered_at(
     triangle = hits.triangle[ray]
     uv = hits.uv[:, ray[0], anchor].copy()
     direction = hits.along[ray[0], :, anchor].T.copy()
-    # on a processor turn by turn: numpy's sums depend on how many stand side by side
-    turns = [first < count] if scene.place else [first == turn for turn in range(count)]
-    for stands in turns:
-        met = np.flatnonzero(stands)
-        if len(met):
-            points = scene.points(np.maximum(triangle[met], 0), uv[:, met], direction[:, met])
-            total[:, met] = _gathered(scene, light, points, shift[:, met], gather_rays)
+    # on the CPU ray by ray: numpy's sums depend on the length of the rows that are summed
+    groups = [first < count] if scene.place else [first == ray_index for ray_index in range(count)]
+    for in_group in groups:
+        rows = np.flatnonzero(in_group)
+        if len(rows):
+            points = scene.points(np.maximum(triangle[rows], 0), uv[:, rows], direction[:, rows])
+            total[:, rows] = _gather_light(scene, light, points, shift[:, rows], gather_rays)
     return total.T.copy()
 
 
-def _gathered(
+def _gather_light(
     scene: LitScene, light: SceneLight, points: Points, shift: Floats, gather_rays: int
 ) -> Floats:
     """Return the means [3, P] over rays; `shift` [5, P] are uniform numbers."""
@@ -84,7 +84,7 @@ def _gathered(
     owner = np.tile(np.arange(count), gather_rays)
     u = np.concatenate(
         [
-            np.stack([spread(shift[pair], turn) for turn in range(gather_rays)], axis=1)
+            np.stack([spread(shift[pair], index) for index in range(gather_rays)], axis=1)
             for pair in (slice(0, 2), slice(2, 4))
         ]
     ).reshape(4, -1)
@@ -92,19 +92,20 @@ def _gathered(
     u_lamp -= np.floor(u_lamp)
     total = np.zeros_like(u, shape=(3, count * gather_rays))
     for part in blocks(scene, count * gather_rays):
-        here = points.only(owner[part])
-        direction = cosine_direction(u[:2, part], here.normal, here.edge)
-        beyond, met = scene.meet(scene.everything, here.start(direction), direction)
-        spreads = np.zeros_like(met)
-        found = brought(scene, light, beyond, u_lamp[part], u[2:, part], spreads)
-        total[:, part] = np.where(met, found, np.float32(0))
+        anchor_points = points.only(owner[part])
+        direction = cosine_direction(u[:2, part], anchor_points.normal, anchor_points.edge)
+        beyond, is_hit = scene.meet(scene.everything, anchor_points.start(direction), direction)
+        spreads = np.zeros_like(is_hit)
+        radiance = outgoing_radiance(scene, light, beyond, u_lamp[part], u[2:, part], spreads)
+        total[:, part] = np.where(is_hit, radiance, np.float32(0))
     return total.reshape(3, gather_rays, count).mean(axis=1)
 
 
 def _van_der_corput(count: int) -> Floats:
     """Return the first `count` numbers of the sequence of base 2 (van der Corput 1935)."""
     number = np.arange(count)
-    total, share = np.zeros(count), 0.5
+    total = np.zeros(count)
+    share = 0.5
     while number.any():
         total += share * (number & 1)
         number, share = number >> 1, share / 2

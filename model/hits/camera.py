@@ -13,15 +13,16 @@ class Rays:
     def __init__(
         self, c2w: Floats, fov_deg: float | Floats, resolution: int, rays_a_side: int
     ) -> None:
-        self.resolution, self.turns = resolution, rays_a_side**2
+        self.resolution = resolution
+        self.rays_per_pixel = rays_a_side**2
         self.origin = c2w[:3, 3].astype(np.float32)
         self._axes = c2w[:3, :3].astype(np.float32)
         self._focal = focal_px(fov_deg, resolution).astype(np.float32)
         self._a_side = rays_a_side
 
-    def direction(self, turn: int, pixels: NDArray[np.int64] | slice = slice(None)) -> Floats:
-        """Return unit directions [3, P] of ray `turn` of pixels, counted row by row."""
-        row, column = divmod(turn, self._a_side)
+    def direction(self, ray_index: int, pixels: NDArray[np.int64] | slice = slice(None)) -> Floats:
+        """Return unit directions [3, P] of ray `ray_index` of pixels, counted row by row."""
+        row, column = divmod(ray_index, self._a_side)
         count = np.arange(self.resolution, dtype=np.float32) - np.float32(self.resolution / 2)
         x = count + np.float32((column + 0.5) / self._a_side)
         y = -(count + np.float32((row + 0.5) / self._a_side))

@@ -1,4 +1,4 @@
-"""What the rays of a camera see first: the triangle of each, and where on it."""
+"""First hits of a camera's rays: the triangle of each, and the position on it."""
 
 from dataclasses import dataclass
 
@@ -13,17 +13,17 @@ from model.hits.vectors import Floats
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraHits:
-    """The first hits of the rays of P pixels, each of which has some `turns`."""
+    """The first hits of the rays of P pixels, each of which has K rays."""
 
     along: Floats
-    """[turns, 3, P] unit directions of the rays."""
+    """[K, 3, P] unit directions of the rays."""
     triangle: NDArray[np.intp]
-    """[turns, P] row of the triangle, or MISS."""
+    """[K, P] row of the triangle, or MISS."""
     uv: Floats
-    """[2, turns, P] weights of its second and third corner."""
+    """[2, K, P] weights of its second and third corner."""
 
     def only(self, part: slice) -> "CameraHits":
-        """Return those of some pixels."""
+        """Return the hits of some pixels."""
         return CameraHits(
             along=self.along[:, :, part], triangle=self.triangle[:, part], uv=self.uv[:, :, part]
         )
@@ -36,15 +36,15 @@ class CameraHits:
 
 
 def camera_hits(scene: LitScene, rays: Rays) -> CameraHits:
-    """Return what all rays of a camera see first; emitters are hidden from them."""
-    along = np.stack([rays.direction(number) for number in range(rays.turns)])
+    """Return the first hits of all rays of a camera; emitters are hidden from them."""
+    along = np.stack([rays.direction(number) for number in range(rays.rays_per_pixel)])
     triangle: list[NDArray] = []
     uv: list[Floats] = []
     for part in blocks(scene, rays.resolution**2):
         directions = along[:, :, part].swapaxes(0, 1).reshape(3, -1)
         hits = scene.first_hits(rays.origin, directions)
-        triangle.append(hits.triangle.reshape(rays.turns, -1))
-        uv.append(hits.uv.reshape(2, rays.turns, -1))
+        triangle.append(hits.triangle.reshape(rays.rays_per_pixel, -1))
+        uv.append(hits.uv.reshape(2, rays.rays_per_pixel, -1))
     return CameraHits(
         along=along, triangle=np.concatenate(triangle, axis=1), uv=np.concatenate(uv, axis=2)
     )

@@ -1,4 +1,4 @@
-"""The view stage `hits`: each pixel is told what its rays found, and learns the rest.
+"""The view stage `hits`: a network reads what each pixel's rays found, and adds the rest.
 
 A grid of anchors asks the scene's tokens, in world space, so that keys are rotated once a scene.
 Each pixel mixes what the nine nearest anchors know, by what it is like them, and a small network
@@ -7,7 +7,7 @@ says how much of each light that was traced counts, and what is missing:
     radiance = diffuse albedo * (gain * mixed gathered light + irradiance)
              + specular albedo * radiance + gain * direct light + gain * filtered mirrored light
 
-Nothing of it is negative. All light is in units of the scene's mean light, by colour: the picture
+Nothing of it is negative. All light is in units of the scene's mean light, by color: the picture
 scales with the lamps exactly. There are no pixels from elsewhere in it, so any width will do.
 """
 
@@ -22,7 +22,13 @@ from torch.nn.functional import silu, softplus
 from model.attention import Keys, attend
 from model.config import ModelConfig
 from model.encoded_scene import EncodedScene, KeysValues, TokenPositions
-from model.hits.lie import FARTHEST, NEIGHBOURS, PLACE, Lie, lies_to
+from model.hits.anchor_offset import (
+    FARTHEST,
+    NEIGHBOURS,
+    OFFSET_DIM,
+    AnchorOffset,
+    offsets_to_anchors,
+)
 from model.hits.light_filter import LightFilter, filter_flops
 from model.hits.second_hits import DEVICE_BLOCK
 from model.hits.traced import INPUTS, Traced
@@ -42,7 +48,7 @@ from model.positions import Rotation, TriangleRotary, packed_rotation, rotate, w
 from model.precision import fast_float32_products, without_autocast
 
 _SURFACE = 3 + 3 + 3 + 1 + 3 + 3 + 1 + 1 + 1 + 4
-"""Numbers that say what surface a pixel sees, and what its mirrored ray (`_surface`)."""
+"""Number of features of the surfaces that a pixel and its mirrored ray see (`_surface`)."""
 
 _LIGHTS = (
     Channel.OPEN_DIFFUSE,
@@ -52,12 +58,12 @@ _LIGHTS = (
     Channel.SHOWN_DIFFUSE,
 )
 
-TOLD = _SURFACE + 3 * (len(_LIGHTS) + 1) + len(INPUTS)
-"""Numbers that a pixel is told; an anchor is told three more, its gathered light."""
+PIXEL_DIM = _SURFACE + 3 * (len(_LIGHTS) + 1) + len(INPUTS)
+"""Number of features of a pixel; an anchor has three more, its gathered light."""
 
 _START = -3.0
-"""Of the light that is learned, before softplus: a twentieth of the scene's mean at the start, so
-that the first picture is what was traced, with dim shadows."""
+"""First value of the learned light, before softplus: a twentieth of the scene's mean, so that the
+first picture is what was traced, with dim shadows."""
 
 _GAINED = 3
 """Lights that are multiplied by a learned gain: gathered, direct, mirrored."""
@@ -68,15 +74,16 @@ BLOCK_PIXELS = 2**12
 
 def view_flops(config: ModelConfig, tokens: int, resolution: int) -> dict[str, int]:
     """Return the FLOPs of the parts of this stage for one view of a scene of so many tokens."""
-    d, p = config.width, config.pixel_width
+    d = config.width
+    p = config.pixel_width
     a = math.gcd(config.hit_anchors, resolution) ** 2
     asks = 4 * a * d * d + 4 * a * tokens * d if config.scene_tokens else 0
-    pixel = TOLD * p + p * p + NEIGHBOURS * (2 * p + 3) + PLACE * p + NEIGHBOURS * 4 * 3
+    pixel = PIXEL_DIM * p + p * p + NEIGHBOURS * (2 * p + 3) + OFFSET_DIM * p + NEIGHBOURS * 4 * 3
     pixel += (2 * p + 3) * 2 * p + 2 * p * p + p * 3 * (_GAINED + 2)
     width = config.filter_width
     return {
-        "filter": filter_flops(TOLD, width, resolution**2) if width else 0,
-        "anchors": 2 * a * ((TOLD + 3) * d + d * d),
+        "filter": filter_flops(PIXEL_DIM, width, resolution**2) if width else 0,
+        "anchors": 2 * a * ((PIXEL_DIM + 3) * d + d * d),
         "cross-attention": config.decoder_layers * asks,
         "view feed-forward": config.decoder_layers * 6 * a * d * config.hidden_width,
         "head": 4 * a * d * p + 2 * resolution**2 * pixel,
@@ -110,8 +117,9 @@ class AnchorLayer(nn.Module):
             return x_BVAW + self.ffn(self.ffn_norm(x_BVAW))
         q_BVHAD = split_heads(cross.q_norm(cross.q(self.cross_norm(x_BVAW))), cross.num_heads)
         q_BVHAD = rotate(q_BVHAD, *rotation_BVAD)
-        views, anchors = q_BVHAD.shape[1], q_BVHAD.shape[3]
-        # the views of a scene ask the same keys: together they are one longer row of questions
+        views = q_BVHAD.shape[1]
+        anchors = q_BVHAD.shape[3]
+        # the views of a scene attend to the same keys: together they are one longer row of queries
         q_BHQD = q_BVHAD.movedim(1, 2).flatten(2, 3)
         attended = attend(q_BHQD, *keys_values, keys).unflatten(2, (views, anchors))
         read = cross.out(merge_heads(attended.movedim(2, 1)))
@@ -125,26 +133,26 @@ class PixelHead(nn.Module):
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         width = config.pixel_width
-        self.told = nn.Linear(TOLD, width)
+        self.told = nn.Linear(PIXEL_DIM, width)
         self.query = nn.Linear(width, width)
         self.key = nn.Linear(config.width, width)
         self.value = nn.Linear(config.width, width)
-        self.place = nn.Linear(PLACE, width)
+        self.place = nn.Linear(OFFSET_DIM, width)
         self.nearness = nn.Parameter(torch.full((3,), 2.0))
         self.first = nn.Linear(2 * width + 3, 2 * width)
         self.second = nn.Linear(2 * width, width)
         self.last = nn.Linear(width, 3 * (_GAINED + 2))
 
     def rounded_parts(self) -> list[nn.Module]:
-        """Return what a precision rounds: nothing. Light is added up here, and steps would show."""
+        """Return the modules that a precision rounds: none, since steps would show in the sum."""
         return []
 
     def forward(
         self,
-        told_MPF: Tensor,
+        features_MPF: Tensor,
         key_M9W: Tensor,
         value_M9W: Tensor,
-        lies: Lie,
+        offsets: AnchorOffset,
         met_M9: Tensor,
         gathered_M93: Tensor,
     ) -> tuple[Tensor, Tensor]:
@@ -152,13 +160,13 @@ class PixelHead(nn.Module):
 
         M parts of the picture have P pixels and nine anchors each; F numbers a pixel.
         """
-        pixel_MPW = silu(self.told(told_MPF))
+        pixel_MPW = silu(self.told(features_MPF))
         alike_MP9 = self.query(pixel_MPW) @ key_M9W.mT / math.sqrt(key_M9W.shape[-1])
-        for weight, unlike_MP9 in zip(softplus(self.nearness), lies.unlike, strict=True):
+        for weight, unlike_MP9 in zip(softplus(self.nearness), offsets.unlike, strict=True):
             alike_MP9 = alike_MP9 - weight * unlike_MP9
         nothing_M19 = torch.where(met_M9, 0.0, -2 * FARTHEST)[:, None]
         share_MP9 = (alike_MP9 + nothing_M19).softmax(dim=-1)
-        known_MPW = share_MP9 @ value_M9W + self.place(lies.mixed(share_MP9))
+        known_MPW = share_MP9 @ value_M9W + self.place(offsets.mixture_offset(share_MP9))
         gathered_MP3 = share_MP9 @ gathered_M93
         both = torch.cat([pixel_MPW, known_MPW, torch.log1p(4 * gathered_MP3)], dim=-1)
         return self.last(silu(self.second(silu(self.first(both))))), gathered_MP3
@@ -172,8 +180,8 @@ class HitDecoder(nn.Module):
         self.config = config
         self.rotary = rotary
         self.recompute = False
-        self.filter = LightFilter(TOLD, config.filter_width) if config.filter_width else None
-        self.told = nn.Linear(TOLD + 3, config.width)
+        self.filter = LightFilter(PIXEL_DIM, config.filter_width) if config.filter_width else None
+        self.told = nn.Linear(PIXEL_DIM + 3, config.width)
         self.anchors = nn.Linear(config.width, config.width)
         self.layers = nn.ModuleList(AnchorLayer(config) for _ in range(config.decoder_layers))
         self.norm = Norm(config.width, eps=LAYER_NORM_EPS)
@@ -182,15 +190,15 @@ class HitDecoder(nn.Module):
     def keys_values(
         self, context_BNW: Tensor, places: TokenPositions, packing: Packing | None = None
     ) -> tuple[KeysValues, ...]:
-        """Return what each layer asks of a context, keys rotated in the world: once a scene."""
+        """Return each layer's keys and values of a context, keys rotated to world space."""
         rotation_BND = world_rotation(self.rotary, places)
         if packing is not None:
             rotation_BND = packed_rotation(rotation_BND, packing)
-        found = []
+        per_layer = []
         for layer in cast(Iterable[Any], self.layers):
             k_BHND, v_BHND = layer.cross.keys_values(context_BNW)
-            found.append((rotate(k_BHND, *rotation_BND), v_BHND))
-        return tuple(found)
+            per_layer.append((rotate(k_BHND, *rotation_BND), v_BHND))
+        return tuple(per_layer)
 
     def forward(self, scene: EncodedScene, traced: Traced) -> Tensor:
         """Return log10(1 + radiance) [B, V, R, R, 3]; each number is at least 0.
@@ -201,38 +209,40 @@ class HitDecoder(nn.Module):
         """
         with without_autocast(traced.pixels_VRRC.device):
             unit_B1113 = traced.unit_3[:, None, None, None, :]
-            told, mirrored = self._told(traced, unit_B1113)
+            features, mirrored = self._pixel_features(traced, unit_B1113)
             at = _at_anchors(traced)
             anchor = torch.cat(
-                [at(told), torch.log1p(4 * traced.gathered_VA3 / unit_B1113[..., 0, :])], dim=-1
+                [at(features), torch.log1p(4 * traced.gathered_VA3 / unit_B1113[..., 0, :])], dim=-1
             )
             place = at(traced.pixels_VRRC)
-        x_BVAW = self._asked(scene, traced, anchor, place[..., Channel.POSITION])
+        x_BVAW = self._read_scene(scene, traced, anchor, place[..., Channel.POSITION])
         device = traced.pixels_VRRC.device
         trains = torch.is_grad_enabled() and torch.is_autocast_enabled("cuda")
         with without_autocast(device), fast_float32_products(device, enabled=trains):
-            return self._pictures(traced, told, mirrored, x_BVAW.to(told.dtype), place, unit_B1113)
+            return self._pictures(
+                traced, features, mirrored, x_BVAW.to(features.dtype), place, unit_B1113
+            )
 
-    def _told(self, traced: Traced, unit_B1113: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what pixels are told [B, V, R, R, F], and their mirrored light, filtered."""
+    def _pixel_features(self, traced: Traced, unit_B1113: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the features of pixels [B, V, R, R, F], and their mirrored light, filtered."""
         pixels = traced.pixels_VRRC
         surface = _surface(pixels)
         light = torch.cat([pixels[..., channel] / unit_B1113 for channel in _LIGHTS], dim=-1)
-        given = traced.given_VI[:, :, None, None, :].expand(*surface.shape[:-1], -1)
+        available = traced.given_VI[:, :, None, None, :].expand(*surface.shape[:-1], -1)
         mirrored = pixels[..., Channel.MIRRORED] / unit_B1113
 
-        def told() -> Tensor:
+        def stack_features() -> Tensor:
             lights = torch.log1p(4 * torch.cat([light, mirrored], dim=-1))
-            return torch.cat([surface, lights, given], dim=-1)
+            return torch.cat([surface, lights, available], dim=-1)
 
         if self.filter is not None:
             albedo = pixels[..., Channel.SPECULAR] * pixels[..., Channel.COVERAGE]
             views = mirrored.shape[:2]
-            flat = [each.flatten(0, 1) for each in (told(), mirrored, albedo)]
+            flat = [each.flatten(0, 1) for each in (stack_features(), mirrored, albedo)]
             mirrored = self.filter(*flat).unflatten(0, views)
-        return told(), mirrored
+        return stack_features(), mirrored
 
-    def _asked(
+    def _read_scene(
         self, scene: EncodedScene, traced: Traced, anchor_BVAF: Tensor, position_BVA3: Tensor
     ) -> Tensor:
         """Return the anchors [B, V, A, W] after they have read the scene."""
@@ -256,15 +266,16 @@ class HitDecoder(nn.Module):
     def _pictures(
         self,
         traced: Traced,
-        told: Tensor,
+        features: Tensor,
         mirrored: Tensor,
         x_BVAW: Tensor,
         place_BVAC: Tensor,
         unit_B1113: Tensor,
     ) -> Tensor:
-        resolution, parts = told.shape[2], x_BVAW.shape[2]
+        resolution = features.shape[2]
+        parts = x_BVAW.shape[2]
         side = round(parts**0.5)
-        views = told.shape[:2]
+        views = features.shape[:2]
         unit = unit_B1113.expand(*views, parts, 1, 3).flatten(0, 2)
         head = self.head
         gathered = (traced.gathered_VA3 / unit_B1113[..., 0, :]).flatten(0, 1)
@@ -277,13 +288,13 @@ class HitDecoder(nn.Module):
                 place_BVAC.flatten(0, 1),
             )
         ]
-        given = [
-            _in_parts(each.flatten(0, 1), side) for each in (told, traced.pixels_VRRC, mirrored)
+        pixel_parts = [
+            _in_parts(each.flatten(0, 1), side) for each in (features, traced.pixels_VRRC, mirrored)
         ]
-        every = [each.flatten(0, 1) for each in (*given, *around)]
+        every = [each.flatten(0, 1) for each in (*pixel_parts, *around)]
         rows = [
             self._some_parts(unit[some], *(each[some] for each in every))
-            for some in _blocks(told, parts)
+            for some in _blocks(features, parts)
         ]
         pictures = _whole(torch.cat(rows).unflatten(0, (-1, parts)), side)
         log10 = torch.log1p(pictures) / math.log(10)
@@ -292,7 +303,7 @@ class HitDecoder(nn.Module):
     def _some_parts(
         self,
         unit_M13: Tensor,
-        told_MPF: Tensor,
+        features_MPF: Tensor,
         pixels_MPC: Tensor,
         mirrored_MP3: Tensor,
         key_M9W: Tensor,
@@ -301,33 +312,33 @@ class HitDecoder(nn.Module):
         place_M9C: Tensor,
     ) -> Tensor:
         """Return the radiance [M, P, 3] of some parts of pictures."""
-        lies = lies_to(pixels_MPC, place_M9C)
+        offsets = offsets_to_anchors(pixels_MPC, place_M9C)
         met_M9 = place_M9C[..., 0] > 0
-        learned, mixed = self.head(told_MPF, key_M9W, value_M9W, lies, met_M9, gathered_M93)
-        return _composed(learned, mixed, mirrored_MP3, pixels_MPC, unit_M13)
+        learned, mixed = self.head(features_MPF, key_M9W, value_M9W, offsets, met_M9, gathered_M93)
+        return _compose_radiance(learned, mixed, mirrored_MP3, pixels_MPC, unit_M13)
 
 
-def _blocks(told: Tensor, parts: int) -> Iterator[slice]:
+def _blocks(features: Tensor, parts: int) -> Iterator[slice]:
     """Yield the parts, of all views, that are computed together.
 
-    A card is told of all at once while it learns: view by view would be as many times its kernels.
-    A processor takes a view at a time, whose numbers stay near it, and less while rendering.
+    A GPU computes all at once in training: view by view would launch its kernels for each view.
+    A CPU computes one view at a time, whose numbers stay in its cache, and less in rendering.
     """
-    count = told.shape[0] * told.shape[1]
-    if told.device.type == "cuda" and torch.is_grad_enabled():
+    count = features.shape[0] * features.shape[1]
+    if features.device.type == "cuda" and torch.is_grad_enabled():
         yield slice(0, count * parts)
         return
     step = parts
     if not torch.is_grad_enabled():
-        pixels = BLOCK_PIXELS if told.device.type == "cpu" else DEVICE_BLOCK
-        step = max(1, pixels * parts // told.shape[2] ** 2)
+        pixels = BLOCK_PIXELS if features.device.type == "cpu" else DEVICE_BLOCK
+        step = max(1, pixels * parts // features.shape[2] ** 2)
     for view in range(count):
         for first in range(0, parts, step):
             yield slice(view * parts + first, view * parts + min(first + step, parts))
 
 
 def _surface(pixels: Tensor) -> Tensor:
-    """Return what is said of surfaces [..., 23]."""
+    """Return the features of surfaces [..., 23]."""
     normal = nn.functional.normalize(pixels[..., Channel.NORMAL], dim=-1)
     toward = nn.functional.normalize(pixels[..., Channel.TOWARD], dim=-1)
     cosine = (normal * toward).sum(dim=-1, keepdim=True)
@@ -348,7 +359,7 @@ def _surface(pixels: Tensor) -> Tensor:
 
 
 def _at_anchors(traced: Traced) -> Callable[[Tensor], Tensor]:
-    """Return a function that takes [B, V, R, R, K] and returns the anchors' own [B, V, A, K]."""
+    """Return a function that takes [B, V, R, R, K] and returns [B, V, A, K] at the anchors."""
 
     def at(values: Tensor) -> Tensor:
         index = traced.anchor_VA[..., None].expand(-1, -1, -1, values.shape[-1])
@@ -379,7 +390,7 @@ def _around(values_VAK: Tensor, side: int) -> Tensor:
     return values_VAK[:, rows.reshape(side * side, NEIGHBOURS)]
 
 
-def _composed(
+def _compose_radiance(
     learned: Tensor, gathered: Tensor, mirrored: Tensor, pixels: Tensor, unit: Tensor
 ) -> Tensor:
     """Return radiance [..., 3] of at least 0; gathered and mirrored light are in units."""

@@ -1,6 +1,6 @@
 """`DeviceArray`: a torch tensor that answers to numpy's functions, so that one code traces on both.
 
-Rays on a processor are numpy. On a card the same functions get `DeviceArray`s, which numpy hands on
+Rays on a CPU are numpy. On a GPU the same functions get `DeviceArray`s, which numpy hands on
 to torch (NEP 13 and 18). Nothing is read back and all shapes are known beforehand, so that a view
 may be recorded as one graph: rows that a mask chooses are all rows, and what is done with those
 that it leaves out is dropped where it would be stored (`MaskedRows`).
@@ -63,11 +63,11 @@ class MaskedRows:
 
     @property
     def counts(self) -> Tensor:
-        """[A] which of the rows that are asked do count."""
+        """[A] True for the requested rows that count."""
         return self.mask if self.within is None else self.mask[self.within]
 
     def zero_others(self, values: "DeviceArray") -> "DeviceArray":
-        """Return the values [..., A] of the rows that are asked, 0 for those that do not count."""
+        """Return the values [..., A] of the requested rows, 0 for those that do not count."""
         zero = values.tensor.new_zeros(())
         return DeviceArray(torch.where(self.counts, values.tensor, zero), values.place)
 
@@ -123,7 +123,7 @@ class DeviceArray(NDArrayOperatorsMixin):
         self.tensor[index] = values
 
     def _index(self, key: Any) -> tuple[Any, Tensor | None]:
-        """Return what torch is asked for, and which of its rows count."""
+        """Return the index for torch, and which of its rows count."""
         keys: list[Any] = []
         mask = None
         parts = key if isinstance(key, tuple) else (key,)

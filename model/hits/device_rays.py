@@ -1,4 +1,4 @@
-"""Rays that a card traces: a tree of boxes, built by torch, and a kernel that walks through it.
+"""Rays that a GPU traces: a tree of boxes, built by torch, and a kernel that walks through it.
 
 A node has four children: its triangles are halved twice, each time where the surface of the halves'
 boxes, weighed by their triangles, is least (binned, Wald 2007). Whether a ray meets a triangle is
@@ -143,7 +143,7 @@ class Tree:
     corners: NDArray[np.float32]
     """[T, 12] of the triangles, leaf by leaf; three unused."""
     rows: NDArray[np.int64]
-    """[T] which triangle each is."""
+    """[T] row of each triangle in the scene."""
 
 
 def build_tree(corners_T33: NDArray[np.float32], rows_T: NDArray[np.intp]) -> Tree:
@@ -192,7 +192,7 @@ def build_tree(corners_T33: NDArray[np.float32], rows_T: NDArray[np.intp]) -> Tr
 def goes_right(
     least: NDArray, most: NDArray, group: NDArray, num_groups: int, *, is_even: bool
 ) -> NDArray[np.bool_]:
-    """Return which of A triangles are of the second half of their group; of a leaf's, none.
+    """Return a mask [A] of the triangles in the second half of their group; of a leaf's, none.
 
     Args:
         least, most: [A, 3] corners of their boxes.
@@ -220,7 +220,7 @@ def goes_right(
 def _costs(
     least: NDArray, most: NDArray, group: NDArray, place_A3: NDArray, num_groups: int
 ) -> NDArray[np.float32]:
-    """Return what each cut of a group costs [groups, 3 axes x (BINS - 1)]; infinite: no cut."""
+    """Return the cost of each cut of a group [groups, 3 axes x (BINS - 1)]; infinite: no cut."""
     cell = ((group[:, None] * 3 + np.arange(3)) * BINS + place_A3).ravel()
     shape = num_groups, 3, BINS
     count = np.bincount(cell, minlength=3 * BINS * num_groups).reshape(shape)
@@ -251,19 +251,19 @@ def _boxes(
 
 @functools.cache
 def compiled_kernel(device: torch.device) -> Any | None:
-    """Return the kernel for a card; None where it cannot be compiled, and rays stay on the CPU."""
+    """Return the kernel for a GPU; None where it cannot be compiled, and rays stay on the CPU."""
     if device.type != "cuda":
         return None
     try:
         with torch.cuda.device(device):
             return torch.cuda._compile_kernel(SOURCE, "trace")
     except (AttributeError, OSError, RuntimeError) as error:
-        warnings.warn(f"the card's rays stay with the processor: {error}", stacklevel=2)
+        warnings.warn(f"the GPU cannot trace rays, so the CPU does: {error}", stacklevel=2)
         return None
 
 
 class DeviceTriangles:
-    """Some triangles of many, as rays on a card meet them: a `RayCaster` of `DeviceArray`s."""
+    """Some triangles of many, as rays on a GPU meet them: a `RayCaster` of `DeviceArray`s."""
 
     def __init__(
         self, corners_T33: NDArray[np.float32], rows: NDArray[np.intp], place: DevicePlace
@@ -274,7 +274,7 @@ class DeviceTriangles:
         self._tree = [place.array(each).tensor for each in vars(tree).values()]
 
     def intersect(self, origins: DeviceArray, directions: DeviceArray) -> RayHits:
-        """Return what rays [N, 3] from `origins` [N, 3] meet first, from either side."""
+        """Return the first hits of rays [N, 3] from `origins` [N, 3], from either side."""
         count = len(directions)
         triangle = torch.empty(count, dtype=torch.long, device=self._place.device)
         uv = torch.empty(2, count, device=self._place.device)

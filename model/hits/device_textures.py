@@ -1,4 +1,4 @@
-"""`DeviceTextures`: the textures of a scene's triangles on a card, all in one row of texels."""
+"""`DeviceTextures`: the textures of a scene's triangles on a GPU, all in one row of texels."""
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from storage.records.texture import CONSTANT, TEXTURED
 
 
 class DeviceTextures:
-    """What `SurfaceTextures` says, in the same precision."""
+    """`SurfaceTextures` as tensors, in the same precision."""
 
     def __init__(self, textures: SurfaceTextures, place: DevicePlace) -> None:
         self.is_textured = place.array(textures.is_textured)

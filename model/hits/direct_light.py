@@ -1,7 +1,7 @@
 """Direct light at points: one point on every lamp's triangle, with and without its shadow.
 
-Unbiased: the mean over `turn`s and shifts is the integral, but for the specular lobe, whose sharp
-part is left to rays that are drawn by the lobe (`lobe_ray_weight`).
+Unbiased: the mean over points and shifts is the integral, but for the specular lobe, whose sharp
+part is left to rays that the lobe draws (`lobe_ray_weight`).
 """
 
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ from model.hits.vectors import Floats, as_rows, brightest, dot
 _INV_PI = np.float32(1 / np.pi)
 
 TOGETHER = 2**21
-"""Pairs of points and lamps that a card computes at a time."""
+"""Pairs of points and lamps that a GPU computes at a time."""
 
 _SHORTENING = np.float32(1 - 1e-4)
 """Share of the way to a lamp that a shadow ray goes, as the renderer's."""
@@ -32,11 +32,11 @@ class DirectLight:
     """Light of lamps and the sky at P points, [3, P] each."""
 
     open_diffuse: Floats
-    """Irradiance over pi, as if nothing stood between."""
+    """Irradiance over pi, without shadows."""
     open_specular: Floats
-    """Specular radiance towards the viewer, likewise."""
+    """Specular radiance towards the viewer, without shadows."""
     diffuse: Floats
-    """Irradiance over pi, shadowed."""
+    """Irradiance over pi, with the shadows of all surfaces."""
     specular: Floats
     """Specular radiance towards the viewer, shadowed."""
 
@@ -74,7 +74,7 @@ def direct_light(
 
 
 def _some_lamps(scene: LitScene, points: Points) -> Iterator[slice]:
-    """Yield which lamps are computed together: one by one, or on a card many."""
+    """Yield which lamps are computed together: one by one, or on a GPU many."""
     count = points.position.shape[1]
     step = 1 if scene.place is None else max(1, TOGETHER // count)
     for first in range(0, len(scene.lamps), step):
@@ -92,31 +92,32 @@ def _add(
 ) -> None:
     """Add the light of l lamps; arrays are [3, l, P] and [l, P]."""
     lamps = scene.lamps[some]
-    here, gloss = points.only(None), None if gloss is None else gloss.only(None)
+    lit_points = points.only(None)
+    gloss = None if gloss is None else gloss.only(None)
     place = _on_triangle(scene, lamps[:, None], on_lamp)
-    to_lamp = place - here.position
+    to_lamp = place - lit_points.position
     square = np.maximum(dot(to_lamp, to_lamp), np.float32(1e-12))
     to_lamp = to_lamp / np.sqrt(square)
-    cosine = dot(here.normal, to_lamp)
+    cosine = dot(lit_points.normal, to_lamp)
     planes = [scene.plane[:, int(lamp)] for lamp in lamps]
     facing = np.abs(np.stack([plane @ to_lamp[:, row] for row, plane in enumerate(planes)]))
     solid = facing * scene.area[lamps][:, None] / square
     diffuse = np.maximum(cosine, 0) * solid * _INV_PI
     specular = None
     if gloss is not None:
-        value, density = lobe(gloss, here, to_lamp, cosine)
+        value, density = lobe(gloss, lit_points, to_lamp, cosine)
         specular = value * solid / (1 + np.square(lobe_rays * density * solid))
     useful = np.flatnonzero(diffuse if specular is None else (diffuse > 0) | (specular > 0))
     is_free = np.zeros_like(diffuse).reshape(-1)
-    is_free[useful] = _is_free(scene, here, place, to_lamp, useful)
+    is_free[useful] = _is_free(scene, lit_points, place, to_lamp, useful)
     is_free = is_free.reshape(diffuse.shape)
     emission = scene.emission[:, lamps][:, :, None]
     np.add(light.open_diffuse, _total(diffuse * emission), out=light.open_diffuse)
     np.add(light.diffuse, _total(diffuse * is_free * emission), out=light.diffuse)
     if specular is not None and gloss is not None:
-        coloured = gloss.colour * specular * emission
-        np.add(light.open_specular, _total(coloured), out=light.open_specular)
-        np.add(light.specular, _total(coloured * is_free), out=light.specular)
+        colored = gloss.color * specular * emission
+        np.add(light.open_specular, _total(colored), out=light.open_specular)
+        np.add(light.specular, _total(colored * is_free), out=light.specular)
 
 
 def _total(of_lamps: Floats) -> Floats:
@@ -125,7 +126,11 @@ def _total(of_lamps: Floats) -> Floats:
 
 
 def lobe_ray_weight(
-    scene: LitScene, met: Points, start: Floats, density: Floats, chance: Floats | float = 1.0
+    scene: LitScene,
+    hit_points: Points,
+    start: Floats,
+    density: Floats,
+    chance: Floats | float = 1.0,
 ) -> Floats:
     """Return the share [P] of a lamp's emission that a ray drawn by the lobe has to bring.
 
@@ -133,17 +138,19 @@ def lobe_ray_weight(
 
     Args:
         scene: the scene.
-        met: what the rays have met, lamps or not.
+        hit_points: what the rays hit, lamps or not.
         start: [3, P] where they began.
         density: [P] of the lobe along the rays.
         chance: [P] with which the lamp would have been chosen there; of `direct_light`, 1.
     """
-    way = met.position - start
-    facing = np.abs(dot(scene.plane[:, met.triangle], met.toward))
-    square = np.maximum(dot(way, way), np.float32(1e-12))
-    solid = facing * scene.area[met.triangle] / square / np.maximum(chance, np.float32(1e-12))
-    kept = np.square(density * solid)
-    weight: Floats = kept / (1 + kept)
+    to_hit = hit_points.position - start
+    facing = np.abs(dot(scene.plane[:, hit_points.triangle], hit_points.to_viewer))
+    square = np.maximum(dot(to_hit, to_hit), np.float32(1e-12))
+    solid = (
+        facing * scene.area[hit_points.triangle] / square / np.maximum(chance, np.float32(1e-12))
+    )
+    mis_ratio = np.square(density * solid)
+    weight: Floats = mis_ratio / (1 + mis_ratio)
     return weight
 
 
@@ -154,22 +161,23 @@ def lamp_chances(scene: LitScene, points: Points, gloss: Gloss) -> Floats:
     rays are spent on lamps that are far away or not where a narrow lobe looks.
     """
     shape = len(scene.lamps), points.position.shape[1]
-    odds = np.zeros_like(gloss.alpha, shape=shape)
+    power_at_points = np.zeros_like(gloss.alpha, shape=shape)
     albedo = scene.diffuse.mean(axis=0)[points.triangle] * _INV_PI
-    colour = gloss.colour.mean(axis=0)
-    here, gloss = points.only(None), gloss.only(None)
+    color = gloss.color.mean(axis=0)
+    lit_points = points.only(None)
+    gloss = gloss.only(None)
     for some in _some_lamps(scene, points):
         lamps = scene.lamps[some]
         middle = scene.corners[:, :, lamps].mean(axis=0)
-        to_lamp = middle[:, :, None] - here.position
+        to_lamp = middle[:, :, None] - lit_points.position
         square = np.maximum(dot(to_lamp, to_lamp), scene.area[lamps][:, None])
         to_lamp = to_lamp / np.sqrt(square)
-        cosine = dot(here.normal, to_lamp)
-        value, _ = lobe(gloss, here, to_lamp, cosine)
-        sent = albedo * np.maximum(cosine, 0) + colour * value + _EVEN
+        cosine = dot(lit_points.normal, to_lamp)
+        value, _ = lobe(gloss, lit_points, to_lamp, cosine)
+        sent = albedo * np.maximum(cosine, 0) + color * value + _EVEN
         power = scene.emission[:, lamps].mean(axis=0) * scene.area[lamps]
-        odds[some] = sent * power[:, None] / square
-    chances: Floats = odds / np.maximum(odds.sum(axis=0), np.float32(1e-30))
+        power_at_points[some] = sent * power[:, None] / square
+    chances: Floats = power_at_points / np.maximum(power_at_points.sum(axis=0), np.float32(1e-30))
     return chances
 
 
@@ -207,7 +215,7 @@ def chosen_lamp_light(
     value, density = lobe(gloss, points, to_lamp, cosine)
     value = value / (1 + np.where(has_lobe_ray, np.square(density * solid), np.float32(0)))
     albedo = scene.diffuse_at(points)
-    reflected = albedo * (np.maximum(cosine, 0) * _INV_PI) + gloss.colour * value
+    reflected = albedo * (np.maximum(cosine, 0) * _INV_PI) + gloss.color * value
     useful = np.flatnonzero(brightest(reflected) > 0)
     is_free = np.zeros_like(solid)
     is_free[useful] = _is_free(scene, points, place, to_lamp, useful)
@@ -217,17 +225,17 @@ def chosen_lamp_light(
 def _is_free(
     scene: LitScene, points: Points, place: Floats, to_lamp: Floats, rows: NDArray[np.intp]
 ) -> NDArray[np.bool_]:
-    """Return whether nothing stands between some of the points and their places on lamps."""
+    """Return True for those of some points whose segment to their place on a lamp is free."""
     if not len(rows):
         return np.zeros(0, np.bool_)
     position, plane, place, to_lamp = (
         np.broadcast_to(each, place.shape).reshape(3, -1)[:, rows]
-        for each in (points.position, points.plane, place, to_lamp)
+        for each in (points.position, points.geometric_normal, place, to_lamp)
     )
     start = off_surface(position, plane, to_lamp)
-    way = place - start
-    length = np.sqrt(np.maximum(dot(way, way), np.float32(1e-20)))
-    return scene.everything.is_free(as_rows(start), as_rows(way / length), length * _SHORTENING)
+    segment = place - start
+    length = np.sqrt(np.maximum(dot(segment, segment), np.float32(1e-20)))
+    return scene.everything.is_free(as_rows(start), as_rows(segment / length), length * _SHORTENING)
 
 
 def _on_triangle(scene: LitScene, rows: NDArray[np.intp], u: Floats) -> Floats:

@@ -4,7 +4,7 @@ One ray of a pixel says what its glossy surface shows, with much noise. Pixels t
 may share what their rays found: each level mixes three by three pixels, as far apart as the level
 says (a trous: Dammertz et al. 2010), by how alike the network finds them and how far it trusts each
 ray. Light is divided by specular albedo before, and multiplied after, so that patterns stay sharp;
-weights have no colour, so that the picture stays linear in the light.
+weights have no color, so that the picture stays linear in the light.
 """
 
 from typing import cast
@@ -23,65 +23,65 @@ _ALIKE = 8
 """Numbers by which pixels are alike."""
 
 _AROUND_PX = (3, 7)
-"""Widths of the squares whose mean light each pixel is told."""
+"""Widths of the squares whose mean light is a feature of each pixel."""
 
 _DARKEST = 1e-4
 """Specular albedo that a mixture is divided by at least."""
 
 _ROWS = 32
-"""Rows of a picture that are mixed at a time while rendering: they stay in the processor's cache.
+"""Rows of a picture that are mixed at a time while rendering: they stay in the CPU's cache.
 """
 
 _MOST_DOUBT = 30.0
 """A ray that is not trusted at all counts e^-30: its pixel, all alone, still shows it."""
 
 
-def filter_flops(told: int, width: int, pixels: int) -> int:
+def filter_flops(num_features: int, width: int, pixels: int) -> int:
     """Return the FLOPs of filtering a picture of so many pixels."""
-    first = (told + 3 * len(_AROUND_PX)) * width + width * width
+    first = (num_features + 3 * len(_AROUND_PX)) * width + width * width
     level = 3 * width + width * (_ALIKE + 1) + TAPS * (_ALIKE + 6)
     return 2 * pixels * (first + len(STEPS_PX) * level)
 
 
 class LightFilter(nn.Module):
-    """What pixels are told, and their mirrored light -> mirrored light with less noise."""
+    """Features of pixels and their mirrored light -> mirrored light with less noise."""
 
-    def __init__(self, told: int, width: int) -> None:
+    def __init__(self, num_features: int, width: int) -> None:
         super().__init__()
-        self.first = nn.Linear(told + 3 * len(_AROUND_PX), width)
+        self.first = nn.Linear(num_features + 3 * len(_AROUND_PX), width)
         self.second = nn.Linear(width, width)
         self.light = nn.ModuleList(nn.Linear(3, width) for _ in STEPS_PX)
         self.alike = nn.ModuleList(nn.Linear(width, _ALIKE + 1) for _ in STEPS_PX)
         self.near = nn.Parameter(torch.zeros(len(STEPS_PX), TAPS))
 
-    def forward(self, told_VRRF: Tensor, light_VRR3: Tensor, albedo_VRR3: Tensor) -> Tensor:
+    def forward(self, features_VRRF: Tensor, light_VRR3: Tensor, albedo_VRR3: Tensor) -> Tensor:
         """Return the mixed light [V, R, R, 3], of at least 0; linear in `light` for equal weights.
 
         Args:
-            told_VRRF: what each pixel is told.
+            features_VRRF: features of each pixel.
             light_VRR3: what its ray brought, in units of the scene's light.
             albedo_VRR3: the specular albedo that it was multiplied by.
         """
         both = torch.cat([light_VRR3, albedo_VRR3], dim=-1).movedim(-1, 1)
-        around = [_seen(_mean_around(both, width)) for width in _AROUND_PX]
-        known_VRRW = self.second(silu(self.first(torch.cat([told_VRRF, *around], dim=-1))))
+        around = [_log_light(_mean_around(both, width)) for width in _AROUND_PX]
+        known_VRRW = self.second(silu(self.first(torch.cat([features_VRRF, *around], dim=-1))))
         levels = zip(STEPS_PX, self.light, self.alike, self.near, strict=True)
         for step, light, alike, near in levels:
-            at_level = silu(known_VRRW + light(_seen(both)))
-            both = self.mixed(alike(at_level).movedim(-1, 1), near, both, step)
+            at_level = silu(known_VRRW + light(_log_light(both)))
+            both = self.mix_level(alike(at_level).movedim(-1, 1), near, both, step)
         return _without_albedo(both).movedim(1, -1) * albedo_VRR3
 
-    def mixed(self, alike_VCRR: Tensor, near_9: Tensor, both_V6RR: Tensor, step: int) -> Tensor:
+    def mix_level(self, alike_VCRR: Tensor, near_9: Tensor, both_V6RR: Tensor, step: int) -> Tensor:
         """Return one level's light and albedo [V, 6, R, R]; a hundred kernels, or one compiled."""
-        return _mixed(alike_VCRR, near_9, both_V6RR, step)
+        return _mix_pixels(alike_VCRR, near_9, both_V6RR, step)
 
 
 def _without_albedo(both_V6RR: Tensor) -> Tensor:
     return both_V6RR[:, :3] / both_V6RR[:, 3:].clamp(min=_DARKEST)
 
 
-def _seen(both_V6RR: Tensor) -> Tensor:
-    """Return light without albedo as the network is told it, [V, R, R, 3]."""
+def _log_light(both_V6RR: Tensor) -> Tensor:
+    """Return light without albedo as the network reads it, log(1 + 4 light), [V, R, R, 3]."""
     return torch.log1p(4 * _without_albedo(both_V6RR)).movedim(1, -1)
 
 
@@ -95,7 +95,7 @@ def _mean_around(both_V6RR: Tensor, width: int) -> Tensor:
     return avg_pool2d(rows, (width, 1), 1, (half, 0), count_include_pad=False)
 
 
-def _mixed(alike_VCRR: Tensor, near_9: Tensor, both_V6RR: Tensor, step: int) -> Tensor:
+def _mix_pixels(alike_VCRR: Tensor, near_9: Tensor, both_V6RR: Tensor, step: int) -> Tensor:
     """Return light and albedo [V, 6, R, R], mixed with the same weights."""
     height = both_V6RR.shape[2]
     frame = (step, step, step, step)
@@ -104,24 +104,25 @@ def _mixed(alike_VCRR: Tensor, near_9: Tensor, both_V6RR: Tensor, step: int) -> 
     rows = _ROWS if around.device.type == "cpu" and not torch.is_grad_enabled() else height
     return torch.cat(
         [
-            _mixed_rows(around[:, :, first : first + rows + 2 * step], near_9, step)
+            _mix_rows(around[:, :, first : first + rows + 2 * step], near_9, step)
             for first in range(0, height, rows)
         ],
         dim=2,
     )
 
 
-def _mixed_rows(around_VCRR: Tensor, near_9: Tensor, step: int) -> Tensor:
+def _mix_rows(around_VCRR: Tensor, near_9: Tensor, step: int) -> Tensor:
     """Return [V, 6, rows, R] from all numbers of pixels with a frame around, 0 outside."""
     height, width = (size - 2 * step for size in around_VCRR.shape[2:])
-    own = around_VCRR[:, :_ALIKE, step : step + height, step : step + width]
+    center = around_VCRR[:, :_ALIKE, step : step + height, step : step + width]
     total: Tensor | float = 0.0
     shares: Tensor | float = 0.0
     for tap, near in enumerate(near_9):
-        row, column = tap // 3 * step, tap % 3 * step
-        there = around_VCRR[:, :, row : row + height, column : column + width]
-        unlike = (own - there[:, :_ALIKE]).square().sum(dim=1, keepdim=True)
-        share = torch.exp(near - unlike) * there[:, _ALIKE : _ALIKE + 1]
-        total = total + share * there[:, _ALIKE + 1 :]
+        row = tap // 3 * step
+        column = tap % 3 * step
+        neighbor = around_VCRR[:, :, row : row + height, column : column + width]
+        unlike = (center - neighbor[:, :_ALIKE]).square().sum(dim=1, keepdim=True)
+        share = torch.exp(near - unlike) * neighbor[:, _ALIKE : _ALIKE + 1]
+        total = total + share * neighbor[:, _ALIKE + 1 :]
         shares = shares + share
     return cast(Tensor, total / shares)

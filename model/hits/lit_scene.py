@@ -23,39 +23,39 @@ from storage.records.environment import Environment
 from storage.records.material import EMISSION, ROUGHNESS
 
 _OFFSET = np.float32(1500 * 2.0**-24)
-"""How far rays start off a surface, as a share of 1 m plus their distance from the origin: the
-renderer's own (pipeline.renders.kernel_scene)."""
+"""Distance from a surface at which rays start, as a fraction of 1 m plus their distance from the
+origin: as in the renderer (pipeline.renders.kernel_scene)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Reflecting:
-    """How each of N triangles or points reflects; all float32."""
+class Reflectance:
+    """Reflectance of N triangles or points; all float32."""
 
     diffuse: Floats
-    """[3, N] diffuse albedo."""
+    """[3, N] diffuse albedo, linear, 0 to 1."""
     specular: Floats
-    """[3, N] specular albedo."""
+    """[3, N] specular albedo, linear, 0 to 1."""
     alpha: Floats
-    """[N] GGX width."""
-    again: Floats
+    """[N] GGX width, above 0 and at most 1."""
+    multiscatter: Floats
     """[3, N] Fms of storage.optics.multiscatter."""
     roughness: Floats
-    """[N] roughness."""
+    """[N] roughness of the material, 0 to 1."""
 
-    def only(self, rows: NDArray[np.intp]) -> "Reflecting":
+    def only(self, rows: NDArray[np.intp]) -> "Reflectance":
         """Return some of them."""
-        return Reflecting(**{name: each[..., rows] for name, each in vars(self).items()})
+        return Reflectance(**{name: each[..., rows] for name, each in vars(self).items()})
 
 
-def reflecting(materials: NDArray[np.float32]) -> Reflecting:
-    """Return how material rows [N, 10] reflect."""
+def reflectance_of(materials: NDArray[np.float32]) -> Reflectance:
+    """Return the reflectance of material rows [N, 10]."""
     lobes = lobes_of(materials)
-    again = scattered_again(lobes.specular, lobes.alpha, "correlated")
-    return Reflecting(
+    multiscatter = scattered_again(lobes.specular, lobes.alpha, "correlated")
+    return Reflectance(
         diffuse=lobes.diffuse.T.astype(np.float32),
         specular=lobes.specular.T.astype(np.float32),
         alpha=lobes.alpha.astype(np.float32),
-        again=again.T.astype(np.float32),
+        multiscatter=multiscatter.T.astype(np.float32),
         roughness=materials[:, ROUGHNESS].reshape(-1).astype(np.float32),
     )
 
@@ -67,20 +67,20 @@ class Points:
     triangle: NDArray[np.intp]
     """[P] row of the scene."""
     position: Floats
-    """[3, P] metres, world space."""
+    """[3, P] meters, world space."""
     normal: Floats
     """[3, P] unit shading normal, turned with the triangle to the side from which it is seen."""
-    plane: Floats
+    geometric_normal: Floats
     """[3, P] unit normal of the triangle, on the side of the shading normal."""
-    toward: Floats
-    """[3, P] unit vector to where the point is seen from."""
+    to_viewer: Floats
+    """[3, P] unit vector from the point to its viewer."""
     edge: Floats
     """[3, P] an edge of the triangle: what frames are built on, so that they turn with the world.
     """
     back: NDArray[np.bool_]
-    """[P] whether the triangle is seen from the side from which its corners run clockwise."""
-    reflecting: Reflecting | None = None
-    """How the points reflect, in textured scenes; None: as their triangles do in the mean."""
+    """[P] True: the viewer is on the side from which the triangle's corners run clockwise."""
+    reflectance: Reflectance | None = None
+    """Reflectance of the points in textured scenes; None: the mean one of their triangles."""
 
     def only(self, rows: NDArray[np.intp] | None) -> "Points":
         """Return some of the points; of None, all of them with an axis before that of points."""
@@ -88,22 +88,22 @@ class Points:
             triangle=self.triangle[rows],
             position=self.position[:, rows],
             normal=self.normal[:, rows],
-            plane=self.plane[:, rows],
-            toward=self.toward[:, rows],
+            geometric_normal=self.geometric_normal[:, rows],
+            to_viewer=self.to_viewer[:, rows],
             edge=self.edge[:, rows],
             back=self.back[rows],
-            reflecting=None
-            if rows is None or self.reflecting is None
-            else self.reflecting.only(rows),
+            reflectance=None
+            if rows is None or self.reflectance is None
+            else self.reflectance.only(rows),
         )
 
     def start(self, direction: Floats) -> Floats:
-        """Return where rays [3, P] that leave the surface begin."""
-        return off_surface(self.position, self.plane, direction)
+        """Return the starts of rays [3, P] that leave the surface."""
+        return off_surface(self.position, self.geometric_normal, direction)
 
 
 def off_surface(position: Floats, plane: Floats, direction: Floats) -> Floats:
-    """Return where rays [3, P] along `direction` begin, off the surface on their side."""
+    """Return the starts of rays [3, P] along `direction`, off the surface on their side."""
     off = (1 + brightest(np.abs(position))) * _OFFSET
     start: Floats = plane * np.copysign(off, dot(plane, direction))
     start += position
@@ -114,7 +114,7 @@ class LitScene:
     """Tables of T triangles, components first: [3, T] and [T]."""
 
     place: DevicePlace | None = None
-    """Where its tables are, as `DeviceArray`s; None: on the CPU."""
+    """Device that holds its tables, as `DeviceArray`s; None: the CPU."""
 
     def __init__(
         self,
@@ -127,7 +127,7 @@ class LitScene:
         """Take triangles in world space.
 
         Args:
-            corners_T33: positions in metres.
+            corners_T33: positions in meters.
             normals_T33: unit shading normals at the corners.
             materials_TM: the ten published numbers of each triangle's material, emission linear;
                 of textures, their means.
@@ -141,10 +141,13 @@ class LitScene:
         across = np.cross(edges[0], edges[1], axis=0)
         self.area = 0.5 * np.sqrt(dot(across, across))
         self.plane = unit(across)
-        means = reflecting(materials_TM)
-        self.diffuse, self.specular, self.again = means.diffuse, means.specular, means.again
-        self.alpha, self.roughness = means.alpha, means.roughness
-        self.textures: Any = textures  # on a card `DeviceTextures`
+        means = reflectance_of(materials_TM)
+        self.diffuse = means.diffuse
+        self.specular = means.specular
+        self.multiscatter = means.multiscatter
+        self.alpha = means.alpha
+        self.roughness = means.roughness
+        self.textures: Any = textures  # on a GPU `DeviceTextures`
         self._materials_TM = materials_TM
         self.sky = sky
         self.emission = np.ascontiguousarray(materials_TM[:, EMISSION].T.astype(np.float32))
@@ -158,7 +161,7 @@ class LitScene:
 
     @property
     def device(self) -> torch.device | None:
-        """The card where its rays are traced; None: the CPU."""
+        """The GPU where its rays are traced; None: the CPU."""
         return None if self.place is None else self.place.device
 
     def on(self, place: DevicePlace, caster: Callable[..., RayCaster]) -> "LitScene":
@@ -188,42 +191,42 @@ class LitScene:
 
     @cached_property
     def seen(self) -> RayCaster:
-        """What cameras see: all but emitters, which are hidden from them."""
+        """The triangles that cameras see: all but emitters, which are hidden from them."""
         return Triangles(self._corner_rows, np.flatnonzero(~self.emits))
 
     @cached_property
     def everything(self) -> RayCaster:
-        """What blocks light and reflects it."""
+        """All triangles, which block and reflect light."""
         return Triangles(self._corner_rows, np.arange(self.num_triangles))
 
     def diffuse_at(self, points: Points) -> Floats:
         """Return the diffuse albedo [3, P]."""
-        if points.reflecting is not None:
-            return points.reflecting.diffuse
+        if points.reflectance is not None:
+            return points.reflectance.diffuse
         return np.take(self.diffuse, points.triangle, axis=1)
 
     def specular_at(self, points: Points) -> Floats:
         """Return the specular albedo [3, P]."""
-        if points.reflecting is not None:
-            return points.reflecting.specular
+        if points.reflectance is not None:
+            return points.reflectance.specular
         return np.take(self.specular, points.triangle, axis=1)
 
-    def again_at(self, points: Points) -> Floats:
+    def multiscatter_at(self, points: Points) -> Floats:
         """Return Fms of multiple scattering [3, P]."""
-        if points.reflecting is not None:
-            return points.reflecting.again
-        return np.take(self.again, points.triangle, axis=1)
+        if points.reflectance is not None:
+            return points.reflectance.multiscatter
+        return np.take(self.multiscatter, points.triangle, axis=1)
 
     def alpha_at(self, points: Points) -> Floats:
         """Return the GGX width [P]."""
-        if points.reflecting is not None:
-            return points.reflecting.alpha
+        if points.reflectance is not None:
+            return points.reflectance.alpha
         return self.alpha[points.triangle]
 
     def roughness_at(self, points: Points) -> Floats:
         """Return the roughness [P]."""
-        if points.reflecting is not None:
-            return points.reflecting.roughness
+        if points.reflectance is not None:
+            return points.reflectance.roughness
         return self.roughness[points.triangle]
 
     def points(self, triangle: NDArray[np.intp], uv: Floats, direction: Floats) -> Points:
@@ -241,25 +244,27 @@ class LitScene:
         back = dot(plane, direction) > 0
         # as the renderer: the triangle's own normal goes with the shading normal, then both turn
         plane = plane * np.where(dot(plane, normal) < 0, np.float32(-1), np.float32(1))
-        turn = np.where(dot(plane, direction) > 0, np.float32(-1), np.float32(1))
+        flip = np.where(dot(plane, direction) > 0, np.float32(-1), np.float32(1))
         return Points(
             triangle=triangle,
             position=position,
-            normal=normal * turn,
-            plane=plane * turn,
-            toward=-direction,
+            normal=normal * flip,
+            geometric_normal=plane * flip,
+            to_viewer=-direction,
             edge=np.take(self.edge, triangle, axis=1),
             back=back,
-            reflecting=self._textured(triangle, weights),
+            reflectance=self._textured_reflectance(triangle, weights),
         )
 
-    def _textured(self, triangle: NDArray[np.intp], weights: Floats) -> Reflecting | None:
+    def _textured_reflectance(
+        self, triangle: NDArray[np.intp], weights: Floats
+    ) -> Reflectance | None:
         if self.textures is None:
             return None
-        return reflecting(self.textures.materials(triangle, weights, self._materials_TM))
+        return reflectance_of(self.textures.materials(triangle, weights, self._materials_TM))
 
     def first_hits(self, origin: Floats, direction: Floats) -> RayHits:
-        """Return what rays [3, P] from one camera [3] see first."""
+        """Return the first hits of rays [3, P] from one camera [3]."""
         start = np.broadcast_to(origin, (direction.shape[1], 3))
         return self.seen.intersect(start.copy(), as_rows(direction))
 
@@ -268,9 +273,9 @@ class LitScene:
 
         Of a ray that meets nothing, the point is one of the first triangle and means nothing.
         """
-        found = among.intersect(as_rows(start), as_rows(direction))
-        met = found.triangle >= 0
-        return self.points(np.maximum(found.triangle, 0), found.uv, direction), met
+        hits = among.intersect(as_rows(start), as_rows(direction))
+        is_hit = hits.triangle >= 0
+        return self.points(np.maximum(hits.triangle, 0), hits.uv, direction), is_hit
 
 
 def _between(corners: Floats, triangle: NDArray[np.intp], weights: Floats) -> Floats:

@@ -1,6 +1,6 @@
 """Light that triangles receive: direct, and by diffuse bounces between all of them.
 
-One number a side of a triangle: what a scene's tokens are told, and what gathering rays end in.
+One number a side of a triangle, which a scene's tokens and gathering rays read.
 """
 
 from dataclasses import dataclass
@@ -32,15 +32,15 @@ _BLOCK = 2**13
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneLight:
-    """What the two sides of T triangles receive, as irradiance over pi: front, then back."""
+    """Light that the two sides of T triangles receive, as irradiance over pi: front, then back."""
 
     direct_2T3: Floats
     """[2, T, 3] from lamps and the sky."""
     indirect_2T3: Floats
     """[2, T, 3] from other triangles, each as if it were diffuse."""
     mean_3: Floats
-    """Mean direct light of the scene's surface, by colour: the unit of all light that a network is
-    told, so that it cannot tell a bright scene from a dark one. No colour counts as darker than a
+    """Mean direct light of the scene's surface, by color: the unit of all light that a network
+    reads, so that it cannot tell a bright scene from a dark one. No color counts as darker than a
     thirtieth of the brightest, and it is above 0 without any light."""
     sky_2T3: Floats | None = None
     """[2, T, 3] the part of the direct light that comes from the sky; None where there is none."""
@@ -61,7 +61,7 @@ class SceneLight:
 
 
 LEAST_SHARE = np.float32(0.03)
-"""Of the brightest colour's mean light: what another colour is held to have at least."""
+"""Least mean light of a color, as a fraction of the brightest color's."""
 
 
 def scene_light(scene: LitScene) -> SceneLight:
@@ -72,7 +72,7 @@ def scene_light(scene: LitScene) -> SceneLight:
     if scene.sky is not None:
         sky = _from_sky(scene, rng_for(0, "radiosity of a sky"))
         direct = direct + sky
-    indirect = _bounced(scene, direct, rng)
+    indirect = _bounce_light(scene, direct, rng)
     weight = scene.area / max(float(2 * scene.area.sum()), 1e-12)
     mean = (direct.sum(axis=0) * weight[:, None]).sum(axis=0)
     return SceneLight(
@@ -90,12 +90,14 @@ def _direct(scene: LitScene, rng: np.random.Generator) -> Floats:
         return _by_side(total, scene)
     on_triangle = rng.random((2, len(rows)), np.float32)
     on_lamps = rng.random((2, len(scene.lamps), len(rows)), np.float32)
-    for turn in range(DIRECT_POINTS):
-        places = spread(on_triangle, turn)
+    for trial in range(DIRECT_POINTS):
+        places = spread(on_triangle, trial)
         for first in range(0, len(rows), _BLOCK):
             some = slice(first, first + _BLOCK)
             points = _points(scene, rows[some], places[:, some])
-            lit = direct_light(scene, points, None, spread(on_lamps[:, :, some], turn), lobe_rays=0)
+            lit = direct_light(
+                scene, points, None, spread(on_lamps[:, :, some], trial), lobe_rays=0
+            )
             total[:, some] += lit.diffuse
     return _by_side(total / np.float32(DIRECT_POINTS), scene)
 
@@ -106,31 +108,31 @@ def _from_sky(scene: LitScene, rng: np.random.Generator) -> Floats:
     total = np.zeros((3, len(rows)), np.float32)
     on_triangle = rng.random((2, len(rows)), np.float32)
     towards = rng.random((2, len(rows)), np.float32)
-    for turn in range(DIRECT_POINTS):
-        places = spread(on_triangle, turn)
+    for trial in range(DIRECT_POINTS):
+        places = spread(on_triangle, trial)
         for first in range(0, len(rows), _BLOCK):
             some = slice(first, first + _BLOCK)
             points = _points(scene, rows[some], places[:, some])
             light = no_light(points)
             add_sky_light(
-                light, scene, points, None, towards[:, some], turn, rays=SKY_RAYS, lobe_rays=0
+                light, scene, points, None, towards[:, some], trial, rays=SKY_RAYS, lobe_rays=0
             )
             total[:, some] += light.diffuse
     return _by_side(total / np.float32(DIRECT_POINTS), scene)
 
 
-def _bounced(scene: LitScene, direct_2T3: Floats, rng: np.random.Generator) -> Floats:
+def _bounce_light(scene: LitScene, direct_2T3: Floats, rng: np.random.Generator) -> Floats:
     """Return the light that arrives after one or more bounces."""
     rows = _sides(scene)
     on_triangle = rng.random((2, len(rows)), np.float32)
     towards = rng.random((2, len(rows)), np.float32)
     faced = np.zeros((RAYS, len(rows)), np.int64)
-    for turn in range(RAYS):
-        points = _points(scene, rows, spread(on_triangle, turn))
-        direction = cosine_direction(spread(towards, turn), points.normal, points.edge)
-        met, is_met = scene.meet(scene.everything, points.start(direction), direction)
-        side = met.triangle + scene.num_triangles * met.back
-        faced[turn] = np.where(is_met, side, len(rows))
+    for trial in range(RAYS):
+        points = _points(scene, rows, spread(on_triangle, trial))
+        direction = cosine_direction(spread(towards, trial), points.normal, points.edge)
+        hits, is_hit = scene.meet(scene.everything, points.start(direction), direction)
+        side = hits.triangle + scene.num_triangles * hits.back
+        faced[trial] = np.where(is_hit, side, len(rows))
     reflects = np.tile((scene.diffuse + scene.specular).T, (2, 1))
     received = direct_2T3.reshape(-1, 3)
     arrived = np.zeros_like(received)
@@ -158,8 +160,8 @@ def _points(scene: LitScene, sides: NDArray[np.intp], u: Floats) -> Points:
         triangle=triangle,
         position=points.position,
         normal=-down,
-        plane=-down,
-        toward=-down,
+        geometric_normal=-down,
+        to_viewer=-down,
         edge=points.edge,
         back=sides >= scene.num_triangles,
     )

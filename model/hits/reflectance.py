@@ -21,21 +21,21 @@ _LEAST_COSINE = np.float32(1e-4)
 class Gloss:
     """The specular lobes of P points, each as its viewer sees it."""
 
-    colour: Floats
+    color: Floats
     """[3, P] specular albedo times the scale that multiple scattering brings."""
     alpha: Floats
-    """[P] GGX width."""
+    """[P] GGX width, above 0 and at most 1."""
     cos_seen: Floats
     """[P] cosine between shading normal and viewer."""
     stretch_seen: Floats
     """[P] length of the viewer's direction on stretched facets."""
     faces: NDArray[np.bool_]
-    """[P] whether the viewer is above the shading normal's horizon: below there is no lobe."""
+    """[P] True: the viewer is above the shading normal's horizon; below there is no lobe."""
 
     def only(self, rows: NDArray[np.intp] | None) -> "Gloss":
         """Return some of the points, as `Points.only`."""
         return Gloss(
-            colour=self.colour[:, rows],
+            color=self.color[:, rows],
             alpha=self.alpha[rows],
             cos_seen=self.cos_seen[rows],
             stretch_seen=self.stretch_seen[rows],
@@ -48,14 +48,15 @@ def gloss_at(scene: LitScene, points: Points, least_alpha: Floats | None = None)
     alpha = scene.alpha_at(points)
     if least_alpha is not None:
         alpha = np.maximum(alpha, least_alpha)
-    cosine = dot(points.normal, points.toward)
+    cosine = dot(points.normal, points.to_viewer)
     seen = np.maximum(cosine, _LEAST_COSINE)
-    stretch = stretched(seen, alpha)
+    stretch = stretched_length(seen, alpha)
     albedo = np.maximum(_albedo(scene, seen / stretch, alpha), np.float32(1e-3))
     lost = (1 - albedo) / albedo
-    specular, again = scene.specular_at(points), scene.again_at(points)
+    specular = scene.specular_at(points)
+    multiscatter = scene.multiscatter_at(points)
     return Gloss(
-        colour=specular * (1 + again * lost),
+        color=specular * (1 + multiscatter * lost),
         alpha=alpha,
         cos_seen=seen,
         stretch_seen=stretch,
@@ -63,7 +64,7 @@ def gloss_at(scene: LitScene, points: Points, least_alpha: Floats | None = None)
     )
 
 
-def stretched(cosine: Floats, alpha: Floats) -> Floats:
+def stretched_length(cosine: Floats, alpha: Floats) -> Floats:
     """Return the length of (alpha sin, cos)."""
     square = cosine * cosine
     length: Floats = np.sqrt(square + alpha * alpha * (1 - square))
@@ -73,36 +74,36 @@ def stretched(cosine: Floats, alpha: Floats) -> Floats:
 def lobe(
     gloss: Gloss, points: Points, to_light: Floats, cos_light: Floats
 ) -> tuple[Floats, Floats]:
-    """Return D G2 / (4 cos_i cos_o) cos_o without colour, and the density of `drawn`, [P] each.
+    """Return D G2 / (4 cos_i cos_o) cos_o without color, and `sample_lobe`'s density, [P] each.
 
     Args:
         gloss, points: of the points.
         to_light: [3, P] unit vectors.
         cos_light: [P] their cosine with the shading normal; where it is not above 0 the lobe is 0.
     """
-    half = unit(to_light + points.toward)
+    half = unit(to_light + points.to_viewer)
     upright = dot(half, points.normal)
     squared = gloss.alpha * gloss.alpha
     # sin^2 + alpha^2 cos^2, with sin^2 from the part across: 1 - cos^2 cancels for a small alpha
     across = half - points.normal * upright
-    beside = dot(across, across) + squared * upright * upright
-    distribution = _INV_PI * squared / np.maximum(beside * beside, np.float32(1e-30))
+    denominator = dot(across, across) + squared * upright * upright
+    distribution = _INV_PI * squared / np.maximum(denominator * denominator, np.float32(1e-30))
     above = np.maximum(cos_light, _LEAST_COSINE)
-    masked = gloss.stretch_seen / gloss.cos_seen + stretched(above, gloss.alpha) / above
+    masked = gloss.stretch_seen / gloss.cos_seen + stretched_length(above, gloss.alpha) / above
     value = distribution / (2 * gloss.cos_seen * masked)
     density = distribution / (2 * (gloss.cos_seen + gloss.stretch_seen))
-    shines = gloss.faces & (cos_light > 0) & (dot(to_light, points.plane) > 0)
+    shines = gloss.faces & (cos_light > 0) & (dot(to_light, points.geometric_normal) > 0)
     return np.where(shines, value, np.float32(0)), density
 
 
-def drawn(gloss: Gloss, points: Points, u: Floats) -> tuple[Floats, Floats]:
+def sample_lobe(gloss: Gloss, points: Points, u: Floats) -> tuple[Floats, Floats]:
     """Return directions [3, P] drawn by visible normals from u [2, P], and their weights [P].
 
     A weight is what the lobe sends along the direction, cosine included, over the density: G2 / G1.
     Spherical caps (Dupuy and Benyoub 2023).
     """
     first, second = tangents(points.normal, points.edge)
-    seen = np.stack([dot(points.toward, first), dot(points.toward, second), gloss.cos_seen])
+    seen = np.stack([dot(points.to_viewer, first), dot(points.to_viewer, second), gloss.cos_seen])
     wide = np.stack([gloss.alpha, gloss.alpha, np.ones_like(gloss.alpha)])
     bent = unit(seen * wide)
     height = 1 - u[1] * (1 + bent[2])
@@ -114,9 +115,9 @@ def drawn(gloss: Gloss, points: Points, u: Floats) -> tuple[Floats, Floats]:
     cosine = local[2]
     above = np.maximum(cosine, _LEAST_COSINE)
     masked_seen = gloss.stretch_seen / gloss.cos_seen
-    masked = stretched(above, gloss.alpha) / above
+    masked = stretched_length(above, gloss.alpha) / above
     direction = first * local[0] + second * local[1] + points.normal * local[2]
-    goes = gloss.faces & (cosine > 0) & (dot(direction, points.plane) > 0)
+    goes = gloss.faces & (cosine > 0) & (dot(direction, points.geometric_normal) > 0)
     weight = (1 + masked_seen) / (masked_seen + masked)
     return direction, np.where(goes, weight, np.float32(0))
 
@@ -128,7 +129,8 @@ def _albedo(scene: LitScene, stretched_cosine: Floats, alpha: Floats) -> Floats:
     v = np.sqrt(alpha) * np.float32(ROUGHNESS_STEPS - 1)
     column = np.minimum(u.astype(np.int32), X_STEPS - 2)
     row = np.minimum(v.astype(np.int32), ROUGHNESS_STEPS - 2)
-    u, v = u - column, v - row
+    u = u - column
+    v = v - row
     at = row * X_STEPS + column
     low = table[at] * (1 - u) + table[at + 1] * u
     high = table[at + X_STEPS] * (1 - u) + table[at + X_STEPS + 1] * u

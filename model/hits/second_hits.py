@@ -1,8 +1,8 @@
-"""What rays bring from the surfaces that they meet: direct light there, and radiosity for the rest.
+"""Radiance from the surfaces that rays meet: direct light there, and radiosity for the rest.
 
 So light of any number of diffuse bounces arrives by one ray. A ray that meets a mirror goes on.
 Lamps are small: of rays that spread, one in thousands is mirrored onto one, and is then a thousand
-times too bright. So lamps are asked for at every surface, whose lobe counts as wider than it is
+times too bright. So lamps are sampled at every surface, whose lobe counts as wider than it is
 (Kaplanyan and Dachsbacher 2013): reflected light of lamps is blurred, and does not flicker. Rays
 that hardly spread, since a mirror sent them, show lamps in the next mirror as sharply as it does.
 """
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from model.hits.direct_light import chosen_lamp_light, lamp_chances, lobe_ray_weight
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
-from model.hits.reflectance import drawn, gloss_at, lobe
+from model.hits.reflectance import gloss_at, lobe, sample_lobe
 from model.hits.vectors import Floats, brightest, dot
 
 WIDENED_ALPHA = np.float32(0.4)
@@ -32,13 +32,13 @@ MIRRORS = 2
 """Mirrors after each other through which a ray is followed."""
 
 BLOCK = 2**13
-"""Points that are computed at a time: their numbers stay in the processor's cache."""
+"""Points that are computed at a time: their numbers stay in the CPU's cache."""
 
 DEVICE_BLOCK = 2**18
-"""On a card: as many as fit its memory."""
+"""Points that a GPU computes at a time: as many as fit its memory."""
 
 
-def brought(
+def outgoing_radiance(
     scene: LitScene,
     light: SceneLight,
     points: Points,
@@ -60,7 +60,8 @@ def brought(
         is_sharp: [P] whether only mirrors have sent the rays.
         mirrors: followed at most.
     """
-    specular, alpha = scene.specular_at(points), scene.alpha_at(points)
+    specular = scene.specular_at(points)
+    alpha = scene.alpha_at(points)
     is_mirror = alpha < SMOOTH_ALPHA
     is_mirror &= brightest(specular) > DIMMEST
     is_mirror &= mirrors > 0
@@ -76,13 +77,13 @@ def brought(
         sent += chosen_lamp_light(scene, points, gloss, chances, u_lamp, on_lamp, has_lobe_ray)
     rows = np.flatnonzero(is_mirror)
     if mirrors and len(rows):
-        sent[:, rows] += _mirrored(
+        sent[:, rows] += _mirrored_radiance(
             scene, light, points, rows, chances, (u_lamp, on_lamp), is_sharp[rows], mirrors
         )
     return sent
 
 
-def _mirrored(
+def _mirrored_radiance(
     scene: LitScene,
     light: SceneLight,
     points: Points,
@@ -92,28 +93,33 @@ def _mirrored(
     is_sharp: NDArray[np.bool_],
     mirrors: int,
 ) -> Floats:
-    """Return what some points, which are mirrors, send on of what they see [3, rows]."""
-    u_lamp, on_lamp = u[0][rows], u[1][:, rows]
-    here = points.only(rows)
-    gloss = gloss_at(scene, here)
-    onward, weight = drawn(gloss, here, on_lamp)
-    beyond, met = scene.meet(scene.everything, here.start(onward), onward)
-    seen = brought(scene, light, beyond, u_lamp, on_lamp[::-1], is_sharp, mirrors=mirrors - 1)
-    lit = np.flatnonzero(is_sharp & met & scene.emits[beyond.triangle])
+    """Return the radiance [3, rows] that some points, which are mirrors, reflect."""
+    u_lamp = u[0][rows]
+    on_lamp = u[1][:, rows]
+    mirror_points = points.only(rows)
+    gloss = gloss_at(scene, mirror_points)
+    onward, weight = sample_lobe(gloss, mirror_points, on_lamp)
+    beyond, is_hit = scene.meet(scene.everything, mirror_points.start(onward), onward)
+    seen = outgoing_radiance(
+        scene, light, beyond, u_lamp, on_lamp[::-1], is_sharp, mirrors=mirrors - 1
+    )
+    lit = np.flatnonzero(is_sharp & is_hit & scene.emits[beyond.triangle])
     if len(lit):
-        some, there, along = here.only(lit), beyond.only(lit), onward[:, lit]
+        some = mirror_points.only(lit)
+        lamp_points = beyond.only(lit)
+        along = onward[:, lit]
         _, density = lobe(gloss.only(lit), some, along, dot(some.normal, along))
-        number = np.searchsorted(scene.lamps, there.triangle).clip(0, len(scene.lamps) - 1)
+        number = np.searchsorted(scene.lamps, lamp_points.triangle).clip(0, len(scene.lamps) - 1)
         chance = chances[number, rows[lit]]
-        kept = lobe_ray_weight(scene, there, some.position, density, chance)
-        seen[:, lit] += np.take(scene.emission, there.triangle, axis=1) * kept
-    arrives = np.where(met, weight * seen, np.float32(0))
+        mis_weight = lobe_ray_weight(scene, lamp_points, some.position, density, chance)
+        seen[:, lit] += np.take(scene.emission, lamp_points.triangle, axis=1) * mis_weight
+    arrives = np.where(is_hit, weight * seen, np.float32(0))
     if scene.sky is not None:
         # blurred: no other ray shares the sun with this one, which is met once in thousands
-        beyond_all = np.flatnonzero(~met & (weight > 0))
+        beyond_all = np.flatnonzero(~is_hit & (weight > 0))
         sky = scene.drawn_sky.blurred_radiance(onward[:, beyond_all])
         arrives[:, beyond_all] = weight[beyond_all] * sky
-    return gloss.colour * arrives
+    return gloss.color * arrives
 
 
 def blocks(scene: LitScene, count: int) -> Iterator[slice]:

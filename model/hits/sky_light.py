@@ -27,7 +27,7 @@ def add_sky_light(
     points: Points,
     gloss: Gloss | None,
     shift: Floats,
-    turn: NDArray[np.intp] | int,
+    ray_index: NDArray[np.intp] | int,
     *,
     rays: int,
     lobe_rays: int,
@@ -39,12 +39,12 @@ def add_sky_light(
         scene: has a sky.
         points, gloss, lobe_rays: as in `direct_light`.
         shift: [2, P] uniform numbers.
-        turn: which of the rays of its pixel a point is ([P]), whose directions all differ.
+        ray_index: which of the rays of its pixel a point is ([P]), whose directions all differ.
         rays: towards the sky from each point, half of them, or one more, by the map.
     """
     by_map = (rays + 1) // 2
     for number in range(rays):
-        u = spread(shift, turn * rays + number)
+        u = spread(shift, ray_index * rays + number)
         if number < by_map:
             direction = scene.drawn_sky.sample_directions(u)
         else:
@@ -72,22 +72,22 @@ def _add(
     useful = np.flatnonzero(diffuse if specular is None else (diffuse > 0) | (specular > 0))
     if not len(useful):
         return
-    here = points.only(useful)
-    is_free = sees_sky(scene, here, direction[:, useful])
+    lit_points = points.only(useful)
+    is_free = sees_sky(scene, lit_points, direction[:, useful])
     radiance = scene.drawn_sky.radiance(direction[:, useful])
     arrives = radiance * diffuse[useful]
     light.open_diffuse[:, useful] += arrives
     light.diffuse[:, useful] += arrives * is_free
     if specular is not None and gloss is not None:
-        coloured = gloss.colour[:, useful] * specular[useful] * radiance
-        light.open_specular[:, useful] += coloured
-        light.specular[:, useful] += coloured * is_free
+        colored = gloss.color[:, useful] * specular[useful] * radiance
+        light.open_specular[:, useful] += colored
+        light.specular[:, useful] += colored * is_free
 
 
 def sky_density(
     scene: LitScene, direction: Floats, cosine: Floats, by_map: int, by_surface: int
 ) -> Floats:
-    """Return how many rays [P] `add_sky_light` sends along directions, per steradian."""
+    """Return the number of rays [P] that `add_sky_light` sends along directions, per steradian."""
     density: Floats = by_map * scene.drawn_sky.pdf(direction)
     density += by_surface * _INV_PI * np.maximum(cosine, 0)
     return np.maximum(density, _LEAST)
@@ -96,27 +96,27 @@ def sky_density(
 def escaped_light(
     scene: LitScene, points: Points, gloss: Gloss, direction: Floats, weight: Floats, rays: int
 ) -> Floats:
-    """Return what directions [3, P] that the lobe has drawn bring of the sky, without shadows.
+    """Return the sky's light along directions [3, P] that the lobe has drawn, without shadows.
 
-    It is their share of what `add_sky_light` brings with so many rays and one by the lobe.
+    It is weighed for use with `add_sky_light` of so many rays and one by the lobe.
 
     Args:
         scene: has a sky.
         points, gloss: where the rays begin.
-        direction, weight: of `reflectance.drawn`.
+        direction, weight: of `reflectance.sample_lobe`.
         rays: as in `add_sky_light`.
     """
     cosine = dot(points.normal, direction)
     _, of_lobe = lobe(gloss, points, direction, cosine)
     by_map = (rays + 1) // 2
-    others = sky_density(scene, direction, cosine, by_map, rays - by_map)
-    share = of_lobe / (of_lobe + others)
-    found: Floats = gloss.colour * (weight * share) * scene.drawn_sky.radiance(direction)
-    return found
+    sky_rays = sky_density(scene, direction, cosine, by_map, rays - by_map)
+    share = of_lobe / (of_lobe + sky_rays)
+    escaped: Floats = gloss.color * (weight * share) * scene.drawn_sky.radiance(direction)
+    return escaped
 
 
 def sees_sky(scene: LitScene, points: Points, direction: Floats) -> NDArray[np.bool_]:
-    """Return whether rays from points meet nothing, lamps included."""
-    start = off_surface(points.position, points.plane, direction)
+    """Return True [P] for rays from points that meet nothing, lamps included."""
+    start = off_surface(points.position, points.geometric_normal, direction)
     far = np.full(direction.shape[1], _FAR_M, np.float32)
     return scene.everything.is_free(as_rows(start), as_rows(direction), far)

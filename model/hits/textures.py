@@ -15,20 +15,20 @@ from storage.records.texture import CONSTANT, TEXTURED, Texture
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SurfaceTextures:
-    """What stands for material columns of T triangles."""
+    """Textures of T triangles, which replace some of their material columns."""
 
     uv_T32: NDArray[np.float32]
     """Texture coordinates at the vertices of each triangle."""
     rows_T3: NDArray[np.int32]
     """Rows of `textures` for diffuse, specular and roughness, or CONSTANT."""
     textures: tuple[Texture, ...]
-    """The textures."""
+    """Textures that `rows_T3` points to."""
     channels: tuple[int, ...] = (0, 1, 2)
-    """Which channel of a colour is red, green and blue here."""
+    """Channels of a color that are red, green and blue here."""
 
     @cached_property
     def is_textured(self) -> NDArray[np.bool_]:
-        """[T] whether any texture lies on a triangle."""
+        """[T] True for triangles with a texture."""
         textured: NDArray[np.bool_] = (self.rows_T3 != CONSTANT).any(axis=1)
         return textured
 
@@ -60,12 +60,12 @@ class SurfaceTextures:
         return rows
 
     def with_vertices(self, order_T3: NDArray[np.integer]) -> "SurfaceTextures":
-        """Return those of the same triangles whose vertices have another order."""
+        """Return the textures of the same triangles with their vertices in another order."""
         uv_T32 = np.take_along_axis(self.uv_T32, order_T3[..., None].astype(np.int64), axis=1)
         return dataclasses.replace(self, uv_T32=uv_T32)
 
     def with_channels(self, order: NDArray[np.integer]) -> "SurfaceTextures":
-        """Return them with the colour channels in another order."""
+        """Return the textures with the color channels in another order."""
         return dataclasses.replace(
             self, channels=tuple(self.channels[int(channel)] for channel in order)
         )

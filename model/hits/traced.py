@@ -1,4 +1,4 @@
-"""`Traced`: what was traced of scenes and views, as the tensors that a network of hits reads."""
+"""`Traced`: traced inputs of scenes and views, as the tensors that a network of hits reads."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -9,7 +9,7 @@ from torch import Tensor
 from model.hits.view_inputs import Channel
 
 INPUTS = ("open", "direct", "mirrored", "gathered", "tokens")
-"""What a network of hits may be without: light from lamps as if nothing stood between, with its
+"""Inputs that a network of hits may lack: light from lamps as if nothing stood between, with its
 shadows, light that one mirrored ray brings, light that anchors gather, and the scene's tokens."""
 
 CHANNELS = {
@@ -17,19 +17,19 @@ CHANNELS = {
     "direct": (Channel.DIRECT_DIFFUSE, Channel.DIRECT_SPECULAR, Channel.SHOWN_DIFFUSE),
     "mirrored": (Channel.MIRRORED, Channel.SEEN_ALBEDO, Channel.SEEN_NEARNESS),
 }
-"""Where the inputs stand that pixels have."""
+"""Channels of the inputs that pixels have."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Traced:
-    """What was traced of a scene and of V of its views; of a batch, B comes first everywhere."""
+    """Traced inputs of a scene and of V of its views; in a batch, B comes first everywhere."""
 
     sides_T12: Tensor
     """Direct and indirect irradiance over pi of the front, then of the back, of each triangle."""
     unit_3: Tensor
-    """Mean light of the scene, by colour (model.hits.radiosity)."""
+    """Mean light of the scene, by color (model.hits.radiosity)."""
     pixels_VRRC: Tensor
-    """model.hits.view_inputs."""
+    """[V, R, R, 40] quantities of each pixel, by `model.hits.view_inputs.Channel`."""
     anchor_VA: Tensor
     """int64 pixel of each anchor."""
     gathered_VA3: Tensor
@@ -37,7 +37,7 @@ class Traced:
     given_VI: Tensor
     """1, or 0 where a view has to do without one of INPUTS."""
 
-    def converted(self, convert: Callable[[Tensor], Tensor]) -> "Traced":
+    def convert_tensors(self, convert: Callable[[Tensor], Tensor]) -> "Traced":
         """Return the same with each tensor converted, such as moved to a device."""
         return Traced(**{each.name: convert(getattr(self, each.name)) for each in fields(self)})
 
@@ -48,19 +48,19 @@ class Traced:
             for channel in channels:
                 pixels[..., channel] *= kept_VI[..., INPUTS.index(name), None, None, None]
         gathered = self.gathered_VA3 * kept_VI[..., INPUTS.index("gathered"), None, None]
-        given = self.given_VI * kept_VI
-        return replace(self, pixels_VRRC=pixels, gathered_VA3=gathered, given_VI=given)
+        available = self.given_VI * kept_VI
+        return replace(self, pixels_VRRC=pixels, gathered_VA3=gathered, given_VI=available)
 
 
-def with_others_tokens(own: Traced, other: Traced | None) -> Traced:
+def with_others_tokens(traced: Traced, other: Traced | None) -> Traced:
     """Return the views of a scene with what the triangles of another one receive.
 
-    It is brought to the own scene's unit, so that the other is neither brighter nor darker.
+    It is scaled to the unit of `traced`, so that the other scene is neither brighter nor darker.
     """
     if other is None:
-        return own
-    sides_T12 = other.sides_T12 * (own.unit_3 / other.unit_3).repeat(4)
-    return replace(own, sides_T12=sides_T12)
+        return traced
+    sides_T12 = other.sides_T12 * (traced.unit_3 / other.unit_3).repeat(4)
+    return replace(traced, sides_T12=sides_T12)
 
 
 def stack_traced(scenes: Sequence[Traced], longest: int) -> Traced:
@@ -69,8 +69,8 @@ def stack_traced(scenes: Sequence[Traced], longest: int) -> Traced:
         torch.nn.functional.pad(each.sides_T12, (0, 0, 0, longest - len(each.sides_T12)))
         for each in scenes
     ]
-    others = [each.name for each in fields(Traced) if each.name != "sides_T12"]
+    names = [each.name for each in fields(Traced) if each.name != "sides_T12"]
     return Traced(
         sides_T12=torch.stack(padded),
-        **{name: torch.stack([getattr(each, name) for each in scenes]) for name in others},
+        **{name: torch.stack([getattr(each, name) for each in scenes]) for name in names},
     )

@@ -1,4 +1,4 @@
-"""Scenes as the network has them -> what is traced of them and of their views."""
+"""Scenes as the network has them -> traced inputs of them and of their views."""
 
 import dataclasses
 from collections.abc import Callable
@@ -26,12 +26,12 @@ from storage.records.environment import Environment
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
 
 MOST_LAMPS = 256
-"""Emitting triangles with which a scene's rays are traced by a card: each takes its kernels."""
+"""Emitting triangles with which a scene's rays are traced by a GPU: each takes its kernels."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TracedScene:
-    """A scene that can be asked for any view."""
+    """A scene whose views can be traced."""
 
     lit: LitScene
     light: SceneLight
@@ -41,7 +41,7 @@ class TracedScene:
     """The scene's mean light (model.hits.radiosity)."""
 
     def on(self, device: torch.device) -> "TracedScene":
-        """Return the scene on a card that traces its rays; itself where none does.
+        """Return the scene on a GPU that traces its rays; itself where none does.
 
         Scenes with a sky, or with hundreds of lamps, stay with the CPU.
         """
@@ -66,7 +66,7 @@ class TracedScene:
     def view(
         self, c2w_44: Tensor, fov_deg: Tensor, resolution: int, config: ModelConfig, seed: int
     ) -> ViewInputs:
-        """Return what is traced for one view."""
+        """Trace the inputs of one view."""
         place = self.lit.place
         c2w: Any = c2w_44.detach().cpu().numpy() if place is None else DeviceArray(c2w_44, place)
         angle: Any = float(fov_deg) if place is None else DeviceArray(fov_deg, place)
@@ -85,7 +85,7 @@ class TracedScene:
 
 
 def anchors_a_side(config: ModelConfig, resolution: int) -> int:
-    """Return how many anchors a picture has along a side: a divisor of its width."""
+    """Return the number of anchors along a side of a picture: a divisor of its width."""
     return int(np.gcd(config.hit_anchors, resolution))
 
 
@@ -126,19 +126,19 @@ def traced_scene(lit: LitScene) -> TracedScene:
 def lit_scenes(batch: SceneBatch) -> tuple[LitScene, ...]:
     """Return the surfaces of the scenes of a batch, without their padding."""
     materials = batch.material_of(PUBLISHED_COLUMNS)
-    found = []
+    scenes = []
     for row in range(len(materials)):
-        there = slice(None) if batch.is_triangle_BT is None else batch.is_triangle_BT[row]
-        found.append(
+        rows = slice(None) if batch.is_triangle_BT is None else batch.is_triangle_BT[row]
+        scenes.append(
             lit_scene(
-                batch.triangles_BT33[row][there],
-                batch.normals_BT33[row][there],
-                materials[row][there],
+                batch.triangles_BT33[row][rows],
+                batch.normals_BT33[row][rows],
+                materials[row][rows],
                 None if batch.textures is None else batch.textures[row],
                 None if batch.skies is None else batch.skies[row],
             )
         )
-    return tuple(found)
+    return tuple(scenes)
 
 
 def with_traced(
@@ -148,7 +148,7 @@ def with_traced(
     seed: int = 0,
     device: torch.device | None = None,
 ) -> SceneTensors:
-    """Return a scene with what is traced of its views: what a trainer's threads do ahead.
+    """Return a scene with the traced inputs of its views; a trainer's threads do this ahead.
 
     Args:
         scene, resolution, config: of the views.
@@ -161,7 +161,7 @@ def with_traced(
         ready = ready.on(device)
     cameras = [each.to(ready.unit_3.device) for each in (scene.c2w_V44, scene.fov_deg_V)]
     traced = traced_views(ready, cameras[0], cameras[1], resolution, config, seed)
-    traced = traced.converted(lambda each: each.to(scene.c2w_V44.device))
+    traced = traced.convert_tensors(lambda each: each.to(scene.c2w_V44.device))
     return dataclasses.replace(scene, traced=traced)
 
 
@@ -178,18 +178,20 @@ def lit_scene_of(scene: SceneTensors) -> LitScene:
 def traced_cameras(
     scenes: tuple[TracedScene, ...], cameras: Cameras, resolution: int, config: ModelConfig
 ) -> Traced:
-    """Return what is traced of any cameras of the scenes of a batch.
+    """Trace the inputs of any cameras of the scenes of a batch.
 
     It is where the cameras are, and of their type.
     """
-    found = [
+    traced = [
         traced_views(scene, c2w_V44, fov_deg_V, resolution, config)
         for scene, c2w_V44, fov_deg_V in zip(
             scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True
         )
     ]
     longest = max(scene.lit.num_triangles for scene in scenes)
-    return stack_traced(found, longest).converted(lambda each: like(each, cameras.fov_deg_BV))
+    return stack_traced(traced, longest).convert_tensors(
+        lambda each: like(each, cameras.fov_deg_BV)
+    )
 
 
 def like(numbers: Tensor, other: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ Floats = NDArray
 
 _TINY = np.float32(1e-20)
 _LEAST_SHARE = np.float32(1e-3)
-"""Of a vector that lies across a normal, for a frame to be built on it."""
+"""Least part of a vector across a normal, as a fraction, for a frame to be built on it."""
 
 
 def dot(a: Floats, b: Floats) -> Floats:
@@ -72,17 +72,17 @@ def from_frame(local: Floats, n: Floats, along: Floats) -> Floats:
     return first * local[0] + second * local[1] + n * local[2]
 
 
-def spread(shift: Floats, turn: int | NDArray[np.intp]) -> Floats:
+def spread(shift: Floats, index: int | NDArray[np.intp]) -> Floats:
     """Return points of a sequence in the unit square, moved by shifts [2, ...].
 
-    `turn` says which point, or which for each ([...]).
+    `index` says which point, or which for each ([...]).
 
     It is R2 (Roberts 2018): its first points are far from each other for any count, and a
     random shift of each pixel makes them unbiased.
     """
     moved = shift.copy()
     for axis, step in enumerate((0.7548776662466927, 0.5698402909980532)):
-        moved[axis] += np.asarray((turn + 1) * step % 1, np.float32)
+        moved[axis] += np.asarray((index + 1) * step % 1, np.float32)
     return moved - np.floor(moved)
 
 
@@ -91,6 +91,7 @@ def cosine_direction(u: Floats, n: Floats, along: Floats) -> Floats:
 
     From u [2, P] in the unit square, in the frame of `tangents`.
     """
-    radius, angle = np.sqrt(u[0]), np.float32(2 * np.pi) * u[1]
+    radius = np.sqrt(u[0])
+    angle = np.float32(2 * np.pi) * u[1]
     height = np.sqrt(np.maximum(1 - u[0], 0))
     return from_frame(np.stack([radius * np.cos(angle), radius * np.sin(angle), height]), n, along)

@@ -1,4 +1,4 @@
-"""`ViewInputs`: what the rays of each pixel find, and what anchors gather; numbers for a network.
+"""`ViewInputs`: results of the rays of each pixel and of anchors, as numbers for a network.
 
 A pixel has rays_a_side^2 rays, whose findings are averaged after shading, as the film does. Light
 from other surfaces is smooth but where it is mirrored. So it is gathered by many rays at few
@@ -18,8 +18,8 @@ from model.hits.device_arrays import DeviceArray, MaskedRows
 from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
-from model.hits.reflectance import Gloss, drawn, gloss_at, lobe
-from model.hits.second_hits import DIMMEST, SMOOTH_ALPHA, blocks, brought
+from model.hits.reflectance import Gloss, gloss_at, lobe, sample_lobe
+from model.hits.second_hits import DIMMEST, SMOOTH_ALPHA, blocks, outgoing_radiance
 from model.hits.sky_light import add_sky_light, escaped_light
 from model.hits.vectors import Floats, brightest, dot, spread
 from model.replayed import aside
@@ -27,12 +27,12 @@ from storage.seeds import rng_for
 
 
 class Channel:
-    """Where in `ViewInputs.pixels` each quantity stands."""
+    """Position of each quantity in the last axis of `ViewInputs.pixels`."""
 
     COVERAGE = slice(0, 1)
     """Share of the pixel's rays that meet something."""
     POSITION = slice(1, 4)
-    """Mean point of those, metres, world space."""
+    """Mean point of those, meters, world space."""
     DISTANCE = slice(4, 5)
     """Mean distance from the camera."""
     NORMAL = slice(5, 8)
@@ -60,7 +60,7 @@ class Channel:
     SEEN_ALBEDO = slice(36, 39)
     """Diffuse and specular albedo of what that ray met; 0 where it met nothing."""
     SEEN_NEARNESS = slice(39, 40)
-    """1 / (1 + d) for a way of d metres to it; 0 where it met nothing."""
+    """1 / (1 + d) for a way of d meters to it; 0 where it met nothing."""
 
 
 NUM_CHANNELS = 40
@@ -91,7 +91,7 @@ def view_inputs(
     sky_rays: int = 0,
     seed: int = 0,
 ) -> ViewInputs:
-    """Return what is traced for a view; equal arguments give equal numbers.
+    """Trace the inputs of a view; equal arguments give equal numbers.
 
     Args:
         scene, light: the scene.
@@ -121,7 +121,9 @@ def view_inputs(
         _add_pixels(sums[:, part], scene, light, rays, *of_part, sky_rays, int(gather_rays > 0))
     join_gathered()
     return ViewInputs(
-        pixels=_averaged(sums, rays.turns).T.copy().reshape(resolution, resolution, NUM_CHANNELS),
+        pixels=_average_rays(sums, rays.rays_per_pixel)
+        .T.copy()
+        .reshape(resolution, resolution, NUM_CHANNELS),
         anchor=anchor,
         gathered=gathered,
     )
@@ -146,7 +148,7 @@ class _Noise:
     """[2, P] for rays to the sky; None without a sky."""
 
     def only(self, part: slice) -> "_Noise":
-        """Return those of some pixels."""
+        """Return the numbers of some pixels."""
         to_sky = None if self.to_sky is None else self.to_sky[:, part]
         return _Noise(
             on_lamps=self.on_lamps[:, :, part], chance=self.chance[:, part], to_sky=to_sky
@@ -163,8 +165,8 @@ def _add_pixels(
     sky_rays: int,
     lobe_rays: int,
 ) -> None:
-    """Add what rays find of a block of pixels to its sums [40, P]; on a card, in two branches."""
-    shaded = _shaded(scene, hits, noise.chance[5])
+    """Add what rays find of a block of pixels to its sums [40, P]; on a GPU, in two branches."""
+    shaded = _shading_points(scene, hits, noise.chance[5])
     if not len(shaded.pixel):
         return
     block = _Block(
@@ -178,15 +180,15 @@ def _add_pixels(
     pixel = shaded.pixel
     with aside(scene.device) as join_direct:
         _add_surface(block, scene, rays.origin)
-        on_lamps = spread(noise.on_lamps[:, :, pixel], shaded.turn)
+        on_lamps = spread(noise.on_lamps[:, :, pixel], shaded.ray_index)
         _add_direct(block, scene, on_lamps, lobe_rays)
         if noise.to_sky is not None:
-            _add_sky(block, scene, noise.to_sky[:, pixel], shaded.turn, sky_rays, lobe_rays)
+            _add_sky(block, scene, noise.to_sky[:, pixel], shaded.ray_index, sky_rays, lobe_rays)
     by_lobe = block if scene.place is None else block.with_own_sums()
     if lobe_rays:
         u = noise.chance[:5, pixel]
-        u[:2] = spread(u[:2], shaded.turn)
-        shading = shaded.chosen * np.float32(rays.turns)
+        u[:2] = spread(u[:2], shaded.ray_index)
+        shading = shaded.chosen * np.float32(rays.rays_per_pixel)
         _add_lobe_rays(by_lobe, scene, light, u, shading, sky_rays)
     join_direct()
     if by_lobe is not block:
@@ -194,7 +196,7 @@ def _add_pixels(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Shaded:
+class _ShadingPoints:
     """Points at which light is computed.
 
     One of a pixel whose rays all meet one triangle without textures stands for all of them; else
@@ -203,45 +205,46 @@ class _Shaded:
 
     points: Points
     pixel: NDArray[np.intp]
-    """[P] which pixel of the block."""
-    turn: NDArray[np.intp]
-    """[P] which of the pixel's rays it is."""
+    """[P] number of its pixel in the block."""
+    ray_index: NDArray[np.intp]
+    """[P] number of its ray among those of the pixel."""
     weight: NDArray[np.float32]
-    """[P] how many of the pixel's rays it stands for."""
+    """[P] number of the pixel's rays that it stands for."""
     of_pixels: Floats
-    """[pixels] of all rays of the block, counted turn by turn: the one drawn of each pixel."""
+    """[pixels] of all rays of the block, counted ray by ray: the one drawn of each pixel."""
     chosen: NDArray[np.float32]
     """[P] 1 for one point of each pixel, drawn evenly from its rays; 0 for others."""
 
 
-def _shaded(
+def _shading_points(
     scene: LitScene,
     hits: CameraHits,
     chance: NDArray[np.float32],
-) -> _Shaded:
+) -> _ShadingPoints:
     """Return the points of a block of pixels."""
     triangle = hits.triangle
-    turns, count = triangle.shape
-    drawn_turn = np.minimum((chance * turns).astype(np.intp), turns - 1)
-    alone = np.arange(turns)[:, None] == drawn_turn
+    rays_per_pixel, count = triangle.shape
+    drawn_ray = np.minimum((chance * rays_per_pixel).astype(np.intp), rays_per_pixel - 1)
+    alone = np.arange(rays_per_pixel)[:, None] == drawn_ray
     is_one = (triangle == triangle[0]).all(axis=0)
     if scene.textures is not None:
         is_one &= ~scene.textures.is_textured[triangle[0]]
     stands = (triangle >= 0) & (alone | ~is_one)
-    turn, pixel = np.nonzero(stands)
-    ray = turn * count + pixel
+    ray_index, pixel = np.nonzero(stands)
+    ray = ray_index * count + pixel
     points = scene.points(
         np.maximum(triangle.reshape(-1)[ray], 0),
         hits.uv.reshape(2, -1)[:, ray],
-        hits.along[turn, :, pixel].T.copy(),
+        hits.along[ray_index, :, pixel].T.copy(),
     )
-    return _Shaded(
+    return _ShadingPoints(
         points=points,
         pixel=pixel,
-        turn=turn,
-        weight=np.where(is_one[pixel], np.float32(turns), np.float32(1)) * stands[turn, pixel],
-        chosen=alone[turn, pixel].astype(np.float32),
-        of_pixels=drawn_turn * count + np.arange(count),
+        ray_index=ray_index,
+        weight=np.where(is_one[pixel], np.float32(rays_per_pixel), np.float32(1))
+        * stands[ray_index, pixel],
+        chosen=alone[ray_index, pixel].astype(np.float32),
+        of_pixels=drawn_ray * count + np.arange(count),
     )
 
 
@@ -254,14 +257,14 @@ class _Block:
     sums: Floats
     """[40, pixels of the block]"""
     pixel: NDArray[np.intp]
-    """[P] which of the block's pixels the points belong to."""
+    """[P] number of each point's pixel in the block."""
     weight: NDArray[np.float32]
-    """[P] how many rays each stands for."""
+    """[P] number of rays that each stands for."""
     of_pixels: Floats
-    """[pixels] on a card: the point of each pixel that stands for all in what one ray brings."""
+    """[pixels] on a GPU: the point of each pixel that stands for all in what one ray brings."""
 
     def with_own_sums(self) -> "_Block":
-        """Return the same points with sums of their own, to which others' may be added later."""
+        """Return the same points with new sums, to be added to those of this block later."""
         return replace(self, sums=np.zeros_like(self.sums))
 
     def add(
@@ -277,7 +280,7 @@ class _Block:
             self.sums[row] += np.bincount(pixel, weighed[number], self.sums.shape[1])
 
     def _add_all(self, channel: slice, values: Any, rows: Any) -> None:
-        """Add those of all rays of the block, turn after turn; where none count, nothing."""
+        """Add the values of all rays of the block, ray after ray; where none count, nothing."""
         counts: Any = np.flatnonzero(self.weight)
         rows = counts if rows is None else counts[rows]
         weighed = rows.zero_others(values * self.weight[rows])
@@ -287,14 +290,14 @@ class _Block:
 
 def _add_surface(block: _Block, scene: LitScene, origin: NDArray[np.float32]) -> None:
     points = block.points
-    away = points.position - origin[:, None]
+    from_camera = points.position - origin[:, None]
     block.add(Channel.COVERAGE, np.ones_like(points.position[:1]))
     block.add(Channel.POSITION, points.position)
-    block.add(Channel.DISTANCE, np.sqrt(dot(away, away))[None])
+    block.add(Channel.DISTANCE, np.sqrt(dot(from_camera, from_camera))[None])
     block.add(Channel.NORMAL, points.normal)
-    block.add(Channel.TOWARD, points.toward)
+    block.add(Channel.TOWARD, points.to_viewer)
     block.add(Channel.DIFFUSE, scene.diffuse_at(points))
-    block.add(Channel.SPECULAR, block.gloss.colour)
+    block.add(Channel.SPECULAR, block.gloss.color)
     block.add(Channel.ROUGHNESS, scene.roughness_at(points)[None])
 
 
@@ -309,13 +312,13 @@ def _add_sky(
     block: _Block,
     scene: LitScene,
     shift: NDArray[np.float32],
-    turn: NDArray[np.intp],
+    ray_index: NDArray[np.intp],
     rays: int,
     lobe_rays: int,
 ) -> None:
     lit = no_light(block.points)
     add_sky_light(
-        lit, scene, block.points, block.gloss, shift, turn, rays=rays, lobe_rays=lobe_rays
+        lit, scene, block.points, block.gloss, shift, ray_index, rays=rays, lobe_rays=lobe_rays
     )
     _add_light(block, scene, lit)
 
@@ -337,7 +340,7 @@ def _add_lobe_rays(
     shading: NDArray[np.float32],
     sky_rays: int,
 ) -> None:
-    """Add what rays drawn by the lobe meet: lamps, by their share of what finds them, and surfaces.
+    """Add what rays drawn by the lobe meet: lamps, weighed by multiple importance, and surfaces.
 
     Those that meet nothing bring their share of the sky. What surfaces send back takes a shadow ray
     each, so one ray of a pixel stands for all.
@@ -345,51 +348,57 @@ def _add_lobe_rays(
     Args:
         block, scene, light: where.
         u: [5, P] uniform numbers.
-        shading: [P] rays of the pixel that a ray counts for as to surfaces; 0: none is asked.
+        shading: [P] rays of the pixel that a ray counts for as to surfaces; 0: it counts for none.
         sky_rays: as in `view_inputs`.
     """
-    some = np.flatnonzero(brightest(block.gloss.colour) > DIMMEST)
-    direction, weight = drawn(block.gloss.only(some), block.points.only(some), u[:2, some])
+    some = np.flatnonzero(brightest(block.gloss.color) > DIMMEST)
+    direction, weight = sample_lobe(block.gloss.only(some), block.points.only(some), u[:2, some])
     goes = np.flatnonzero(weight > 0)
-    some, direction, weight = some[goes], direction[:, goes], weight[goes]
+    some = some[goes]
+    direction = direction[:, goes]
+    weight = weight[goes]
     if not len(some):
         return
-    points, gloss = block.points.only(some), block.gloss.only(some)
-    beyond, met = scene.meet(scene.everything, points.start(direction), direction)
-    arrives = gloss.colour * np.where(met, weight, np.float32(0))
-    lamps = np.flatnonzero(met & scene.emits[beyond.triangle])
+    points = block.points.only(some)
+    gloss = block.gloss.only(some)
+    beyond, is_hit = scene.meet(scene.everything, points.start(direction), direction)
+    arrives = gloss.color * np.where(is_hit, weight, np.float32(0))
+    lamps = np.flatnonzero(is_hit & scene.emits[beyond.triangle])
     if len(lamps):
-        here, there = points.only(lamps), beyond.only(lamps)
+        glossy_points = points.only(lamps)
+        lamp_points = beyond.only(lamps)
         along = direction[:, lamps]
-        _, density = lobe(gloss.only(lamps), here, along, dot(here.normal, along))
-        kept = lobe_ray_weight(scene, there, here.position, density)
-        emitted = arrives[:, lamps] * np.take(scene.emission, there.triangle, axis=1) * kept
+        _, density = lobe(gloss.only(lamps), glossy_points, along, dot(glossy_points.normal, along))
+        mis_weight = lobe_ray_weight(scene, lamp_points, glossy_points.position, density)
+        emission = np.take(scene.emission, lamp_points.triangle, axis=1)
+        emitted = arrives[:, lamps] * emission * mis_weight
         block.add(Channel.DIRECT_SPECULAR, emitted, some[lamps])
         block.add(Channel.OPEN_SPECULAR, emitted, some[lamps])
     if scene.sky is not None:
         escaped = escaped_light(scene, points, gloss, direction, weight, sky_rays)
         block.add(Channel.OPEN_SPECULAR, escaped, some)
-        block.add(Channel.DIRECT_SPECULAR, np.where(met, np.float32(0), escaped), some)
-    asked = np.flatnonzero(met & (shading[some] > 0))
-    if isinstance(asked, MaskedRows):
-        asked = MaskedRows(asked.mask, block.of_pixels.tensor)
-    if len(asked):
-        rows = some[asked]
-        is_sharp, seen = gloss.alpha[asked] < SMOOTH_ALPHA, beyond.only(asked)
-        found = brought(scene, light, seen, u[2, rows], u[3:5, rows], is_sharp)
+        block.add(Channel.DIRECT_SPECULAR, np.where(is_hit, np.float32(0), escaped), some)
+    shaded = np.flatnonzero(is_hit & (shading[some] > 0))
+    if isinstance(shaded, MaskedRows):
+        shaded = MaskedRows(shaded.mask, block.of_pixels.tensor)
+    if len(shaded):
+        rows = some[shaded]
+        is_sharp = gloss.alpha[shaded] < SMOOTH_ALPHA
+        seen = beyond.only(shaded)
+        radiance = outgoing_radiance(scene, light, seen, u[2, rows], u[3:5, rows], is_sharp)
         # `add` counts the rays that a point stands for; here one stands for all of its pixel
         counts = shading[rows] / block.weight[rows]
-        block.add(Channel.MIRRORED, found * arrives[:, asked] * counts, rows)
-        way = seen.position - points.position[:, asked]
+        block.add(Channel.MIRRORED, radiance * arrives[:, shaded] * counts, rows)
+        path = seen.position - points.position[:, shaded]
         albedo = scene.diffuse_at(seen) + scene.specular_at(seen)
         block.add(Channel.SEEN_ALBEDO, albedo * counts, rows)
-        block.add(Channel.SEEN_NEARNESS, (counts / (1 + np.sqrt(dot(way, way))))[None], rows)
+        block.add(Channel.SEEN_NEARNESS, (counts / (1 + np.sqrt(dot(path, path))))[None], rows)
 
 
-def _averaged(sums: NDArray[np.float32], turns: int) -> NDArray[np.float32]:
+def _average_rays(sums: NDArray[np.float32], rays_per_pixel: int) -> NDArray[np.float32]:
     """Return means: of surfaces over the rays that met one, of radiance over all."""
     covered = np.maximum(sums[Channel.COVERAGE], np.float32(1))
-    means = sums / np.float32(turns)
+    means = sums / np.float32(rays_per_pixel)
     of_surfaces = slice(Channel.POSITION.start, Channel.OPEN_SPECULAR.start)
     means[of_surfaces] = sums[of_surfaces] / covered
     return means

@@ -77,7 +77,7 @@ class PublishedConfig:
     """Content of a published configuration."""
 
     model: ModelConfig
-    """Configuration of the network."""
+    """Configuration of the network, in this project's terms."""
     texture_patch: int
     """Width P of its texture input in cells."""
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 DIELECTRIC_F0 = 0.04
-"""What glass, plastic, wood and stone reflect head-on, about."""
+"""Typical reflectance of glass, plastic, wood and stone head-on."""
 
 _MEAN_OF_SCHLICK = 1 / 21
 """Mean of (1 - cos)^5 over cosine-weighted directions: 2 B(2, 6)."""
@@ -26,11 +26,11 @@ def constant_albedos(
     """Return diffuse and specular albedo; they add up to at most 1.
 
     Where nothing is metal the specular one knows nothing of `base`: its shape is that of the
-    others, so that a texture of the base colour leaves it one number.
+    others, so that a texture of the base color leaves it one number.
 
     Args:
-        base: [..., 3] linear base colour, 0 to 1.
-        metal: [..., 1] share of metal, 0 to 1, which reflects its base colour head-on.
+        base: [..., 3] linear base color, 0 to 1.
+        metal: [..., 1] share of metal, 0 to 1, which reflects its base color head-on.
         f0, f90: what is no metal reflects head-on and at grazing angles, 0 to 1; they broadcast
             with `base`.
     """

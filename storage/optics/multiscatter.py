@@ -1,9 +1,9 @@
-"""What a rough mirror of GGX facets returns after one reflection, and what all others add.
+"""Light that rough GGX facets return after one reflection, and that all further ones add.
 
 A facet may send light to another facet. Single scattering loses that light: 59 % of it in a white
 furnace at roughness 1. As Cycles does for its "Multiscatter GGX", the lobe is scaled so that it
 returns what a random walk over the facets would (Turquin 2019, and Kulla and Conty 2017 for the
-colour). With E the directional albedo of a lobe that absorbs nothing, Eavg its cosine-weighted mean
+color). With E the directional albedo of a lobe that absorbs nothing, Eavg its cosine-weighted mean
 over directions and F the specular albedo of a channel:
 
     scale = 1 + Fms (1 - E) / E        Fms = F Eavg / (1 - F (1 - Eavg))
@@ -24,18 +24,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Smith = Literal["correlated", "separable"]
-"""Whether the masking of both directions depends on the same height of a facet (our kernel, as
-Cycles) or not (Mitsuba's `roughconductor`, in the tests). Each needs a table of its own."""
+"""Masking of both directions that depends on the same height of a facet (our kernel, as Cycles) or
+not (Mitsuba's `roughconductor`, in the tests). Each needs a table of its own."""
 
-X_STEPS, ROUGHNESS_STEPS = 64, 32
+X_STEPS = 64
+ROUGHNESS_STEPS = 32
 """Size of the table, linear in sqrt(x) and in roughness = sqrt(alpha): exact to 0.25 % between."""
 
-_INNER, _OUTER = 10, 8
+_INNER = 10
+_OUTER = 8
 """Nodes over the slope of the facets, and over each half turn of their azimuth: exact to 3e-4."""
 
 _SMALLEST_X = 1e-4
 _SMALLEST_ALPHA = 1e-6
-"""What the table's entries at 0 are computed at."""
+"""Values at which the table's entries at 0 are computed."""
 
 
 def directional_albedo(
@@ -57,16 +59,17 @@ def directional_albedo(
     """
     x, width = (np.asarray(a, np.float64)[..., None, None] for a in (stretched_cos, alpha))
     length = np.sqrt(1 - x**2 + np.square(width * x))
-    cos_in, sin_in = width * x / length, np.sqrt(1 - x**2) / length
-    turn, turn_weight = _clustered(_OUTER)
-    cos_azimuth = np.sin(0.5 * np.pi * turn)[:, None]
+    cos_in = width * x / length
+    sin_in = np.sqrt(1 - x**2) / length
+    azimuth, azimuth_weight = _clustered_quadrature(_OUTER)
+    cos_azimuth = np.sin(0.5 * np.pi * azimuth)[:, None]
     share = np.zeros(np.broadcast_shapes(x.shape, width.shape)[:-2])
     for side in (1, -1):  # facets that lean towards the viewer, and away
         along = side * sin_in * cos_azimuth
         steepest = (along + np.sqrt(along**2 + cos_in**2)) / cos_in
         # tan(facet) = alpha tan(psi) draws facets by D: their share is sin^2(psi).
         last = np.arctan2(steepest, width)
-        node, weight = _clustered(_INNER)
+        node, weight = _clustered_quadrature(_INNER)
         psi = last * (1 - node)
         slope = width * np.tan(psi)
         projected = along * slope + cos_in
@@ -76,7 +79,7 @@ def directional_albedo(
         both = masked_in * masked_out if smith == "separable" else 0
         visible = projected / (cos_in * (1 + masked_in + masked_out + both))
         inner = (visible * last * np.sin(2 * psi) * weight).sum(axis=-1)
-        share += 0.5 * (inner * turn_weight).sum(axis=-1)
+        share += 0.5 * (inner * azimuth_weight).sum(axis=-1)
     return share
 
 
@@ -113,7 +116,7 @@ def _mean_albedos(smith: Smith) -> tuple[NDArray[np.float64], NDArray[np.float64
     return roughness, 2 * (directional_albedo(x, alpha, smith) * weight * cosine).sum(axis=1)
 
 
-def _clustered(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _clustered_quadrature(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return nodes and weights over [0, 1], denser near 0: the squares of Gauss-Legendre's."""
     node, weight = _gauss_legendre(count)
     return node**2, 2 * node * weight

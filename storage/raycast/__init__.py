@@ -1,1 +1,1 @@
-"""Which triangles rays meet, and what the pixels of a camera see first."""
+"""Ray casting: the triangles that rays meet, and the first hits of a camera's pixels."""

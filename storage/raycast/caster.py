@@ -1,4 +1,4 @@
-"""`RayCaster`: which triangles rays meet, on the processor or on a card.
+"""`RayCaster`: which triangles rays meet, on the CPU or on a GPU.
 
 Embree is its form for numpy (storage.raycast.embree); a kernel of model.hits is that for tensors.
 """
@@ -12,7 +12,7 @@ MISS = -1
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RayHits:
-    """What N rays meet first; arrays of the caster's kind."""
+    """First hits of N rays; arrays of the caster's kind."""
 
     triangle: Any
     """[N] row of the triangle, or MISS; int64."""
@@ -24,7 +24,7 @@ class RayCaster(Protocol):
     """Some triangles of many, as rays meet them; arrays are of one kind, all float32."""
 
     def intersect(self, origins: Any, directions: Any) -> RayHits:
-        """Return what rays [N, 3] from `origins` [N, 3] meet first, from either side."""
+        """Return the first hits of rays [N, 3] from `origins` [N, 3], from either side."""
 
     def is_free(self, origins: Any, directions: Any, distances_m: Any) -> Any:
         """Return [N] whether rays meet nothing up to a distance [N], in lengths of directions."""

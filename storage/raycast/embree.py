@@ -1,7 +1,7 @@
-"""Triangles prepared for rays: everybody's way to Embree.
+"""Triangles prepared for rays: the only module that calls Embree, but for one.
 
 Embree works in single precision, here in its robust mode, in which no ray slips between two
-triangles of one edge. Only `pipeline.assets.outside_rays` asks Embree by itself: it has no scene.
+triangles of one edge. `pipeline.assets.outside_rays` calls Embree by itself: it has no scene.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from storage.records.scene import Scene
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MetSurfaces(RayHits):
-    """What N rays meet first, in Embree's own precision."""
+    """First hits of N rays, in Embree's precision."""
 
     distance_m: NDArray[np.float32]
     """[N] along the ray, in lengths of its direction; beyond all measure where nothing is met."""
@@ -50,13 +50,13 @@ class Triangles:
     def intersect(
         self, origins: NDArray[np.float32], directions: NDArray[np.float32]
     ) -> MetSurfaces:
-        """Return what rays [N, 3] from `origins` [N, 3] meet first, from either side."""
-        found = self._embree.run(origins, directions, output=True)
+        """Return the first hits of rays [N, 3] from `origins` [N, 3], from either side."""
+        hits = self._embree.run(origins, directions, output=True)
         return MetSurfaces(
-            triangle=self._rows[found["primID"]],
-            uv=np.stack([found["u"], found["v"]]),
-            distance_m=found["tfar"],
-            normal=found["Ng"],
+            triangle=self._rows[hits["primID"]],
+            uv=np.stack([hits["u"], hits["v"]]),
+            distance_m=hits["tfar"],
+            normal=hits["Ng"],
         )
 
     def is_free(
@@ -66,8 +66,8 @@ class Triangles:
         distances_m: NDArray[np.float32],
     ) -> NDArray[np.bool_]:
         """Return [N] whether rays meet nothing up to a distance [N], in lengths of directions."""
-        found = self._embree.run(origins, directions, dists=distances_m, query="OCCLUDED")
-        free: NDArray[np.bool_] = np.asarray(found) < 0
+        occluder = self._embree.run(origins, directions, dists=distances_m, query="OCCLUDED")
+        free: NDArray[np.bool_] = np.asarray(occluder) < 0
         return free
 
 

@@ -1,8 +1,8 @@
-"""What the pixels of a camera see first: triangle, object, depth, position, normals, material.
+"""First hits of a camera's pixels: triangle, object, depth, position, normals, material.
 
 Embree finds the triangle, in single precision (storage.raycast.embree); where on it, is then
 computed in double precision from the triangle's stored corners. Emitters are hidden from cameras,
-so rays pass through them. Each quantity is computed when it is first asked for.
+so rays pass through them. Each quantity is computed on first use.
 """
 
 from dataclasses import dataclass
@@ -26,11 +26,12 @@ class SeenFrom:
     """
 
     def __init__(self, scene: Scene, origin: NDArray[np.float64]) -> None:
-        self.scene, self.origin = scene, origin
+        self.scene = scene
+        self.origin = origin
         self.surfaces = Surfaces(scene)
 
     def hits(self, directions: NDArray[np.float64]) -> "FirstHits":
-        """Return what rays along unit `directions` [..., 3] meet first."""
+        """Return the first hits of rays along unit `directions` [..., 3]."""
         toward = directions.reshape(-1, 3).astype(np.float32)
         start = np.tile(self.origin.astype(np.float32), (len(toward), 1))
         triangle = self.surfaces.intersect(start, toward).triangle
@@ -40,7 +41,7 @@ class SeenFrom:
 
     @cached_property
     def corners(self) -> NDArray[np.float64]:
-        """[T + 1, 3, 3] positions in metres."""
+        """[T + 1, 3, 3] positions in meters."""
         return corner_table(self.scene, self.scene.vertex_positions)
 
     @cached_property
@@ -56,7 +57,8 @@ class SeenFrom:
         sum of a, b and c with positive weights; that of a is in proportion to its product with
         b x c (Cramer's rule).
         """
-        b, c = np.roll(self.corners, -1, axis=1), np.roll(self.corners, -2, axis=1)
+        b = np.roll(self.corners, -1, axis=1)
+        c = np.roll(self.corners, -2, axis=1)
         # b x c with the difference taken first, or small triangles far away would lose digits
         return np.cross(b - self.origin, c - b)
 
@@ -100,9 +102,9 @@ class FirstHits:
 
     @property
     def met(self) -> NDArray[np.bool_]:
-        """[...] whether a ray meets anything."""
-        met: NDArray[np.bool_] = np.asarray(self.triangle != MISS)
-        return met
+        """[...] True for rays that meet a surface."""
+        is_met: NDArray[np.bool_] = np.asarray(self.triangle != MISS)
+        return is_met
 
     @property
     def object(self) -> NDArray[np.int64]:
@@ -125,8 +127,8 @@ class FirstHits:
 
     @cached_property
     def position(self) -> NDArray[np.float64]:
-        """[..., 3] in world space, metres; NaN where nothing is met."""
-        return self.interpolated(self.seen.corners)
+        """[..., 3] in world space, meters; NaN where nothing is met."""
+        return self.interpolate(self.seen.corners)
 
     @cached_property
     def depth_m(self) -> NDArray[np.float64]:
@@ -151,24 +153,25 @@ class FirstHits:
         cancel out.
         """
         with np.errstate(invalid="ignore"):
-            return _unit(self.interpolated(self.seen.corner_normals))
+            return _unit(self.interpolate(self.seen.corner_normals))
 
     @cached_property
     def uv(self) -> NDArray[np.float64]:
         """[..., 2] texture coordinates; NaN where nothing is met or the scene has none."""
-        return self.interpolated(self.seen.corner_uv)
+        return self.interpolate(self.seen.corner_uv)
 
     @cached_property
     def material(self) -> NDArray[np.float32]:
         """[..., M] row of `Scene.materials`, with its textures; NaN where nothing is met."""
-        rows, scene = self.seen.materials[self.triangle], self.seen.scene
+        rows = self.seen.materials[self.triangle]
+        scene = self.seen.scene
         if scene.textures:
-            met = self.met
-            index = scene.material_index[self.triangle[met]]
-            rows[met] = textured_rows(scene, index, self.uv[met])
+            is_met = self.met
+            index = scene.material_index[self.triangle[is_met]]
+            rows[is_met] = textured_rows(scene, index, self.uv[is_met])
         return rows
 
-    def interpolated(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    def interpolate(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return [..., K] between the corners of a table [T + 1, 3, K]."""
         return np.einsum("...c,...ci->...i", self.barycentric, corners[self.triangle])
 
@@ -176,15 +179,15 @@ class FirstHits:
 def first_hits(
     scene: Scene, *, view: int = 0, resolution: int = 256, pixel: tuple[int, int] | None = None
 ) -> FirstHits:
-    """Return what a camera of a scene sees, in all pixels of its picture or in one.
+    """Return the first hits of a camera of a scene, in all pixels of its picture or in one.
 
-    Rays go through the centres of pixels, as those of the renderer's own `hits`.
+    Rays go through the centers of pixels, as those of the renderer's own `hits`.
 
     Args:
         scene: passes `Scene.check`.
         view: row of `scene.c2w`.
         resolution: width and height of the picture in pixels.
-        pixel: row from the top and column from the left of the only one that is asked for.
+        pixel: row from the top and column from the left of the only one that is computed.
 
     Raises:
         TrilightError: there is no such view or pixel.

@@ -90,7 +90,7 @@ def compiled_parts(
     for layer in model.decoder.layers:
         yield "decoder layers", layer, "forward"
     if isinstance(model.decoder, HitDecoder) and model.decoder.filter is not None:
-        yield "filter", model.decoder.filter, "mixed"
+        yield "filter", model.decoder.filter, "mix_level"
     yield "head", model.decoder.head, "forward"
     for module in objective.modules():
         if isinstance(module, Lpips):

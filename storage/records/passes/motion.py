@@ -21,7 +21,7 @@ def motion_px(rays: PassRays) -> NDArray[np.float64]:
     later_scene = rays.later.scene
     view = rays.later.view
     places = pixel_places(
-        rays.hits.interpolated(rays.later.corners),
+        rays.hits.interpolate(rays.later.corners),
         later_scene.c2w[view],
         float(later_scene.fov_deg[view]),
         rays.resolution,

@@ -56,7 +56,7 @@ def in_double(batch: SceneBatch) -> SceneBatch:
 
     whole = {name: value.double() for name, value in vars(batch).items() if real(value)}
     assert batch.traced is not None
-    traced = batch.traced.converted(lambda x: x.double() if real(x) else x)
+    traced = batch.traced.convert_tensors(lambda x: x.double() if real(x) else x)
     return dataclasses.replace(batch, **whole, traced=traced)
 
 

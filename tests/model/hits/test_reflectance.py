@@ -13,11 +13,11 @@ from model.hits.light_filter import (
     TAPS,
     LightFilter,
     _mean_around,
-    _mixed,
+    _mix_pixels,
 )
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import BOUNCES, scene_light
-from model.hits.reflectance import drawn, gloss_at, lobe
+from model.hits.reflectance import gloss_at, lobe, sample_lobe
 from model.hits.vectors import dot, unit
 from model.hits.view_inputs import Channel
 from storage.optics.multiscatter import directional_albedo
@@ -55,13 +55,13 @@ def test_a_white_lobe_returns_all_light(roughness: float, cosine: float) -> None
     points = _points(scene, _toward(cosine))
     gloss = gloss_at(scene, points)
     u = np.random.default_rng(0).random((2, COUNT), np.float32)
-    _, weight = drawn(gloss, points, u)
+    _, weight = sample_lobe(gloss, points, u)
     alpha = roughness**2
     stretch = np.sqrt(cosine**2 + alpha**2 * (1 - cosine**2))
     single = directional_albedo(cosine / stretch, alpha, "correlated")
     # standard error of weights between 0 and 1, five times; then the table's 0.25 % between entries
     assert weight.mean() == pytest.approx(float(single), abs=5 * 0.5 / np.sqrt(COUNT))
-    assert float(single) * gloss.colour[0, 0] == pytest.approx(1.0, abs=4e-3)
+    assert float(single) * gloss.color[0, 0] == pytest.approx(1.0, abs=4e-3)
 
 
 @for_each("roughness", [0.15, 0.4, 0.9])
@@ -70,7 +70,7 @@ def test_a_sample_weighs_its_value_over_its_density(roughness: float) -> None:
     points = _points(scene, _toward(0.6, 500))
     gloss = gloss_at(scene, points)
     u = np.random.default_rng(1).random((2, 500), np.float32)
-    direction, weight = drawn(gloss, points, u)
+    direction, weight = sample_lobe(gloss, points, u)
     value, density = lobe(gloss, points, direction, dot(direction, points.normal))
     goes = weight > 0
     assert goes.mean() > 0.7
@@ -89,7 +89,7 @@ def test_the_density_integrates_to_what_is_drawn_above(roughness: float) -> None
     points = _points(scene, _toward(0.7))
     gloss = gloss_at(scene, points)
     _, density = lobe(gloss, points, even, even[2])
-    _, weight = drawn(gloss, points, rng.random((2, COUNT)).astype(np.float32))
+    _, weight = sample_lobe(gloss, points, rng.random((2, COUNT)).astype(np.float32))
     spread = 2 * np.pi * density.std() / np.sqrt(COUNT)
     assert 2 * np.pi * density.mean() == pytest.approx((weight > 0).mean(), abs=5 * spread + 0.01)
 
@@ -251,9 +251,9 @@ def test_a_level_is_its_slow_twin(step: int) -> None:
                 expected[0, :, row, column] += share * both[0, :, y, x]
                 total += share
             expected[0, :, row, column] /= total
-    torch.testing.assert_close(_mixed(alike, near, both, step), expected)
+    torch.testing.assert_close(_mix_pixels(alike, near, both, step), expected)
     with torch.inference_mode():  # by rows, in parts
-        torch.testing.assert_close(_mixed(alike, near, both, step), expected)
+        torch.testing.assert_close(_mix_pixels(alike, near, both, step), expected)
 
 
 @for_each("px", [8, 40, 72])
@@ -315,7 +315,7 @@ def test_a_level_may_be_compiled() -> None:
     alike, both = (each.requires_grad_() for each in given)
     near = torch.randn(9, generator=generator)
     results: list[tuple[Tensor, ...]] = []
-    for mixed in (one.mixed, torch.compile(one.mixed, backend="aot_eager")):
+    for mixed in (one.mix_level, torch.compile(one.mix_level, backend="aot_eager")):
         alike.grad = both.grad = None
         shown = mixed(alike, near, both, 2)
         shown.square().mean().backward()

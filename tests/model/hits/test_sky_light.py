@@ -8,7 +8,7 @@ import pytest
 from model.hits.direct_light import no_light
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import scene_light
-from model.hits.reflectance import drawn, gloss_at
+from model.hits.reflectance import gloss_at, sample_lobe
 from model.hits.sky_light import add_sky_light, escaped_light, sees_sky
 from model.hits.view_inputs import Channel
 from scene_templates.rotations import uniform_rotation
@@ -167,7 +167,7 @@ def test_the_lobe_ray_and_the_others_share_what_a_mirror_shows() -> None:
     alone = light.specular.mean(axis=1)
     shared = no_light(points)
     add_sky_light(shared, lit, points, gloss, shift, 0, rays=8, lobe_rays=1)
-    direction, weight = drawn(
+    direction, weight = sample_lobe(
         gloss, points, np.random.default_rng(1).random((2, 4_000), np.float32)
     )
     free = sees_sky(lit, points, direction) & (weight > 0)
