@@ -15,7 +15,7 @@ import numpy as np
 from trilight.extend import COLUMNS, SIZES, MaterialColumn, ModelConfig, Within
 
 
-def coat_rand(rng: np.random.Generator, count: int) -> np.ndarray:
+def sample_coat(rng: np.random.Generator, count: int) -> np.ndarray:
     """Return the coats of the materials of a scene: none on half of them."""
     return np.where(rng.random((count, 1)) < 0.5, 0.0, rng.uniform(0.1, 1.0, (count, 1)))
 
@@ -27,7 +27,7 @@ COLUMNS.register(
         means="Weight of a clear coat over the other lobes.",
         width=1,
         within=Within(0, 1),
-        draw=coat_rand,  # without it, composed scenes hold the default, which is 0
+        draw=sample_coat,  # without it, composed scenes hold the default, which is 0
     ),
 )
 

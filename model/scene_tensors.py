@@ -184,7 +184,7 @@ def in_light_units(batch: SceneBatch, unit_B3: Tensor) -> SceneBatch:
 
 
 def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
-    """Stack scenes of equal view count and columns; a scene's picture depends on no other scene."""
+    """Collate scenes of equal view count and columns; a picture depends on its own scene alone."""
     assert all(scene.columns == scenes[0].columns for scene in scenes)
     lengths = [scene.num_triangles for scene in scenes]
     longest = max(lengths)

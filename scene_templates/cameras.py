@@ -31,7 +31,7 @@ class Sector:
         require(-90 <= low <= high <= 90, "elevation_deg", (low, high), "two from -90 to 90")
         require(0 <= self.half_width_deg <= 180, "half_width_deg", self.half_width_deg, "0 to 180")
 
-    def direction_rand(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def sample_direction(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """Draw a unit direction [3], uniform by solid angle."""
         low, high = (math.sin(math.radians(angle)) for angle in self.elevation_deg)
         z = rng.uniform(low, high)
@@ -55,10 +55,10 @@ class CameraSettings:
     """Full field of view, horizontal and vertical."""
 
 
-def camera_rand(rng: np.random.Generator, settings: CameraSettings, sector: Sector) -> CameraPose:
+def sample_camera(rng: np.random.Generator, settings: CameraSettings, sector: Sector) -> CameraPose:
     """Draw one camera. Whether it sees anything is for the caller to find out."""
     target = rng.uniform(-settings.target_jitter, settings.target_jitter, size=3)
-    eye = target + rng.uniform(*settings.distance) * sector.direction_rand(rng)
+    eye = target + rng.uniform(*settings.distance) * sector.sample_direction(rng)
     up = np.array([0, 0, 1]) + rng.uniform(-settings.up_jitter, settings.up_jitter, size=3)
     return CameraPose(
         c2w=look_at_c2w(eye=eye, target=target, up=up),

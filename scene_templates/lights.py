@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scene_templates.cameras import Sector
 from scene_templates.checks import OFFSET, SIZE, Counts, Range
 from scene_templates.layout import Emitter
-from scene_templates.rotations import Orientation, rotate_points, rotation_rand
+from scene_templates.rotations import Orientation, rotate_points, sample_rotation
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
 
@@ -62,7 +62,7 @@ class LightSettings:
     distribution."""
 
 
-def emitters_rand(
+def sample_emitters(
     rng: np.random.Generator,
     settings: LightSettings,
     sector: Sector,
@@ -74,8 +74,8 @@ def emitters_rand(
     for _ in range(count):
         directions.append(_spaced_direction(rng, sector, directions, settings.spacing))
     inside = list(object_centres)[: settings.num_inside]
-    outside = [_centre_rand(rng, settings, towards) for towards in directions[len(inside) :]]
-    return tuple(_emitter_rand(rng, settings, centre, count) for centre in [*inside, *outside])
+    outside = [_sample_center(rng, settings, towards) for towards in directions[len(inside) :]]
+    return tuple(_sample_emitter(rng, settings, centre, count) for centre in [*inside, *outside])
 
 
 def _spaced_direction(
@@ -84,10 +84,10 @@ def _spaced_direction(
     placed_directions: list[NDArray[np.float64]],
     spacing: float,
 ) -> NDArray[np.float64]:
-    best = sector.direction_rand(rng)
+    best = sector.sample_direction(rng)
     best_gap = -1.0
     for _ in range(SPACING_TRIES):
-        candidate = sector.direction_rand(rng)
+        candidate = sector.sample_direction(rng)
         distances = [
             float(np.sqrt(np.sum(np.square(candidate - other)))) for other in placed_directions
         ]
@@ -100,29 +100,29 @@ def _spaced_direction(
     return best
 
 
-def _centre_rand(
+def _sample_center(
     rng: np.random.Generator, settings: LightSettings, towards: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     target = rng.uniform(-settings.target_jitter, settings.target_jitter, size=3)
     return target + rng.uniform(*settings.distance) * towards
 
 
-def _emitter_rand(
+def _sample_emitter(
     rng: np.random.Generator, settings: LightSettings, centre: NDArray[np.float64], count: int
 ) -> Emitter:
     # About its own middle, so that its distance is the one drawn.
     turned = rotate_points(
-        TRIANGLE - TRIANGLE.mean(axis=0), rotation_rand(rng, settings.orientation)
+        TRIANGLE - TRIANGLE.mean(axis=0), sample_rotation(rng, settings.orientation)
     )
     triangle = turned * rng.uniform(*settings.scale, size=3) + centre
     radiance = rng.uniform(*settings.total_emission) / count
-    red, green, blue = radiance * _tint_rand(rng, settings.coloured_share)
+    red, green, blue = radiance * _sample_tint(rng, settings.coloured_share)
     return Emitter(
         triangle=triangle, radiance_rgb=(red, green, blue), reflectance=settings.reflectance
     )
 
 
-def _tint_rand(rng: np.random.Generator, coloured_share: float) -> NDArray[np.float64]:
+def _sample_tint(rng: np.random.Generator, coloured_share: float) -> NDArray[np.float64]:
     if rng.random() >= coloured_share:
         return np.ones(3)
     channels = rng.uniform(PALEST, 1, size=3)

@@ -67,7 +67,7 @@ class MaterialSettings:
         require(low >= bias, "roughness_bias", bias, "at most roughness_log's low")
 
 
-def surface_rand(
+def sample_material(
     rng: np.random.Generator,
     settings: MaterialSettings,
     *,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scene_templates.checks import Range
 from scene_templates.layout import Plane, Pose
 from scene_templates.rooms import SIDES, Room
-from scene_templates.rotations import Orientation, rotate_points, rotation_rand
+from scene_templates.rotations import Orientation, rotate_points, sample_rotation
 from storage.errors import Rejected
 from storage.settings.described import checked
 from storage.settings.ranges import Share
@@ -100,7 +100,7 @@ class ObjectSpace:
         return all(bool((plane.height(points) >= -TOUCHING).all()) for plane in self.planes)
 
 
-def poses_rand(
+def sample_poses(
     rng: np.random.Generator,
     settings: PlacementSettings,
     space: ObjectSpace,
@@ -128,7 +128,7 @@ def poses_rand(
         poses: dict[int, Pose] = {}
         for row in np.argsort(-radii, kind="stable").tolist():
             obstacles = [] if overlaps else [(shapes[other], at) for other, at in poses.items()]
-            pose = _pose_rand(rng, settings, space, shapes[row], float(radii[row]), obstacles)
+            pose = _sample_pose(rng, settings, space, shapes[row], float(radii[row]), obstacles)
             if pose is None:
                 break
             poses[row] = pose
@@ -137,7 +137,7 @@ def poses_rand(
     raise Rejected("no_room", f"{len(shapes)} objects met in {ARRANGEMENT_TRIES} arrangements")
 
 
-def _pose_rand(
+def _sample_pose(
     rng: np.random.Generator,
     settings: PlacementSettings,
     space: ObjectSpace,
@@ -146,7 +146,7 @@ def _pose_rand(
     obstacles: Sequence[tuple[PlaceableShape, Pose]],
 ) -> Pose | None:
     """Draw a place for an object clear of others, or None where none was found."""
-    rotation = rotation_rand(rng, settings.orientation)
+    rotation = sample_rotation(rng, settings.orientation)
     rests = bool(rng.random() < settings.resting_share)
     points = radius * rotate_points(shape.points, rotation)
     low = np.full(3, -0.5)

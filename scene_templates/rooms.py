@@ -127,7 +127,7 @@ class SharedRoom:
     allow 10 for open layouts and 3 for the box; parts tilted by 10 must be half as large again for
     their seams to stay closed."""
 
-    def room_rand(self, rng: np.random.Generator, names: Sequence[str]) -> Room:
+    def sample_room(self, rng: np.random.Generator, names: Sequence[str]) -> Room:
         """Draw a room with the parts `names`."""
         scale = rng.uniform(*self.scale, size=3)
         shift = rng.uniform(-self.shift, self.shift, size=2)

@@ -9,7 +9,7 @@ Orientation = Literal["uniform", "euler"]
 """`uniform` on SO(3), or three `euler` angles as published, which prefer the poles."""
 
 
-def rotation_rand(rng: np.random.Generator, orientation: Orientation) -> NDArray[np.float64]:
+def sample_rotation(rng: np.random.Generator, orientation: Orientation) -> NDArray[np.float64]:
     """Return a rotation [3, 3] of the stated distribution."""
     if orientation == "euler":
         return rotation_xyz(rng.uniform(-180, 180, size=3))

@@ -34,7 +34,7 @@ class SideRanges:
     shift_z: Annotated[Range, SHIFT] = (0.0, 0.0)
     """Shift along Z, for a room of side 2."""
 
-    def placement_rand(self, rng: np.random.Generator, axis: int) -> PatchPlacement:
+    def sample_placement(self, rng: np.random.Generator, axis: int) -> PatchPlacement:
         """Draw the place of a side that is perpendicular to `axis` before it is turned."""
         angles_deg = rng.uniform(-self.tilt_deg, self.tilt_deg, size=3)
         angles_deg[axis] = rng.uniform(-self.spin_deg, self.spin_deg)
@@ -62,7 +62,7 @@ class SeparateSides:
     wall2_faces_out: bool = False
     """Turn the front of the wall at -X away from the room, as in the original policy."""
 
-    def room_rand(self, rng: np.random.Generator, names: Sequence[str]) -> Room:
+    def sample_room(self, rng: np.random.Generator, names: Sequence[str]) -> Room:
         """Draw the sides `names`; the space between them is the nominal room."""
-        patches = [getattr(self, name).placement_rand(rng, SIDES[name].axis) for name in names]
+        patches = [getattr(self, name).sample_placement(rng, SIDES[name].axis) for name in names]
         return Room(patches=tuple(patches), low=np.full(3, -0.5), high=np.full(3, 0.5), lean=0.0)

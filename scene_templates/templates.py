@@ -1,14 +1,14 @@
 """Layouts as data: which walls they have, and from where they are seen and lit.
 
 Following infinigen's convention, `Template.layout(params)` builds and draws nothing, while
-`layout_rand(rng, ...)` in the file of that name draws the parameters and builds.
+`sample_layout(rng, ...)` in the file of that name draws the parameters and builds.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from scene_templates.cameras import CameraSettings, Sector, camera_rand
+from scene_templates.cameras import CameraSettings, Sector, sample_camera
 from scene_templates.checks import require
 from scene_templates.layout import (
     CameraPose,
@@ -78,9 +78,9 @@ class Template:
         )
         return Layout(shell=shell, objects=params.objects, emitters=params.emitters)
 
-    def camera_rand(self, rng: np.random.Generator, settings: CameraSettings) -> CameraPose:
+    def sample_camera(self, rng: np.random.Generator, settings: CameraSettings) -> CameraPose:
         """Draw one camera."""
-        return camera_rand(rng, settings, self.cameras)
+        return sample_camera(rng, settings, self.cameras)
 
 
 PLANE = Template(

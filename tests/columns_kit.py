@@ -15,12 +15,12 @@ from storage.settings.ranges import Within
 WITH_COAT = (*PUBLISHED_COLUMNS, "coat")
 
 
-def coat_rand(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+def sample_coat(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
     return rng.uniform(0.1, 0.9, (count, 1))
 
 
 COAT = MaterialColumn(
-    name="coat", means="Weight of a clear coat.", width=1, within=Within(0, 1), draw=coat_rand
+    name="coat", means="Weight of a clear coat.", width=1, within=Within(0, 1), draw=sample_coat
 )
 TINT = MaterialColumn(
     name="tint",

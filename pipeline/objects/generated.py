@@ -12,17 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.objects.builtin.furniture import furniture_rand
-from pipeline.objects.builtin.gear import gear_rand
+from pipeline.objects.builtin.furniture import sample_furniture
+from pipeline.objects.builtin.gear import sample_gear
 from pipeline.objects.builtin.grids import Mesh
-from pipeline.objects.builtin.lattice import lattice_rand
-from pipeline.objects.builtin.plant import plant_rand
-from pipeline.objects.builtin.rock import rock_rand
-from pipeline.objects.builtin.shell import shell_rand
-from pipeline.objects.builtin.superquadric import superquadric_rand
-from pipeline.objects.builtin.torus_knot import torus_knot_rand
-from pipeline.objects.builtin.tree import tree_rand
-from pipeline.objects.builtin.vase import vase_rand
+from pipeline.objects.builtin.lattice import sample_lattice
+from pipeline.objects.builtin.plant import sample_plant
+from pipeline.objects.builtin.rock import sample_rock
+from pipeline.objects.builtin.shell import sample_shell
+from pipeline.objects.builtin.superquadric import sample_superquadric
+from pipeline.objects.builtin.torus_knot import sample_torus_knot
+from pipeline.objects.builtin.tree import sample_tree
+from pipeline.objects.builtin.vase import sample_vase
 from pipeline.objects.ply import encode_ply
 from storage.atomic import write_atomically
 from storage.dataset.layout import numbered_path
@@ -31,16 +31,16 @@ from storage.records.objects import ObjectRecord
 from storage.seeds import rng_for
 
 FAMILIES: Mapping[str, Callable[[np.random.Generator], Mesh]] = {
-    "superquadric": superquadric_rand,
-    "torus_knot": torus_knot_rand,
-    "gear": gear_rand,
-    "vase": vase_rand,
-    "rock": rock_rand,
-    "shell": shell_rand,
-    "furniture": furniture_rand,
-    "tree": tree_rand,
-    "lattice": lattice_rand,
-    "plant": plant_rand,
+    "superquadric": sample_superquadric,
+    "torus_knot": sample_torus_knot,
+    "gear": sample_gear,
+    "vase": sample_vase,
+    "rock": sample_rock,
+    "shell": sample_shell,
+    "furniture": sample_furniture,
+    "tree": sample_tree,
+    "lattice": sample_lattice,
+    "plant": sample_plant,
 }
 """Families by name; object i of `builtin:` has family i modulo their number, so the order counts.
 """

@@ -31,7 +31,7 @@ from pipeline.scenes.subdivision import fill_triangles
 from pipeline.scenes.textured_pieces import with_drawn_textures
 from pipeline.scenes.views import with_first_cameras
 from scene_templates.layout import Layout
-from scene_templates.layout_rand import ScenePlan, layout_rand, scene_plan
+from scene_templates.sample_layout import ScenePlan, sample_layout, scene_plan
 from scene_templates.settings import SceneSettings
 from scene_templates.skies.drawn_scene import scene_sky
 from scene_templates.user_maps import NO_OWN_MAPS, OwnMaps
@@ -74,14 +74,14 @@ def compose_scene(
     provenance = _provenance(settings, plan, scene_key)
     settings = settings.of_scene(scene_key.index)
     rng = scene_key.rng("scene")
-    chosen = _objects_rand(rng, settings, plan, pool)
+    chosen = _sample_objects(rng, settings, plan, pool)
     budget = _object_budget(settings, plan)
     levels = levels_within([entry.asset for entry in chosen], budget, settings.enough_error)
     shapes = [
         MeshShape(entry.locked.uid, level, settings.centring)
         for entry, level in zip(chosen, levels, strict=True)
     ]
-    layout = layout_rand(rng, settings, plan, shapes)
+    layout = sample_layout(rng, settings, plan, shapes)
     skins = source_skins(chosen, levels, settings.materials, scene_key)
     pieces = scene_pieces(layout, chosen, shapes, settings, rng, skins)
     pieces = with_drawn_textures(
@@ -152,7 +152,7 @@ def _provenance(settings: SceneSettings, plan: ScenePlan, scene_key: SceneKey) -
     return origin
 
 
-def _objects_rand(
+def _sample_objects(
     rng: np.random.Generator,
     settings: SceneSettings,
     plan: ScenePlan,

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.drawn_columns import with_drawn_columns
 from pipeline.scenes.pieces import concatenate_pieces, emitter_piece
-from scene_templates.lights import LightSettings, emitters_rand
-from scene_templates.materials import MaterialSettings, surface_rand
+from scene_templates.lights import LightSettings, sample_emitters
+from scene_templates.materials import MaterialSettings, sample_material
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
 from storage.records.material import DIFFUSE, ROUGHNESS, SPECULAR
@@ -46,7 +46,7 @@ def with_new_materials(scene: Scene, settings: MaterialSettings, scene_key: Scen
         new = scene.materials[used].copy()
         if row not in lit and row in facts:
             surface = facts[row]
-            look = surface_rand(
+            look = sample_material(
                 rng,
                 settings,
                 smooth_share=float(surface.smooth),
@@ -90,7 +90,7 @@ def with_new_lights(
     lit = np.array([entry.is_lamp for entry in scene.objects])
     count = int(lit.sum()) if num_lights is None else num_lights
     rng = scene_key.rng("new lights")
-    emitters = emitters_rand(rng, settings, TEMPLATES[name].lights, count, _centres(scene, kinds))
+    emitters = sample_emitters(rng, settings, TEMPLATES[name].lights, count, _centres(scene, kinds))
     lamps = [emitter_piece(emitter, row) for row, emitter in enumerate(emitters)]
     dark = _without(scene, lit)
     new = concatenate_pieces(lamps)

@@ -1,4 +1,4 @@
-"""`MeshShape`: an object's mesh for the layouts, with collision tests by FCL.
+"""`MeshShape`: an object's mesh for scene_templates.placement, with FCL's collision tests.
 
 FCL (Pan, Chitta, Manocha 2012) tests triangle against triangle in float64 over bounding volume
 trees; distant objects are separated by their bounding spheres alone. A mesh inside another one does

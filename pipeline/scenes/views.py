@@ -87,7 +87,7 @@ def with_cameras(scene: Scene, cameras: Sequence[ViewCamera]) -> Scene:
     return dataclasses.replace(posed, provenance=provenance)
 
 
-def view_problem(facts: ViewFacts, settings: ViewLaws, *, has_objects: bool) -> str | None:
+def visibility_problem(facts: ViewFacts, settings: ViewLaws, *, has_objects: bool) -> str | None:
     """Return why a view is rejected, or None."""
     if facts.depth < settings.min_depth:
         return "too near"
@@ -109,7 +109,7 @@ def _accepted_proposals(
     for attempt in range(first, CAMERA_ATTEMPTS):
         camera = _proposal(scene, settings, view, attempt)
         facts = sight.facts(camera.c2w, float(camera.fov_deg), settings.views.coverage_grid)
-        problem = view_problem(facts, settings.views, has_objects=has_objects)
+        problem = visibility_problem(facts, settings.views, has_objects=has_objects)
         if problem is None:
             yield camera
             first = attempt + 1
@@ -123,6 +123,7 @@ def _accepted_proposals(
 
 
 def _proposal(scene: Scene, settings: SceneSettings, view: int, attempt: int) -> ViewCamera:
+    """Return proposal number `attempt` of a view (scene_templates.cameras.sample_camera)."""
     origin = scene.provenance
     template = origin["template"]
     names = (origin["scene_index"], origin["attempt"], view, attempt)
@@ -135,7 +136,7 @@ def _proposal(scene: Scene, settings: SceneSettings, view: int, attempt: int) ->
         raise Rejected(
             "no_layout", f"{template!r} is no layout that draws cameras; name one, or give cameras"
         )
-    pose = TEMPLATES[template].camera_rand(rng, settings.cameras)
+    pose = TEMPLATES[template].sample_camera(rng, settings.cameras)
     return ViewCamera(
         c2w=pose.c2w.astype(np.float32), fov_deg=np.float32(pose.fov_deg), attempt=attempt
     )

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH
 from scene_templates.layout import Layout, Pose
-from scene_templates.layout_rand import ScenePlan, layout_rand, scene_plan
 from scene_templates.rooms import PatchPlacement
+from scene_templates.sample_layout import ScenePlan, sample_layout, scene_plan
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
 from storage.seeds import rng_for
@@ -84,7 +84,7 @@ def one_drawn(
     for attempt in range(16):
         rng = rng_for(seed, "scene", scene_index, attempt)
         try:
-            layout = layout_rand(rng, after, plan, [shape] * plan.num_objects)
+            layout = sample_layout(rng, after, plan, [shape] * plan.num_objects)
         except Rejected:
             if attempt == 15:
                 raise

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from scene_templates.layout import Pose
-from scene_templates.layout_rand import layout_rand, scene_plan
-from scene_templates.materials import MaterialSettings, surface_rand
+from scene_templates.materials import MaterialSettings, sample_material
 from scene_templates.placement import TOUCHING
 from scene_templates.renderformer_v1 import stage_1_families
 from scene_templates.rooms import plane_of
+from scene_templates.sample_layout import sample_layout, scene_plan
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
@@ -106,7 +106,7 @@ def test_objects_that_cannot_fit_are_rejected_with_a_reason() -> None:
     settings = template_settings("open_box", {**changes, "placement.overlap_share": 0.0})
     plan = scene_plan(settings, seed=0, scene_index=0)
     with pytest.raises(Rejected) as caught:
-        layout_rand(rng_for(0, "scene", 0, 0), settings, plan, [BALL] * 3)
+        sample_layout(rng_for(0, "scene", 0, 0), settings, plan, [BALL] * 3)
     assert caught.value.reason == "no_room"
     overlapping = template_settings("open_box", {**changes, "placement.overlap_share": 1.0})
     assert len(one_drawn(overlapping, 0).layout.objects) == 3
@@ -156,7 +156,7 @@ def test_surfaces_keep_their_energy() -> None:
     settings = MaterialSettings(coloured_specular_share=0.5)
     tinted = 0
     for _ in range(4000):
-        surface = surface_rand(rng, settings, smooth_share=0.5, kind="object")
+        surface = sample_material(rng, settings, smooth_share=0.5, kind="object")
         specular = max(surface.specular_rgb)
         assert surface.diffuse_scale + specular <= 1 + ROUNDING
         assert 0 <= min(*surface.diffuse_rgb, *surface.specular_rgb)

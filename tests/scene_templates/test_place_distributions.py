@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scene_templates.cameras import CameraSettings, Sector, camera_rand
+from scene_templates.cameras import CameraSettings, Sector, sample_camera
 from scene_templates.layout import CameraPose
-from scene_templates.lights import LightSettings, emitters_rand
+from scene_templates.lights import LightSettings, sample_emitters
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
 from scene_templates.rooms import SIDES, PatchPlacement, SharedRoom, plane_of
 from scene_templates.templates import TEMPLATES
@@ -37,7 +37,7 @@ def _placements(
     shell: SharedRoom, template: str, count: int = COUNT
 ) -> list[tuple[PatchPlacement, ...]]:
     rng = np.random.default_rng(0)
-    return [shell.room_rand(rng, TEMPLATES[template].parts).patches for _ in range(count)]
+    return [shell.sample_room(rng, TEMPLATES[template].parts).patches for _ in range(count)]
 
 
 def _shared_room_table(shell: SharedRoom) -> Table:
@@ -92,7 +92,7 @@ def _sides_table(stage: int, drawn_policy: Policy, stated_policy: Policy) -> Tab
     for family in (stage_1_families if stage == 1 else stage_2_families)(drawn_policy):
         parts = TEMPLATES[family.template].parts
         for _ in range(100):
-            patches = family.shell.room_rand(rng, parts).patches
+            patches = family.shell.sample_room(rng, parts).patches
             for part, at in zip(parts, patches, strict=True):
                 assert at.reach == 1
                 axis = SIDES[part].axis
@@ -221,7 +221,7 @@ def _sector_table(directions: NDArray[np.float64], sector: Sector) -> Table:
 def _light_centres(sector: Sector, **changes: object) -> NDArray[np.float64]:
     settings = LightSettings(**changes)  # type: ignore[arg-type]
     rng = np.random.default_rng(0)
-    drawn_ones = [emitters_rand(rng, settings, sector, 1, [])[0] for _ in range(COUNT)]
+    drawn_ones = [sample_emitters(rng, settings, sector, 1, [])[0] for _ in range(COUNT)]
     return np.stack([one.triangle.mean(axis=0) for one in drawn_ones])
 
 
@@ -243,7 +243,7 @@ def test_lights_hang_evenly_in_their_sector(name: str) -> None:
 def _cameras(sector: Sector, **changes: object) -> list[CameraPose]:
     settings = CameraSettings(**changes)  # type: ignore[arg-type]
     rng = np.random.default_rng(0)
-    return [camera_rand(rng, settings, sector) for _ in range(COUNT)]
+    return [sample_camera(rng, settings, sector) for _ in range(COUNT)]
 
 
 def _camera_table(sector: Sector, **changes: object) -> Table:
@@ -273,7 +273,7 @@ def _roll(up: NDArray[np.float64], backward: NDArray[np.float64]) -> float:
 def _roll_twin(sector: Sector) -> list[float]:
     rng = np.random.default_rng(1)
     return [
-        _roll(np.array([0, 0, 1]) + rng.uniform(-0.1, 0.1, size=3), sector.direction_rand(rng))
+        _roll(np.array([0, 0, 1]) + rng.uniform(-0.1, 0.1, size=3), sector.sample_direction(rng))
         for _ in range(2 * COUNT)
     ]
 

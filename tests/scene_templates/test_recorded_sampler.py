@@ -12,9 +12,9 @@ import pytest
 from pipeline.builds.named import named_build
 from scene_templates.exact import cosine, dot, lerp, ramp, sine, smoothstep
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH
-from scene_templates.layout_rand import scene_plan
 from scene_templates.recorded_sampler import RecordedSampler
 from scene_templates.rotations import rotate_points, rotation_xyz, uniform_rotation
+from scene_templates.sample_layout import scene_plan
 from scene_templates.settings import SceneSettings
 from storage.seeds import rng_for
 from tests.conftest import ROOT

@@ -40,7 +40,7 @@ def _corner_normals(positions: NDArray[np.float64]) -> NDArray[np.float64]:
 def _room(ranges: SharedRoom, name: str, seed: int) -> tuple[Room, list[NDArray[np.float64]]]:
     """Draw a room, and return it with the vertices of its parts."""
     parts = TEMPLATES[name].parts
-    room = ranges.room_rand(np.random.default_rng(seed), parts)
+    room = ranges.sample_room(np.random.default_rng(seed), parts)
     return room, [patch(SIDES[part], at) for part, at in zip(parts, room.patches, strict=True)]
 
 

@@ -99,7 +99,7 @@ def bucket_scenes(
 
 
 def make_batch(scenes: Sequence[TrainingScene]) -> TrainingBatch:
-    """Stack scenes of equal view count; targets stay lookup rows if all of them are."""
+    """Collate scenes of equal view count; targets stay lookup rows if all of them are."""
     levels = [scene.levels_L for scene in scenes if scene.levels_L is not None]
     if len(levels) < len(scenes):
         scenes = [with_target(scene) for scene in scenes]

@@ -75,7 +75,7 @@ class Surface:
         self._tree.init(mesh.positions, mesh.faces)
 
     def deviation(self, other: TriangleMesh) -> Deviation:
-        """Return the two-way distance between this surface and `other`."""
+        """Return the sampled Hausdorff distances to and from `other`, point by point."""
         points = self.points.positions
         squared, nearest, _ = igl.point_mesh_squared_distance(points, other.positions, other.faces)
         cosine = np.einsum(

@@ -25,7 +25,7 @@ from pipeline.exchange.usd.names import (
     VISIBLE_TO_CAMERA,
     format_map,
 )
-from pipeline.foreign.usd.stage import OpenedUsd
+from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.errors import TrilightError
 from storage.records.environment import Environment
@@ -91,7 +91,7 @@ def sky_attributes(sky: Environment | None) -> Attributes:
     }
 
 
-def read_exact_dome(prim: Any, layer: Any, opened: OpenedUsd) -> Environment:
+def read_exact_dome(prim: Any, layer: Any, opened: OpenedStage) -> Environment:
     """Read the environment that `add_dome` wrote; raises LookupError without its file."""
     resolved = opened.resolve(layer, prim.attributes[_PATH].default.path)
     data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
@@ -108,7 +108,7 @@ def read_exact_dome(prim: Any, layer: Any, opened: OpenedUsd) -> Environment:
 
 
 def read_foreign_dome(
-    prim: Any, to_world: NDArray[np.float64], time: Any, opened: OpenedUsd, licence: str
+    prim: Any, to_world: NDArray[np.float64], time: Any, opened: OpenedStage, licence: str
 ) -> Environment | None:
     """Read the environment of any DomeLight; return None, with a note, where it is unusable.
 
@@ -175,7 +175,7 @@ def _pole_rotation(prim: Any) -> NDArray[np.float64]:
     return np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) if is_turned else np.eye(3)
 
 
-def _read_map(prim: Any, time: Any, opened: OpenedUsd) -> NDArray[np.float64] | None:
+def _read_map(prim: Any, time: Any, opened: OpenedStage) -> NDArray[np.float64] | None:
     """Return the map [H, 2 H, 3] of a dome; uniform radiance 1 where it names no file."""
     prim_path = str(prim.GetPath())
     attribute = prim.GetAttribute(_PATH)

@@ -18,7 +18,7 @@ from pipeline.exchange.usd.foreign_meshes import TriangleSoup
 from pipeline.exchange.usd.foreign_textures import ForeignTexture, read_texture
 from pipeline.exchange.usd.foreign_uv_textures import CHANNELS
 from pipeline.foreign.usd.shaders import StatedMaterial, parse_color, reflect_head_on
-from pipeline.foreign.usd.stage import OpenedUsd
+from pipeline.foreign.usd.stage import OpenedStage
 from storage.records.texture import MapSource, Texture
 
 
@@ -26,7 +26,7 @@ class ShaderInputs:
     """Inputs of a material on one mesh, read on demand."""
 
     def __init__(
-        self, stated: StatedMaterial, surface: TriangleSoup, time: Any, opened: OpenedUsd
+        self, stated: StatedMaterial, surface: TriangleSoup, time: Any, opened: OpenedStage
     ) -> None:
         """Store the sources of the inputs; nothing is read yet.
 

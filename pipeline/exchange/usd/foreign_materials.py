@@ -28,7 +28,7 @@ from pipeline.exchange.usd.held_materials import (
 )
 from pipeline.exchange.usd.names import added_column
 from pipeline.foreign.usd.shaders import read_bindings, read_colors, read_material
-from pipeline.foreign.usd.stage import OpenedUsd
+from pipeline.foreign.usd.stage import OpenedStage
 from storage.records.material import (
     DIFFUSE,
     EMISSION,
@@ -66,7 +66,7 @@ class SurfaceMaterials:
 
 
 def read_surface_materials(
-    surface: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
+    surface: TriangleSoup, time: Any, opened: OpenedStage, licence: str
 ) -> SurfaceMaterials:
     """Read the materials and textures of the triangles of a mesh.
 
@@ -128,7 +128,7 @@ class _MaterialOnSurface:
 
 
 def _read_material_on_surface(
-    material: Any, surface: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
+    material: Any, surface: TriangleSoup, time: Any, opened: OpenedStage, licence: str
 ) -> _MaterialOnSurface:
     """Evaluate a material on the whole mesh; the display color replaces a missing one."""
     held = read_held_material(material, time) if material else None

@@ -24,7 +24,7 @@ from pipeline.exchange.usd.foreign_meshes import TriangleSoup, read_mesh
 from pipeline.exchange.usd.names import FOV_DEG, INDEX, OBJECT_TEXTS, parse_camera_row
 from pipeline.foreign.usd.placed import DOMES, PlacedPrim, placed_prims
 from pipeline.foreign.usd.solids import SOLIDS
-from pipeline.foreign.usd.stage import OpenedUsd
+from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.scenes.shading import flat_shaded
 from storage.errors import TrilightError
 from storage.records.environment import Environment
@@ -36,7 +36,7 @@ MAX_ROWS = 1 << 16
 """Maximum number of objects, and of materials, in a scene."""
 
 
-def build_stage_scene(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Scene:
+def build_stage_scene(stage: Any, time: Any, opened: OpenedStage, licence: str) -> Scene:
     """Build the scene of a stage at a time; `opened.lost` receives notes on losses.
 
     Raises:
@@ -84,7 +84,7 @@ def _build_scene(
     pieces: Sequence[TexturedPiece],
     placed: Sequence[PlacedPrim],
     time: Any,
-    opened: OpenedUsd,
+    opened: OpenedStage,
     sky: Environment | None,
 ) -> Scene:
     arrays = join_arrays(pieces)
@@ -105,7 +105,7 @@ def _build_scene(
 
 
 def _read_environment(
-    placed: Sequence[PlacedPrim], time: Any, opened: OpenedUsd, licence: str
+    placed: Sequence[PlacedPrim], time: Any, opened: OpenedStage, licence: str
 ) -> Environment | None:
     """Return the environment of the first readable dome; note the others."""
     domes = [each for each in placed if each.prim.GetTypeName() in DOMES]
@@ -119,7 +119,7 @@ def _read_environment(
 
 
 def _pieces(
-    each: PlacedPrim, time: Any, opened: OpenedUsd, licence: str, names: set[str]
+    each: PlacedPrim, time: Any, opened: OpenedStage, licence: str, names: set[str]
 ) -> list[TexturedPiece]:
     prim = each.prim
     if prim.GetTypeName() not in ("Mesh", *SOLIDS):
@@ -153,7 +153,7 @@ def _build_light(triangles: NDArray[np.float32], light: NDArray[np.float32]) -> 
 
 
 def _build_mesh(
-    placed: PlacedPrim, soup: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
+    placed: PlacedPrim, soup: TriangleSoup, time: Any, opened: OpenedStage, licence: str
 ) -> TexturedTriangles:
     prim = placed.prim
     materials = read_surface_materials(soup, time, opened, licence)

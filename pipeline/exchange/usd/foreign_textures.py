@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.pictures import MAX_BYTES, Pixels, decode_pixels, is_encoded
 from pipeline.exchange.wrapping import Wrap
-from pipeline.foreign.usd.stage import OpenedUsd
+from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import TextureNode, UvChart, asset_bytes
 from storage.records.texture import MapSource, Texture
 
@@ -84,7 +84,7 @@ class ForeignTexture:
         return rgba * self.scale + self.bias
 
 
-def read_texture(node: TextureNode, opened: OpenedUsd) -> ForeignTexture | None:
+def read_texture(node: TextureNode, opened: OpenedStage) -> ForeignTexture | None:
     """Read the texture of a node; return None, with a note, where its picture is unreadable.
 
     Raises:

@@ -25,7 +25,7 @@ from pipeline.exchange.usd.names import (
 )
 from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS
 from pipeline.foreign.usd.shaders import surface_shader
-from pipeline.foreign.usd.stage import OpenedUsd
+from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import find_sources, is_output, read_texture_node
 from storage.records.material import EMISSION, declared_column, default_rows, laid_out
 from storage.records.texture import TEXTURED, MapSource, Texture
@@ -95,7 +95,7 @@ def parse_map_text(text: Any) -> tuple[str, MapSource] | None:
 
 
 def read_held_textures(
-    held: HeldMaterial | None, material: Any, time: Any, opened: OpenedUsd
+    held: HeldMaterial | None, material: Any, time: Any, opened: OpenedStage
 ) -> dict[str, ForeignTexture]:
     """Read the specular texture where only the coat roughness still refers to it."""
     from pxr import UsdShade

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.exchange.usd.foreign_scene import build_stage_scene
 from pipeline.exchange.usd.read_exact_scene import is_marked, read_exact, scene_keys
-from pipeline.foreign.usd.stage import OpenedUsd, read_quietly
+from pipeline.foreign.usd.stage import OpenedStage, read_quietly
 from storage.errors import TrilightError
 from storage.records.scene import Scene
 
@@ -36,7 +36,7 @@ def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
     Raises:
         TrilightError: the file is unusable (pipeline.foreign.usd.stage).
     """
-    return read_quietly(path, lambda: _keys(OpenedUsd(path, folder)))
+    return read_quietly(path, lambda: _keys(OpenedStage(path, folder)))
 
 
 def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> UsdScene:
@@ -55,7 +55,7 @@ def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> 
 
 
 def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> UsdScene:
-    opened = OpenedUsd(path, folder)
+    opened = OpenedStage(path, folder)
     shard = scene_keys(opened.root)
     if shard is not None:
         return _read_shard_scene(opened, shard, key or shard[0])
@@ -81,7 +81,7 @@ def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> Usd
     return UsdScene(key=chosen, scene=scene, lost=opened.notes, exact=False)
 
 
-def _read_shard_scene(opened: OpenedUsd, keys: list[str], key: str) -> UsdScene:
+def _read_shard_scene(opened: OpenedStage, keys: list[str], key: str) -> UsdScene:
     name = opened.path.name
     if key not in keys:
         raise TrilightError(f"{name}: no scene {key}; expected one of {keys[0]} to {keys[-1]}.")
@@ -94,7 +94,7 @@ def _read_shard_scene(opened: OpenedUsd, keys: list[str], key: str) -> UsdScene:
     return UsdScene(key=key, scene=scene, lost=(), exact=True)
 
 
-def _keys(opened: OpenedUsd) -> list[str]:
+def _keys(opened: OpenedStage) -> list[str]:
     shard = scene_keys(opened.root)
     if shard is not None:
         return shard

@@ -19,7 +19,7 @@ from pipeline.exchange.usd.exact_layer import (
 from pipeline.exchange.usd.texture_files import decode_texture
 from pipeline.exchange.usd.write_materials import material_tables
 from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, SHADERS, Used, material_links
-from pipeline.foreign.usd.stage import OpenedUsd
+from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.records.material import PUBLISHED_COLUMNS, declared_column, default_rows, laid_out
 from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
@@ -40,7 +40,7 @@ class ExactMaterials:
     """[M, 3] the value of `Scene.material_textures`; None without textures."""
 
 
-def read_exact_materials(folder: Any, opened: OpenedUsd | None) -> ExactMaterials:
+def read_exact_materials(folder: Any, opened: OpenedStage | None) -> ExactMaterials:
     """Read the materials below a prim.
 
     Args:
@@ -93,7 +93,7 @@ def _require_prims(
             require(connections == ([] if source is None else [f"{root_path}/{source}"]))
 
 
-def _read_textures(prim: Any, textures: dict[int, Texture], opened: OpenedUsd | None) -> Used:
+def _read_textures(prim: Any, textures: dict[int, Texture], opened: OpenedStage | None) -> Used:
     """Return the textures of a material, and add new ones to `textures`."""
     used = {}
     for name, shader in SHADERS.items():
@@ -109,7 +109,7 @@ def _read_textures(prim: Any, textures: dict[int, Texture], opened: OpenedUsd | 
     return used
 
 
-def _read_texture(attributes: Any, layer: Any, opened: OpenedUsd) -> Texture:
+def _read_texture(attributes: Any, layer: Any, opened: OpenedStage) -> Texture:
     named = attributes["inputs:file"].default.path
     resolved = opened.resolve(layer, named)
     data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)

@@ -37,7 +37,7 @@ from pipeline.exchange.usd.write_meshes import (
     sum_positions,
 )
 from pipeline.exchange.usd.write_textures import ST
-from pipeline.foreign.usd.stage import OpenedUsd
+from pipeline.foreign.usd.stage import OpenedStage
 from storage.conventions import require_readable
 from storage.errors import TrilightError
 from storage.records.environment import Environment
@@ -66,7 +66,9 @@ def is_marked(layer: Any, key: str | None = None) -> bool:
     return _find_root(layer, key) is not None
 
 
-def read_exact(layer: Any, key: str | None = None, opened: OpenedUsd | None = None) -> Scene | None:
+def read_exact(
+    layer: Any, key: str | None = None, opened: OpenedStage | None = None
+) -> Scene | None:
     """Read the scene of a layer or of a shard's key; return None where it was changed.
 
     Args:
@@ -107,7 +109,7 @@ def _find_root(layer: Any, key: str | None) -> Any:
     return root if root and all(mark in root.attributes for mark in marks) else None
 
 
-def _read_scene(root: Any, opened: OpenedUsd | None) -> Scene:
+def _read_scene(root: Any, opened: OpenedStage | None) -> Scene:
     sky = _read_environment(root, opened)
     names_of = {"Materials", "Objects", "Cameras"}
     folders = require_children(root, names_of if sky is None else {*names_of, ENVIRONMENT})
@@ -149,7 +151,7 @@ def _read_scene(root: Any, opened: OpenedUsd | None) -> Scene:
     return scene
 
 
-def _read_environment(root: Any, opened: OpenedUsd | None) -> Environment | None:
+def _read_environment(root: Any, opened: OpenedStage | None) -> Environment | None:
     prim = root.nameChildren.get(ENVIRONMENT)
     if prim is None:
         return None

@@ -14,7 +14,7 @@ from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.usd.placed import PlacedPrim, placed_prims
 from pipeline.foreign.usd.skins import UnposedMesh
 from pipeline.foreign.usd.solids import SOLIDS
-from pipeline.foreign.usd.stage import OpenedUsd, OutsideFile, read_quietly
+from pipeline.foreign.usd.stage import OpenedStage, OutsideFile, read_quietly
 from storage.errors import Rejected, TrilightError
 
 Read = TypeVar("Read")
@@ -24,7 +24,7 @@ Read = TypeVar("Read")
 class UsdStage:
     """A composed stage with its visible meshes."""
 
-    opened: OpenedUsd
+    opened: OpenedStage
     """Opened layers of the stage, with notes on unread contents."""
     composed: Any
     """The Usd.Stage, kept because its prims expire with it."""
@@ -60,7 +60,7 @@ def read_or_reject(path: Path, read: Callable[[], Read]) -> Read:
 def _read_stage(path: Path, limits: ReadLimits) -> UsdStage:
     from pxr import Usd
 
-    opened = OpenedUsd(path, max_file_bytes=limits.max_bytes)
+    opened = OpenedStage(path, max_file_bytes=limits.max_bytes)
     stage = opened.compose()
     time = Usd.TimeCode.EarliestTime()
     if opened.unresolved:

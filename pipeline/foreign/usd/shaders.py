@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.usd.colors import convert_to_rec709
 from pipeline.foreign.usd.polygons import CutMesh, as_array
-from pipeline.foreign.usd.stage import OpenedUsd
+from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import (
     TextureNode,
     find_sources,
@@ -205,7 +205,7 @@ def surface_shader(material: Any) -> Any:
 
 
 def read_material(
-    material: Any, time: Any, opened: OpenedUsd, known: Collection[str] = ()
+    material: Any, time: Any, opened: OpenedStage, known: Collection[str] = ()
 ) -> StatedMaterial | None:
     """Return the inputs of a material, or None where it has no supported shader.
 
@@ -247,7 +247,7 @@ def read_material(
 class _Reader:
     """Reads the inputs of one shader."""
 
-    def __init__(self, shader: Any, time: Any, opened: OpenedUsd) -> None:
+    def __init__(self, shader: Any, time: Any, opened: OpenedStage) -> None:
         self._shader = shader
         self._time = time
         self._opened = opened

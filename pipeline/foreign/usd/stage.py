@@ -51,7 +51,7 @@ class OutsideFile(TrilightError):
     """A named file that may not be read: in another folder, on the network, or no plain file."""
 
 
-class OpenedUsd:
+class OpenedStage:
     """A root layer with its notes; it resolves and opens all files that layers name."""
 
     def __init__(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.numbers import read_number, read_numbers
 from pipeline.foreign.usd.polygons import CutMesh
-from pipeline.foreign.usd.stage import OpenedUsd, file_and_member
+from pipeline.foreign.usd.stage import OpenedStage, file_and_member
 from storage.errors import TrilightError
 
 _MOST_NODES = 8
@@ -70,7 +70,7 @@ class TextureNode:
     """[4] RGBA value used without a picture; None where none is stated."""
 
 
-def read_texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> TextureNode:
+def read_texture_node(shader: Any, output: str, time: Any, opened: OpenedStage) -> TextureNode:
     """Return the inputs of a UsdUVTexture shader.
 
     Args:

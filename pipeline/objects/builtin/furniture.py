@@ -43,7 +43,7 @@ def furniture(params: FurnitureParams) -> Mesh:
     return join(parts)
 
 
-def furniture_rand(rng: np.random.Generator) -> Mesh:
+def sample_furniture(rng: np.random.Generator) -> Mesh:
     """Return a random piece of furniture."""
     kind = str(rng.choice(["table", "round", "chair", "chair", "shelf"]))
     width, depth, height = {

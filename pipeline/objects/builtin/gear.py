@@ -57,7 +57,7 @@ def gear(params: GearParams) -> Mesh:
     return grid.reshape(-1, 3), torus_faces(rows, len(section))
 
 
-def gear_rand(rng: np.random.Generator) -> Mesh:
+def sample_gear(rng: np.random.Generator) -> Mesh:
     """Return a random gear."""
     kind = rng.choice(["spur", "helical", "bevel"])
     half = float(rng.uniform(0.08, 0.35))

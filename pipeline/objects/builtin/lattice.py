@@ -46,7 +46,7 @@ def lattice(params: LatticeParams) -> Mesh:
     return _warp(unit, params), faces
 
 
-def lattice_rand(rng: np.random.Generator) -> Mesh:
+def sample_lattice(rng: np.random.Generator) -> Mesh:
     """Return a random lattice."""
     kind = str(rng.choice(["frame", "crate", "tower", "cage", "grille"]))
     low, high = {

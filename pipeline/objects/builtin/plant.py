@@ -85,7 +85,7 @@ def leaf_sheet(leaf: LeafParams, rise_rad: float) -> Mesh:
     return np.concatenate([grid.reshape(-1, 3), rib[-1:]]), faces
 
 
-def plant_rand(rng: np.random.Generator) -> Mesh:
+def sample_plant(rng: np.random.Generator) -> Mesh:
     """Return a random plant."""
     kind = str(rng.choice(["agave", "grass", "palm", "broad", "herb"]))
     leaf, numbers, stem, stalk, rises = {

@@ -44,7 +44,7 @@ def rock(params: RockParams) -> Mesh:
     return direction * radius[:, None] * np.array(params.half_sizes), faces
 
 
-def rock_rand(rng: np.random.Generator) -> Mesh:
+def sample_rock(rng: np.random.Generator) -> Mesh:
     """Return a random rock."""
     kind = rng.choice(["pebble", "broken", "layered"])
     cuts = _rand_cuts(rng, int(rng.integers(9, 22)))

@@ -53,7 +53,7 @@ def shell(params: ShellParams) -> Mesh:
     return np.concatenate([grid, poles]) @ lean.T, faces
 
 
-def shell_rand(rng: np.random.Generator) -> Mesh:
+def sample_shell(rng: np.random.Generator) -> Mesh:
     """Return a random shell."""
     kind = str(rng.choice(["nautilus", "snail", "turret", "whelk"]))
     growth, drop, tube, stretch, turns = {

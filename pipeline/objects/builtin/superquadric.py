@@ -45,7 +45,7 @@ def superquadric(params: SuperquadricParams) -> Mesh:
     return positions, sphere_faces(params.rings, params.columns)
 
 
-def superquadric_rand(rng: np.random.Generator) -> Mesh:
+def sample_superquadric(rng: np.random.Generator) -> Mesh:
     """Return a random superquadric."""
     box = rng.random() < 0.5
     exponents = np.exp(rng.uniform(np.log(0.12), np.log(0.6 if box else 3.2), 2))

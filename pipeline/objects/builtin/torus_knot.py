@@ -50,7 +50,7 @@ def torus_knot(params: TorusKnotParams) -> Mesh:
     return positions, torus_faces(params.segments, params.sides)
 
 
-def torus_knot_rand(rng: np.random.Generator) -> Mesh:
+def sample_torus_knot(rng: np.random.Generator) -> Mesh:
     """Return a random knot."""
     windings = _KNOTS[rng.integers(len(_KNOTS))]
     ribs = int(rng.choice([0, 3, 4, 5]))

@@ -53,7 +53,7 @@ def tree(params: TreeParams) -> Mesh:
     return join(parts)
 
 
-def tree_rand(rng: np.random.Generator) -> Mesh:
+def sample_tree(rng: np.random.Generator) -> Mesh:
     """Return a random tree."""
     crown = str(rng.choice(["masses", "masses", "tiers", "bare"]))
     children: tuple[int, ...] = (int(rng.integers(3, 5)), int(rng.integers(2, 4)))

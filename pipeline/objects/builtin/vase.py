@@ -45,7 +45,7 @@ def vase(params: VaseParams) -> Mesh:
     return positions, sphere_faces(2 * params.rings, params.columns)
 
 
-def vase_rand(rng: np.random.Generator) -> Mesh:
+def sample_vase(rng: np.random.Generator) -> Mesh:
     """Return a random vase."""
     radii = rng.uniform(0.16, 0.55, int(rng.integers(4, 7)))
     flutes = int(rng.choice([0, 0, 5, 6, 8, 10]))

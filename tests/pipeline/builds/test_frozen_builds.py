@@ -16,7 +16,7 @@ from pipeline.builds.judging import JUDGING_BUILDS
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.builds.renderformer import RENDERFORMER_BUILDS
 from scene_templates import lights, placement
-from scene_templates.cameras import camera_rand
+from scene_templates.cameras import sample_camera
 from scene_templates.rooms import PATCH_FACES, QUADS, SIDES
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
@@ -112,7 +112,7 @@ def _numbers(settings: SceneSettings, seed: int, index: int) -> np.ndarray:
     drawn = one_drawn(settings, index, seed)
     layout, after = drawn.layout, settings.of_scene(index)
     sector = TEMPLATES[drawn.plan.family.template].cameras
-    camera = camera_rand(rng_for(seed, "camera of a test", index), after.cameras, sector)
+    camera = sample_camera(rng_for(seed, "camera of a test", index), after.cameras, sector)
     found: list[Any] = [part.positions for part in layout.shell]
     for placed in layout.objects:
         found += [placed.pose.centre, placed.pose.radius, placed.pose.rotation]

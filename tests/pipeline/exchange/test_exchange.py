@@ -20,7 +20,7 @@ from pipeline.exchange.open_scene import SceneSource, load_source, scene_source
 from pipeline.exchange.renderformer_json import describe_scene
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.layout_rand import scene_plan
+from scene_templates.sample_layout import scene_plan
 from scene_templates.settings import SceneSettings
 from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS, columns_in_use, laid_out

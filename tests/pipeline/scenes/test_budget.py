@@ -39,7 +39,7 @@ def _asset(rungs: Rungs) -> Asset:
     )
 
 
-def _assets_rand(rng: np.random.Generator, most: int = 4) -> list[Asset]:
+def _sample_assets(rng: np.random.Generator, most: int = 4) -> list[Asset]:
     """Assets whose error falls with every triangle more, as it should."""
     assets = []
     for _ in range(rng.integers(1, most + 1)):
@@ -61,7 +61,7 @@ def test_budgets_hold_and_nothing_that_is_wanted_would_still_fit() -> None:
     rng = np.random.default_rng(0)
     rejected = refined = 0
     for _ in range(500):
-        assets, total = _assets_rand(rng), int(rng.integers(100, 3000))
+        assets, total = _sample_assets(rng), int(rng.integers(100, 3000))
         enough = float(rng.choice([0.0, 0.005, 0.02]))
         try:
             levels = levels_within(assets, total, enough)
@@ -91,7 +91,7 @@ def test_the_worst_error_is_the_least_that_the_budget_allows() -> None:
     rng = np.random.default_rng(1)
     compared = better = 0
     for _ in range(400):
-        assets, total = _assets_rand(rng, most=3), int(rng.integers(100, 2500))
+        assets, total = _sample_assets(rng, most=3), int(rng.integers(100, 2500))
         enough = float(rng.choice([0.0, 0.01]))
         fitting = [
             combination

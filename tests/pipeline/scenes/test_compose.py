@@ -12,7 +12,7 @@ from pipeline.renders.load_tracer import choose_tracing_scale
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.families import DEFAULT_FAMILIES
-from scene_templates.layout_rand import scene_plan
+from scene_templates.sample_layout import scene_plan
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected, TrilightError

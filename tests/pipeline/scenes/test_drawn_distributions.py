@@ -16,8 +16,8 @@ from pipeline.scenes.pieces import object_piece, shell_piece
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.shapes import MeshShape
 from scene_templates.layout import ShellPart, SurfaceLook
-from scene_templates.layout_rand import layout_rand, scene_plan
 from scene_templates.rooms import PATCH_FACES, SIDES, patch
+from scene_templates.sample_layout import sample_layout, scene_plan
 from storage.records.material import DIFFUSE
 from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
@@ -108,7 +108,7 @@ def test_how_far_meshes_shift_sizes(
         plan = scene_plan(settings, seed=0, scene_index=index)
         rng = rng_for(0, "scene", index, 0)
         shapes = [coarse[row] for row in rng.integers(len(coarse), size=plan.num_objects)]
-        layout = layout_rand(rng, settings, plan, shapes)
+        layout = sample_layout(rng, settings, plan, shapes)
         low, high = plan.family.object_scale
         sizes[plan.num_objects] += [
             (4 * placement.pose.radius - low) / (high - low) for placement in layout.objects

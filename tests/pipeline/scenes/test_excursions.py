@@ -12,8 +12,8 @@ from scipy.spatial.distance import pdist
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import differences
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.layout_rand import scene_plan
 from scene_templates.out_of_range import median_settings
+from scene_templates.sample_layout import scene_plan
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene
 from tests.pipeline.scenes.scene_facts import planes_of, points_of, rows_of, triangles_of

@@ -12,8 +12,8 @@ from pipeline.scenes.posing import in_unit_sphere, pose_points, without_slivers
 from pipeline.scenes.shapes import MeshShape
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Pose
-from scene_templates.layout_rand import scene_plan
 from scene_templates.rotations import uniform_rotation
+from scene_templates.sample_layout import scene_plan
 from scene_templates.settings import SceneSettings
 from storage.records.scene import Scene
 from storage.settings.changes import changed

@@ -15,7 +15,7 @@ from pipeline.scenes.views import (
     CAMERA_ATTEMPTS,
     ViewCamera,
     cameras_of_view,
-    view_problem,
+    visibility_problem,
     with_cameras,
 )
 from pipeline.scenes.visibility import Visibility
@@ -127,10 +127,12 @@ def test_light_is_seen_from_its_side_past_emitters_and_not_through_roofs() -> No
     assert (above.lit, above.shell_back, above.coverage) == (1.0, 0.0, 0.0)
     assert (below.lit, below.shell_back, below.coverage) == (0.0, 1.0, 0.0)
     # A scene without objects need not show any, and one with objects must.
-    assert view_problem(above, ViewLaws(), has_objects=False) is None
-    assert view_problem(above, ViewLaws(), has_objects=True) == "sees too little of the objects"
-    assert view_problem(below, ViewLaws(), has_objects=False) == "sees the back of the shell"
-    assert view_problem(below, ViewLaws(max_shell_back=1.0), has_objects=False) is not None
+    assert visibility_problem(above, ViewLaws(), has_objects=False) is None
+    assert (
+        visibility_problem(above, ViewLaws(), has_objects=True) == "sees too little of the objects"
+    )
+    assert visibility_problem(below, ViewLaws(), has_objects=False) == "sees the back of the shell"
+    assert visibility_problem(below, ViewLaws(max_shell_back=1.0), has_objects=False) is not None
     scene = tiny_scene()
     roof = scene.vertex_positions[:4] + np.array([0, 0, 1.5], np.float32)
     covered = dataclasses.replace(

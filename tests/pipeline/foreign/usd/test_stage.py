@@ -10,7 +10,7 @@ from pxr import Usd, UsdGeom
 from pipeline.exchange.usd.write import write_usd
 from pipeline.foreign.usd import composition, placed
 from pipeline.foreign.usd import stage as opening
-from pipeline.foreign.usd.stage import OpenedUsd, read_quietly
+from pipeline.foreign.usd.stage import OpenedStage, read_quietly
 from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.errors import TrilightError
 from tests.for_each import for_each
@@ -20,7 +20,7 @@ HEAD = "#usda 1.0\n"
 
 
 def prims_of(path: Path) -> list[str]:
-    stage = read_quietly(path, OpenedUsd(path).compose)
+    stage = read_quietly(path, OpenedStage(path).compose)
     return [str(prim.GetPath()) for prim in stage.Traverse()]
 
 
@@ -86,7 +86,7 @@ def test_brackets_in_the_name_of_a_folder_are_no_archive(tmp_path: Path, packed:
         for name, text in layers.items():
             (folder / name).write_text(text)
         assert asset_bytes(f"{folder}/lib.usda", 100) == layers["lib.usda"].encode()
-    opened = OpenedUsd(folder / ("s.usdz" if packed else "s.usda"))
+    opened = OpenedStage(folder / ("s.usdz" if packed else "s.usda"))
     stage = read_quietly(opened.path, opened.compose)
     assert [str(prim.GetPath()) for prim in stage.Traverse()] == ["/x", "/x/L"]
     assert opened.files == [opened.path, *([] if packed else [folder / "lib.usda"])]
@@ -100,16 +100,16 @@ def test_the_user_may_name_the_folder_and_the_stage_is_compared_with_it_at_last(
     folder = tmp_path / "inner"
     folder.mkdir()
     (folder / "a.usda").write_text(f'{HEAD}def "A" (references = @../shared.usda@</A>) {{}}')
-    stage = OpenedUsd(folder / "a.usda", tmp_path).compose()
+    stage = OpenedStage(folder / "a.usda", tmp_path).compose()
     assert len(list(stage.Traverse())) == 1
-    monkeypatch.setattr(OpenedUsd, "_open_all", lambda self: None)
+    monkeypatch.setattr(OpenedStage, "_open_all", lambda self: None)
     with pytest.raises(TrilightError, match="uses 'shared.usda' of another folder"):
         prims_of(folder / "a.usda")
 
 
 def test_what_is_missing_is_noted(tmp_path: Path) -> None:
     (tmp_path / "a.usda").write_text(f'{HEAD}def "A" (references = @./no.usda@</A>) {{}}')
-    opened = OpenedUsd(tmp_path / "a.usda")
+    opened = OpenedStage(tmp_path / "a.usda")
     read_quietly(opened.path, opened.compose)
     assert opened.lost == ["file './no.usda' is missing"]
 
@@ -118,12 +118,12 @@ def test_sizes_are_looked_at_first(tmp_path: Path) -> None:
     with (tmp_path / "a.usdc").open("wb") as stream:
         stream.truncate(opening.MAX_FILE_BYTES + 1)  # a hole: it takes no room
     with pytest.raises(TrilightError, match="expected a file of 1 to"):
-        OpenedUsd(tmp_path / "a.usdc")
+        OpenedStage(tmp_path / "a.usdc")
     (tmp_path / "b.usda").touch()
     with pytest.raises(TrilightError, match="0 bytes"):
-        OpenedUsd(tmp_path / "b.usda")
+        OpenedStage(tmp_path / "b.usda")
     with pytest.raises(TrilightError, match="cannot be read"):
-        OpenedUsd(tmp_path / "absent.usda")
+        OpenedStage(tmp_path / "absent.usda")
 
 
 @pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usdz"])
@@ -135,7 +135,7 @@ def test_cut_files(tmp_path: Path, suffix: str) -> None:
         cut = tmp_path / f"cut{kept}{suffix}"
         cut.write_bytes(data[:kept])
         with pytest.raises(TrilightError, match="^cut"):
-            OpenedUsd(cut)
+            OpenedStage(cut)
 
 
 def chain(length: int) -> str:

@@ -13,9 +13,9 @@ import numpy as np
 
 from scene_templates.families import Family
 from scene_templates.layout import Layout, ObjectPlacement, SurfaceLook
-from scene_templates.lights import emitters_rand
-from scene_templates.materials import surface_rand
-from scene_templates.placement import ObjectSpace, PlaceableShape, poses_rand
+from scene_templates.lights import sample_emitters
+from scene_templates.materials import sample_material
+from scene_templates.placement import ObjectSpace, PlaceableShape, sample_poses
 from scene_templates.rooms import SIDES, patch, plane_of
 from scene_templates.separate_sides import SeparateSides
 from scene_templates.settings import SceneSettings
@@ -42,16 +42,16 @@ def scene_plan(settings: SceneSettings, *, seed: int, scene_index: int) -> Scene
         1, len(settings.excursions)
     )  # every excursion meets every family
     settings = settings.of_scene(scene_index)
-    family = _family_rand(rng, settings, round_number)
+    family = _sample_family(rng, settings, round_number)
     return ScenePlan(
         family=family,
-        num_objects=_count_rand(rng, family.num_objects),
-        num_lights=_count_rand(rng, settings.lights.count),
+        num_objects=_sample_count(rng, family.num_objects),
+        num_lights=_sample_count(rng, settings.lights.count),
         overlaps=bool(rng.random() < settings.placement.overlap_share),
     )
 
 
-def _family_rand(rng: np.random.Generator, settings: SceneSettings, round_number: int) -> Family:
+def _sample_family(rng: np.random.Generator, settings: SceneSettings, round_number: int) -> Family:
     if settings.families_in_turn:
         return settings.families[round_number % len(settings.families)]
     weights = np.array([family.weight for family in settings.families])
@@ -61,11 +61,11 @@ def _family_rand(rng: np.random.Generator, settings: SceneSettings, round_number
     return settings.families[min(row, len(weights) - 1)]
 
 
-def _count_rand(rng: np.random.Generator, bounds: tuple[int, int]) -> int:
+def _sample_count(rng: np.random.Generator, bounds: tuple[int, int]) -> int:
     return int(rng.integers(bounds[0], bounds[1] + 1))
 
 
-def layout_rand(
+def sample_layout(
     rng: np.random.Generator,
     settings: SceneSettings,
     plan: ScenePlan,
@@ -84,14 +84,14 @@ def layout_rand(
     """
     family = plan.family
     template = TEMPLATES[family.template]
-    room = family.shell.room_rand(rng, template.parts)
+    room = family.shell.sample_room(rng, template.parts)
     placed = zip(template.parts, room.patches, strict=True)
     space = ObjectSpace(
         room=room,
         parts=template.parts,
         planes=tuple(plane_of(patch(SIDES[name], placement)) for name, placement in placed),
     )
-    poses = poses_rand(
+    poses = sample_poses(
         rng,
         settings.placement,
         space,
@@ -99,13 +99,13 @@ def layout_rand(
         object_scale=family.object_scale,
         overlaps=plan.overlaps,
     )
-    surfaces = tuple(_surface_rand(rng, settings, family, "shell") for _ in template.parts)
+    surfaces = tuple(_sample_surface(rng, settings, family, "shell") for _ in template.parts)
     objects = tuple(
-        ObjectPlacement(pose=pose, surface=_surface_rand(rng, settings, family, "object"))
+        ObjectPlacement(pose=pose, surface=_sample_surface(rng, settings, family, "object"))
         for pose in poses
     )
     centres = [pose.centre for pose in poses]
-    emitters = emitters_rand(rng, settings.lights, template.lights, plan.num_lights, centres)
+    emitters = sample_emitters(rng, settings.lights, template.lights, plan.num_lights, centres)
     shell = family.shell
     return template.layout(
         LayoutParams(
@@ -118,10 +118,10 @@ def layout_rand(
     )
 
 
-def _surface_rand(
+def _sample_surface(
     rng: np.random.Generator,
     settings: SceneSettings,
     family: Family,
     kind: Literal["shell", "object"],
 ) -> SurfaceLook:
-    return surface_rand(rng, settings.materials, smooth_share=family.smooth_share, kind=kind)
+    return sample_material(rng, settings.materials, smooth_share=family.smooth_share, kind=kind)
