@@ -21,7 +21,7 @@ from model.neural_renderer import NeuralRenderer
 from model.renderformer import RenderFormer
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, with_retries
 from pipeline.renders.preview import MOST_SPP, PreviewRenderer, PreviewSettings
-from pipeline.renders.renderer import finished, set_threads
+from pipeline.renders.renderer import run_to_end, set_threads
 from pipeline.renders.variant import Variant, activate, choose_variant
 from storage.errors import Rejected, TrilightError
 from storage.records.sample import Sample
@@ -253,7 +253,7 @@ def _price_preview(scene: Scene, settings: PreviewSettings) -> Price:
 
 def _show(renderer: PreviewRenderer, scene: Scene, view: int) -> NDArray[np.float32]:
     steps = renderer.view_steps(scene.c2w[view], float(scene.fov_deg[view]), _SEED)
-    return finished(steps).radiance_rgb
+    return run_to_end(steps).radiance_rgb
 
 
 def _network_price(renderer: NeuralRenderer, scene: Scene, resolution: int) -> Price:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.denoiser import Quality, denoise
 from pipeline.renders.preview import PreviewRenderer, PreviewSettings
-from pipeline.renders.renderer import finished
+from pipeline.renders.renderer import run_to_end
 from pipeline.renders.settings import Filtered
 from pipeline.renders.tracer import Features
 from storage.records.scene import Scene
@@ -91,7 +91,7 @@ def sampled_method(resolution: int, spp: int, denoiser: Filtered) -> Method:
     def load(scene: Scene) -> View:
         renderer = PreviewRenderer(scene, settings)
         return lambda c2w, fov_deg: (
-            finished(renderer.view_steps(c2w, fov_deg, SAMPLE_SEED)).radiance_rgb
+            run_to_end(renderer.view_steps(c2w, fov_deg, SAMPLE_SEED)).radiance_rgb
         )
 
     return load

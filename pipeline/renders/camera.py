@@ -17,7 +17,7 @@ class Camera:
     resolution: int
     """Width and height in pixels."""
 
-    def scaled(self, factor: float) -> "Camera":
+    def at_scale(self, factor: float) -> "Camera":
         """Return the camera that sees the same of a scene that is so many times as large."""
         c2w = self.c2w.copy()
         c2w[:3, 3] *= factor

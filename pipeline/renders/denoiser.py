@@ -23,7 +23,7 @@ _QUALITIES = {"high": "OIDN_QUALITY_HIGH", "fast": "OIDN_QUALITY_FAST"}
 _INPUTS = ("color", "albedo", "normal")
 
 DenoiserDevice = Literal["CPU", "CUDA"]
-"""What Open Image Denoise runs on. It supports more cards, but Mitsuba renders on CUDA alone."""
+"""What Open Image Denoise runs on. It supports more GPUs, but Mitsuba renders on CUDA alone."""
 
 _threads = 0
 """Threads of filters made from now on; 0 is all cores."""
@@ -47,7 +47,7 @@ def set_denoiser_device(device: DenoiserDevice) -> None:
 def denoise(
     radiance_rgb: NDArray[np.float32], features: Features, quality: Quality
 ) -> NDArray[np.float32]:
-    """Return the picture without noise, exactly black where no ray met anything.
+    """Return the picture without noise, exactly black where no ray hit anything.
 
     Args:
         radiance_rgb: [R, R, 3] finite and at least 0. Values that are not finite vanish in the
@@ -60,8 +60,8 @@ def denoise(
     filtered = _filter(radiance_rgb.shape[0], quality, _device, _threads)
     inputs = (radiance_rgb, features.albedo, features.normal)
     picture = filtered.run(dict(zip(_INPUTS, inputs, strict=True)))
-    met = np.any(features.normal != 0, axis=-1) | np.any(radiance_rgb != 0, axis=-1)
-    return np.where(met[..., None], np.maximum(picture, 0), np.float32(0))
+    covered = np.any(features.normal != 0, axis=-1) | np.any(radiance_rgb != 0, axis=-1)
+    return np.where(covered[..., None], np.maximum(picture, 0), np.float32(0))
 
 
 def denoise_arrays(
@@ -182,7 +182,7 @@ def open_device(device: DenoiserDevice, threads: int = 0) -> Any:
     """Return a device of Open Image Denoise; raises RuntimeError where there is none.
 
     Args:
-        device: what it runs on. A card is the first one, on which Mitsuba renders too.
+        device: CPU, or CUDA for the first GPU, on which Mitsuba renders too.
         threads: of the processor; 0 is all cores.
     """
     oidn = load_oidn()
@@ -197,8 +197,8 @@ def open_device(device: DenoiserDevice, threads: int = 0) -> Any:
     return opened
 
 
-def card_is_supported() -> bool:
-    """Return whether Open Image Denoise can run on the first graphics card (CUDA)."""
+def gpu_is_supported() -> bool:
+    """Return whether Open Image Denoise can run on the first GPU (CUDA)."""
     return bool(load_oidn().Device.is_cuda_available())
 
 

@@ -23,7 +23,7 @@ from pipeline.renders.pixel_arithmetic import (
     channel_sum,
     choose,
     clean,
-    converged,
+    converged_mask,
     estimates,
     log10,
     reduce_tiles,
@@ -32,7 +32,7 @@ from pipeline.renders.pixel_arithmetic import (
     where_any,
     with_means_of,
 )
-from pipeline.renders.recorded_calls import KernelInputs, recorded
+from pipeline.renders.recorded_calls import KernelInputs, record_launches
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tiles import TILE_PX, tile_means
@@ -89,9 +89,9 @@ class DevicePictures:
         self._masks = masks
         bits = read_numbers(masks).reshape(camera.resolution, camera.resolution)
         self.hits = bits & 1 > 0
-        self.shown = bits & 2 > 0
-        if not self.shown.any():
-            self.shown[:] = True
+        self.visible = bits & 2 > 0
+        if not self.visible.any():
+            self.visible[:] = True
         hits = TILE * tile_means(self.hits.astype(np.float64)).ravel()
         everywhere = np.full_like(hits, TILE)
         self._counts = everywhere, everywhere, hits
@@ -147,14 +147,14 @@ def _sums(samples: HalfSamples) -> Sums:
     return [[each.sums for each in half] for half in samples.sums]  # type: ignore[attr-defined]
 
 
-@recorded
+@record_launches
 def _brightness(_: Any, sums: Sums, resolution: int) -> Any:
     """Return the sum of all channels of the mean of both halves, and the broken pixels."""
     means = [add_up(half) for half in _half_means(sums)]
     return totals([channel_sum(add_up(means)) / 2, _broken(sums)], resolution)
 
 
-@recorded
+@record_launches
 def _guides(
     _: Any, arrays: dict[str, Any], hits: Any, names: Sequence[str], resolution: int
 ) -> tuple[Any, Any]:
@@ -165,12 +165,12 @@ def _guides(
         albedo = mi.Color3f(arrays.get(name.partition("_")[0], arrays["albedo"]))
         seen = normal if name.partition("_")[0] not in arrays else where_any(albedo, normal)
         guides[name] = dr.ravel(albedo), dr.ravel(seen)
-    shown: Any = functools.reduce(operator.or_, normal != 0)
+    visible: Any = functools.reduce(operator.or_, normal != 0)
     byte: Any = mi.UInt8
-    return guides, byte(dr.select(hits, 1, 0) + dr.select(shown, 2, 0))
+    return guides, byte(dr.select(hits, 1, 0) + dr.select(visible, 2, 0))
 
 
-@recorded
+@record_launches
 def _raws(
     _: Any, sums: Sums, names: Sequence[str], of_both: bool, resolution: int
 ) -> list[list[Any]]:
@@ -181,7 +181,7 @@ def _raws(
     ]
 
 
-@recorded
+@record_launches
 def _measure(
     _: Any,
     sums: Sums,
@@ -206,7 +206,7 @@ def _measure(
     if is_filtered and len(sums[0]) == 1:
         picture = [[(a + b) / 2 for a, b in zip(*each, strict=True)] for each in (denoised, raws)]
         error = _squared_error_of_means(sums)
-        right = converged(picture[0], picture[1], error, resolution)
+        right = converged_mask(picture[0], picture[1], error, resolution)
         corrected = [choose(right, *each) for each in zip(raws, denoised, strict=True)]
     hit = (masks & 1) > 0
     rows = []
@@ -222,7 +222,7 @@ def _measure(
     return dr.concat([sums_of_tiles, reduce_tiles(most, dr.ReduceOp.Max, resolution)]), new_logs
 
 
-@recorded
+@record_launches
 def _finish(
     _: Any,
     sums: Sums,
@@ -237,7 +237,7 @@ def _finish(
     if is_filtered:
         (pictures,) = _clean_pictures(raws, filtered, guides, names, resolution)
         if len(sums[0]) == 1:
-            right = converged(pictures, raws[0], _squared_error_of_means(sums), resolution)
+            right = converged_mask(pictures, raws[0], _squared_error_of_means(sums), resolution)
             pairs = list(zip(choose(right, raws[0], pictures), raws[0], strict=True))
             pictures = with_means_of(pairs, resolution)
     else:

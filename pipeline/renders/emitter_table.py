@@ -27,13 +27,13 @@ class EmitterPoint:
     """A sampled point on an emitter, lane by lane."""
 
     position: Any
-    """Point3f."""
+    """Position on the triangle, Point3f in meters."""
     normal: Any
     """Vector3f, unit; its side does not matter."""
     area_density: Any
-    """Float: probability per area of this point among all emitters."""
+    """Probability of this point among all emitters, Float per square meter."""
     radiance: Any
-    """Color3f."""
+    """Emitted radiance, Color3f; equal in all directions."""
 
 
 class EmitterTable:
@@ -63,7 +63,8 @@ class EmitterTable:
         radiance = scene.materials[scene.material_index[order]][:, EMISSION].astype(np.float64)
         if lit is not None:
             radiance *= lit[:, None]
-        edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        edge1 = corners[:, 1] - corners[:, 0]
+        edge2 = corners[:, 2] - corners[:, 0]
         area = 0.5 * np.linalg.norm(np.cross(edge1, edge2), axis=1)
         power = area * radiance.mean(axis=1)
         if not power.sum() > 0 and may_be_dark:
@@ -91,12 +92,13 @@ class EmitterTable:
         column = dr.minimum(mi.UInt32(scaled), self._count - 1)
         fraction = scaled - mi.Float(column)
         keep, alias = dr.gather(mi.Vector2f, self._alias, column, active)
-        kept = fraction < keep
-        row = dr.select(kept, column, mi.UInt32(alias))
-        fraction = dr.select(kept, fraction / keep, (fraction - keep) / (1 - keep))
+        keeps = fraction < keep
+        row = dr.select(keeps, column, mi.UInt32(alias))
+        fraction = dr.select(keeps, fraction / keep, (fraction - keep) / (1 - keep))
         fraction = dr.clip(fraction, 0, _ONE_MINUS_EPSILON)
         corner, edge1, edge2, radiance = (self._group(row, group, active) for group in range(4))
-        edge1, edge2 = mi.Vector3f(edge1.xyz), mi.Vector3f(edge2.xyz)
+        edge1 = mi.Vector3f(edge1.xyz)
+        edge2 = mi.Vector3f(edge2.xyz)
         weights = mi.warp.square_to_uniform_triangle(mi.Point2f(fraction, u.y))
         return EmitterPoint(
             position=mi.Point3f(mi.Point3f(corner.xyz) + edge1 * weights.x + edge2 * weights.y),
@@ -116,11 +118,13 @@ class EmitterTable:
 
 def alias_table(share: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
     """Return for each column the part that it keeps and the row that the rest goes to."""
-    keep, alias = share * len(share), np.arange(len(share))
+    keep = share * len(share)
+    alias = np.arange(len(share))
     small = [row for row in range(len(share)) if keep[row] < 1]
     large = [row for row in range(len(share)) if keep[row] >= 1]
     while small and large:
-        poor, rich = small.pop(), large[-1]
+        poor = small.pop()
+        rich = large[-1]
         alias[poor] = rich
         keep[rich] -= 1 - keep[poor]
         if keep[rich] < 1:

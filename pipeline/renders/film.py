@@ -30,7 +30,8 @@ class Film:
 
     def rays(self, x: Any, y: Any) -> Any:
         """Return rays through points of the picture in pixels: storage.conventions.camera_rays."""
-        right, up = self._right * (x - self._half), self._up * (self._half - y)
+        right = self._right * (x - self._half)
+        up = self._up * (self._half - y)
         return mi.Ray3f(self.origin, dr.normalize(right + up - self._backward * self._focal))
 
     def corners(self, pixel: Any) -> tuple[Any, Any]:
@@ -46,7 +47,8 @@ class Film:
         y = self._half - scale * dr.dot(local, self._up)
         width = mi.Float(self._width)
         inside = (scale > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < width)
-        row, column = mi.UInt32(dr.select(inside, y, 0)), mi.UInt32(dr.select(inside, x, 0))
+        row = mi.UInt32(dr.select(inside, y, 0))
+        column = mi.UInt32(dr.select(inside, x, 0))
         return row * self._width + column, inside
 
     def density(self, direction: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The BRDF inside a kernel: Lambert plus GGX without Fresnel, compensated for multiple scattering.
+"""The BSDF inside a kernel: Lambert plus GGX without Fresnel, with multiple scattering.
 
     f = diffuse / pi + scale * specular * D * G2 / (4 cos_i cos_o)
 
@@ -27,15 +27,15 @@ class KernelLobes:
     """The material of each lane, as Dr.Jit arrays."""
 
     diffuse: Any
-    """Color3f."""
+    """Albedo of the Lambert lobe, Color3f."""
     specular: Any
-    """Color3f: with the scale of `seen_from`, after which it may exceed 1."""
+    """Albedo of the GGX lobe, Color3f; scaled by `seen_from`, it may exceed 1."""
     alpha: Any
-    """Float: GGX width."""
+    """GGX width, Float: the square of the roughness."""
     weight: Any
-    """Float: share of the specular lobe."""
-    again: Any
-    """Color3f: Fms of storage.optics.multiscatter."""
+    """Probability of the specular lobe in a sample, Float."""
+    multiscatter: Any
+    """Multiple-scattering factor Fms (storage.optics.multiscatter), Color3f."""
 
 
 class AlbedoLookup:
@@ -58,7 +58,8 @@ class AlbedoLookup:
         # bounded: what is no number becomes another integer on each kind of processor
         column = dr.minimum(mi.UInt32(u), X_STEPS - 1)
         row = dr.minimum(mi.UInt32(v), ROUGHNESS_STEPS - 1)
-        u, v = u - mi.Float(column), v - mi.Float(row)
+        u = u - mi.Float(column)
+        v = v - mi.Float(row)
         near = dr.gather(mi.Vector4f, self._rows, row * X_STEPS + column, active)
         return dr.lerp(dr.lerp(near.x, near.y, u), dr.lerp(near.z, near.w, u), v)
 
@@ -69,7 +70,7 @@ def seen_from(lobes: KernelLobes, wi: Any, albedo: Any) -> KernelLobes:
     A shading normal may turn away from a viewer who sees the triangle's front: then the specular
     lobe is gone, as in Cycles.
     """
-    scaled = lobes.specular * (1 + lobes.again * ((1 - albedo) / albedo))
+    scaled = lobes.specular * (1 + lobes.multiscatter * ((1 - albedo) / albedo))
     return replace(lobes, specular=scaled, weight=dr.select(wi.z > 0, lobes.weight, 0))
 
 
@@ -93,7 +94,8 @@ def evaluate(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> tuple[Any,
     density = (1 - lobes.weight) * cosine + lobes.weight * facets / (1 + masked_in)
     reflected = lobes.diffuse * cosine + dr.select(dr.dot(wo, geometric) > 0, mirrored, 0)
     # A viewer below has no specular lobe: its terms are 0 times what may be infinite.
-    faces, above = wi.z > 0, wo.z > 0
+    faces = wi.z > 0
+    above = wo.z > 0
     reflected = dr.select(faces, reflected, lobes.diffuse * cosine)
     density = dr.select(faces, density, cosine)
     return dr.select(above, reflected, 0), dr.select(above, density, 0)

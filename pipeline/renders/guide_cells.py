@@ -1,4 +1,4 @@
-"""Cells of a scene's surfaces, in each of which path guiding may know other directions.
+"""Cells of a scene's surfaces: path guiding learns directions for each of them.
 
 Each triangle is cut into a grid of cells of bounded size, apart for its two sides.
 """
@@ -24,7 +24,8 @@ class GuideCells:
 
     def __init__(self, corners: NDArray[np.float64]) -> None:
         """Cut triangles, [T, 3, 3], into cells."""
-        edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        edge1 = corners[:, 1] - corners[:, 0]
+        edge2 = corners[:, 2] - corners[:, 0]
         normal = np.cross(edge1, edge2)
         area = 0.5 * np.linalg.norm(normal, axis=1)
         self.size_m = max(float(np.sqrt(area.sum() / _CELLS)), np.finfo(np.float32).tiny)
@@ -37,7 +38,8 @@ class GuideCells:
             np.arange(len(triangle)) - first[triangle], cuts[triangle]
         )
         u, v = ((place + 0.5) / cuts[triangle] for place in (column, row))
-        u, v = np.where(u + v > 1, 1 - v, u), np.where(u + v > 1, 1 - u, v)
+        is_beyond = u + v > 1
+        u, v = np.where(is_beyond, (1 - v, 1 - u), (u, v))
         self.centres_m = (
             corners[triangle, 0] + u[:, None] * edge1[triangle] + v[:, None] * edge2[triangle]
         )
@@ -50,7 +52,8 @@ class GuideCells:
     def index(self, triangle: Any, barycentric: Any, front: Any, active: Any) -> Any:
         """Return the cell (UInt32) of a point; `front` says which side of the triangle it is."""
         row = dr.gather(mi.Vector2u, self._rows, triangle, active)
-        first, cuts = row.x, row.y
+        first = row.x
+        cuts = row.y
         column, line = (
             dr.minimum(mi.UInt32(dr.maximum(weight, 0) * mi.Float(cuts)), cuts - 1)
             for weight in barycentric

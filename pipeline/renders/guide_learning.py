@@ -1,4 +1,4 @@
-"""What path guiding knows of a scene, learnt from light paths once (after Jensen 1995).
+"""Learns the guide table of a scene from photons, once (after Jensen 1995).
 
 Small cells have few photons. So cells that lie in one cube of space and face the same way share a
 row, from small cubes to large ones: a cell takes the smallest that has enough photons, with a part
@@ -29,29 +29,30 @@ _PARENT = 0.25
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Photons:
-    """Where light arrived by way of a narrow lobe."""
+    """Photons that arrived by way of a narrow lobe."""
 
     cell: NDArray[np.int64]
-    """[P]."""
+    """[P] cell that each photon hit (`GuideCells`)."""
     bin: NDArray[np.int64]
-    """[P] of the direction from which it came."""
+    """[P] bin of the direction from which each photon came (`bin_of`)."""
     power: NDArray[np.float64]
     """[P] in any unit, above 0."""
 
 
 def learn(cells: GuideCells, photons: Photons) -> GuideTable | None:
-    """Return the table, or None where too few photons arrived anywhere."""
+    """Return the guide table, or None if no cell got enough photons."""
     least = max(_LEAST_PHOTONS, math.ceil(len(photons.cell) / _MOST_ROWS))
-    row_of_cell, rows = np.zeros(len(cells.facing), np.int64), np.zeros((1, BINS))
+    row_of_cell = np.zeros(len(cells.facing), np.int64)
+    rows = np.zeros((1, BINS))
     for level in reversed(range(_LEVELS)):
         group = _groups(cells, cells.size_m * 2**level)
-        enough = np.flatnonzero(
+        large_groups = np.flatnonzero(
             np.bincount(group[photons.cell], minlength=group.max() + 1) >= least
         )
         place = np.full(group.max() + 1, -1)
-        place[enough] = np.arange(len(enough))
-        finer = _shares(_histograms(place[group], photons, len(enough)))
-        parents = np.zeros(len(enough), np.int64)
+        place[large_groups] = np.arange(len(large_groups))
+        finer = _shares(_histograms(place[group], photons, len(large_groups)))
+        parents = np.zeros(len(large_groups), np.int64)
         held = place[group] >= 0
         parents[place[group[held]]] = row_of_cell[held]
         known = (parents > 0)[:, None]
@@ -61,10 +62,10 @@ def learn(cells: GuideCells, photons: Photons) -> GuideTable | None:
     used, row_of_cell = np.unique(np.append(row_of_cell, 0), return_inverse=True)
     if len(used) == 1:
         return None
-    return GuideTable(cells, row_of_cell[:-1], apportioned(rows[used[1:]]))
+    return GuideTable(cells, row_of_cell[:-1], apportion_entries(rows[used[1:]]))
 
 
-def apportioned(shares: NDArray[np.float64]) -> NDArray[np.int64]:
+def apportion_entries(shares: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return shares [N, BINS] as whole numbers that add up to ENTRIES; each row of shares to 1."""
     edges = np.rint(np.cumsum(shares, axis=1) * ENTRIES).astype(np.int64)
     return np.diff(edges, axis=1, prepend=0)

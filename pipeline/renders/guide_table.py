@@ -38,12 +38,12 @@ _ROUGH_ALPHA = 0.05
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Guidance:
-    """What guides a path at its vertex, lane by lane."""
+    """The guide of each path at its vertex, lane by lane."""
 
     row: Any
-    """UInt32: of the table."""
+    """Row of the guide table, UInt32; 0 is not guided."""
     share: Any
-    """Float: of the directions that are drawn from the row."""
+    """Fraction of directions that are drawn from the row, Float."""
 
 
 class GuideTable:
@@ -61,7 +61,8 @@ class GuideTable:
         """
         bins = np.repeat(np.tile(np.arange(BINS), len(counts)), counts.ravel())
         on_square = np.concatenate([np.zeros(BINS), counts.ravel() * (BINS / 4 / ENTRIES)])
-        self._cells, self._row_of_cell = cells, own_integers(row_of_cell)
+        self._cells = cells
+        self._row_of_cell = own_integers(row_of_cell)
         self._bins = own_integers(np.concatenate([np.zeros(ENTRIES, np.int64), bins]))
         self._densities = own_floats(on_square)
 
@@ -107,11 +108,13 @@ def bin_of(direction: Any) -> tuple[Any, Any]:
     An area on the square [-1, 1]^2 is a solid angle divided by the third power of that sum.
     """
     length = dr.abs(direction.x) + dr.abs(direction.y) + dr.abs(direction.z)
-    x, y = direction.x / length, direction.y / length
+    x = direction.x / length
+    y = direction.y / length
     below = direction.z < 0
     folded_x = dr.mulsign(1 - dr.abs(y), x)
     folded_y = dr.mulsign(1 - dr.abs(x), y)
-    x, y = dr.select(below, folded_x, x), dr.select(below, folded_y, y)
+    x = dr.select(below, folded_x, x)
+    y = dr.select(below, folded_y, y)
     # A direction of no length is no number, and what that is as an integer is the processor's own:
     # bounded behind the conversion too, it reads within the table, and its light is nothing anyway.
     column, line = (

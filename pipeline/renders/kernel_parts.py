@@ -19,8 +19,9 @@ class KernelParts:
     """The sums of a kernel. Not a dataclass: Dr.Jit would take it for variables of the loop."""
 
     def __init__(self, *, bounces: bool, lobes: bool) -> None:
-        """Say what is apart, as `storage.records.parts.part_names`."""
-        self._bounces, self._lobes = bounces, lobes
+        """Choose the sums, as `storage.records.parts.part_names`."""
+        self._bounces = bounces
+        self._lobes = lobes
         self.count = max(1, len(part_names(bounces=bounces, lobes=lobes)))
         """Number of sums."""
         self.num_lobes = 2 if lobes else 1
@@ -31,7 +32,7 @@ class KernelParts:
         return [mi.Color3f(0) for _ in range(self.count)]
 
     def first_share(self) -> Any:
-        """Return what `carried` returns for a path that has met no surface."""
+        """Return the value of `carry_share` for a path that has hit no surface."""
         return mi.Color3f(0) if self._lobes else None
 
     def share(self, vertex: Vertex, local: Any) -> Any:
@@ -47,7 +48,7 @@ class KernelParts:
             return None
         return ggx.diffuse_share(vertex.lobes, vertex.incoming, local, vertex.geometric)
 
-    def carried(self, vertex: Vertex, local: Any, depth: Any, before: Any) -> Any:
+    def carry_share(self, vertex: Vertex, local: Any, depth: Any, before: Any) -> Any:
         """Return the `share` of the first vertex of a path, which has `depth` (UInt32) by now."""
         if not self._lobes:
             return None

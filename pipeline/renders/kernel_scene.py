@@ -1,4 +1,4 @@
-"""One scene as kernels see it, and what the paths of both kinds have in common at its surfaces."""
+"""One scene as kernels see it, and the surface code that both kinds of paths share."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -46,7 +46,7 @@ class KernelScene:
         guide: GuideTable | None = None,
         sky: SkyTable | None = None,
     ) -> None:
-        """Bring the parts together.
+        """Combine the tables.
 
         Args:
             surfaces: mi.Scene without emitters: what camera rays meet.
@@ -58,7 +58,7 @@ class KernelScene:
             max_depth: longest path in edges.
             rr_depth: edges after which a path goes on by Russian roulette.
             guide: the directions in which camera paths look for light; None: by the BRDF alone.
-            sky: light from far away; None makes the kernel that knows of none.
+            sky: the environment map; None compiles a kernel without one.
         """
         self.surfaces = surfaces
         self.everything = everything
@@ -72,8 +72,8 @@ class KernelScene:
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
 
-    def picked(self, density: Any) -> Any:
-        """Return a density (Float) of picks among lamps as one among all, the sky's too."""
+    def to_pick_density(self, density: Any) -> Any:
+        """Return a density among lamps (Float) as a density among lamps and sky."""
         return density if self.sky is None else self.sky.of_lamps(density)
 
 
@@ -83,17 +83,17 @@ class Vertex:
 
     point: SurfacePoint
     triangle: Any
-    """UInt32."""
+    """Triangle number, UInt32; surfaces first, then emitters."""
     barycentric: Any
-    """Point2f: weights of the 2nd and 3rd corner."""
+    """Weights of the 2nd and 3rd corner, Point2f."""
     front: Any
-    """Bool: whether the ray came to the front of the triangle, by its winding."""
+    """True where the ray hit the front of the triangle by its winding, Bool."""
     frame: Any
-    """Frame3f: shading frame, turned over with the triangle to face the incoming ray."""
+    """Shading frame, flipped with the triangle to face the incoming ray, Frame3f."""
     geometric: Any
-    """Vector3f: normal of the triangle on the side of the incoming ray, in the frame."""
+    """Normal of the triangle on the side of the incoming ray, in the frame, Vector3f."""
     incoming: Any
-    """Vector3f: where the path came from, in the frame."""
+    """Direction to the previous vertex, in the frame, Vector3f."""
     lobes: KernelLobes
 
 

@@ -20,8 +20,11 @@ from pipeline.renders.device_memory import own_floats, own_integers
 from storage.records.scene import Scene
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
-_COLOUR, _NUMBER = 4, 1
-"""Floats of a texel: colours are padded, so that a lane loads one as an aligned group."""
+_COLOUR = 4
+"""Floats of a color texel, padded so that a lane loads it as an aligned group."""
+
+_NUMBER = 1
+"""Floats of a texel of numbers."""
 
 _BLOCK = 1 << 16
 """Texels that are decoded at a time."""
@@ -68,25 +71,25 @@ class KernelTextures:
         v = weight * near.y + barycentric.x * near.w + barycentric.y * far.y
         material = dr.gather(mi.UInt32, self._material, triangle, active)
         kinds = (mi.Color3f, mi.Color3f, mi.Float)
-        found = []
+        values = []
         for place, (kind, constant) in enumerate(zip(kinds, columns, strict=True)):
             row = material * len(TEXTURED) + place
             texture = dr.gather(mi.Vector4u, self._rows, row, active)
             textured = active & (texture.w > 0)
             value = self._bilinear(kind, texture, u - dr.floor(u), v - dr.floor(v), textured)
-            found.append(dr.select(textured, value, constant))
-        return found[0], found[1], found[2]
+            values.append(dr.select(textured, value, constant))
+        return values[0], values[1], values[2]
 
     def _bilinear(self, kind: Any, texture: Any, u: Any, v: Any, active: Any) -> Any:
         """Return the value at u and v in [0, 1] of a texture (Vector4u: first, width, height)."""
-        left, right, along = _neighbours(u, texture.y)
+        near, far, along = _neighbours(u, texture.y)
         low, high, across = _neighbours(v, texture.z)
 
         def row(line: Any) -> Any:
             first = texture.x + line * texture.y
             return dr.lerp(
-                self._texel(kind, first + left, active),
-                self._texel(kind, first + right, active),
+                self._texel(kind, first + near, active),
+                self._texel(kind, first + far, active),
                 along,
             )
 
@@ -110,7 +113,8 @@ def _neighbours(place: Any, count: Any) -> tuple[Any, Any, Any]:
 
 def _places(textures: list[Texture]) -> dict[str, tuple[int, int, int, int]]:
     """Return where each texture begins, in texels, its width and height, and 1: it is there."""
-    places, first = {}, 0
+    places = {}
+    first = 0
     for texture in textures:
         height, width = texture.texels.shape[:2]
         places[texture.sha256] = (first, width, height, 1)
@@ -121,7 +125,8 @@ def _places(textures: list[Texture]) -> dict[str, tuple[int, int, int, int]]:
 def _texels(textures: list[Texture], floats: int) -> Any:
     """Return the linear values of all texels, row by row, `floats` of each; 0 beyond its own."""
     count = sum(each.texels.shape[0] * each.texels.shape[1] for each in textures)
-    values, first = np.zeros((max(1, count), floats), np.float32), 0
+    values = np.zeros((max(1, count), floats), np.float32)
+    first = 0
     for texture in textures:
         flat = texture.texels.reshape(-1, texture.channels)
         for start in range(0, len(flat), _BLOCK):

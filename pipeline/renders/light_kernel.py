@@ -76,7 +76,7 @@ def trace_light(
         scene: the scene.
         film: the camera.
         parts: what is kept apart; all light that lands is indirect.
-        light_paths: Float, light paths for each sample of a pixel, as `trace` was told.
+        light_paths: Float, light paths for each sample of a pixel, the same as of `trace`.
         emitter: where the path of each lane begins.
         u_direction: Point2f, uniform, for the directions in which they leave.
         sampler: mi.Sampler with a lane for each path.
@@ -93,22 +93,27 @@ def trace_light(
     ray = mi.Ray3f(off_surface(start, direction), direction)
     hit = scene.everything.ray_intersect_preliminary(ray, active=active)
     active &= hit.is_valid()
-    triangle, barycentric = mi.UInt32(hit.prim_index), mi.Point2f(hit.prim_uv)
-    pick_odds, depth = mi.Float(scene.picked(dr.square(hit.t) / leaving)), mi.UInt32(1)
+    triangle = mi.UInt32(hit.prim_index)
+    barycentric = mi.Point2f(hit.prim_uv)
+    pick_odds = mi.Float(scene.to_pick_density(dr.square(hit.t) / leaving))
+    depth = mi.UInt32(1)
     while active:
         point = scene.table.point(triangle, barycentric, active)
         vertex = vertex_at(scene, point, triangle, barycentric, direction, active)
         spread = dr.maximum(dr.dot(vertex.geometric, vertex.incoming), SMALLEST_COSINE)
-        throughput, hit_odds, pick_odds = throughput / spread, hit_odds / spread, pick_odds / spread
+        throughput = throughput / spread
+        hit_odds = hit_odds / spread
+        pick_odds = pick_odds / spread
         visible = active & (triangle < scene.num_surfaces)
         landing = visible & (depth > 1) & (depth < scene.max_depth)
         odds = dr.minimum(dr.hypot(hit_odds, pick_odds), MOST_ODDS) / light_paths
         place = film, light_paths, vertex, odds, landing
-        value, share, pixel, landing = _landed(scene, parts, *place)
+        value, share, pixel, landing = _connect_to_camera(scene, parts, *place)
         _add(splats, parts.by_lobe(throughput * strength * value, share), pixel, landing)
         depth += 1
         active &= depth < scene.max_depth
-        u_lobe, u_local = sampler.next_1d(active), sampler.next_2d(active)
+        u_lobe = sampler.next_1d(active)
+        u_local = sampler.next_2d(active)
         local, reflected, forward, ratio = bounce(scene, vertex, u_lobe, u_local, active)
         throughput *= reflected * ratio
         hit_odds = dr.minimum(hit_odds * forward * ratio, MOST_ODDS)
@@ -119,7 +124,8 @@ def trace_light(
         ray = mi.Ray3f(off_surface(point, direction), direction)
         hit = scene.everything.ray_intersect_preliminary(ray, active=active)
         active &= hit.is_valid()
-        triangle, barycentric = mi.UInt32(hit.prim_index), mi.Point2f(hit.prim_uv)
+        triangle = mi.UInt32(hit.prim_index)
+        barycentric = mi.Point2f(hit.prim_uv)
 
 
 def _add(splats: Sequence[Splats], values: list[Any], pixel: Any, active: Any) -> None:
@@ -127,7 +133,7 @@ def _add(splats: Sequence[Splats], values: list[Any], pixel: Any, active: Any) -
         total.add(value, pixel, active)
 
 
-def _landed(
+def _connect_to_camera(
     scene: KernelScene,
     parts: KernelParts,
     film: Film,
@@ -136,9 +142,9 @@ def _landed(
     odds: Any,
     active: Any,
 ) -> tuple[Any, Any, Any, Any]:
-    """Return what the camera sees of light at a vertex (Color3f), in which pixel, and whether.
+    """Return the light of a vertex in the picture: value, diffuse share, pixel and visibility.
 
-    The second of these four is the share of the diffuse lobe in it.
+    The value and the share of the diffuse lobe are Color3f, the pixel UInt32, visibility Bool.
 
     Args:
         odds: Float, the square root of (hit^2 + pick^2) / land^2, without P and c_1.
@@ -147,7 +153,7 @@ def _landed(
     distance_sq = dr.squared_norm(to_camera)
     direction = to_camera * dr.rsqrt(distance_sq)
     local = vertex.frame.to_local(direction)
-    reflected, forward, _ = _viewed(scene, vertex, local, active, None)
+    reflected, forward, _ = _evaluate_brdf(scene, vertex, local, active, None)
     pixels = film.density(-direction) * dr.abs(dr.dot(vertex.geometric, local)) / distance_sq
     share = 1 / (1 + dr.square(pixels * odds * forward))
     pixel, inside = film.pixel(vertex.point.position)
@@ -157,7 +163,7 @@ def _landed(
     ray = mi.Ray3f(start, mi.Vector3f(dr.normalize(remaining)))
     ray.maxt = dr.norm(remaining)
     active &= ~scene.surfaces.ray_test(ray, active=active)
-    of_diffuse = parts.share(*_faced(scene, vertex, local, active))
+    of_diffuse = parts.share(*_flip_to_viewer(scene, vertex, local, active))
     return reflected * (share * pixels / light_paths), of_diffuse, pixel, active
 
 
@@ -168,19 +174,19 @@ def bounce(
     faced = dr.select(vertex.incoming.z > 0, vertex.lobes.weight, 0)
     lobes = replace(vertex.lobes, weight=faced)
     local = ggx.sample(lobes, vertex.incoming, u_lobe, u_direction)
-    reflected, forward, drawn = _viewed(scene, vertex, local, active, scene.guide)
+    reflected, forward, drawn = _evaluate_brdf(scene, vertex, local, active, scene.guide)
     across = dr.abs(dr.dot(vertex.geometric, local))
     return local, reflected, forward, dr.select(active & (drawn > 0), across / drawn, 0)
 
 
-def _viewed(
+def _evaluate_brdf(
     scene: KernelScene, vertex: Vertex, view: Any, active: Any, guide: GuideTable | None
 ) -> tuple[Any, Any, Any]:
     """Return f cos (Color3f), c and r for light that comes from `incoming` and goes to `view`.
 
-    `guide` is what guides the viewer's path.
+    `guide` is the guide table of the viewer's path.
     """
-    seen, wo = _faced(scene, vertex, view, active)
+    seen, wo = _flip_to_viewer(scene, vertex, view, active)
     reflected, density = ggx.evaluate(seen.lobes, seen.incoming, wo, seen.geometric)
     if guide is not None:
         guidance = guide.at(vertex.triangle, vertex.barycentric, seen.front, seen.lobes, active)
@@ -190,15 +196,19 @@ def _viewed(
     return reflected, density, back
 
 
-def _faced(scene: KernelScene, vertex: Vertex, view: Any, active: Any) -> tuple[Vertex, Any]:
+def _flip_to_viewer(
+    scene: KernelScene, vertex: Vertex, view: Any, active: Any
+) -> tuple[Vertex, Any]:
     """Return the vertex as a viewer in direction `view` has it, and where light comes from.
 
     The surface is turned to the side of the viewer, as the path tracer has it. The BRDF is the same
     around the normal, so that mirroring z is enough.
     """
     side = dr.mulsign(mi.Float(1), dr.dot(vertex.geometric, view))
-    turn = mi.Vector3f(1, 1, side)
-    wi, wo, geometric = view * turn, vertex.incoming * turn, vertex.geometric * turn * side
+    flip = mi.Vector3f(1, 1, side)
+    wi = view * flip
+    wo = vertex.incoming * flip
+    geometric = vertex.geometric * flip * side
     albedo = scene.albedo(wi.z, vertex.lobes.alpha, active)
     lobes = ggx.seen_from(vertex.lobes, wi, albedo)
     front = vertex.front ^ (side < 0)

@@ -1,4 +1,4 @@
-"""Where LLVM's shared library may be on this machine: a list of candidates, newest first."""
+"""Finds candidates for LLVM's shared library on this machine, newest first."""
 
 import os
 import re
@@ -25,10 +25,10 @@ def llvm_libraries() -> list[Path]:
 
     Symbolic links are resolved, so that one library is named once.
     """
-    asked = os.environ.get("DRJIT_LIBLLVM_PATH")
-    found = {path.resolve() for path in (*_known_to_loader(), *_in_usual_folders())}
-    ordered = sorted(found, key=lambda path: (-_major_version(path), str(path)))
-    first = [Path(asked).resolve()] if asked else []
+    named = os.environ.get("DRJIT_LIBLLVM_PATH")
+    candidates = {path.resolve() for path in (*_known_to_loader(), *_in_usual_folders())}
+    ordered = sorted(candidates, key=lambda path: (-_major_version(path), str(path)))
+    first = [Path(named).resolve()] if named else []
     return [path for path in dict.fromkeys([*first, *ordered]) if path.is_file()]
 
 

@@ -20,7 +20,8 @@ def load_tracer(scene: Scene, *, max_depth: int, rr_depth: int) -> Tracer:
     """
     from pipeline.renders.vector_tracer import VectorTracer  # imports mitsuba
 
-    scene, scale = without_constant_textures(scene), choose_tracing_scale(scene)
+    scale = choose_tracing_scale(scene)
+    scene = without_constant_textures(scene)
     if scale != 1:
         scene = dataclasses.replace(
             scene, vertex_positions=scene.vertex_positions * np.float32(scale)

@@ -1,4 +1,4 @@
-"""How wrong a picture is, measured without a reference: each half of its samples judges the other.
+"""Stated error of a picture, without a reference: each half of its samples judges the other.
 
 The samples of a picture are two halves A and B that share nothing. Let T be the truth, x = A - T
 and y = B - T their noise, and a, b the errors of the two halves once they are denoised:
@@ -61,11 +61,11 @@ class MeasuredFloor:
     """The measured error of one picture, in dB."""
 
     log_db: float
-    """As psnr_log_db: this one is meant by "noise floor"."""
+    """Stated error as psnr_log_db, in dB: the "noise floor" without another word."""
     linear_db: float
-    """As psnr_linear_db."""
+    """Stated error as psnr_linear_db, in dB: of radiance clamped to [0, 1]."""
     object_log_db: float
-    """As object_psnr_log_db: over the pixels that show geometry."""
+    """Stated error as object_psnr_log_db, in dB: over pixels that show geometry."""
 
 
 def floor_db(
@@ -93,11 +93,11 @@ def floor_db(
 
 
 def _standard_error(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> float:
-    """Return that of the mean error over the pixels, from its sums over blocks."""
+    """Return the standard error of the mean error over the pixels, from sums over blocks."""
     total = counts.sum()
-    apart = sums - counts * (sums.sum() / total)
+    deviations = sums - counts * (sums.sum() / total)
     blocks = np.count_nonzero(counts)
-    spread = np.square(apart).sum() * blocks / max(blocks - 1, 1)
+    spread = np.square(deviations).sum() * blocks / max(blocks - 1, 1)
     return float(np.sqrt(spread) / total)
 
 

@@ -44,17 +44,24 @@ def trace(
     Args:
         scene: the scene.
         film: the camera.
-        parts: what is kept apart.
+        parts: the sums that are kept apart.
         light_paths: Float, light paths for each sample of a pixel. What they may find is left out
             in proportion.
         sampler: mi.Sampler with a lane for each ray.
         ray: Ray3f from `film`.
     """
     hit = scene.surfaces.ray_intersect_preliminary(ray, coherent=True)
-    active, (distance, triangle, barycentric) = mi.Bool(hit.is_valid()), _met(hit)
-    origin, direction = mi.Point3f(ray.o), mi.Vector3f(ray.d)
-    radiance, throughput = _background(scene, parts, direction, active), mi.Color3f(1)
-    share, density, depth, guided = parts.first_share(), mi.Float(0), mi.UInt32(0), mi.Float(1)
+    active = mi.Bool(hit.is_valid())
+    distance, triangle, barycentric = _unpack_hit(hit)
+    origin = mi.Point3f(ray.o)
+    direction = mi.Vector3f(ray.d)
+    radiance = _background(scene, parts, direction, active)
+    throughput = mi.Color3f(1)
+    share = parts.first_share()
+    density = mi.Float(0)
+    depth = mi.UInt32(0)
+    guided = mi.Float(1)
+    # the ratio L / P * product of C+_i r_i / (c_i C-_(i+1)) of pipeline.renders.light_kernel
     odds = light_paths * dr.square(distance) / film.density(direction)
     while active:
         point = scene.table.point(triangle, barycentric, active)
@@ -65,39 +72,40 @@ def trace(
         radiance = parts.add(radiance, throughput * seen, depth, share)
         depth += 1
         active &= depth < scene.max_depth
-        vertex = _viewed(scene, point, triangle, barycentric, direction, active)
+        vertex = _vertex_from_viewer(scene, point, triangle, barycentric, direction, active)
         guidance = _guidance(scene, vertex, active & (depth > 1))
         u = sampler.next_2d(active)
         lit, local = _direct_light(scene, vertex, guidance, odds, depth, u, active)
-        lit_share = parts.carried(vertex, local, depth, share)
+        lit_share = parts.carry_share(vertex, local, depth, share)
         radiance = parts.add(radiance, throughput * lit, depth, lit_share)
-        u_lobe, u_local = sampler.next_1d(active), sampler.next_2d(active)
-        local = _drawn(scene, vertex, guidance, u_lobe, u_local, active)
-        reflected, unguided = _reflected(vertex, local)
+        u_lobe = sampler.next_1d(active)
+        u_local = sampler.next_2d(active)
+        local = _sample_direction(scene, vertex, guidance, u_lobe, u_local, active)
+        reflected, unguided = _evaluate_brdf(vertex, local)
         density = _density(scene, vertex, guidance, unguided, local, active)
-        share = parts.carried(vertex, local, depth, share)
+        share = parts.carry_share(vertex, local, depth, share)
         active &= density > 0
         guided *= _ratio(guidance, density, unguided)
         throughput = dr.select(active, throughput * reflected / density, throughput)
-        odds = dr.minimum(odds * _turned_back(vertex, local, depth) / density, MOST_ODDS)
+        odds = dr.minimum(odds * _reverse_pdf_term(vertex, local, depth) / density, MOST_ODDS)
         u_end = sampler.next_1d(active)
         throughput, active = roulette(scene, throughput, depth, u_end, active, guided)
         direction = mi.Vector3f(vertex.frame.to_world(local))
         origin = off_surface(point, direction)
         hit = scene.everything.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
-        lit = _missed(scene, direction, density, throughput, active, hit)
+        lit = _sky_emission(scene, direction, density, throughput, active, hit)
         radiance = radiance if lit is None else parts.add(radiance, lit, depth, share)
         active &= hit.is_valid()
-        distance, triangle, barycentric = _met(hit)
+        distance, triangle, barycentric = _unpack_hit(hit)
     return radiance
 
 
-def _met(hit: Any) -> tuple[Any, Any, Any]:
-    """Return the distance, the triangle, and where on it a ray has met it."""
+def _unpack_hit(hit: Any) -> tuple[Any, Any, Any]:
+    """Return distance (Float), triangle (UInt32) and barycentric weights (Point2f) of a hit."""
     return mi.Float(hit.t), mi.UInt32(hit.prim_index), mi.Point2f(hit.prim_uv)
 
 
-def _viewed(
+def _vertex_from_viewer(
     scene: KernelScene,
     point: SurfacePoint,
     triangle: Any,
@@ -120,29 +128,31 @@ def _seen_emission(
     landing: Any,
     emits: Any,
 ) -> Any:
-    """Return the emission that a drawn direction ran into, weighed against the other strategies."""
+    """Return the emission that a sampled direction hit, weighed against the other strategies."""
     row = dr.select(emits, triangle - scene.num_surfaces, 0)
     area_density, emitted = scene.emitters.density_and_radiance(row, emits)
     cosine = dr.abs(dr.dot(point.geometric_normal, direction))
-    emitter_density = scene.picked(area_density) * dr.square(distance) / cosine
+    emitter_density = scene.to_pick_density(area_density) * dr.square(distance) / cosine
     leaving = scene.cone.density(point.position, point.geometric_normal, -direction)
-    others = dr.square(emitter_density / density) + dr.square(landing * area_density * leaving)
+    other_ratios_sq = dr.square(emitter_density / density) + dr.square(
+        landing * area_density * leaving
+    )
     shines = emits & (dr.max(emitted) > 0)  # one that is off has no density: 0/0 at grazing angles
-    return dr.select(shines, emitted / (1 + others), 0)
+    return dr.select(shines, emitted / (1 + other_ratios_sq), 0)
 
 
-def _background(scene: KernelScene, parts: KernelParts, direction: Any, met: Any) -> list[Any]:
-    """Return the sums with what a camera ray sees that meets nothing; it is direct light."""
+def _background(scene: KernelScene, parts: KernelParts, direction: Any, is_hit: Any) -> list[Any]:
+    """Return the sums with the sky behind camera rays that hit nothing; it is direct light."""
     if scene.sky is None or not scene.sky.is_seen:
         return parts.dark()
-    seen, _ = scene.sky.radiance_and_density(direction, ~met)
-    return parts.add(parts.dark(), dr.select(met, 0, seen), mi.UInt32(1), parts.first_share())
+    seen, _ = scene.sky.radiance_and_density(direction, ~is_hit)
+    return parts.add(parts.dark(), dr.select(is_hit, 0, seen), mi.UInt32(1), parts.first_share())
 
 
-def _missed(
+def _sky_emission(
     scene: KernelScene, direction: Any, density: Any, throughput: Any, active: Any, hit: Any
 ) -> Any:
-    """Return the sky's light where a drawn direction meets nothing; None where there is no sky."""
+    """Return the sky's light where a sampled direction hits nothing; None without a sky."""
     if scene.sky is None:
         return None
     free = active & ~hit.is_valid()
@@ -157,7 +167,7 @@ def _guidance(scene: KernelScene, vertex: Vertex, active: Any) -> Guidance | Non
     return scene.guide.at(*place, vertex.lobes, active)
 
 
-def _drawn(
+def _sample_direction(
     scene: KernelScene,
     vertex: Vertex,
     guidance: Guidance | None,
@@ -165,7 +175,7 @@ def _drawn(
     u_local: Any,
     active: Any,
 ) -> Any:
-    """Return the direction (in the frame) in which a path goes on."""
+    """Return the next direction (Vector3f, in the frame) of a path."""
     if scene.guide is None or guidance is None:
         return ggx.sample(vertex.lobes, vertex.incoming, u_lobe, u_local)
     guided = u_lobe < guidance.share
@@ -183,23 +193,23 @@ def _density(
     local: Any,
     active: Any,
 ) -> Any:
-    """Return the density of `_drawn` from that of a BRDF sample."""
+    """Return the density of `_sample_direction` from that of a BRDF sample."""
     if scene.guide is None or guidance is None:
         return unguided
     return scene.guide.mixture(guidance, unguided, vertex.frame.to_world(local), active)
 
 
 def _ratio(guidance: Guidance | None, density: Any, unguided: Any) -> Any:
-    """Return by how much guiding has changed the density of a direction; 1 if nothing is seen."""
+    """Return the density of a guided direction over its BRDF density; 1 where that is 0."""
     return 1 if guidance is None else dr.select(unguided > 0, density / unguided, 1)
 
 
-def _reflected(vertex: Vertex, local: Any) -> tuple[Any, Any]:
+def _evaluate_brdf(vertex: Vertex, local: Any) -> tuple[Any, Any]:
     return ggx.evaluate(vertex.lobes, vertex.incoming, local, vertex.geometric)
 
 
-def _turned_back(vertex: Vertex, local: Any, depth: Any) -> Any:
-    """Return C+ r of a light path that comes from `local`; at x1, its end, it draws nothing."""
+def _reverse_pdf_term(vertex: Vertex, local: Any, depth: Any) -> Any:
+    """Return C+ r of a light path that comes from `local`; r is 1 at x1, where it ends."""
     drawn = ggx.reverse_density(vertex.lobes, vertex.incoming, local, vertex.geometric)
     return dr.abs(dr.dot(vertex.geometric, local)) * dr.select(depth > 1, drawn, 1)
 
@@ -219,12 +229,14 @@ def _direct_light(
     """
     pick = picked_light(scene, vertex.point.position, u, active)
     local = vertex.frame.to_local(pick.direction)
-    reflected, unguided = _reflected(vertex, local)
+    reflected, unguided = _evaluate_brdf(vertex, local)
     density = _density(scene, vertex, guidance, unguided, local, active)
-    landing = odds * _turned_back(vertex, local, depth) * pick.leaving / pick.distance_sq
-    others = dr.square(density / pick.density) + dr.square(dr.select(depth > 1, landing, 0))
+    landing = odds * _reverse_pdf_term(vertex, local, depth) * pick.leaving / pick.distance_sq
+    other_ratios_sq = dr.square(density / pick.density) + dr.square(
+        dr.select(depth > 1, landing, 0)
+    )
     useful = active & (dr.max(reflected) > 0) & dr.isfinite(pick.density)
     shadow_ray = pick.shadow_ray(off_surface(vertex.point, pick.direction))
     lit = useful & ~scene.everything.ray_test(shadow_ray, active=useful)
-    weighed = reflected * pick.radiance / (pick.density * (1 + others))
+    weighed = reflected * pick.radiance / (pick.density * (1 + other_ratios_sq))
     return dr.select(lit, weighed, 0), local

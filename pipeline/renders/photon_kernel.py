@@ -57,9 +57,9 @@ class PhotonRecords:
     def photons(self) -> Photons:
         """Return all that was recorded, path by path."""
         powers = read_back(self._powers).astype(np.float64)
-        there = np.flatnonzero((powers > 0) & np.isfinite(powers))
-        cell, number = (read_back(v)[there].astype(np.int64) for v in (self._cells, self._bins))
-        return Photons(cell=cell, bin=number, power=powers[there])
+        rows = np.flatnonzero((powers > 0) & np.isfinite(powers))
+        cell, number = (read_back(v)[rows].astype(np.int64) for v in (self._cells, self._bins))
+        return Photons(cell=cell, bin=number, power=powers[rows])
 
 
 @dr.syntax
@@ -82,8 +82,10 @@ def trace_photons(
     ray = mi.Ray3f(off_surface(start, direction), direction)
     hit = scene.everything.ray_intersect_preliminary(ray, active=active)
     active &= hit.is_valid()
-    triangle, barycentric = mi.UInt32(hit.prim_index), mi.Point2f(hit.prim_uv)
-    depth, drawn = mi.UInt32(1), mi.Float(0)
+    triangle = mi.UInt32(hit.prim_index)
+    barycentric = mi.Point2f(hit.prim_uv)
+    depth = mi.UInt32(1)
+    drawn = mi.Float(0)
     while active:
         point = scene.table.point(triangle, barycentric, active)
         vertex = vertex_at(scene, point, triangle, barycentric, direction, active)
@@ -97,7 +99,8 @@ def trace_photons(
         throughput /= spread
         depth += 1
         active &= depth < scene.max_depth
-        u_lobe, u_local = sampler.next_1d(active), sampler.next_2d(active)
+        u_lobe = sampler.next_1d(active)
+        u_local = sampler.next_2d(active)
         local, reflected, _, ratio = bounce(scene, vertex, u_lobe, u_local, active)
         throughput *= reflected * ratio
         throughput, active = roulette(scene, throughput, depth, sampler.next_1d(active), active)
@@ -106,4 +109,5 @@ def trace_photons(
         ray = mi.Ray3f(off_surface(point, direction), direction)
         hit = scene.everything.ray_intersect_preliminary(ray, active=active)
         active &= hit.is_valid()
-        triangle, barycentric = mi.UInt32(hit.prim_index), mi.Point2f(hit.prim_uv)
+        triangle = mi.UInt32(hit.prim_index)
+        barycentric = mi.Point2f(hit.prim_uv)

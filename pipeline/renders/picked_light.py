@@ -12,31 +12,31 @@ _SHORTENING = 1e-4
 """Relative length that a shadow ray stops short of its emitter, so that it does not hit it."""
 
 _LEAST_SHARE = 1e-30
-"""Of lamps that are never picked, so that nothing divides by 0."""
+"""Smallest fraction of picks that go to lamps, so that nothing divides by 0."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PickedLight:
-    """Where a path looks for light, lane by lane."""
+    """One sampled point or direction of light, lane by lane."""
 
     direction: Any
-    """Vector3f, unit: from the path's vertex."""
+    """Unit direction from the path's vertex, Vector3f."""
     density: Any
     """Float, per steradian; not finite where no light can come from there."""
     radiance: Any
-    """Color3f."""
+    """Radiance of the lamp or the sky, Color3f."""
     leaving: Any
     """Float: density per steradian, of a light path in the unit of picks, to leave towards the
     vertex; 0 of the sky, from which no light paths come."""
     distance_sq: Any
-    """Float, to the point of the lamp."""
+    """Squared distance to the point on the lamp, Float; 1 for the sky."""
     position: Any
-    """Point3f of the lamp."""
+    """Point on the lamp, Point3f; means nothing for the sky."""
     is_sky: Any = None
     """Bool; None where there is no sky."""
 
     def shadow_ray(self, start: Any) -> Any:
-        """Return the ray that meets whatever is before the light."""
+        """Return the ray whose hits are the occluders of the light."""
         remaining = self.position - start
         length = dr.norm(remaining)
         ray = mi.Ray3f(start, mi.Vector3f(remaining / length))
@@ -51,15 +51,15 @@ def picked_light(scene: KernelScene, position: Any, u: Any, active: Any) -> Pick
     """Return a pick for a vertex at a position (Point3f), from a uniform Point2f."""
     if scene.sky is None:
         return _of_lamps(scene, position, u, active)
-    is_sky, u_sky, u_lamp = scene.sky.chosen(u)
+    is_sky, u_sky, u_lamp = scene.sky.split_picks(u)
     lamp = _of_lamps(scene, position, u_lamp, active & ~is_sky)
     sky = scene.sky.sample(u_sky, active & is_sky)
     # A light path leaves a lamp with its density among lamps; picks have only their share of it.
-    leaving = lamp.leaving / dr.maximum(scene.picked(mi.Float(1)), _LEAST_SHARE)
+    leaving = lamp.leaving / dr.maximum(scene.to_pick_density(mi.Float(1)), _LEAST_SHARE)
     return replace(
         lamp,
         direction=mi.Vector3f(dr.select(is_sky, sky.direction, lamp.direction)),
-        density=dr.select(is_sky, sky.density, scene.picked(lamp.density)),
+        density=dr.select(is_sky, sky.density, scene.to_pick_density(lamp.density)),
         radiance=mi.Color3f(dr.select(is_sky, sky.radiance, lamp.radiance)),
         leaving=dr.select(is_sky, 0, leaving),
         distance_sq=dr.select(is_sky, 1, lamp.distance_sq),

@@ -24,9 +24,9 @@ _INV_LN_10 = 0.4342944819032518
 
 
 def clean(picture: Any, raw: Any, normal: Any) -> Any:
-    """Return a picture that is at least 0, and black where no ray met anything."""
-    met = dr.any(dr.unravel(mi.Color3f, normal) != 0) | dr.any(raw != 0)
-    return dr.select(met, dr.maximum(picture, 0), 0)
+    """Return a picture that is at least 0, and black where no ray hit anything."""
+    covered = dr.any(dr.unravel(mi.Color3f, normal) != 0) | dr.any(raw != 0)
+    return dr.select(covered, dr.maximum(picture, 0), 0)
 
 
 def with_means_of(pairs: Sequence[tuple[Any, Any]], resolution: int) -> list[Any]:
@@ -47,9 +47,9 @@ def with_means_of(pairs: Sequence[tuple[Any, Any]], resolution: int) -> list[Any
         factors = [_factor(is_now, was), _factor(rest_is, rest_was)]
         least = dr.minimum(*factors)
         most = dr.maximum(*factors)
-        apart = (least < 1 / MOST_APART) | (most > MOST_APART)
-        whole = _factor(is_now + rest_is, was + rest_was)
-        factor = dr.select(apart, whole, dr.select(glints, *factors))
+        is_extreme = (least < 1 / MOST_APART) | (most > MOST_APART)
+        common_factor = _factor(is_now + rest_is, was + rest_was)
+        factor = dr.select(is_extreme, common_factor, dr.select(glints, *factors))
         pictures.append(mi.Color3f(mi.Color3d(denoised) * factor))
     return pictures
 
@@ -66,8 +66,8 @@ def shares_of(parts: Sequence[Any]) -> list[Any]:
     ]
 
 
-def converged(denoised: list[Any], raw: list[Any], squared_error: Any, resolution: int) -> Any:
-    """Return which pixels of the raw picture are right (Bool), as numpy's `converged`."""
+def converged_mask(denoised: list[Any], raw: list[Any], squared_error: Any, resolution: int) -> Any:
+    """Return which pixels of the raw picture are right (Bool), as `converged_mask` in numpy."""
     is_now, was = (channel_mean(mi.Color3d(add_up(parts))) for parts in (denoised, raw))
     dr.eval(squared_error)  # eight neighbours of each pixel read it
     row, column = _rows_and_columns(resolution)

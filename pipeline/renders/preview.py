@@ -26,7 +26,7 @@ from storage.settings.described import checked
 from storage.settings.ranges import Within
 
 MOST_SPP = 4096
-"""Samples of a preview; whoever wants more wants to know the error."""
+"""Maximum number of samples of a preview; above it, use a noise floor."""
 
 FAST_SPP = 16
 """Up to so many samples the fast filter is the better trade: more samples cost less than the better
@@ -34,7 +34,7 @@ filter, 0.5 core-seconds at 256 pixels, and bring as much (study S21)."""
 
 
 def usual_filter(spp: int) -> Filtered:
-    """Return the quality of Open Image Denoise that is used where nobody chooses one."""
+    """Return the default quality of Open Image Denoise for a number of samples."""
     return "fast" if spp <= FAST_SPP else "high"
 
 
@@ -44,16 +44,16 @@ PASSES = (*PASS_SPP, 1)
 
 @checked("preview settings")
 class PreviewSettings:
-    """How a preview is made."""
+    """Settings of a preview."""
 
     resolution: Resolution
-    """Width and height in pixels."""
+    """Width and height in pixels, a multiple of 8."""
     spp: Annotated[int, Within(1, MOST_SPP, unit="samples")]
-    """Samples per pixel."""
+    """Number of samples of each pixel."""
     denoiser: Filtered = "fast"
     """Quality of Open Image Denoise."""
     max_depth: Depth = RenderSettings.max_depth
-    """Longest path in edges."""
+    """Maximum length of a path in edges; 2 is direct light."""
     rr_depth: Depth = RenderSettings.rr_depth
     """Depth in edges from which Russian roulette may end a path."""
 
@@ -66,12 +66,12 @@ class PreviewSettings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Preview:
-    """A picture that does not know its error."""
+    """A picture without a measured error."""
 
     radiance_rgb: NDArray[np.float32]
     """[R, R, 3] linear radiance that half floats can hold."""
     spp: int
-    """Samples per pixel."""
+    """Number of samples of each pixel."""
 
 
 class PreviewRenderer:
@@ -90,7 +90,7 @@ class PreviewRenderer:
     def view_steps(
         self, c2w: ArrayLike, fov_deg: float, seed: int
     ) -> Generator[Sampling, None, Preview]:
-        """Return the picture of one camera, yielding after each pass; equal arguments, equal bits.
+        """Yield after each pass and return the picture; equal arguments give equal bits.
 
         Raises:
             Rejected: "nonfinite_radiance" or "radiance_overflow", as of `SceneRenderer`.
@@ -109,7 +109,7 @@ class PreviewRenderer:
             broken = int((~np.isfinite(mean)).any(axis=-1).sum())
             raise Rejected("nonfinite_radiance", f"{broken} pixels of raw samples")
         require_bounded(float(mean.max()))
-        picture = denoised(self._tracer, camera, mean, done, settings.denoiser)
+        picture = denoise_preview(self._tracer, camera, mean, done, settings.denoiser)
         return Preview(radiance_rgb=representable(picture), spp=done)
 
 
@@ -131,7 +131,7 @@ def samples_sum(
     return size * picture.astype(np.float64), done + size
 
 
-def denoised(
+def denoise_preview(
     tracer: Tracer, camera: Camera, picture_rgb: NDArray[np.float32], spp: int, quality: Filtered
 ) -> NDArray[np.float32]:
     """Return a picture [R, R, 3] of `spp` samples without noise, guided by rays to first hits."""

@@ -1,4 +1,4 @@
-"""What making a preview consists of, and what each part takes: from these any preview is priced."""
+"""Steps of a preview and their seconds, from which the cost of any preview is predicted."""
 
 import time
 from collections import Counter
@@ -44,27 +44,29 @@ def timed_parts(
         resolution: pixels each way.
         clock: returns seconds; `time.process_time` counts those of all threads.
     """
-    pose, fov_deg = np.asarray(scene.c2w[0], np.float64), float(scene.fov_deg[0])
+    pose = np.asarray(scene.c2w[0], np.float64)
+    fov_deg = float(scene.fov_deg[0])
     depths = {"max_depth": RenderSettings.max_depth, "rr_depth": RenderSettings.rr_depth}
     load_tracer(scene, **depths)  # the first one loads libraries as well
     began = clock()
     tracer = load_tracer(scene, **depths)
-    found = {SCENE: clock() - began}
+    seconds = {SCENE: clock() - began}
     small = Camera(c2w=pose, fov_deg=fov_deg, resolution=_SMALL)
     camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=resolution)
     for size in PASSES:
         tracer.radiance(small, seed=_SEED, spp=size)  # kernels are compiled, or read from disk
-        found[_pass_name(size)] = _median_s(
+        seconds[_pass_name(size)] = _median_s(
             clock, partial(tracer.radiance, camera, seed=_SEED, spp=size)
         )
     for rays in PASS_SPP[1:]:
         tracer.features(small, spp=rays)
-        found[_guides_name(rays)] = _median_s(clock, partial(tracer.features, camera, spp=rays))
-    picture, features = tracer.radiance(camera, seed=_SEED, spp=1), tracer.features(camera, spp=4)
+        seconds[_guides_name(rays)] = _median_s(clock, partial(tracer.features, camera, spp=rays))
+    picture = tracer.radiance(camera, seed=_SEED, spp=1)
+    features = tracer.features(camera, spp=4)
     for quality in get_args(Quality):
         _warm_up(resolution, quality)
-        found[quality] = _median_s(clock, partial(denoise, picture, features, quality))
-    return found
+        seconds[quality] = _median_s(clock, partial(denoise, picture, features, quality))
+    return seconds
 
 
 def _warm_up(resolution: int, quality: Quality) -> None:
@@ -91,7 +93,8 @@ def _guides_name(rays: int) -> str:
 
 def all_parts() -> tuple[str, ...]:
     """Return the names of all parts, in the order in which they are timed."""
-    passes, guides = map(_pass_name, PASSES), map(_guides_name, PASS_SPP[1:])
+    passes = map(_pass_name, PASSES)
+    guides = map(_guides_name, PASS_SPP[1:])
     return (SCENE, *passes, *guides, *get_args(Quality))
 
 

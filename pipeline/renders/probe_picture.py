@@ -28,4 +28,5 @@ TABLE = """
 """A line is a block, row after row: the mean of R, G and B, and their standard deviations."""
 
 _numbers = np.array(TABLE.split(), np.float64).reshape(4, 4, 2, 3)
-MEAN_RGB, DEVIATION_RGB = _numbers[:, :, 0], _numbers[:, :, 1]
+MEAN_RGB = _numbers[:, :, 0]
+DEVIATION_RGB = _numbers[:, :, 1]

@@ -1,6 +1,6 @@
-"""`ProgressiveRenderer`: a picture that is there at once and becomes better while one looks at it.
+"""`ProgressiveRenderer`: a picture that appears at once and then improves step by step.
 
-First come previews of few samples, whose error nobody knows; then the picture of `SceneRenderer`
+First come previews of few samples, whose error is unknown; then the picture of `SceneRenderer`
 grows to its target, shown at each measurement. What comes at the end is, bit by bit, what
 `SceneRenderer` alone makes.
 """
@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.noise_floor import MeasuredFloor
-from pipeline.renders.preview import denoised, samples_sum, usual_filter
-from pipeline.renders.renderer import SceneRenderer, finished, representable
+from pipeline.renders.preview import denoise_preview, samples_sum, usual_filter
+from pipeline.renders.renderer import SceneRenderer, representable, run_to_end
 from pipeline.renders.results import GrowingPicture, RenderedView, Sampling
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.view_pictures import require_bounded
@@ -37,7 +37,7 @@ class ProgressiveRenderer:
     def view_steps(
         self, c2w: ArrayLike, fov_deg: float, seed: int
     ) -> Generator[Sampling, None, GrowingPicture]:
-        """Yield looks, and how far the samples are between them; the last look is returned.
+        """Yield looks, and the progress of sampling between them; return the last look.
 
         Args:
             c2w: [4, 4] camera to world.
@@ -50,7 +50,7 @@ class ProgressiveRenderer:
         pose = np.asarray(c2w, np.float64)
         camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=self._settings.resolution)
         for spp in FIRST_LOOKS_SPP:
-            yield finished(self._preview(camera, seed, spp))
+            yield run_to_end(self._preview(camera, seed, spp))
         view: RenderedView = yield from self._measured.view_steps(c2w, fov_deg, seed)
         floor = MeasuredFloor(
             log_db=view.noise_floor_db,
@@ -81,7 +81,9 @@ class ProgressiveRenderer:
         self, camera: Camera, seed: int, spp: int
     ) -> Generator[Sampling, None, GrowingPicture]:
         tracer = self._measured.tracer
-        began_s, total, done = time.process_time(), np.zeros(3), 0
+        began_s = time.process_time()
+        total = np.zeros(3)
+        done = 0
         while done < spp:
             part, done = samples_sum(tracer, camera, seed, done, spp)
             total = total + part
@@ -90,7 +92,7 @@ class ProgressiveRenderer:
         if not np.isfinite(mean).all():
             raise Rejected("nonfinite_radiance", "raw samples are not finite")
         require_bounded(float(mean.max()))
-        picture = representable(denoised(tracer, camera, mean, done, usual_filter(done)))
+        picture = representable(denoise_preview(tracer, camera, mean, done, usual_filter(done)))
         return GrowingPicture(
             spp=done,
             expected_spp=self._settings.first_spp,

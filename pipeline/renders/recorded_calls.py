@@ -1,4 +1,4 @@
-"""Kernel launches that are recorded once: `recorded` functions replay them without tracing again.
+"""Kernel launches that are traced once: functions with `record_launches` replay them.
 
 `dr.freeze` bakes in what a function finds outside of its arguments, without a word, and keeps its
 arguments for good. So the objects that kernels read come as `KernelInputs`: all of their arrays are
@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 _MOST_RECORDINGS = 64
-"""Of each function. The oldest go first; what is left out of it is recorded again."""
+"""Maximum number of recordings of a function; the oldest are dropped and recorded again."""
 
 
 class KernelInputs:
@@ -47,7 +47,7 @@ class KernelInputs:
 
 
 class _Kind:
-    """What tells recordings apart, and the objects of the call at hand."""
+    """Key of a recording, and the objects of the current call."""
 
     def __init__(self, names: tuple[Any, ...], objects: tuple[Any, ...]) -> None:
         self._names = names
@@ -60,7 +60,7 @@ class _Kind:
         return isinstance(other, _Kind) and other._names == self._names
 
 
-def recorded(function: Callable[..., Any]) -> Callable[..., Any]:
+def record_launches(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that takes `KernelInputs` where `function` takes their objects, first.
 
     What differs from call to call comes in arrays. Numbers of Python among the arguments tell

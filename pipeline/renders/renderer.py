@@ -110,7 +110,7 @@ class SceneRenderer:
                 it), "radiance_overflow" (a pixel that half floats cannot hold),
                 "floor_not_reached" (at max_spp, with `reject_at_cap`).
         """
-        return finished(self.view_steps(c2w, fov_deg, seed))
+        return run_to_end(self.view_steps(c2w, fov_deg, seed))
 
     def view_steps(
         self, c2w: ArrayLike, fov_deg: float, seed: int
@@ -132,11 +132,11 @@ class SceneRenderer:
             yield Sampling(spp=samples.spp, expected_spp=settled, missing_db=None)
         pictures = self._pictures(samples, camera)
         if not self._sees_sky:
-            samples.count_over(pictures.shown)
+            samples.count_over(pictures.visible)
         look = yield from self._sample_to_targets(samples, pictures)
         floor = look.floor
         self._refuse_noisy(floor)
-        stored = self._stored(pictures.finish())
+        stored = self._to_stored(pictures.finish())
         return RenderedView(
             spp=samples.spp,
             noise_floor_db=floor.log_db,
@@ -155,7 +155,7 @@ class SceneRenderer:
 
         return DevicePictures(samples, self._tracer, camera, self._settings)
 
-    def _stored(self, pictures: NDArray[np.float32]) -> dict[str, Any]:
+    def _to_stored(self, pictures: NDArray[np.float32]) -> dict[str, Any]:
         """Return the pictures of a view by their fields: the sum of what is apart, as stored."""
         per_light = self._settings.per_light
         names = self._settings.part_names
@@ -197,8 +197,8 @@ class SceneRenderer:
         targets_db = self._settings.targets_db
         max_spp = self._settings.max_spp
         measured: list[tuple[int, Floors]] = []
-        shown = np.ones_like(pictures.shown) if self._sees_sky else pictures.shown
-        tiles = TileChoice(shown)
+        visible = np.ones_like(pictures.visible) if self._sees_sky else pictures.visible
+        tiles = TileChoice(visible)
         while True:
             quality = self._filter_of_halves(samples.spp)
             look = pictures.look(quality)
@@ -229,7 +229,7 @@ class SceneRenderer:
         missing_db: float,
     ) -> GrowingPicture:
         before_s = self._used.core_s()
-        picture = self._stored(pictures.finish())["radiance_rgb"]
+        picture = self._to_stored(pictures.finish())["radiance_rgb"]
         core_s = self._used.core_s()
         self._used.leave_out(core_s - before_s)
         return GrowingPicture(
@@ -274,8 +274,8 @@ def _refuse_sky(scene: Scene) -> None:
         )
 
 
-def finished(steps: Generator[Any, None, Result]) -> Result:
-    """Run steps to their end, whatever they say of their progress, and return what they return."""
+def run_to_end(steps: Generator[Any, None, Result]) -> Result:
+    """Run a generator to its end and return its result, without its progress."""
     while True:
         try:
             next(steps)

@@ -1,4 +1,4 @@
-"""What a renderer gives: a finished picture, and on the way to it how far it is."""
+"""Results of a renderer: progress, pictures that grow, and finished pictures."""
 
 import time
 from collections.abc import Generator, Iterator, Mapping
@@ -17,7 +17,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RenderedView:
-    """One finished picture and how far to trust it."""
+    """One finished picture with its measured error."""
 
     radiance_rgb: NDArray[np.float32]
     """[R, R, 3] linear radiance, finite, at least 0, below HALF_FLOAT_MAX; the background is 0."""
@@ -25,21 +25,21 @@ class RenderedView:
     """Samples per pixel that were spent, on each light where they are apart: the mean over the
     pixels that show anything, rounded down."""
     noise_floor_db: float
-    """Measured error as psnr_log_db."""
+    """Measured error as psnr_log_db, in dB; more is better."""
     noise_floor_linear_db: float
-    """Measured error as psnr_linear_db."""
+    """Measured error as psnr_linear_db, in dB; more is better."""
     object_noise_floor_db: float
-    """Measured error as object_psnr_log_db, over `hits`."""
+    """Measured error as object_psnr_log_db over `hits`, in dB; more is better."""
     at_cap: bool
-    """Whether sampling ended at max_spp with a floor below its target."""
+    """True if sampling ended at max_spp with a floor below its target."""
     hits: NDArray[np.bool_]
-    """[R, R] whether the ray through the pixel's centre meets geometry (emitters do not count)."""
+    """[R, R] true where the ray through a pixel's center hits geometry other than emitters."""
     lights_rgb: NDArray[np.float32] | None = None
-    """With `per_light`: [L, R, R, 3] radiance of each emitter object alone, rounded to half floats;
+    """[L, R, R, 3] radiance of each emitter object alone, with `per_light`; rounded to half floats.
     `radiance_rgb` is their storage.records.lights.sum_of_lights in every bit."""
     parts_rgb: Parts | None = None
-    """With `split` or `split_lobes`: [R, R, 3] radiance of each part, rounded to half floats, or
-    [L, R, R, 3] of lights apart. Their storage.records.parts.sum_of_parts is `radiance_rgb`, or
+    """[R, R, 3] radiance of each part, with `split` or `split_lobes`; rounded to half floats. With
+    `per_light` [L, R, R, 3]. Their storage.records.parts.sum_of_parts is `radiance_rgb`, or
     `lights_rgb`, in every bit."""
     part_floors: Mapping[str, MeasuredFloor] | None = None
     """Measured error of each part, of all lights together."""
@@ -47,7 +47,7 @@ class RenderedView:
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """How far the sampling of a view has come."""
+    """Progress of the samples of a view."""
 
     spp: int
     """Samples per pixel so far."""
@@ -59,12 +59,12 @@ class Sampling:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GrowingPicture(Sampling):
-    """A picture of the samples so far, for whoever watches it become better."""
+    """A picture of the samples so far, for display while it improves."""
 
     radiance_rgb: NDArray[np.float32]
     """[R, R, 3] linear radiance that half floats can hold."""
     floor: MeasuredFloor | None
-    """Its measured error; None where too few samples tell."""
+    """Measured error of the picture; None if there are too few samples."""
     core_s: float
     """Core-seconds that a picture as good as this one takes, without the looks before it and
     without loading the scene."""

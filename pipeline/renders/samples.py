@@ -68,8 +68,8 @@ class HalfSamples:
         on in passes of 64, however small its first ones were.
         """
         done = int(self._spp[0].max())
-        left = (self._most if done else self._first) - done
-        return next(size for size in PASS_SPP if done % size == 0 and left % size == 0)
+        remaining = (self._most if done else self._first) - done
+        return next(size for size in PASS_SPP if done % size == 0 and remaining % size == 0)
 
     def passes_to(self, spp: int) -> Iterator[None]:
         """Add passes to both halves until there are `spp` samples at least, yielding after each.

@@ -1,4 +1,4 @@
-"""How often a path picks the environment map, and how often a lamp, when it looks for light.
+"""Fraction of light samples that go to the environment map; the others go to lamps.
 
 Lamps weigh area x radiance. In that unit a map weighs 2 pi R^2 times its mean radiance, with R the
 radius of the scene. But most of a smooth map is found by directions that the surface draws, and

@@ -27,11 +27,11 @@ class SkySample:
     """A direction drawn from a map, lane by lane."""
 
     direction: Any
-    """Vector3f, unit, in world space."""
+    """Unit direction in world space, Vector3f."""
     density: Any
-    """Float, per steradian; not finite where there is no light."""
+    """Density of the direction per steradian, Float; not finite where there is no light."""
     radiance: Any
-    """Color3f."""
+    """Radiance from the direction, Color3f."""
 
 
 class SkyTable:
@@ -55,12 +55,13 @@ class SkyTable:
         self._edges = own_floats(np.cos(np.pi * np.arange(height + 1) / height))
         self._height, self._width = (dr.opaque(mi.UInt32, side) for side in (height, width))
         self._to_world = [_opaque_vector(sky.rotation[:, axis]) for axis in range(3)]
-        self._share, self._rest = dr.opaque(mi.Float, share), dr.opaque(mi.Float, 1 - share)
+        self._share = dr.opaque(mi.Float, share)
+        self._rest = dr.opaque(mi.Float, 1 - share)
         self.is_seen = sky.is_seen
-        """Whether camera rays that meet nothing see it."""
+        """True if camera rays that hit nothing see the map."""
 
-    def chosen(self, u: Any) -> tuple[Any, Any, Any]:
-        """Return whether the map is picked, and the uniform Point2f for it and for a lamp."""
+    def split_picks(self, u: Any) -> tuple[Any, Any, Any]:
+        """Return which picks go to the map (Bool), and the uniform Point2f for map and lamp."""
         last = _ONE_MINUS_EPSILON
         to_sky = dr.minimum(u.x / self._share, last)
         to_lamp = dr.clip((u.x - self._share) / dr.maximum(self._rest, _TINY), 0, last)
@@ -72,8 +73,10 @@ class SkyTable:
 
     def sample(self, u: Any, active: Any) -> SkySample:
         """Return a direction drawn by the light of the map, from a uniform Point2f."""
-        row, down = self._drawn(self._rows, mi.UInt32(0), self._height, u.x, active)
-        column, along = self._drawn(self._columns, row * self._width, self._width, u.y, active)
+        row, down = self._sample_alias(self._rows, mi.UInt32(0), self._height, u.x, active)
+        column, along = self._sample_alias(
+            self._columns, row * self._width, self._width, u.y, active
+        )
         above = dr.gather(mi.Float, self._edges, row, active)
         below = dr.gather(mi.Float, self._edges, row + 1, active)
         z = above + (below - above) * down
@@ -95,12 +98,12 @@ class SkyTable:
         x, y, z = (dr.dot(axis, direction) for axis in self._to_world)
         u = 0.5 - dr.atan2(y, x) / (2 * dr.pi)
         v = dr.atan2(dr.sqrt(x * x + y * y), z) / dr.pi
-        left, along = _between(u * mi.Float(self._width))
+        first_column, along = _between(u * mi.Float(self._width))
         above, down = _between(v * mi.Float(self._height))
         most = mi.Int32(self._height) - 1
         rows = [mi.UInt32(dr.clip(above + step, 0, most)) for step in (0, 1)]
         width = mi.Int32(self._width)
-        columns = [left + step for step in (0, 1)]
+        columns = [first_column + step for step in (0, 1)]
         columns = [mi.UInt32(dr.select(c < 0, c + width, c)) for c in columns]
         columns = [dr.select(c >= self._width, c - self._width, c) for c in columns]
         columns = [dr.minimum(c, self._width - 1) for c in columns]  # of what is no direction
@@ -116,15 +119,17 @@ class SkyTable:
         nearest = dr.select(down < 0.5, *(dr.select(along < 0.5, *row) for row in (upper, lower)))
         return mi.Color3f(mean.xyz), nearest.w * self._share
 
-    def _drawn(self, table: Any, first: Any, count: Any, u: Any, active: Any) -> tuple[Any, Any]:
-        """Return a number below `count` drawn from a part of an alias table, and a fresh one."""
+    def _sample_alias(
+        self, table: Any, first: Any, count: Any, u: Any, active: Any
+    ) -> tuple[Any, Any]:
+        """Return an index below `count` drawn from a row of an alias table, and a fresh uniform."""
         scaled = u * mi.Float(count)
         place = dr.minimum(mi.UInt32(scaled), count - 1)
         fraction = scaled - mi.Float(place)
         keep, alias = dr.gather(mi.Vector2f, table, first + place, active)
-        kept = fraction < keep
-        chosen = dr.select(kept, place, mi.UInt32(alias))
-        fraction = dr.select(kept, fraction / keep, (fraction - keep) / (1 - keep))
+        keeps = fraction < keep
+        chosen = dr.select(keeps, place, mi.UInt32(alias))
+        fraction = dr.select(keeps, fraction / keep, (fraction - keep) / (1 - keep))
         return chosen, dr.clip(fraction, 0, _ONE_MINUS_EPSILON)
 
 
@@ -138,27 +143,32 @@ def alias_rows(weights: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
     total = weights.sum(axis=1, keepdims=True)
     even = np.ones_like(weights)
     scaled = np.divide(weights * count, total, out=even, where=total > 0)
-    keep, alias = np.ones_like(scaled), np.tile(np.arange(count), (len(scaled), 1))
+    keep = np.ones_like(scaled)
+    alias = np.tile(np.arange(count), (len(scaled), 1))
     order = np.argsort(scaled >= 1, axis=1, kind="stable")  # the poor columns, then the rich
-    poor, all_rows = np.zeros(len(scaled), np.intp), np.arange(len(scaled))
+    poor = np.zeros(len(scaled), np.intp)
+    all_rows = np.arange(len(scaled))
     num_poor = (scaled < 1).sum(axis=1)
     rich = num_poor.copy()
-    left = scaled[all_rows, order[all_rows, np.minimum(rich, count - 1)]]
+    residual = scaled[all_rows, order[all_rows, np.minimum(rich, count - 1)]]
     for _ in range(count):
         going = (poor < num_poor) & (rich < count)
-        from_rich = going & (left >= 1)
+        from_rich = going & (residual >= 1)
         rich_column = order[all_rows, np.minimum(rich, count - 1)]
         poor_column = order[all_rows, np.minimum(poor, count - 1)]
-        rows, columns = all_rows[from_rich], poor_column[from_rich]
+        rows = all_rows[from_rich]
+        columns = poor_column[from_rich]
         keep[rows, columns] = scaled[rows, columns]
         alias[rows, columns] = rich_column[from_rich]
-        left = np.where(from_rich, left - (1 - scaled[all_rows, poor_column]), left)
+        residual = np.where(from_rich, residual - (1 - scaled[all_rows, poor_column]), residual)
         poor += from_rich
-        used_up = ~from_rich & (rich < count - 1) & (left < 1)
+        used_up = ~from_rich & (rich < count - 1) & (residual < 1)
         following = order[all_rows, np.minimum(rich + 1, count - 1)]
-        rows, columns = all_rows[used_up], rich_column[used_up]
-        keep[rows, columns], alias[rows, columns] = left[used_up], following[used_up]
-        left = np.where(used_up, left + scaled[all_rows, following] - 1, left)
+        rows = all_rows[used_up]
+        columns = rich_column[used_up]
+        keep[rows, columns] = residual[used_up]
+        alias[rows, columns] = following[used_up]
+        residual = np.where(used_up, residual + scaled[all_rows, following] - 1, residual)
         rich += used_up
     return np.clip(keep, 0, 1), alias
 

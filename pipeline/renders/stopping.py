@@ -1,4 +1,4 @@
-"""When the sampling of a view ends: at its targets, at all of them, or at the cap.
+"""Stopping rule of adaptive sampling: a view's ends at all of its targets, or at the cap.
 
 Targets and measured floors go by the name of their metric (storage.metrics). One view may need many
 more samples by one metric than by another: the linear PSNR weighs bright pixels more, up to
@@ -21,8 +21,11 @@ _DB_PER_DOUBLING = 1.2
 """The true error falls by 0.9 to 2.0 dB per doubling of the samples, not by 3. This low guess is
 used until the view itself has been measured twice."""
 
-_SLOWEST_DB, _FASTEST_DB = 0.6, 3.0
-"""Bounds of the gain per doubling that is read off two floors of a view, which are noisy."""
+_SLOWEST_DB = 0.6
+"""Smallest gain per doubling that is believed: two floors of a view are noisy."""
+
+_FASTEST_DB = 3.0
+"""Largest gain per doubling that is believed."""
 
 _MAX_GROWTH = 2.0
 """The samples grow at most by this between two measurements: each of them is a new choice of tiles.
@@ -31,14 +34,14 @@ With 4 half of what these gain was lost."""
 
 @dataclass(frozen=True, kw_only=True)
 class Goal:
-    """When sampling ends."""
+    """Targets and cap of the samples of a view."""
 
     targets_db: Floors
-    """The floors to reach."""
+    """Noise floors to reach, in dB by metric."""
     step: int
-    """Samples per pixel of one pass of both halves."""
+    """Samples per pixel that one pass adds, both halves together."""
     max_spp: int
-    """The cap, a multiple of `step`."""
+    """Maximum samples per pixel, a multiple of `step`."""
 
 
 def gaps_db(targets_db: Floors, floors_db: Floors) -> dict[str, float]:
@@ -48,26 +51,27 @@ def gaps_db(targets_db: Floors, floors_db: Floors) -> dict[str, float]:
 
 
 def next_spp(measured: Measured, goal: Goal) -> int:
-    """Return how many samples to go on to before the floors are measured again.
+    """Return the number of samples at which the floors are measured next.
 
     Args:
         measured: of this view so far; the last floors miss a target of the goal, and their samples
             are a multiple of its step below its cap.
         goal: when sampling ends.
     """
-    spp, step = measured[-1][0], goal.step
+    spp = measured[-1][0]
+    step = goal.step
     growth = max(step * math.ceil(spp * _MAX_GROWTH / step), spp + step)
     return min(expected_spp(measured, goal), growth)
 
 
 def expected_spp(measured: Measured, goal: Goal) -> int:
-    """Return at how many samples the last target should be reached, or the cap; as `next_spp`."""
+    """Return the number of samples that should reach all targets, or the cap; as `next_spp`."""
     spp, floors_db = measured[-1]
     gaps = gaps_db(goal.targets_db, floors_db)
-    needed = max(gap_db / slope_db(measured, metric) for metric, gap_db in gaps.items())
-    doublings = min(needed, math.log2(goal.max_spp / spp) + 1)
-    wanted = goal.step * math.ceil(spp * 2**doublings / goal.step)
-    return min(goal.max_spp, max(wanted, spp + goal.step))
+    needed_doublings = max(gap_db / slope_db(measured, metric) for metric, gap_db in gaps.items())
+    doublings = min(needed_doublings, math.log2(goal.max_spp / spp) + 1)
+    target_spp = goal.step * math.ceil(spp * 2**doublings / goal.step)
+    return min(goal.max_spp, max(target_spp, spp + goal.step))
 
 
 def slope_db(measured: Measured, metric: str) -> float:

@@ -26,12 +26,12 @@ _TINY = 1e-20
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SurfacePoint:
-    """Where a ray hit, lane by lane."""
+    """Hit point of each ray, lane by lane."""
 
     position: Any
-    """Point3f."""
+    """Position of the hit, Point3f in meters."""
     geometric_normal: Any
-    """Vector3f, unit, by the winding of the triangle."""
+    """Unit normal by the winding of the triangle, Vector3f."""
 
 
 class SurfaceTable:
@@ -64,7 +64,8 @@ class SurfaceTable:
         first = self._group(triangle, 0, active)
         edge1 = self._group(triangle, 1, active)
         edge2 = self._group(triangle, 2, active)
-        edge1, edge2 = mi.Vector3f(edge1.xyz), mi.Vector3f(edge2.xyz)
+        edge1 = mi.Vector3f(edge1.xyz)
+        edge2 = mi.Vector3f(edge2.xyz)
         position = mi.Point3f(first.xyz) + edge1 * barycentric.x + edge2 * barycentric.y
         return SurfacePoint(
             position=mi.Point3f(position), geometric_normal=dr.normalize(dr.cross(edge1, edge2))
@@ -83,7 +84,7 @@ class SurfaceTable:
             specular=mi.Color3f(groups[5].y, groups[5].z, groups[5].w),
             alpha=groups[6].x,
             weight=groups[6].y,
-            again=mi.Color3f(groups[6].z, groups[6].w, groups[7].x),
+            multiscatter=mi.Color3f(groups[6].z, groups[6].w, groups[7].x),
         )
         # Opposite normals may cancel: a zero normal reflects nothing, where 0 / 0 would spread.
         length_sq = dr.maximum(dr.squared_norm(normal), _TINY)

@@ -35,14 +35,15 @@ class TexturedTable(SurfaceTable):
         columns = lobes.diffuse, lobes.specular, dr.sqrt(lobes.alpha)
         diffuse, specular, roughness = self._textures.values(triangle, barycentric, columns, active)
         alpha = dr.maximum(dr.square(roughness), MIN_ALPHA)
-        most, mirrored = dr.max(diffuse), dr.max(specular)
+        most = dr.max(diffuse)
+        mirrored = dr.max(specular)
         reflects = most + mirrored > 0
         return normal, KernelLobes(
             diffuse=diffuse,
             specular=specular,
             alpha=alpha,
             weight=dr.select(reflects, mirrored / (most + mirrored), 0),
-            again=self._scattered_again(specular, alpha, active),
+            multiscatter=self._scattered_again(specular, alpha, active),
         )
 
     def _scattered_again(self, specular: Any, alpha: Any, active: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Which tiles of a picture need more samples: those whose denoised pixels still change most.
+"""Adaptive sampling: chooses the tiles that get more samples, those that still change most.
 
 Where a half of the samples grew from m to n of them per pixel, its denoised picture changed by d in
 log10(1 + radiance). If the variance there is v / n, then d^2 is v (1 / m - 1 / n) on average: each
@@ -38,15 +38,15 @@ _SMOOTHING = np.array([0.25, 0.5, 0.25])
 
 
 class TileChoice:
-    """Chooses what each half is given next, by what the other one looked like as it grew."""
+    """Chooses the next passes of each half by the changes of the other one."""
 
-    def __init__(self, shown: NDArray[np.bool_]) -> None:
+    def __init__(self, visible: NDArray[np.bool_]) -> None:
         """Begin with nothing seen.
 
         Args:
             shown: [R, R] pixels that may have light at all.
         """
-        self._weight = tile_means(shown.astype(np.float64))
+        self._weight = tile_means(visible.astype(np.float64))
         self._seen: list[NDArray[np.int64]] = []
         self._variance: list[NDArray[np.float64]] = []
         self._filter: Filtered | None = None
@@ -69,7 +69,8 @@ class TileChoice:
             self._variance = [
                 _variance(*each) for each in zip(changes, self._seen, seen, known, strict=True)
             ]
-        self._seen, self._filter = seen, quality
+        self._seen = seen
+        self._filter = quality
 
     def passes(self, samples: HalfSamples, mean_spp: int) -> list[NDArray[np.int64]] | None:
         """Return how many more passes each pixel of each half gets, [R, R]; None: all alike.
@@ -83,8 +84,8 @@ class TileChoice:
         if not started or more < 2 * _PASS:
             return None
         return [
-            of_pixels(passes_of_tiles(others, spp, self._weight, more / 2))
-            for others, spp in zip(self._variance[::-1], self._seen, strict=True)
+            of_pixels(passes_of_tiles(other_variance, spp, self._weight, more / 2))
+            for other_variance, spp in zip(self._variance[::-1], self._seen, strict=True)
         ]
 
 
@@ -94,10 +95,10 @@ def _variance(
     spp: NDArray[np.int64],
     known: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return that of one sample, [T, T], from two looks; the known one where nothing came."""
+    """Return the variance of one sample, [T, T], by two looks; `known` where nothing was added."""
     grown = spp > spp_before
     less = np.where(grown, 1 / spp_before - 1 / spp, 1)
-    return np.where(grown, _smoothed(change) / less, known)
+    return np.where(grown, _smooth(change) / less, known)
 
 
 def passes_of_tiles(
@@ -115,19 +116,20 @@ def passes_of_tiles(
         more: by how many samples per pixel the mean shall grow, _PASS at least.
     """
     weight = weight / weight.sum()
-    wanted = (weight * spp).sum() + more
+    target_spp = (weight * spp).sum() + more
     mean = (variance * weight).sum()
     share = np.where(weight > 0, np.cbrt(variance + _LEAST_SHARE * mean) if mean else 1.0, 0)
-    room = np.maximum((_MOST * wanted - spp) // _PASS, 0)
+    room = np.maximum((_MOST * target_spp - spp) // _PASS, 0)
 
     def passes(factor: float) -> NDArray[np.float64]:
         return np.clip(np.floor((factor * share - spp) / _PASS + 0.5), 0, room)
 
-    low, high = 0.0, 2 * _MOST * wanted / share[weight > 0].min()
+    low = 0.0
+    high = 2 * _MOST * target_spp / share[weight > 0].min()
     for _ in range(60):  # bisection, to the precision of float64
         middle = (low + high) / 2
-        enough = (weight * (spp + _PASS * passes(middle))).sum() >= wanted
-        low, high = (low, middle) if enough else (middle, high)
+        suffices = (weight * (spp + _PASS * passes(middle))).sum() >= target_spp
+        low, high = (low, middle) if suffices else (middle, high)
     return passes(high).astype(np.int64)
 
 
@@ -148,7 +150,7 @@ def of_pixels(tiles: NDArray[np.int64]) -> NDArray[np.int64]:
     return tiles.repeat(TILE_PX, axis=0).repeat(TILE_PX, axis=1)
 
 
-def _smoothed(tiles: NDArray[np.float64]) -> NDArray[np.float64]:
+def _smooth(tiles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the tiles, each mixed with its eight neighbours (the edge's own beyond the edge)."""
     across = len(tiles)
     for axis in range(2):

@@ -1,4 +1,4 @@
-"""Which of Mitsuba's variants this machine can run, found out by really rendering with it.
+"""Chooses the Mitsuba variant of this machine, by rendering a small picture with each.
 
 LLVM is loaded at run time, and a library that loads may still abort the whole process while it
 compiles (LLVM 15 does, "Cannot select: fminimum"). So each candidate renders a small picture in a
@@ -54,16 +54,16 @@ _DEVICES: Mapping[str, Device] = {"llvm_ad_rgb": "cpu", "cuda_ad_rgb": "gpu"}
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """What Mitsuba runs on."""
+    """Mitsuba variant, with its libraries and devices."""
 
     name: VariantName
-    """Mitsuba's name for it."""
+    """Name of the Mitsuba variant, with its backend and color mode."""
     libllvm: str
     """The LLVM library that it compiles with; empty on a GPU."""
     note: str
-    """What the user should know of this choice; empty if nothing."""
+    """Note for the user about this choice; empty if there is none."""
     denoiser: DenoiserDevice = "CPU"
-    """What Open Image Denoise runs on."""
+    """Device of Open Image Denoise."""
 
     @property
     def device(self) -> Device:
@@ -121,19 +121,19 @@ def choose_variant(default: Device = "cpu", *, device: Device | None = None) -> 
     )
 
 
-def _probe_gpu(*, retry_failed: bool) -> "_Probed":
-    """Return what a probe of the GPU found, from memory where it may be.
+def _probe_gpu(*, retry_failed: bool) -> "_ProbeResult":
+    """Return the result of a probe of the GPU, remembered or new.
 
     Args:
         retry_failed: whether a remembered problem is probed again: its cause may be fixed.
     """
     memory = cache_folder("gpu_probes.json")
     identity = _gpu_identity()
-    known = _remembered(memory)
+    known = _read_memory(memory)
     for text in known:
         name, problem, denoiser_problem = json.loads(text)
         if name == identity and not (problem and retry_failed):
-            return _Probed(problem=problem, denoiser_problem=denoiser_problem)
+            return _ProbeResult(problem=problem, denoiser_problem=denoiser_problem)
     probed = _probe(_GPU)
     other_rows = [text for text in known if json.loads(text)[0] != identity]
     row = json.dumps([identity, probed.problem, probed.denoiser_problem])
@@ -147,9 +147,9 @@ def _on_processor() -> Variant:
         if _works(library):
             return Variant(name="llvm_ad_rgb", libllvm=str(library), note="")
         tried.append(library.name)
-    found = f"of {', '.join(tried)} none works with Mitsuba" if tried else "no LLVM library found"
+    reason = f"of {', '.join(tried)} none works with Mitsuba" if tried else "no LLVM library found"
     raise TrilightError(
-        f"rendering: {found}; expected LLVM, by which Mitsuba compiles. Install it: "
+        f"rendering: {reason}; expected LLVM, by which Mitsuba compiles. Install it: "
         "apt-get install libllvm19."
     )
 
@@ -183,7 +183,7 @@ def _works(library: Path) -> bool:
     """
     memory = cache_folder("llvm_probes.json")
     identity = sha256_hex(canonical_json([_identity(library), probe_picture.TABLE]))
-    known = _remembered(memory)
+    known = _read_memory(memory)
     if identity in known:
         return True
     probed = _probe(Variant(name="llvm_ad_rgb", libllvm=str(library), note=""))
@@ -204,7 +204,7 @@ def _remember(memory: Path, known: list[str]) -> None:
         write_atomically(memory, json.dumps(known[-_REMEMBERED_TRIES:]).encode())
 
 
-def _remembered(memory: Path) -> list[str]:
+def _read_memory(memory: Path) -> list[str]:
     try:
         known = json.loads(memory.read_bytes())
     except (OSError, ValueError):
@@ -226,30 +226,30 @@ def _gpu_identity() -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Probed:
-    """What a probe found."""
+class _ProbeResult:
+    """Result of a probe."""
 
     problem: str = ""
-    """Why the variant cannot be used; empty where it can."""
+    """Reason why the variant cannot be used; empty if it can."""
     is_silent: bool = False
-    """Whether the problem is that there was no answer in time, which a busy machine may cause."""
+    """True if there was no answer in time, which a busy machine may cause."""
     denoiser_problem: str = ""
-    """Why its GPU cannot denoise; empty where it can, or where there is no GPU."""
+    """Reason why its GPU cannot denoise; empty if it can, or if there is no GPU."""
 
 
 _GPU = Variant(name="cuda_ad_rgb", libllvm="", note="", denoiser="CUDA")
 
 
-def _probe(variant: Variant) -> _Probed:
+def _probe(variant: Variant) -> _ProbeResult:
     """Render a small picture in a child, and once more where it gave no answer."""
-    found = _probe_within(variant, _PROBE_S[0])
+    result = _probe_within(variant, _PROBE_S[0])
     for wall_s in _PROBE_S[1:]:
-        if found.is_silent:
-            found = _probe_within(variant, wall_s)
-    return found
+        if result.is_silent:
+            result = _probe_within(variant, wall_s)
+    return result
 
 
-def _probe_within(variant: Variant, wall_s: float) -> _Probed:
+def _probe_within(variant: Variant, wall_s: float) -> _ProbeResult:
     """Render a small picture in a child; an abort, a hang or a wrong picture is a problem."""
     with tempfile.TemporaryDirectory() as kernels:
         environment = {**child_environment(), "DRJIT_CACHE_DIR": kernels}
@@ -267,10 +267,10 @@ def _probe_within(variant: Variant, wall_s: float) -> _Probed:
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            return _Probed(problem=f"no answer within {wall_s:g} s", is_silent=True)
+            return _ProbeResult(problem=f"no answer within {wall_s:g} s", is_silent=True)
     if _RAYS_LEFT_OUT in result.stderr:
-        return _Probed(problem="Dr.Jit left out some of the rays")
+        return _ProbeResult(problem="Dr.Jit left out some of the rays")
     if result.returncode == 0:
-        return _Probed(denoiser_problem=result.stdout.strip())
+        return _ProbeResult(denoiser_problem=result.stdout.strip())
     lines = result.stderr.strip().splitlines()
-    return _Probed(problem=lines[-1] if lines else f"it ended with status {result.returncode}")
+    return _ProbeResult(problem=lines[-1] if lines else f"it ended with status {result.returncode}")

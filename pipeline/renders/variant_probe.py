@@ -5,7 +5,7 @@ one (pipeline.renders.probe_picture) within its noise. The scene needs every kin
 lamp beside the view, a glossy wall that reflects light, and a screen that hides and shades what is
 behind it. Where a kernel misses one kind of hit, some block of the picture is wrong.
 
-On a graphics card it then says on standard output why pictures cannot be denoised there, if so.
+On a GPU it then prints why pictures cannot be denoised there, if so.
 """
 
 import resource
@@ -17,7 +17,7 @@ import mitsuba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.renders.denoiser import DenoiserDevice, card_is_supported, set_denoiser_device
+from pipeline.renders.denoiser import DenoiserDevice, gpu_is_supported, set_denoiser_device
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
 from storage.conventions import look_at_c2w
 from storage.records.material import completed_rows
@@ -30,8 +30,8 @@ _MOST_DEVIATIONS = 6
 """Standard deviations by which a right picture is off, somewhere, once in ten million probes."""
 
 _DENOISER_TOLERANCE = 0.02
-"""Of a block's mean: cards compute in half floats, which are exact to 0.0005, through many layers;
-a picture that a card gets wrong is off by far more."""
+"""Tolerance relative to a block's mean: GPUs compute in half floats, which are exact to 0.0005,
+through many layers; a picture that a GPU gets wrong is off by far more."""
 
 _DEVICES: tuple[DenoiserDevice, ...] = ("CPU", "CUDA")
 
@@ -65,7 +65,7 @@ def wrong_picture() -> str:
 
 def denoiser_problem() -> str:
     """Return why pictures cannot be denoised on the graphics card, or nothing."""
-    if not card_is_supported():
+    if not gpu_is_supported():
         return "Open Image Denoise does not support the graphics card"
     blocks = []
     for device in _DEVICES:
@@ -74,8 +74,8 @@ def denoiser_problem() -> str:
             blocks.append(probe_blocks(seed=0, denoiser="high")[0])
         except RuntimeError as error:
             return f"{error} (on {device})"
-    right, found = blocks
-    if (np.abs(found - right) < _DENOISER_TOLERANCE * right).all():
+    on_cpu, on_gpu = blocks
+    if (np.abs(on_gpu - on_cpu) < _DENOISER_TOLERANCE * on_cpu).all():
         return ""
     return "Open Image Denoise gives another picture on the graphics card"
 

@@ -29,7 +29,7 @@ from pipeline.renders.kernel_scene import KernelScene
 from pipeline.renders.light_kernel import trace_light
 from pipeline.renders.path_kernel import trace
 from pipeline.renders.photon_kernel import PhotonRecords, trace_photons
-from pipeline.renders.recorded_calls import KernelInputs, recorded
+from pipeline.renders.recorded_calls import KernelInputs, record_launches
 from pipeline.renders.sky_share import shining_sky, sky_share
 from pipeline.renders.sky_table import SkyTable
 from pipeline.renders.splats import Splats, SplatUnit, splat_unit
@@ -66,7 +66,7 @@ class VectorTracer:
         sky = shining_sky(scene)
         self._scene = KernelScene(
             surfaces=seen,
-            everything=_load(scene, order, beside=seen),
+            everything=_load(scene, order, child=seen),
             table=surface_table(scene, order),
             emitters=EmitterTable(scene, emitters, may_be_dark=sky is not None),
             cone=EmissionCone(scene),
@@ -79,7 +79,7 @@ class VectorTracer:
             _settle(KernelInputs(self._scene))
         self._parts = KernelParts(bounces=False, lobes=False)
         self._unit = SplatUnit(splat_unit(scene))
-        self._guide = functools.cache(functools.partial(_learnt, scene, self._scene))
+        self._guide = functools.cache(functools.partial(_learn_guide, scene, self._scene))
 
     def only_light(self, row: int) -> "VectorTracer":
         lit = self._record.object_index[self._emitters] == row
@@ -94,8 +94,8 @@ class VectorTracer:
         tracer._parts = KernelParts(bounces=bounces, lobes=lobes)
         return tracer
 
-    def guided(self) -> "VectorTracer":
-        """Return a tracer of the same light that is guided where a mirror lights rough surfaces.
+    def with_guide(self) -> "VectorTracer":
+        """Return the same tracer with a guide where a mirror lights rough surfaces.
 
         The first call learns the scene, always the same whatever was traced before. The tracers of
         single lights use the table that was learnt with all of them.
@@ -118,7 +118,7 @@ class VectorTracer:
         return DeviceSum(self, camera)
 
     def _film(self, camera: Camera) -> Film:
-        return Film(camera.scaled(self._scale))
+        return Film(camera.at_scale(self._scale))
 
     @property
     def _light_paths(self) -> float:
@@ -222,12 +222,12 @@ def trace_light_paths(
     return [dr.gather(mi.Color3f, part, pixels) for part in landed]
 
 
-@recorded
+@record_launches
 def _means(objects: Any, pixels: Any, traced: Any, resolution: int, spp: int, count: int) -> Any:
     return traced(objects, pixels, resolution, spp, count)
 
 
-@recorded
+@record_launches
 def _sums(
     objects: Any, pixels: Any, traced: Any, resolution: int, spp: int, count: int, sums: list[Any]
 ) -> list[Any]:
@@ -244,12 +244,12 @@ def _sums(
     return sums
 
 
-@recorded
+@record_launches
 def _settle(objects: Any) -> Any:
     return objects[0].num_surfaces + 1
 
 
-@recorded
+@record_launches
 def _features(objects: Any, resolution: int, spp: int) -> dict[str, Any]:
     scene, film, parts = objects
     hit = _first_hit(scene, film, resolution, spp)
@@ -261,7 +261,7 @@ def _features(objects: Any, resolution: int, spp: int) -> dict[str, Any]:
     return {name: _pixel_means(spp, dr.select(active, values, 0)) for name, values in named.items()}
 
 
-@recorded
+@record_launches
 def _hits(objects: Any, resolution: int) -> Any:
     scene, film = objects
     return _first_hit(scene, film, resolution, 1).is_valid()
@@ -297,7 +297,7 @@ class DeviceSum:
         self.sums = _sums(*arguments, self.sums)
 
     def guide(self) -> None:
-        self._tracer = self._tracer.guided()
+        self._tracer = self._tracer.with_guide()
 
     def read(self) -> NDArray[np.float64]:
         return np.stack([_picture(self._camera, total) for total in self.sums[:-3]])
@@ -306,7 +306,7 @@ class DeviceSum:
         return read_back(self.sums[-3]).reshape(self._camera.resolution, self._camera.resolution)
 
 
-def _learnt(record: Scene, scene: KernelScene) -> GuideTable | None:
+def _learn_guide(record: Scene, scene: KernelScene) -> GuideTable | None:
     """Return the guide of a scene: None where no mirror lights a rough surface."""
     order = np.concatenate(split_triangles(record))
     corners = record.vertex_positions[record.faces[order]]
@@ -339,10 +339,10 @@ def even_numbers(count: int, shifts: Sequence[Any]) -> list[Any]:
     ]
 
 
-def _load(scene: Scene, triangles: NDArray[np.intp], beside: Any = None) -> Any:
-    """Return a mi.Scene of one mesh, whose triangle numbers are places in `triangles`.
+def _load(scene: Scene, triangles: NDArray[np.intp], child: Any = None) -> Any:
+    """Return a mi.Scene of one mesh, whose triangle numbers are positions in `triangles`.
 
-    One kernel may trace rays into this scene and into `beside`. On a graphics card all rays of a
+    One kernel may trace rays into this scene and into `child`. On a GPU all rays of a
     kernel use one OptiX shader binding table, and miss whatever is in another table. A scene that
     has another scene as a child shares its table.
     """
@@ -351,7 +351,7 @@ def _load(scene: Scene, triangles: NDArray[np.intp], beside: Any = None) -> Any:
     parameters["vertex_positions"] = own_floats(scene.vertex_positions)
     parameters["faces"] = own_integers(scene.faces[triangles])
     parameters.update()
-    children = {"mesh": mesh} if beside is None else {"mesh": mesh, "beside": beside}
+    children = {"mesh": mesh} if child is None else {"mesh": mesh, "beside": child}
     return mi.load_dict({"type": "scene", **children})
 
 

@@ -1,4 +1,4 @@
-"""`ViewPictures`: what is worked out of the samples of a view, in whatever memory that is done."""
+"""`ViewPictures`: means, errors and denoised pictures of a view, in numpy or on the device."""
 
 import functools
 import operator
@@ -21,7 +21,7 @@ which would hide the overflow."""
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MeasuredLook:
-    """What is measured on the samples of a view at one time."""
+    """Measurements on the samples of a view at one time."""
 
     floor: MeasuredFloor
     """Stated error of the picture."""
@@ -39,8 +39,8 @@ class ViewPictures(Protocol):
     """
 
     hits: NDArray[np.bool_]
-    """[R, R] as of `Tracer.hits`."""
-    shown: NDArray[np.bool_]
+    """[R, R] true where `Tracer.hits` is."""
+    visible: NDArray[np.bool_]
     """[R, R] pixels with a first surface, anywhere within the pixel; all of them if none has."""
 
     def look(self, quality: Filtered) -> MeasuredLook:

@@ -269,7 +269,7 @@ GUIDED = {
 @pytest.mark.parametrize("scene", GUIDED.values(), ids=GUIDED.keys())
 def test_a_guided_picture_has_the_light_of_an_unguided_one(scene: Scene) -> None:
     tracer = VectorTracer(scene, max_depth=10, rr_depth=2)
-    guided = tracer.guided()
+    guided = tracer.with_guide()
     guide = guided._scene.guide
     assert guide is not None
     assert len(guide._densities) <= (1 + 4 * 2048) * BINS

@@ -69,7 +69,7 @@ def _register() -> None:
             lobes = KernelLobes(
                 diffuse=colours["diffuse"] * (1 - weight),
                 specular=colours["specular"] * weight,
-                again=colours["again"],
+                multiscatter=colours["again"],
                 **numbers,
             )
             geometric = si.to_local(si.n)

@@ -55,9 +55,9 @@ def squared_error(a: Half, b: Half, curve: Curve) -> NDArray[np.float64]:
         return of_half
     of_halves = 0.5 * (np.square(a.denoised_rgb - raw_b) + np.square(b.denoised_rgb - raw_a))
     noise = 0.5 * np.square(raw_a - raw_b)
-    apart = 0.25 * np.square(a.denoised_rgb - b.denoised_rgb, dtype=np.float64)
+    half_difference_sq = 0.25 * np.square(a.denoised_rgb - b.denoised_rgb, dtype=np.float64)
     slope = secant_slope(curve, *_means(a, b))
-    estimate = of_halves - noise - apart
+    estimate = of_halves - noise - half_difference_sq
     mean: NDArray[np.float64] = (np.square(slope) * estimate).mean(axis=-1)
     return mean
 

@@ -40,22 +40,23 @@ class HostPictures:
         self._settings = settings
         self._features = tracer.features(camera, spp=settings.aux_spp)
         self.hits = tracer.hits(camera)
-        self.shown = _shown(self._features)
+        self.visible = _visible_pixels(self._features)
         self._changes = LogChanges()
 
     def look(self, quality: Filtered) -> MeasuredLook:
         names = self._settings.part_names
         self._means = means = HostMeans(self._samples)
-        pairs = [(raw, self._denoised(raw, quality)) for raw in means.half_means()]
+        pairs = [(raw, self._denoise(raw, quality)) for raw in means.half_means()]
         error = means.standard_error()
-        kept = pairs
+        corrected = pairs
         if error is not None and self._settings.denoiser != "off":
-            kept = keep_in_halves(pairs, error)
-        first, second = map(_half, kept)
+            corrected = keep_in_halves(pairs, error)
+        first, second = map(_half, corrected)
         floors = [measure_floor(first, second, self.hits)]
         for part in range(len(names)):
             parts = [
-                _half((raw[part :: len(names)], rest[part :: len(names)])) for raw, rest in kept
+                _half((raw[part :: len(names)], rest[part :: len(names)]))
+                for raw, rest in corrected
             ]
             floors.append(measure_floor(parts[0], parts[1], self.hits))
         return MeasuredLook(
@@ -67,13 +68,13 @@ class HostPictures:
     def finish(self) -> NDArray[np.float32]:
         raw = self._means.mean()
         error = self._means.standard_error()
-        parts = self._denoised(raw, self._settings.denoiser)
+        parts = self._denoise(raw, self._settings.denoiser)
         if error is None or self._settings.denoiser == "off":
             return parts
-        kept = keep_converged(parts, raw, error)
-        return np.stack([with_mean_of(*pair) for pair in zip(kept, raw, strict=True)])
+        corrected = keep_converged(parts, raw, error)
+        return np.stack([with_mean_of(*pair) for pair in zip(corrected, raw, strict=True)])
 
-    def _denoised(self, pictures: Pictures, quality: Filtered) -> Pictures:
+    def _denoise(self, pictures: Pictures, quality: Filtered) -> Pictures:
         require_bounded(float(pictures.max()))
         if quality == "off":
             return pictures
@@ -153,11 +154,11 @@ def _half(pair: tuple[Pictures, Pictures]) -> Half:
     return Half(raw_rgb=pair[0].sum(axis=0), denoised_rgb=pair[1].sum(axis=0))
 
 
-def _shown(features: Features) -> NDArray[np.bool_]:
-    shown: NDArray[np.bool_] = np.any(features.normal != 0, axis=-1)
-    if not shown.any():
-        shown[:] = True
-    return shown
+def _visible_pixels(features: Features) -> NDArray[np.bool_]:
+    visible: NDArray[np.bool_] = np.any(features.normal != 0, axis=-1)
+    if not visible.any():
+        visible[:] = True
+    return visible
 
 
 def _with_means_of(pairs: Sequence[tuple[Pictures, Pictures]]) -> list[Pictures]:

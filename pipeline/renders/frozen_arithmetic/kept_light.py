@@ -17,9 +17,9 @@ def keep_converged(
     raw_rgb: NDArray[np.float32],
     standard_error: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return the denoised picture with the raw pixels that are right; as `converged`."""
-    kept = converged(denoised_rgb, raw_rgb, standard_error)
-    return np.where(kept[..., None], raw_rgb, denoised_rgb)
+    """Return the denoised picture with the raw pixels of `converged_mask`."""
+    mask = converged_mask(denoised_rgb, raw_rgb, standard_error)
+    return np.where(mask[..., None], raw_rgb, denoised_rgb)
 
 
 def keep_in_halves(
@@ -30,11 +30,11 @@ def keep_in_halves(
     So the floor is that of the picture: of a glint that is kept, what remains is its noise.
     """
     raw_rgb, denoised_rgb = (np.mean(pictures, axis=0) for pictures in zip(*halves, strict=True))
-    kept = converged(denoised_rgb, raw_rgb, standard_error)[..., None]
-    return [(raw, np.where(kept, raw, denoised)) for raw, denoised in halves]
+    mask = converged_mask(denoised_rgb, raw_rgb, standard_error)[..., None]
+    return [(raw, np.where(mask, raw, denoised)) for raw, denoised in halves]
 
 
-def converged(
+def converged_mask(
     denoised_rgb: NDArray[np.floating],
     raw_rgb: NDArray[np.floating],
     standard_error: NDArray[np.float64],
@@ -53,9 +53,9 @@ def converged(
     bright = raw - denoised > STANDARD_ERRORS * standard_error
     around = np.sqrt(sliding_window_view(np.pad(standard_error**2, 1, "edge"), (3, 3)).mean((2, 3)))
     dark = denoised - raw > STANDARD_ERRORS * around
-    kept: NDArray[np.bool_] = bright & (raw > STANDS_OUT * denoised)
-    kept |= dark & (denoised > DARKER * raw)
-    return kept
+    mask: NDArray[np.bool_] = bright & (raw > STANDS_OUT * denoised)
+    mask |= dark & (denoised > DARKER * raw)
+    return mask
 
 
 def with_mean_of(

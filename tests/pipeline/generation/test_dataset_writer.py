@@ -14,7 +14,7 @@ from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.environment import environment
 from pipeline.generation.run import choose_dataset_variant
 from pipeline.objects.generated import generate_objects
-from pipeline.renders.variant import Device, Variant, _Probed, device_of
+from pipeline.renders.variant import Device, Variant, _ProbeResult, device_of
 from pipeline.shards.pack import pack_shard
 from storage.dataset import layout
 from storage.dataset.dataset import open_dataset
@@ -145,7 +145,7 @@ def test_a_dataset_stays_on_the_device_that_it_began_on(
     monkeypatch.setenv("TRILIGHT_VARIANT", named)
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
-    monkeypatch.setattr("pipeline.renders.variant._probe", lambda variant: _Probed())
+    monkeypatch.setattr("pipeline.renders.variant._probe", lambda variant: _ProbeResult())
     on_cpu = Variant(name="llvm_ad_rgb", libllvm="", note="")
     monkeypatch.setattr("pipeline.renders.variant._on_processor", lambda: on_cpu)
     order = DatasetOrder(build=build, device=device)

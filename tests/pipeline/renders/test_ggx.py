@@ -33,7 +33,7 @@ def kernel_lobes(*, diffuse: Any = 0.0, specular: Any = 0.0, roughness: float) -
         specular=mi.Color3f(*lobes.specular[0].tolist()),
         alpha=mi.Float(lobes.alpha[0]),
         weight=mi.Float(lobes.weight[0]),
-        again=mi.Color3f(*again[0].tolist()),
+        multiscatter=mi.Color3f(*again[0].tolist()),
     )
 
 

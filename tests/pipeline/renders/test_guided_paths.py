@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders import guide_learning, vector_tracer
 from pipeline.renders.guide_cells import GuideCells
-from pipeline.renders.guide_learning import Photons, apportioned, learn
+from pipeline.renders.guide_learning import Photons, apportion_entries, learn
 from pipeline.renders.guide_table import BINS, ENTRIES, SIDE, Guidance, GuideTable, bin_of
 from pipeline.renders.kernel_scene import KernelScene
 from pipeline.renders.renderer import SceneRenderer, set_threads
@@ -34,7 +34,7 @@ def _tracer(scene: Scene) -> VectorTracer:
 
 
 def _guided(tracer: VectorTracer) -> VectorTracer:
-    guided = tracer.guided()
+    guided = tracer.with_guide()
     assert guided._scene.guide is not None, "there is something to learn"
     return guided
 
@@ -105,7 +105,7 @@ def test_a_guided_picture_has_the_same_bits_for_any_number_of_threads() -> None:
 
 def test_a_matt_scene_has_nothing_to_learn() -> None:
     scene = join([quad(FLOOR, material(diffuse=0.6)), light(LAMP, 30.0)], eye=(0, -2, 1))
-    assert _tracer(scene).guided()._scene.guide is None
+    assert _tracer(scene).with_guide()._scene.guide is None
     nothing = np.zeros(0, np.int64)
     cells = GuideCells(np.random.default_rng(5).normal(size=(9, 3, 3)))
     assert learn(cells, Photons(cell=nothing, bin=nothing, power=np.zeros(0))) is None
@@ -136,7 +136,7 @@ def test_adaptive_guided_views_keep_the_light() -> None:
 def test_only_views_that_miss_their_floor_are_guided(monkeypatch: pytest.MonkeyPatch) -> None:
     """A scene is learnt once, whatever its views and lights, and not for views that need little."""
     learnt = list[Scene]()
-    learn = vector_tracer._learnt
+    learn = vector_tracer._learn_guide
 
     def counted(record: Scene, scene: KernelScene) -> GuideTable | None:
         learnt.append(record)
@@ -167,7 +167,7 @@ def test_lights_apart_share_a_table_and_add_up(passes: int, most: float) -> None
     parts = [quad(FLOOR, material(diffuse=0.6)), quad(WALL, material(specular=0.9, roughness=0.2))]
     both = join([*parts, *lamps], eye=(0.3, -2.4, 1.0), target=(0, 0.6, 0.4), fov_deg=50)
     tracer = _tracer(both)
-    alone = [tracer.only_light(row).guided() for row in (2, 3)]
+    alone = [tracer.only_light(row).with_guide() for row in (2, 3)]
     assert alone[0]._scene.guide is alone[1]._scene.guide is _guided(tracer)._scene.guide
     sums = [
         _means(each, both, range(passes * k, passes * k + passes)) for k, each in enumerate(alone)
@@ -184,7 +184,7 @@ def _table(peaks: NDArray[np.int64]) -> Any:
     cells = GuideCells(np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]]))
     shares = np.bincount(peaks, minlength=BINS)[None] / len(peaks)
     rows = (np.arange(len(cells.facing)) % 2).astype(np.int64)
-    return GuideTable(cells, rows, apportioned(shares))
+    return GuideTable(cells, rows, apportion_entries(shares))
 
 
 def _guidance() -> Any:
@@ -284,6 +284,6 @@ def test_a_table_is_bounded_however_many_cells_have_photons(
 def test_shares_become_whole_numbers_that_add_up() -> None:
     shares = np.random.default_rng(4).exponential(size=(50, BINS)) ** 4
     shares /= shares.sum(axis=1, keepdims=True)
-    counts = apportioned(shares)
+    counts = apportion_entries(shares)
     assert (counts.sum(axis=1) == ENTRIES).all()
     assert np.abs(counts - shares * ENTRIES).max() < 1 + 1e-6  # rounded at both ends

@@ -98,7 +98,7 @@ def test_guided_passes_have_one_more_set_of_kernels_for_every_scene() -> None:
 
 
 def _guided(scene: Scene, *, max_depth: int) -> tuple[VectorTracer, Camera]:
-    tracer = VectorTracer(scene, max_depth=max_depth, rr_depth=2).guided()
+    tracer = VectorTracer(scene, max_depth=max_depth, rr_depth=2).with_guide()
     assert tracer._scene.guide is not None
     return tracer, camera_of(scene, 32)
 

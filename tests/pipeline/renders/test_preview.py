@@ -14,7 +14,7 @@ from pipeline.renders.camera import Camera
 from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings, usual_filter
 from pipeline.renders.preview_parts import all_parts, preview_parts, seconds_of, timed_parts
 from pipeline.renders.progressive import FIRST_LOOKS_SPP, ProgressiveRenderer
-from pipeline.renders.renderer import SceneRenderer, finished
+from pipeline.renders.renderer import SceneRenderer, run_to_end
 from pipeline.renders.results import GrowingPicture, Sampling
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tracer import Features
@@ -134,7 +134,7 @@ def test_a_preview_is_made_of_its_parts(
     for spp in (1, 2, 3, 15, 16, 63, 64, 85, 1024, 4096):
         tracer.asked.clear()
         settings = PreviewSettings(resolution=8, spp=spp, denoiser=denoiser)
-        finished(PreviewRenderer(scene, settings).view_steps(scene.c2w[0], 40.0, 0))
+        run_to_end(PreviewRenderer(scene, settings).view_steps(scene.c2w[0], 40.0, 0))
         assert tracer.asked == preview_parts(spp, denoiser), spp
         assert set(tracer.asked) <= set(all_parts())
 
@@ -166,7 +166,7 @@ def looks(scene: Scene) -> list[GrowingPicture]:
 
 def test_the_last_look_is_the_picture_and_the_others_come_nearer() -> None:
     scene = tiny_scene()
-    view = finished(SceneRenderer(scene, GROWING).view_steps(scene.c2w[0], 45.0, 7))
+    view = run_to_end(SceneRenderer(scene, GROWING).view_steps(scene.c2w[0], 45.0, 7))
     seen = looks(scene)
     np.testing.assert_array_equal(seen[-1].radiance_rgb, view.radiance_rgb)
     assert seen[-1].floor is not None and seen[-1].floor.log_db == view.noise_floor_db
@@ -190,11 +190,11 @@ def test_a_preview_of_the_same_scene_is_the_one_that_render_makes() -> None:
     for spp in (4, 64):
         steps = renderer.preview_steps(scene.c2w[0], 45.0, 7, spp)
         first = next(steps)
-        look = finished(steps)
+        look = run_to_end(steps)
         assert not isinstance(first, GrowingPicture) and first.expected_spp == spp
         assert (look.spp, look.floor) == (spp, None) and look.core_s > 0
         asked = PreviewSettings(resolution=32, spp=spp, denoiser=usual_filter(spp))
-        alone = finished(PreviewRenderer(scene, asked).view_steps(scene.c2w[0], 45.0, 7))
+        alone = run_to_end(PreviewRenderer(scene, asked).view_steps(scene.c2w[0], 45.0, 7))
         np.testing.assert_array_equal(look.radiance_rgb, alone.radiance_rgb)
 
 

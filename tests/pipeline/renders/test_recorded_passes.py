@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import read_back
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.recorded_calls import KernelInputs, recorded
+from pipeline.renders.recorded_calls import KernelInputs, record_launches
 from pipeline.renders.tracer import Tracer
 from pipeline.renders.vector_tracer import VectorTracer
 from storage.records.scene import Scene
@@ -74,5 +74,5 @@ def test_old_scenes_are_not_freed_while_a_call_is_recorded() -> None:
             gc.collect()
         return 2 * values
 
-    doubled = recorded(double)(KernelInputs(), dr.opaque(mi.Float, 1, 3))
+    doubled = record_launches(double)(KernelInputs(), dr.opaque(mi.Float, 1, 3))
     np.testing.assert_array_equal(doubled, 2)

@@ -96,7 +96,7 @@ def test_guided_paths_expect_the_same() -> None:
     scene = join([floor, mirror, lamp], eye=(0, -2, 1.5), sky=smooth())
     tracer = load_tracer(scene, max_depth=6, rr_depth=5)
     assert isinstance(tracer, VectorTracer)
-    guided = tracer.guided()
+    guided = tracer.with_guide()
     assert guided._scene.guide is not None and guided._scene.sky is not None
     plain = render_passes(tracer, scene, passes=8)
     assert_same_light(render_passes(guided, scene, first_seed=500, passes=8), plain)

@@ -22,7 +22,7 @@ from pipeline.renders.facts import render_facts
 from pipeline.renders.llvm_libraries import llvm_libraries
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.variant import Device, Variant, _Probed, activate, choose_variant
+from pipeline.renders.variant import Device, Variant, _ProbeResult, activate, choose_variant
 from pipeline.renders.variant_probe import BLOCK, probe_scene, wrong_picture
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.records.scene_file import encode_scene
@@ -64,12 +64,12 @@ def test_a_library_that_is_none_is_passed_over_and_success_is_remembered(
         patch.setattr(variant_module, "_probe", _must_not_be_asked)
         assert choose_variant() == variant
     memory.write_text("damaged")
-    monkeypatch.setattr(variant_module, "_probe", lambda variant: _Probed())
+    monkeypatch.setattr(variant_module, "_probe", lambda variant: _ProbeResult())
     assert choose_variant() == variant
     assert json.loads(memory.read_text()) == remembered
 
 
-def _must_not_be_asked(variant: Variant) -> _Probed:
+def _must_not_be_asked(variant: Variant) -> _ProbeResult:
     raise AssertionError(f"{variant} was probed again")
 
 
@@ -79,8 +79,8 @@ def test_where_no_library_works_it_says_what_to_install(
     library = tmp_path / "libLLVM-1.so"
     library.touch()
     monkeypatch.setattr(variant_module, "llvm_libraries", lambda: [library])
-    monkeypatch.setattr(variant_module, "_probe", lambda variant: _Probed(problem="abort"))
-    monkeypatch.setattr(variant_module, "_remembered", lambda memory: [])
+    monkeypatch.setattr(variant_module, "_probe", lambda variant: _ProbeResult(problem="abort"))
+    monkeypatch.setattr(variant_module, "_read_memory", lambda memory: [])
     with pytest.raises(TrilightError, match=r"of libLLVM-1.so none works with Mitsuba; .*libllvm"):
         choose_variant()
     monkeypatch.setattr(variant_module, "llvm_libraries", list)
@@ -122,7 +122,7 @@ def test_a_probe_without_an_answer_is_tried_again_and_leads_to_no_other_library(
     libraries = [Path("/usr/lib/libLLVM-1.so"), Path("/usr/lib/libLLVM-2.so")]
     monkeypatch.setattr(variant_module, "llvm_libraries", lambda: libraries)
     monkeypatch.setattr(variant_module, "_identity", str)
-    monkeypatch.setattr(variant_module, "_remembered", lambda memory: [])
+    monkeypatch.setattr(variant_module, "_read_memory", lambda memory: [])
     monkeypatch.setattr(variant_module, "write_atomically", lambda path, data: None)
     monkeypatch.setattr(variant_module.subprocess, "run", run)
     if silent == 1:
@@ -183,7 +183,7 @@ def test_an_option_names_the_device_before_the_variable_and_the_default(
     monkeypatch.setenv("TRILIGHT_VARIANT", named)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     monkeypatch.setattr(variant_module, "_on_processor", lambda: ON_CPU)
-    monkeypatch.setattr(variant_module, "_probe", lambda variant: _Probed(problem=problem))
+    monkeypatch.setattr(variant_module, "_probe", lambda variant: _ProbeResult(problem=problem))
     if chosen not in (CPU, GPU):
         with pytest.raises(TrilightError, match=chosen):
             choose_variant(default, device=device)
@@ -213,9 +213,9 @@ def test_a_probe_of_a_gpu_is_remembered_for_its_driver(
     probes: list[str] = []
     results = iter(["no OptiX", "", ""])
 
-    def probe(variant: Variant) -> _Probed:
+    def probe(variant: Variant) -> _ProbeResult:
         probes.append(variant.name)
-        return _Probed(problem=next(results))
+        return _ProbeResult(problem=next(results))
 
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
     monkeypatch.setattr(variant_module, "_probe", probe)
