@@ -1,4 +1,4 @@
-"""Stopping rule of adaptive sampling: a view's ends at all of its targets, or at the cap.
+"""Stopping rule of adaptive sampling: at all targets of a view, or at the cap.
 
 Targets and measured floors go by the name of their metric (storage.metrics). One view may need many
 more samples by one metric than by another: the linear PSNR weighs bright pixels more, up to
