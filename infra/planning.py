@@ -220,9 +220,7 @@ def _settings(order: DatasetOrder) -> BuildSettings:
     return named_build(
         order.build,
         resolution=order.resolution,
-        noise_floor_db=order.noise_floor_db,
-        noise_floor_linear_db=order.noise_floor_linear_db,
-        noise_floor_objects_db=order.noise_floor_objects_db,
+        noise_targets=order.noise_targets,
         changes=order.changes,
     )
 

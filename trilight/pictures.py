@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from infra.rendering.cameras import own_camera
 from infra.torch_library import require_torch
 from pipeline.renders.results import RenderedView
-from pipeline.renders.settings import one_picture
+from pipeline.renders.settings import NoiseTargets, one_picture
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX, preview_srgb8
 from storage.errors import TrilightError
@@ -128,9 +128,11 @@ def render_views(
         one_picture(
             resolution=resolution,
             max_spp=max_spp,
-            noise_floor_db=noise_floor_db,
-            noise_floor_linear_db=noise_floor_linear_db,
-            noise_floor_objects_db=noise_floor_objects_db,
+            noise_targets=NoiseTargets(
+                log_db=noise_floor_db,
+                linear_db=noise_floor_linear_db,
+                objects_db=noise_floor_objects_db,
+            ),
             split=split,
             split_lobes=split_lobes,
         ),

@@ -6,7 +6,6 @@ from typing import Any, TypeVar
 from infra.cli.changes import BaseSettings, all_changes, dataset_record
 from pipeline.builds.named import named_build
 from pipeline.generation.dataset_order import DatasetOrder
-from pipeline.renders.settings import asked_floors
 
 Order = TypeVar("Order", bound=DatasetOrder)
 _LICENCES = "allowed_licences"
@@ -31,8 +30,5 @@ def with_base_settings(order: Order, base: BaseSettings) -> Order:
 def _options(order: DatasetOrder) -> dict[str, Any]:
     """Return the settings that single options state; they override those of a file."""
     stated = {"seed": order.seed, "renders.resolution": order.resolution}
-    floors = asked_floors(
-        order.noise_floor_db, order.noise_floor_linear_db, order.noise_floor_objects_db
-    )
     options: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
-    return options | {f"renders.{name}": db for name, db in floors.items()}
+    return options | {f"renders.{name}": db for name, db in order.noise_targets.overrides.items()}

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from infra.rendering.look import ToneMap
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.renders.preview import MOST_SPP
-from pipeline.renders.settings import Filtered, NoiseFloor, Resolution, Samples
+from pipeline.renders.settings import Filtered, NoiseFloor, NoiseTargets, Resolution, Samples
 from storage.errors import TrilightError
 from storage.metrics import MAX_DB
 from storage.settings.described import checked
@@ -95,6 +95,15 @@ class RenderOptions:
                 "--split or --split-lobes is given; expected --engine mitsuba or both beside it, "
                 "since a network makes all light together."
             )
+
+    @property
+    def noise_targets(self) -> NoiseTargets:
+        """The target errors."""
+        return NoiseTargets(
+            log_db=self.noise_floor_db,
+            linear_db=self.noise_floor_linear_db,
+            objects_db=self.noise_floor_objects_db,
+        )
 
     def _require_one_kind(self) -> None:
         """Raise TrilightError where options of a preview and of a measured picture are mixed."""

@@ -154,9 +154,7 @@ def _settings(options: RenderOptions, resolution: int) -> RenderSettings | Previ
     return one_picture(
         resolution=resolution,
         max_spp=options.max_spp,
-        noise_floor_db=options.noise_floor_db,
-        noise_floor_linear_db=options.noise_floor_linear_db,
-        noise_floor_objects_db=options.noise_floor_objects_db,
+        noise_targets=options.noise_targets,
         split=options.split,
         split_lobes=options.split_lobes,
     )

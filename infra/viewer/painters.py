@@ -16,7 +16,7 @@ from pipeline.documents.scene_passes import PASS_VIEWS, PassView
 from pipeline.generation.progressive_tracer import ProgressiveTracer
 from pipeline.renders.preview import usual_filter
 from pipeline.renders.results import GrowingPicture, Sampling
-from pipeline.renders.settings import FIRST_SPP, RenderSettings, one_picture
+from pipeline.renders.settings import FIRST_SPP, NoiseTargets, RenderSettings, one_picture
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.records.passes.declared import pass_names
@@ -130,7 +130,9 @@ class SamplesPainter:
 
 def _traced_settings(options: PictureOptions) -> RenderSettings:
     return one_picture(
-        resolution=options.resolution, max_spp=MOST_SPP, noise_floor_db=options.error_db
+        resolution=options.resolution,
+        max_spp=MOST_SPP,
+        noise_targets=NoiseTargets(log_db=options.error_db),
     )
 
 

@@ -10,7 +10,7 @@ from pipeline.builds.settings import BuildSettings, NamedBuild
 from pipeline.builds.training import TRAINING_BUILDS
 from pipeline.objects.generated import BENCHMARK
 from pipeline.objects.generated import PREFIX as BUILTIN
-from pipeline.renders.settings import asked_floors
+from pipeline.renders.settings import NoiseTargets
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
 from storage.registry import Registry
@@ -56,9 +56,7 @@ def named_build(
     *,
     seed: int | None = None,
     resolution: int | None = None,
-    noise_floor_db: float | None = None,
-    noise_floor_linear_db: float | None = None,
-    noise_floor_objects_db: float | None = None,
+    noise_targets: NoiseTargets | None = None,
     allow_licences: tuple[str, ...] = (),
     changes: Mapping[str, Any] | None = None,
 ) -> BuildSettings:
@@ -67,8 +65,7 @@ def named_build(
     Args:
         name: one of BUILDS.
         seed, resolution: replace the build's value unless None.
-        noise_floor_db, noise_floor_linear_db, noise_floor_objects_db: if one is a number, they
-            replace all of the build's targets, and None means no such target.
+        noise_targets: if one is set, they replace all of the build's targets.
         allow_licences: licences that are allowed in addition to the build's.
         changes: any other settings by dotted name, such as `scenes.lights.coloured_share`.
 
@@ -84,8 +81,8 @@ def named_build(
         )
     named = {"seed": seed, "renders.resolution": resolution}
     overrides: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
-    floors = asked_floors(noise_floor_db, noise_floor_linear_db, noise_floor_objects_db)
-    overrides |= {f"renders.{name}": db for name, db in floors.items()}
+    targets = (noise_targets or NoiseTargets()).overrides
+    overrides |= {f"renders.{name}": db for name, db in targets.items()}
     build = changed(build, overrides)
     licences = tuple(sorted({*build.allowed_licences, *allow_licences}))
     return changed(dataclasses.replace(build, allowed_licences=licences), changes or {})

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from pipeline.builds.named import BUILDS
 from pipeline.exchange.from_description import AlbedoOverOne
-from pipeline.renders.settings import NoiseFloor, Resolution
+from pipeline.renders.settings import NoiseFloor, NoiseTargets, Resolution
 from pipeline.renders.variant import Device
 from storage.dataset.layout import dataset_folder
 from storage.dataset.settings import MOST_SCENES
@@ -117,6 +117,15 @@ class DatasetOrder:
             raise TrilightError(f"--views is {self.views}; expected it only with --scenes-from.")
         dataset_folder(self.place)
         self.shard_range()
+
+    @property
+    def noise_targets(self) -> NoiseTargets:
+        """The target errors."""
+        return NoiseTargets(
+            log_db=self.noise_floor_db,
+            linear_db=self.noise_floor_linear_db,
+            objects_db=self.noise_floor_objects_db,
+        )
 
     @property
     def place(self) -> str:

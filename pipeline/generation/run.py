@@ -193,9 +193,7 @@ def resolve_settings(
         order.build,
         seed=order.seed,
         resolution=order.resolution,
-        noise_floor_db=order.noise_floor_db,
-        noise_floor_linear_db=order.noise_floor_linear_db,
-        noise_floor_objects_db=order.noise_floor_objects_db,
+        noise_targets=order.noise_targets,
         allow_licences=order.allow_licences,
         changes=order.changes,
     )

@@ -1,6 +1,7 @@
 """`RenderSettings`: how good a picture must be, and how much it may cost."""
 
 import math
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import pydantic
@@ -166,26 +167,32 @@ class RenderSettings:
         return {k: value for k, value in record.items() if k not in _LATER or value != _LATER[k]}
 
 
-def asked_floors(
-    noise_floor_db: float | None,
-    noise_floor_linear_db: float | None,
-    noise_floor_objects_db: float | None,
-) -> dict[str, float | None]:
-    """Return all three targets by name where one of them is asked for, else none.
+@dataclass(frozen=True, kw_only=True)
+class NoiseTargets:
+    """Target errors of a picture in dB; those that are set are all reached, or the cap is."""
 
-    Whoever asks for one wants it in place of those that are there: the others become None.
-    """
-    asked = (noise_floor_db, noise_floor_linear_db, noise_floor_objects_db)
-    return {} if asked == (None, None, None) else dict(zip(_METRICS, asked, strict=True))
+    log_db: float | None = None
+    """psnr_log_db: over all pixels, of log radiance."""
+    linear_db: float | None = None
+    """psnr_linear_db: of radiance clamped to [0, 1]."""
+    objects_db: float | None = None
+    """object_psnr_log_db: over the pixels that show geometry."""
+
+    @property
+    def overrides(self) -> dict[str, float | None]:
+        """Values of the fields of RenderSettings; empty if no target is set."""
+        values = (self.log_db, self.linear_db, self.objects_db)
+        return {} if values == (None, None, None) else dict(zip(_METRICS, values, strict=True))
+
+
+_USUAL_TARGETS = NoiseTargets(log_db=USUAL_FLOOR_DB)
 
 
 def one_picture(
     *,
     resolution: int,
     max_spp: int,
-    noise_floor_db: float | None = None,
-    noise_floor_linear_db: float | None = None,
-    noise_floor_objects_db: float | None = None,
+    noise_targets: NoiseTargets | None = None,
     split: bool = False,
     split_lobes: bool = False,
 ) -> RenderSettings:
@@ -194,19 +201,18 @@ def one_picture(
     Args:
         resolution: width and height in pixels, a multiple of 8.
         max_spp: most samples per pixel.
-        noise_floor_db, noise_floor_linear_db, noise_floor_objects_db: targets; where all are None,
-            psnr_log_db of USUAL_FLOOR_DB.
+        noise_targets: targets; where none is set, psnr_log_db of USUAL_FLOOR_DB.
         split, split_lobes: what is kept apart.
 
     Raises:
         TrilightError: a value that is refused; the message names it.
     """
-    asked = (noise_floor_db, noise_floor_linear_db, noise_floor_objects_db)
+    targets = noise_targets if noise_targets and noise_targets.overrides else _USUAL_TARGETS
     return RenderSettings(
         resolution=resolution,
-        noise_floor_db=USUAL_FLOOR_DB if asked == (None, None, None) else noise_floor_db,
-        noise_floor_linear_db=noise_floor_linear_db,
-        noise_floor_objects_db=noise_floor_objects_db,
+        noise_floor_db=targets.log_db,
+        noise_floor_linear_db=targets.linear_db,
+        noise_floor_objects_db=targets.objects_db,
         min_spp=min(FIRST_SPP, max_spp),
         max_spp=max_spp,
         min_mean_radiance=0.0,

@@ -8,6 +8,7 @@ import pytest
 
 from pipeline.builds.named import BUILDS, frozen_note, named_build, object_source
 from pipeline.builds.settings import BuildSettings, differences
+from pipeline.renders.settings import NoiseTargets
 from storage.dataset.splits import split_of_object, split_of_shard
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
@@ -31,7 +32,11 @@ def test_settings_survive_the_manifest(name: str) -> None:
 def test_what_is_named_changes_and_nothing_else(name: str) -> None:
     before = named_build(name)
     after = named_build(
-        name, seed=7, resolution=64, noise_floor_db=33.0, changes={"scenes.num_views": 3}
+        name,
+        seed=7,
+        resolution=64,
+        noise_targets=NoiseTargets(log_db=33.0),
+        changes={"scenes.num_views": 3},
     )
     found = {path: value for path, _, value in differences(before.as_json(), after.as_json())}
     expected: dict[str, Any] = {"seed": 7, "renders.resolution": 64}
@@ -42,7 +47,7 @@ def test_what_is_named_changes_and_nothing_else(name: str) -> None:
 
 def test_floors_licences_and_mistakes_of_a_build() -> None:
     plain = named_build("smoke").renders
-    linear = named_build("smoke", noise_floor_linear_db=33.0)
+    linear = named_build("smoke", noise_targets=NoiseTargets(linear_db=33.0))
     assert linear.renders.targets_db == {"psnr_linear_db": 33.0}
     added = named_build("smoke", changes={"renders.noise_floor_linear_db": 33.0})
     assert added.renders.targets_db == {**plain.targets_db, "psnr_linear_db": 33.0}

@@ -17,7 +17,7 @@ from pipeline.renders.frozen_arithmetic.halves import (
 )
 from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans
 from pipeline.renders.samples import HalfSamples
-from pipeline.renders.settings import RenderSettings, one_picture
+from pipeline.renders.settings import NoiseTargets, RenderSettings, one_picture
 from pipeline.renders.stopping import Goal, expected_spp, gaps_db, next_spp, slope_db
 from pipeline.renders.tracer import Chosen
 from storage.conventions import log10_radiance
@@ -128,9 +128,9 @@ def test_one_target_is_enough_and_one_is_needed() -> None:
         RenderSettings(**{**GOOD, "noise_floor_db": None})
     common: dict[str, Any] = {"resolution": 64, "max_spp": 512}
     assert one_picture(**common).targets_db == {"psnr_log_db": 40.0}
-    linear = one_picture(**common, noise_floor_linear_db=35.0)
+    linear = one_picture(**common, noise_targets=NoiseTargets(linear_db=35.0))
     assert linear.targets_db == {"psnr_linear_db": 35.0}
-    both = one_picture(**common, noise_floor_db=44.0, noise_floor_objects_db=43.0)
+    both = one_picture(**common, noise_targets=NoiseTargets(log_db=44.0, objects_db=43.0))
     assert both.targets_db == {"psnr_log_db": 44.0, "object_psnr_log_db": 43.0}
 
 
