@@ -74,7 +74,7 @@ def seen_from(lobes: KernelLobes, wi: Any, albedo: Any) -> KernelLobes:
     return replace(lobes, specular=scaled, weight=dr.select(wi.z > 0, lobes.weight, 0))
 
 
-def evaluate(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> tuple[Any, Any]:
+def evaluate_bsdf(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> tuple[Any, Any]:
     """Return f * cos_o (Color3f) and the density with which `sample` draws wo (Float).
 
     Args:
@@ -103,7 +103,7 @@ def evaluate(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> tuple[Any,
 
 def diffuse_share(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any:
     """Return the share (Color3f) of the diffuse lobe in what `evaluate` reflects; 1 of nothing."""
-    reflected, _ = evaluate(lobes, wi, wo, geometric)
+    reflected, _ = evaluate_bsdf(lobes, wi, wo, geometric)
     diffuse = lobes.diffuse * (_INV_PI * dr.maximum(wo.z, 0))
     return dr.select(reflected > diffuse, diffuse / reflected, 1)
 

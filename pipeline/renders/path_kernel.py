@@ -205,7 +205,7 @@ def _ratio(guidance: Guidance | None, density: Any, unguided: Any) -> Any:
 
 
 def _evaluate_brdf(vertex: Vertex, local: Any) -> tuple[Any, Any]:
-    return ggx.evaluate(vertex.lobes, vertex.incoming, local, vertex.geometric)
+    return ggx.evaluate_bsdf(vertex.lobes, vertex.incoming, local, vertex.geometric)
 
 
 def _reverse_pdf_term(vertex: Vertex, local: Any, depth: Any) -> Any:

@@ -45,7 +45,7 @@ def _register() -> None:
         def sample(self, ctx: Any, si: Any, u: Any, u2: Any, active: Any = True) -> Any:
             lobes, wi, geometric, side = self._seen(si, active)
             wo = ggx.sample(lobes, wi, u, u2)
-            reflected, density = ggx.evaluate(lobes, wi, wo, geometric)
+            reflected, density = ggx.evaluate_bsdf(lobes, wi, wo, geometric)
             drawn: Any = mi.BSDFSample3f(_mirrored(wo, side))
             drawn.pdf, drawn.eta = density, 1.0
             drawn.sampled_type = +mi.BSDFFlags.GlossyReflection
@@ -54,7 +54,7 @@ def _register() -> None:
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
             lobes, wi, geometric, side = self._seen(si, active)
-            return ggx.evaluate(lobes, wi, _mirrored(wo, side), geometric)
+            return ggx.evaluate_bsdf(lobes, wi, _mirrored(wo, side), geometric)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
             return self.eval_pdf(ctx, si, wo, active)[0]

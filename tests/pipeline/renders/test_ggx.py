@@ -65,7 +65,7 @@ def _returned(roughness: float) -> NDArray:
     grid = [np.repeat(middles, side), np.tile(middles, side)]
     u = mi.Point2f(*(mi.Float(np.tile(axis, len(cosines))) for axis in grid))
     wo = ggx.sample(lobes, wi, mi.Float(0), u)
-    reflected, density = ggx.evaluate(lobes, wi, wo, mi.Vector3f(*UP))
+    reflected, density = ggx.evaluate_bsdf(lobes, wi, wo, mi.Vector3f(*UP))
     returned = dr.block_sum(dr.select(density > 0, reflected.x / density, 0), count) / count
     return np.array(returned)
 
@@ -75,9 +75,9 @@ def test_no_mirror_reflects_to_below_the_triangle() -> None:
     lobes = kernel_lobes(diffuse=0.3, specular=0.6, roughness=0.8)
     wi, wo = direction(0.5), mi.Vector3f(-0.8, 0.0, 0.6)
     leaning = mi.Vector3f(0.8, 0.0, 0.6)
-    reflected, density = ggx.evaluate(seen_at(lobes, wi), wi, wo, leaning)
+    reflected, density = ggx.evaluate_bsdf(seen_at(lobes, wi), wi, wo, leaning)
     assert float(reflected.x[0]) == pytest.approx(0.3 * 0.6 / np.pi, rel=1e-6)
-    free, same_density = ggx.evaluate(seen_at(lobes, wi), wi, wo, mi.Vector3f(*UP))
+    free, same_density = ggx.evaluate_bsdf(seen_at(lobes, wi), wi, wo, mi.Vector3f(*UP))
     assert float(free.x[0]) > 1.5 * float(reflected.x[0])
     # It is still sampled, and what is sampled must be counted.
     assert float(density[0]) == float(same_density[0])
@@ -94,7 +94,7 @@ def test_nothing_is_negative_and_nothing_is_nan() -> None:
             directions = [
                 mi.Vector3f(mi.TensorXf(d.astype(np.float32))) for d in (wi, wo, geometric)
             ]
-            result = ggx.evaluate(seen_at(lobes, directions[0]), *directions)
+            result = ggx.evaluate_bsdf(seen_at(lobes, directions[0]), *directions)
             for values in result:
                 dr.eval(values)
                 assert np.isfinite(np.array(values)).all()
@@ -113,13 +113,13 @@ def test_what_is_reciprocal_and_what_is_not() -> None:
                 wi, wo = direction(float(cosines[a])), mi.Vector3f(direction(float(cosines[b])))
                 wo = mi.Vector3f(-0.6 * wo.x, 0.8 * wo.x, wo.z)
                 single = kernel_lobes(diffuse=0.3, specular=0.7, roughness=roughness)
-                there = ggx.evaluate(single, wi, wo, up)[0].x / wo.z
-                back = ggx.evaluate(single, wo, wi, up)[0].x / wi.z
+                there = ggx.evaluate_bsdf(single, wi, wo, up)[0].x / wo.z
+                back = ggx.evaluate_bsdf(single, wo, wi, up)[0].x / wi.z
                 # float32
                 assert float(there[0]) == pytest.approx(float(back[0]), rel=1e-4)
                 white = kernel_lobes(specular=1.0, roughness=roughness)
-                there = ggx.evaluate(seen_at(white, wi), wi, wo, up)[0].x / wo.z
-                back = ggx.evaluate(seen_at(white, wo), wo, wi, up)[0].x / wi.z
+                there = ggx.evaluate_bsdf(seen_at(white, wi), wi, wo, up)[0].x / wo.z
+                back = ggx.evaluate_bsdf(seen_at(white, wo), wo, wi, up)[0].x / wi.z
                 # The table is exact to 0.25 % for each of the two.
                 assert float(there[0] / back[0]) == pytest.approx(albedo[b] / albedo[a], rel=6e-3)
 
@@ -197,7 +197,7 @@ def _chi_square(
     normal = mi.Vector3f(*geometric)
 
     def density(wo: Any) -> Any:
-        return ggx.evaluate(seen_at(claimed or lobes, wi), wi, wo, normal)[1]
+        return ggx.evaluate_bsdf(seen_at(claimed or lobes, wi), wi, wo, normal)[1]
 
     def sample(u: Any) -> tuple[Any, Any]:
         wo = ggx.sample(seen_at(lobes, wi), wi, u[0], mi.Point2f(u[1], u[2]))

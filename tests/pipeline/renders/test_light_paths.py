@@ -354,9 +354,9 @@ def test_the_way_back_has_the_density_that_a_path_from_there_draws(roughness: fl
     mirror = mi.Vector3f(1, 1, turn)
     there, back = wo * mirror, wi * mirror
     normal = geometric * mirror * turn
-    expected = ggx.evaluate(seen_at(lobes, there), there, back, normal)[1]
+    expected = ggx.evaluate_bsdf(seen_at(lobes, there), there, back, normal)[1]
     found = ggx.reverse_density(seen_at(lobes, wi), wi, wo, geometric)
-    useful = np.array(ggx.evaluate(seen_at(lobes, wi), wi, wo, geometric)[1]) > 0
+    useful = np.array(ggx.evaluate_bsdf(seen_at(lobes, wi), wi, wo, geometric)[1]) > 0
     sides = np.array(turn)[useful]
     assert (sides > 0).sum() > 100 and (sides < 0).sum() > 100
     # The same formula in another order, in float32.
