@@ -142,7 +142,7 @@ def test_only_views_that_miss_their_floor_are_guided(monkeypatch: pytest.MonkeyP
         learnt.append(record)
         return learn(record, scene)
 
-    monkeypatch.setattr(vector_tracer, "_learnt", counted)
+    monkeypatch.setattr(vector_tracer, "_learn_guide", counted)
     scene = mirrors()
     camera = camera_of(scene, 16)
     for floor_db, max_spp, times in ((1.0, 512, 0), (90.0, 256, 0), (90.0, 512, 1)):
