@@ -10,9 +10,9 @@ from storage.errors import TrilightError
 from storage.extensions import function_name
 from storage.settings.described import checked, option_words
 from storage.settings.ranges import Within
+from train.resume import StartOptions
 from train.runs import changed_run
 from train.settings import TrainSettings
-from train.start_options import StartOptions
 
 RESTARTS = "TORCHELASTIC_RESTART_COUNT"
 """Environment variable in which torchrun counts the restarts of its processes."""

@@ -35,9 +35,8 @@ from train.loop.state import TrainState, new_state
 from train.monitoring.rows import read_rows
 from train.progress import TrainProgress
 from train.result import pretty_json
-from train.resume import Event, ResumePlan, event_records, plan_resume
+from train.resume import Event, ResumePlan, StartOptions, event_records, plan_resume
 from train.settings import TrainSettings
-from train.start_options import StartOptions
 from train.stored_settings import stored_settings
 
 

@@ -35,8 +35,8 @@ from train.monitoring.settings import WatchSettings
 from train.monitoring.weights_and_biases import require_wandb
 from train.progress import TrainProgress
 from train.result import TrainResult, finish_run
+from train.resume import StartOptions
 from train.settings import TrainSettings
-from train.start_options import StartOptions
 
 MEDIAN_SCENES = 256
 """Number of training scenes for the median picture; more would not change it."""

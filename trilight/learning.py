@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from infra.torch_library import require_torch
 from train.monitoring.settings import WatchSettings
+from train.resume import StartOptions
 from train.runs import changed_run, named_run
 from train.settings import TrainSettings
-from train.start_options import StartOptions
 
 if TYPE_CHECKING:
     from infra.judging import Judgement

@@ -23,9 +23,9 @@ from train.loop.step import Stepper
 from train.loss.objective import Objective
 from train.progress import TrainProgress
 from train.result import TrainResult
+from train.resume import StartOptions
 from train.run import train_run
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
-from train.start_options import StartOptions
 
 CPU = torch.device("cpu")
 ALONE = DistributedContext(device=CPU)

@@ -58,10 +58,10 @@ from train.loop.distributed import DistributedContext
 from train.loop.schedule import learning_rate
 from train.loop.state import TrainState, new_state
 from train.loss.lpips import LINEAR_FILE, VGG16_FILE, load_lpips
+from train.resume import StartOptions
 from train.run import stream_settings, train_run
 from train.runs import changed_run
 from train.settings import AugmentationSettings, TrainSettings
-from train.start_options import StartOptions
 
 SMALL = dataclasses.replace(
     smoke_model(), width=64, num_heads=1, hidden_width=192, encoder_layers=2, decoder_layers=2

@@ -27,7 +27,7 @@ from train.loop.interrupts import Stopped
 from train.monitoring.rows import read_rows
 from train.progress import TrainProgress
 from train.result import TrainResult
-from train.start_options import StartOptions
+from train.resume import StartOptions
 
 TIMINGS = {"views_per_s", "data_wait_share", "flops_per_s", "peak_share", "time_s", "memory_mb"}
 

@@ -28,8 +28,8 @@ from tests.train.kit import TINY_MODEL, Heard, Killed, flip_a_bit, tiny_run, tra
 from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import read_checkpoint
 from train.progress import TrainProgress
+from train.resume import StartOptions
 from train.settings import LossSettings
-from train.start_options import StartOptions
 
 
 def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) -> None:

@@ -28,8 +28,8 @@ from train.loop.recorder import read_rows
 from train.loop.step import PendingStats, Stepper
 from train.progress import TrainProgress
 from train.result import TrainResult
+from train.resume import StartOptions
 from train.settings import TrainSettings
-from train.start_options import StartOptions
 
 
 def run(

@@ -21,8 +21,8 @@ from train.data.mixture import RECORD, Mixture, plan_mixture
 from train.data.scenes import TrainingScene
 from train.data.stream import StreamSettings
 from train.loop.checkpoints import read_checkpoint
+from train.resume import StartOptions
 from train.run import train_run
-from train.start_options import StartOptions
 
 BATCH = 4
 SETTINGS = StreamSettings(seed=1, window=2, batch_size=BATCH, resolution=16, views_per_scene=1)
