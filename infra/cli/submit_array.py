@@ -10,7 +10,7 @@ from pipeline.executors.kubernetes_array import (
     KubernetesOptions,
     create_command,
     submit_job,
-    write_manifest,
+    write_job_file,
 )
 from pipeline.executors.slurm_array import sbatch_command, sbatch_environment, submit_array
 from pipeline.generation.dataset_order import DatasetOrder
@@ -79,7 +79,7 @@ def _submit_slurm(job: ArrayJob, array: ArrayOptions, *, as_json: bool) -> None:
 def _submit_kubernetes(
     job: ArrayJob, array: ArrayOptions, options: KubernetesOptions, *, as_json: bool
 ) -> None:
-    manifest = (write_manifest if array.dry_run else submit_job)(job, options)
+    manifest = (write_job_file if array.dry_run else submit_job)(job, options)
     name = manifest.parent.name
     words = create_command(manifest)
     if as_json:

@@ -79,7 +79,7 @@ def options_from_environment() -> KubernetesOptions:
     return from_record(KubernetesOptions, record)
 
 
-def write_manifest(job: ArrayJob, options: KubernetesOptions) -> Path:
+def write_job_file(job: ArrayJob, options: KubernetesOptions) -> Path:
     """Write the manifest of a job, in a folder of its name, and return the file.
 
     Raises:
@@ -103,7 +103,7 @@ def submit_job(job: ArrayJob, options: KubernetesOptions) -> Path:
     Raises:
         TrilightError: there is no kubectl here, or it refuses; or as `write_manifest`.
     """
-    path = write_manifest(job, options)
+    path = write_job_file(job, options)
     if shutil.which("kubectl") is None:
         raise TrilightError(
             "submit kubernetes: no kubectl here; expected it installed and logged in. The "

@@ -101,7 +101,7 @@ class DevicePictures:
         kind = (self._names, self._resolution, quality != "off")
         filtered = self._denoise_raws(sums, quality, of_both=False)
         arrays = sums, filtered, self._guides, self._masks, self._logs
-        numbers, self._logs = _measure(KernelInputs(), *arrays, *kind)
+        numbers, self._logs = _estimate_error(KernelInputs(), *arrays, *kind)
         rows = read_numbers(numbers).reshape(-1, len(self._counts[0]))
         require_finite(int(rows[2].sum()))
         require_bounded(float(rows[-1].max()))
@@ -182,7 +182,7 @@ def _raws(
 
 
 @record_launches
-def _measure(
+def _estimate_error(
     _: Any,
     sums: Sums,
     filtered: list[list[Any]],

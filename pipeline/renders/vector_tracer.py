@@ -1,4 +1,6 @@
-"""`VectorTracer`: a pass is two compiled kernels (LLVM or CUDA): camera paths and light paths.
+"""`VectorTracer`: path tracing in two compiled kernels (LLVM or CUDA), without `mi.render()`.
+
+One kernel traces paths from the camera, one from the lights.
 
 The sum over a pixel's samples is a reduction of our own, in a fixed order, and that of the light
 paths is one of whole numbers: pictures do not depend on the number of threads. A pass is explicit,

@@ -12,7 +12,7 @@ SMALLEST_DOUBLE_AREA = 1e-12
 """A triangle of a square micrometre: no ray meets it, and its normal is rounding."""
 
 
-def in_unit_sphere(
+def normalize_to_unit_sphere(
     positions: NDArray[np.float32], centring: Literal["vertex_mean", "box"]
 ) -> NDArray[np.float64]:
     """Return the vertices [V, 3] of a level scaled so that the farthest lies on the unit sphere.

@@ -12,7 +12,7 @@ import fcl
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scenes.posing import in_unit_sphere
+from pipeline.scenes.posing import normalize_to_unit_sphere
 from scene_templates.layout import Pose
 from scene_templates.rotations import rotate_points
 from storage.errors import Rejected
@@ -28,7 +28,7 @@ class MeshShape:
         Raises:
             Rejected: "no_faces" if it is a single point or not finite.
         """
-        self.points = in_unit_sphere(level.positions, centring)
+        self.points = normalize_to_unit_sphere(level.positions, centring)
         if not np.isfinite(self.points).all():
             raise Rejected("no_faces", f"{uid}: the level has no extent, or is not finite")
         self.faces = level.faces

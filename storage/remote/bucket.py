@@ -1,4 +1,4 @@
-"""Writing to a bucket: files that appear whole or not at all, and, where asked for, only once.
+"""Uploads to a bucket (s3://, gs://): files appear whole or not at all, and once if asked.
 
 A bucket shows a file when all of it has come, however large it is, so a kill leaves nothing half
 written; parts of an upload that was cut off are invisible, and a rule of the bucket may delete them

@@ -1,4 +1,4 @@
-"""Endless stream of batches of training scenes, fetched and decoded ahead in threads.
+"""Data loader: an endless stream of batches of scenes, fetched and decoded ahead in threads.
 
 Batch i holds the same scenes with the same augmentation wherever the stream starts, for any number
 of ranks and threads: a run resumes by the number of its step.

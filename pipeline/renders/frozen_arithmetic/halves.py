@@ -27,7 +27,7 @@ class Half:
     """[R, R, 3] the same, denoised."""
 
 
-def measure_floor(a: Half, b: Half, hits: NDArray[np.bool_]) -> MeasuredFloor:
+def estimate_error(a: Half, b: Half, hits: NDArray[np.bool_]) -> MeasuredFloor:
     """Return the floor of the picture made from both halves.
 
     Args:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise
-from pipeline.renders.frozen_arithmetic.halves import Half, measure_floor
+from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error
 from pipeline.renders.frozen_arithmetic.kept_light import (
     Pictures,
     keep_converged,
@@ -52,13 +52,13 @@ class HostPictures:
         if error is not None and self._settings.denoiser != "off":
             corrected = keep_in_halves(pairs, error)
         first, second = map(_half, corrected)
-        floors = [measure_floor(first, second, self.hits)]
+        floors = [estimate_error(first, second, self.hits)]
         for part in range(len(names)):
             parts = [
                 _half((raw[part :: len(names)], rest[part :: len(names)]))
                 for raw, rest in corrected
             ]
-            floors.append(measure_floor(parts[0], parts[1], self.hits))
+            floors.append(estimate_error(parts[0], parts[1], self.hits))
         return MeasuredLook(
             floor=floors[0],
             part_floors=dict(zip(names, floors[1:], strict=True)),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders import denoiser, variant_probe
 from pipeline.renders.denoiser import denoise, load_oidn, set_denoiser_device
-from pipeline.renders.frozen_arithmetic.halves import Half, measure_floor
+from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error
 from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans
 from pipeline.renders.frozen_arithmetic.kept_light import (
     Pictures,
@@ -220,7 +220,7 @@ def test_the_floor_of_a_kept_glint_is_its_noise() -> None:
 
 def _floor_db(halves: Sequence[tuple[Pictures, Pictures]], hits: NDArray[np.bool_]) -> float:
     a, b = (Half(raw_rgb=raw[0], denoised_rgb=denoised[0]) for raw, denoised in halves)
-    return measure_floor(a, b, hits).log_db
+    return estimate_error(a, b, hits).log_db
 
 
 def test_the_standard_error_is_that_between_passes() -> None:

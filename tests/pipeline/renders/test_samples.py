@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.renders.camera import Camera
 from pipeline.renders.frozen_arithmetic.halves import (
     Half,
-    measure_floor,
+    estimate_error,
     squared_error,
     surprises,
 )
@@ -253,7 +253,7 @@ def test_a_bias_that_both_halves_share_is_stated() -> None:
     flat = np.full((PX, PX, 3), truth().mean(), np.float32)
     a, b = (Half(raw_rgb=half(rng).raw_rgb, denoised_rgb=flat) for _ in range(2))
     assert psnr_log_db(a.denoised_rgb, b.denoised_rgb) == MAX_DB, "the halves agree exactly"
-    floor = measure_floor(a, b, EVERYWHERE)
+    floor = estimate_error(a, b, EVERYWHERE)
     # The allowances take off what one standard error and one pixel's surprise are: under 1 dB here.
     assert psnr_log_db(flat, truth()) - 1 < floor.log_db < psnr_log_db(flat, truth())
     assert psnr_linear_db(flat, truth()) - 1 < floor.linear_db < psnr_linear_db(flat, truth())
@@ -267,10 +267,10 @@ def test_rare_light_that_one_half_found_is_allowed_for() -> None:
     mean = 0.5 * (raw[3, 4] + calm[3, 4])
     surprise = np.square(log10_radiance(mean) - log10_radiance(calm[3, 4])).mean()
     assert surprises(found, missed, log10_radiance).max() == pytest.approx(surprise)
-    floor = measure_floor(found, missed, EVERYWHERE)
+    floor = estimate_error(found, missed, EVERYWHERE)
     # What one half alone has cancels in the estimate: the allowance is all that is stated.
     assert floor.log_db == pytest.approx(-10 * np.log10(surprise / PX**2), abs=0.1)
-    both = measure_floor(found, found, EVERYWHERE)
+    both = estimate_error(found, found, EVERYWHERE)
     assert both.log_db < floor.log_db - 3, "light that both found is an error, and still a surprise"
 
 
@@ -280,16 +280,16 @@ def test_raw_halves_state_the_error_of_one() -> None:
     halves = [Half(raw_rgb=picture, denoised_rgb=picture) for picture in raw]
     exact = psnr_log_db(raw[0], truth())
     # One standard error of 64 blocks more: 0.2 dB.
-    assert measure_floor(halves[0], halves[1], EVERYWHERE).log_db == pytest.approx(exact, abs=0.4)
+    assert estimate_error(halves[0], halves[1], EVERYWHERE).log_db == pytest.approx(exact, abs=0.4)
 
 
 def test_pictures_without_error_or_without_geometry_state_the_cap() -> None:
     calm = Half(raw_rgb=truth(), denoised_rgb=truth())
-    assert measure_floor(calm, calm, EVERYWHERE).log_db == MAX_DB
+    assert estimate_error(calm, calm, EVERYWHERE).log_db == MAX_DB
     rng = np.random.default_rng(4)
     a, b = half(rng), half(rng)
-    assert measure_floor(a, b, ~EVERYWHERE).object_log_db == MAX_DB
-    assert measure_floor(a, b, EVERYWHERE) == measure_floor(b, a, EVERYWHERE)
+    assert estimate_error(a, b, ~EVERYWHERE).object_log_db == MAX_DB
+    assert estimate_error(a, b, EVERYWHERE) == estimate_error(b, a, EVERYWHERE)
 
 
 def test_an_empty_background_earns_nothing() -> None:
@@ -298,7 +298,7 @@ def test_an_empty_background_earns_nothing() -> None:
     hits[:PX, :PX] = True
     inner = (half(rng), half(rng))
     framed = (_framed(inner[0]), _framed(inner[1]))
-    alone, floor = measure_floor(*inner, EVERYWHERE), measure_floor(*framed, hits)
+    alone, floor = estimate_error(*inner, EVERYWHERE), estimate_error(*framed, hits)
     assert floor.object_log_db == pytest.approx(alone.log_db, abs=1e-9)
     assert floor.log_db > alone.log_db + 3, "three quarters of the pixels are exact"
 

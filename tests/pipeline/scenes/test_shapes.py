@@ -8,7 +8,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.scenes.pool import PooledAsset
-from pipeline.scenes.posing import in_unit_sphere, pose_points, without_slivers
+from pipeline.scenes.posing import normalize_to_unit_sphere, pose_points, without_slivers
 from pipeline.scenes.shapes import MeshShape
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Pose
@@ -177,15 +177,15 @@ def _off_centre() -> NDArray[np.float32]:
 
 def test_the_centre_is_the_mean_of_the_vertices_or_the_middle_of_the_source() -> None:
     for entry in small_pool():
-        points = in_unit_sphere(entry.asset.levels[0].positions, "vertex_mean")
+        points = normalize_to_unit_sphere(entry.asset.levels[0].positions, "vertex_mean")
         # Sums of a thousand float64 below 1.
         assert np.abs(points.mean(axis=0)).max() < 1e-12
         assert abs(np.linalg.norm(points, axis=1).max() - 1) < 1e-12
-    moved = in_unit_sphere(_off_centre() + np.float32(0.3), "vertex_mean")
+    moved = normalize_to_unit_sphere(_off_centre() + np.float32(0.3), "vertex_mean")
     # Positions are float32 before they are centred: 6e-8 of a number below 1, over a radius of 0.5.
-    assert np.abs(moved - in_unit_sphere(_off_centre(), "vertex_mean")).max() < TOUCH
+    assert np.abs(moved - normalize_to_unit_sphere(_off_centre(), "vertex_mean")).max() < TOUCH
     # It is the origin of the asset's unit box, however a level is cut: levels fit each other.
-    points = in_unit_sphere(_off_centre(), "box")
+    points = normalize_to_unit_sphere(_off_centre(), "box")
     assert np.array_equal(
         points, _off_centre() / np.linalg.norm(_off_centre().astype(float), axis=1).max()
     )
@@ -198,7 +198,7 @@ def test_a_posed_mesh_fills_its_sphere(centring: str) -> None:
     rng = np.random.default_rng(0)
     for entry in small_pool():
         pose = _pose(rng, rng.uniform(0.2, 0.5))
-        source = in_unit_sphere(entry.asset.levels[0].positions, centring)  # type: ignore[arg-type]
+        source = normalize_to_unit_sphere(entry.asset.levels[0].positions, centring)  # type: ignore[arg-type]
         points = pose_points(source, pose)
         assert points.dtype == np.float32
         reach = np.linalg.norm(points - pose.centre, axis=1).max()
@@ -208,7 +208,7 @@ def test_a_posed_mesh_fills_its_sphere(centring: str) -> None:
 def test_posing_is_a_similarity() -> None:
     rng = np.random.default_rng(1)
     for entry in small_pool():
-        source = in_unit_sphere(entry.asset.levels[-1].positions, "box")
+        source = normalize_to_unit_sphere(entry.asset.levels[-1].positions, "box")
         pose = _pose(rng, rng.uniform(0.2, 0.5))
         points = pose_points(source, pose).astype(np.float64)
         before = np.linalg.norm(source[:, None] - source[None], axis=-1)
