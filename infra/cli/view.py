@@ -5,6 +5,7 @@ import signal
 import sys
 import threading
 import webbrowser
+from queue import SimpleQueue
 from typing import Annotated
 
 from infra.cli.console import console, first_words, look_at
@@ -41,7 +42,7 @@ def view(options: ViewOptions) -> None:
         require_torch("--checkpoint")
     later = DeferredHandlers(page_of(options.source))
     server = PageServer(later.gets, later.posts, port=options.port)
-    stopped = threading.Event()
+    stops = SimpleQueue[None]()  # an event would deadlock where its waiter handles the signal
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     look_at(f"Look at {server.address}")
@@ -52,10 +53,9 @@ def view(options: ViewOptions) -> None:
 
     room = open_handlers(options.source, checkpoint=options.checkpoint, threads=options.threads)
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stopped.set())
+        signal.signal(number, lambda *_: stops.put(None))
     later.opened.set_result(room)
-    while not stopped.wait(3600):
-        pass
+    stops.get()
     room.close()
     server.shutdown()
     server.server_close()
