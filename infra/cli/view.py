@@ -4,8 +4,8 @@ import os
 import signal
 import sys
 import threading
+import time
 import webbrowser
-from queue import SimpleQueue
 from typing import Annotated
 
 from infra.cli.console import console, first_words, look_at
@@ -14,6 +14,9 @@ from infra.torch_library import require_torch
 from storage.remote.safe_url import safe_url
 from storage.settings.described import checked
 from storage.settings.ranges import Within
+
+_STOP_S = 0.2
+"""Seconds within which Ctrl-C is noticed."""
 
 
 @checked()
@@ -42,7 +45,7 @@ def view(options: ViewOptions) -> None:
         require_torch("--checkpoint")
     later = DeferredHandlers(page_of(options.source))
     server = PageServer(later.gets, later.posts, port=options.port)
-    stops = SimpleQueue[None]()  # an event would deadlock where its waiter handles the signal
+    stops: list[int] = []
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     look_at(f"Look at {server.address}")
@@ -53,9 +56,10 @@ def view(options: ViewOptions) -> None:
 
     room = open_handlers(options.source, checkpoint=options.checkpoint, threads=options.threads)
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stops.put(None))
+        signal.signal(number, lambda number, _: stops.append(number))
     later.opened.set_result(room)
-    stops.get()
+    while not stops:  # no lock: a signal just before a wait without end would be seen after it
+        time.sleep(_STOP_S)
     room.close()
     server.shutdown()
     server.server_close()
