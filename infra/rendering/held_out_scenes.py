@@ -59,7 +59,7 @@ def composing_child(
         source=objects, licence=None, settings=build, writer=publication, workers=workers
     )
     accepted = accept_objects(objects_order)
-    recipe = SceneRecipe(settings=build, variant=variant, threads=workers, pool=accepted.pool)
+    recipe = SceneRecipe(settings=build, variant=variant, threads=workers, origin=accepted.origin)
     limits = dataclasses.replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
     return IsolatedChild(limits=limits, factory=SceneWorker, args=(recipe,))
 

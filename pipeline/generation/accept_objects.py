@@ -20,6 +20,7 @@ from pipeline.generation.object_batches import (
     prepare_in_batches,
 )
 from pipeline.generation.object_options import ObjectOptions
+from pipeline.generation.scene_origin import ComposedScenes
 from pipeline.objects.listing import Fetched
 from pipeline.objects.sources import ListedObjects
 from storage.dataset.layout import DatasetFolder
@@ -183,6 +184,5 @@ def load_trusted_objects(options: ObjectOptions) -> AcceptedObjects | None:
     return AcceptedObjects(
         num_objects=facts.num_objects,
         num_found=facts.num_found,
-        pool=options.pool,
-        maps=maps,
+        origin=ComposedScenes(pool=options.pool, maps=maps),
     )

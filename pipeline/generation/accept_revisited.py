@@ -84,5 +84,5 @@ def accept_revisited(path: str, settings: BuildSettings, writer: DatasetWriter) 
     return AcceptedObjects(
         num_objects=sum(entry.kind == OBJECT for entry in locked),
         num_found=len(locked),
-        revisited=RevisitedScenes(root=root, digest=source.manifest.dataset_digest),
+        origin=RevisitedScenes(root=root, digest=source.manifest.dataset_digest),
     )

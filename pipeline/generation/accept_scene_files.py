@@ -67,7 +67,7 @@ def accept_scene_files(
     return AcceptedObjects(
         num_objects=len(locked),
         num_found=len(locked),
-        files=files,
+        origin=files,
     )
 
 

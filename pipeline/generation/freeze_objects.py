@@ -6,13 +6,11 @@ from operator import attrgetter
 from pathlib import Path
 
 from pipeline.builds.settings import BuildSettings
-from pipeline.exchange.scene_files import SceneFiles
 from pipeline.generation.accept_maps import NO_MAPS, AcceptedMaps
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.frozen_pool import FrozenPool
 from pipeline.generation.object_batches import PreparedObject
 from pipeline.generation.object_options import ObjectOptions
-from pipeline.generation.revisited_scenes import RevisitedScenes
+from pipeline.generation.scene_origin import ComposedScenes, SceneOrigin
 from pipeline.generation.unread_notes import format_unread, write_unread
 from pipeline.isolation import is_transient
 from storage.conventions import SPLITS
@@ -40,14 +38,7 @@ class AcceptedObjects:
     """Objects that scenes may draw from."""
     num_found: int
     """Objects in the source, refused ones included."""
-    pool: FrozenPool | None = None
-    """The frozen objects, if scenes are composed."""
-    maps: tuple[tuple[LockedObject, Path], ...] = ()
-    """The user's textures and skies with their prepared files."""
-    files: SceneFiles | None = None
-    """The scene files, if scenes come from files; the objects are then the files themselves."""
-    revisited: RevisitedScenes | None = None
-    """Reader of a finished dataset, if scenes are those of one; the objects are its objects."""
+    origin: SceneOrigin
 
 
 def freeze_objects(
@@ -94,8 +85,7 @@ def freeze_objects(
     return AcceptedObjects(
         num_objects=len(objects),
         num_found=num_found,
-        pool=options.pool,
-        maps=maps.rows,
+        origin=ComposedScenes(pool=options.pool, maps=maps.rows),
     )
 
 

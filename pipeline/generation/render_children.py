@@ -69,12 +69,17 @@ def scene_reader(job: ShardJob) -> Iterator[Callable[[int], Scene] | None]:
 
     The function raises as `SceneFiles.scene`, and ChildFailed.
     """
-    files = job.accepted.files
+    files = job.accepted.origin
     settings = job.settings
-    if files is None:
+    if not isinstance(files, SceneFiles):
         yield None
         return
-    with _borrow_child(("files",), job, _reading_pool) as child:
+    folder = reach(files=[files.root])
+
+    def new_pool(job: ShardJob) -> ChildPool:
+        return ChildPool(lambda _: asset_child(folder), job.num_at_once)
+
+    with _borrow_child(("files",), job, new_pool) as child:
 
         def read(index: int) -> Scene:
             num_views = settings.scenes.num_views
@@ -114,13 +119,6 @@ def _borrow_child(
             pool.num_users -= 1
 
 
-def _reading_pool(job: ShardJob) -> ChildPool:
-    files = job.accepted.files
-    assert files is not None
-    folder = reach(files=[files.root])
-    return ChildPool(lambda _: asset_child(folder), job.num_at_once)
-
-
 def _render_pool(job: ShardJob) -> ChildPool:
     require_same_extensions("this worker: the dataset", job.extensions, extension_digests("data"))
     variant = choose_variant(device=job.device)
@@ -135,9 +133,7 @@ def _render_pool(job: ShardJob) -> ChildPool:
             variant=variant,
             threads=cores_of_child(job),
             gpu=gpus[number % len(gpus)] if gpus else None,
-            pool=job.accepted.pool,
-            maps=job.accepted.maps,
-            revisited=job.accepted.revisited,
+            origin=job.accepted.origin,
             folder=job.folder,
         )
         limits = replace(_RENDER_LIMITS, memory_bytes=memory_bytes)

@@ -6,6 +6,7 @@ from pathlib import Path
 from pipeline.generation.freeze_objects import object_changed_error, require_tried
 from pipeline.generation.prepare_isolated import asset_store, prepare_isolated
 from pipeline.generation.run import ShardJob
+from pipeline.generation.scene_origin import ComposedScenes
 from pipeline.objects.sources import ListedObjects, list_objects
 from storage.atomic import write_atomically
 from storage.digests import sha256_hex
@@ -26,9 +27,10 @@ def restore_object(job: ShardJob, uid: str, asset_name: str) -> None:
         TrilightError: the source has lost or changed the object.
         EnvironmentFailure: it could not be prepared this time.
     """
-    frozen = job.accepted.pool
+    origin = job.accepted.origin
+    assert isinstance(origin, ComposedScenes), "only composed scenes draw objects"
+    frozen = origin.pool
     store = asset_store()
-    assert frozen is not None
     display_name = safe_url(frozen.source)
     locked = LockRows(frozen.lock).find(uid)
     path = store.asset_path(asset_name)

@@ -6,6 +6,7 @@ from typing import Any
 
 from pipeline.builds.named import BUILDS, frozen_note, named_build, object_source
 from pipeline.builds.settings import BuildSettings
+from pipeline.exchange.scene_files import SceneFiles
 from pipeline.exchange.scene_folder import SceneFolder, find_scene_files
 from pipeline.generation.accept_revisited import settings_for_revisit
 from pipeline.generation.accept_scene_files import settings_for_files
@@ -75,8 +76,9 @@ class Run:
         writer = self.publication
         listed = self.scene_folder
         notes: tuple[str, ...] = ()
-        if listed and self.accepted.files:
-            notes = (*self.accepted.files.notes, *listed.notes(self.settings.scenes.num_views))
+        origin = self.accepted.origin
+        if listed and isinstance(origin, SceneFiles):
+            notes = (*origin.notes, *listed.notes(self.settings.scenes.num_views))
         elif statistics and self.order.revisits is None:
             notes = frozen_note(self.order.build, statistics)
             splits = self.settings.splits
@@ -101,11 +103,12 @@ class Run:
         Scene files that cannot become a scene do not count.
         """
         writer = self.publication
-        files = self.accepted.files
+        origin = self.accepted.origin
+        num_unusable = len(origin.unusable) if isinstance(origin, SceneFiles) else 0
         num_scenes = writer.manifest.num_scenes
         budget = self.order.failure_budget
         given_up = writer.progress.given_up
-        if given_up > budget * num_scenes + (len(files.unusable) if files else 0):
+        if given_up > budget * num_scenes + num_unusable:
             writer.add_failures(writer.failures)
             raise TrilightError(
                 f"{writer.folder.display_name}: {given_up} of {num_scenes} scenes could not be "

@@ -4,14 +4,14 @@ import contextlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from pipeline.assets.store import AssetStore
 from pipeline.builds.settings import BuildSettings
-from pipeline.generation.frozen_pool import AssetMissing, FrozenPool
+from pipeline.generation.frozen_pool import AssetMissing
 from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.render_sample import RenderInput, render_sample
 from pipeline.generation.revisited_scenes import RevisitedScenes
+from pipeline.generation.scene_origin import ComposedScenes, SceneOrigin
 from pipeline.generation.user_maps import user_maps
 from pipeline.generation.view_progress import ViewProgress
 from pipeline.renders.renderer import set_threads
@@ -22,7 +22,7 @@ from scene_templates.settings import SceneSettings
 from scene_templates.user_maps import OwnMaps
 from storage.dataset.layout import DatasetFolder
 from storage.errors import Rejected
-from storage.records.objects import Failure, LockedObject
+from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
 from storage.records.scene import Scene
 from storage.seeds import SceneKey
@@ -43,14 +43,9 @@ class SceneRecipe:
     """Number of CPU threads of this child."""
     gpu: str | None = None
     """GPU of this child, as CUDA_VISIBLE_DEVICES names it; None without one."""
-    pool: FrozenPool | None = None
-    """The frozen objects, if scenes are composed of them."""
+    origin: SceneOrigin
     assets: AssetStore = field(default_factory=asset_store)
     """Store of the objects' prepared files, as the worker sees it."""
-    maps: tuple[tuple[LockedObject, Path], ...] = ()
-    """The user's textures and skies with their prepared files."""
-    revisited: RevisitedScenes | None = None
-    """Reader of a finished dataset, if scenes are those of one."""
     folder: DatasetFolder | None = None
     """Folder that gets the progress of a scene; None reports none."""
 
@@ -141,8 +136,8 @@ class SceneWorker:
         self, split: str, scene_index: int, attempt: int, from_file: Scene | None
     ) -> RenderInput:
         recipe = self._recipe
-        if recipe.revisited is not None:
-            return recipe.revisited.scene(scene_index, attempt, recipe.settings)
+        if isinstance(recipe.origin, RevisitedScenes):
+            return recipe.origin.scene(scene_index, attempt, recipe.settings)
         if from_file is not None:
             return RenderInput(scene=from_file, kept_cameras=recipe.settings.scenes.num_views)
         scene = compose_scene(
@@ -153,16 +148,20 @@ class SceneWorker:
         )
         return RenderInput(scene=scene)
 
+    def _composed(self) -> ComposedScenes:
+        origin = self._recipe.origin
+        assert isinstance(origin, ComposedScenes), "only composed scenes draw objects"
+        return origin
+
     def _pool(self, split: str) -> Sequence[PooledAsset]:
         """Return the objects of a split, sorted by uid; each is opened on first access."""
         if split not in self._pools:
-            frozen = self._recipe.pool
-            assert frozen is not None, "only composed scenes draw objects"
-            self._pools[split] = frozen.open_split(split, self._recipe.assets)
+            pool = self._composed().pool
+            self._pools[split] = pool.open_split(split, self._recipe.assets)
         return self._pools[split]
 
     def _maps_of(self, split: str) -> OwnMaps:
         """Return the user's textures and maps of a split; each is read when a scene takes it."""
         if split not in self._maps:
-            self._maps[split] = user_maps(self._recipe.maps, split)
+            self._maps[split] = user_maps(self._composed().maps, split)
         return self._maps[split]

@@ -29,6 +29,7 @@ from storage.dataset.splits import scenes_of_shard, shard_name
 from storage.errors import Rejected, TrilightError
 from storage.records.objects import read_objects_lock
 from storage.records.scene import Scene
+from tests.pipeline.generation.tiny_scenes_kit import NO_OBJECTS
 
 CAMERA = {"position": [0, -2, 0], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 40}
 
@@ -261,7 +262,7 @@ def test_a_run_reads_files_in_a_confined_child(
     )
     job = cast(Any, SimpleNamespace(
         folder=DatasetFolder(tmp_path / "set"), settings=settings, lock_sha256="",
-        accepted=SimpleNamespace(files=files), num_at_once=1, device="",
+        accepted=SimpleNamespace(origin=files), num_at_once=1, device="",
     ))  # fmt: skip
     try:
         with render_children.scene_reader(job) as read:
@@ -280,7 +281,7 @@ def test_a_run_reads_files_in_a_confined_child(
             assert child._reach is not None and child._reach.reads == {folder.resolve()}
     finally:
         render_children.close_children()
-    job.accepted.files = None
+    job.accepted.origin = NO_OBJECTS.origin
     with render_children.scene_reader(job) as nothing:
         assert nothing is None
 
@@ -304,8 +305,8 @@ def test_a_bad_file_keeps_its_number_and_stops_nobody(folder: Path, tmp_path: Pa
     assert found.names == ("a.json", "aa.json", "b.json", "c.json")
     assert settings.splits.listed_scenes == 4
     publication = begin(DatasetFolder(tmp_path / "set"), settings, {}, 1, accept_environment=False)
-    files = accept_scene_files(found, None, settings, publication).files
-    assert files is not None
+    files = accept_scene_files(found, None, settings, publication).origin
+    assert isinstance(files, SceneFiles)
     assert sorted(files.unusable) == ["aa.json", "c.json"]
     for scene_index in (1, 3):
         with pytest.raises(Rejected, match="unusable_scene_file") as rejection:

@@ -13,6 +13,7 @@ from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.frozen_pool import AssetMissing
 from pipeline.generation.pipeline import prepare_dataset
 from pipeline.generation.prepare_isolated import asset_store
+from pipeline.generation.scene_origin import ComposedScenes
 from pipeline.shards import bucket_mirror
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
@@ -215,7 +216,7 @@ def test_who_comes_later_trusts_the_index_of_the_first(bucket: Any, machines: Ma
         assert accepted.num_objects == 30
     with machines.maker("b") as later:
         trusted = load_trusted_objects(asked(later))
-        assert trusted is not None and trusted.pool is not None
+        assert trusted is not None and isinstance(trusted.origin, ComposedScenes)
         assert trusted.num_objects == 30
         with pytest.raises(AssetMissing):
-            trusted.pool.open_split("train", asset_store())[0]
+            trusted.origin.pool.open_split("train", asset_store())[0]

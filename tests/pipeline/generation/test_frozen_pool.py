@@ -23,6 +23,7 @@ from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects, require_same
 from pipeline.generation.frozen_pool import AssetMissing, SplitPool
 from pipeline.generation.prepare_isolated import asset_store
+from pipeline.generation.scene_origin import ComposedScenes
 from pipeline.generation.scene_worker import SceneAttempt
 from pipeline.generation.user_maps import user_maps
 from pipeline.objects.maps.prepared import MapFiles, prepare_map
@@ -67,8 +68,8 @@ def made(
 
 
 def _opened(accepted: AcceptedObjects, split: str = "train") -> SplitPool:
-    assert accepted.pool is not None
-    return accepted.pool.open_split(split, asset_store())
+    assert isinstance(accepted.origin, ComposedScenes)
+    return accepted.origin.pool.open_split(split, asset_store())
 
 
 def _whole(writer: DatasetWriter, accepted: AcceptedObjects) -> list[PooledAsset]:

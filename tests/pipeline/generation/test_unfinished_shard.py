@@ -16,7 +16,6 @@ from PIL import Image
 from pipeline.generation import pipeline, render_children, tasks, unfinished_shard
 from pipeline.generation.child_pool import ChildPool
 from pipeline.generation.dataset_order import DatasetOrder
-from pipeline.generation.freeze_objects import AcceptedObjects
 from pipeline.generation.pipeline import make_dataset, make_piece
 from pipeline.generation.run import Run, ShardJob, TaskResult
 from pipeline.generation.scene_worker import SceneAttempt
@@ -42,7 +41,7 @@ from tests.pipeline.generation.test_dataset_writer import (
     begin_tiny,
     make_tiny_shard,
 )
-from tests.pipeline.generation.tiny_scenes_kit import shard_job
+from tests.pipeline.generation.tiny_scenes_kit import NO_OBJECTS, shard_job
 
 NAME = "train-000000.tar"
 
@@ -233,7 +232,7 @@ def _run(root: Path, scenes: int) -> Run:
         settings=_build(),
         scene_folder=None,
         publication=begin_tiny(root, scenes),
-        accepted=AcceptedObjects(num_objects=0, num_found=0),
+        accepted=NO_OBJECTS,
     )
 
 

@@ -10,8 +10,10 @@ import pytest
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.freeze_objects import AcceptedObjects
+from pipeline.generation.frozen_pool import FrozenPool
 from pipeline.generation.object_options import ObjectOptions
 from pipeline.generation.run import ShardJob
+from pipeline.generation.scene_origin import ComposedScenes
 from pipeline.renders.variant import Variant
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.statistics import Statistics
@@ -19,6 +21,14 @@ from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
 from tests.pipeline.generation.test_dataset_writer import _build, _locked
 from tests.scenes_by_hand import tiny_sample
+
+NO_OBJECTS = AcceptedObjects(
+    num_objects=0,
+    num_found=0,
+    origin=ComposedScenes(
+        pool=FrozenPool(lock=Path("none"), index=Path("none"), source="none", licence=None)
+    ),
+)
 
 
 def tiny_order(**changes: Any) -> DatasetOrder:
@@ -32,7 +42,7 @@ def shard_job(root: Path, **changes: Any) -> ShardJob:
         folder=DatasetFolder(root),
         settings=_build(),
         environment={},
-        accepted=AcceptedObjects(num_objects=0, num_found=0),
+        accepted=NO_OBJECTS,
         lock_sha256="",
         num_at_once=1,
         extensions={},
@@ -54,7 +64,7 @@ def without_rendering(
     def accept(order: ObjectOptions, *more: Any) -> AcceptedObjects:
         if not order.writer.manifest.objects_lock_sha256:
             order.writer.lock_objects([_locked()])
-        return AcceptedObjects(num_objects=0, num_found=1)
+        return dataclasses.replace(NO_OBJECTS, num_found=1)
 
     def make(split: str, scene: int, *more: Any) -> tuple[Sample, list[Failure]]:
         scenes.append((split, scene))
