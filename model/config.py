@@ -6,7 +6,8 @@ block. `SIZES` has the named configurations.
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, ClassVar, Literal, NoReturn
 
 from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS, material_columns
@@ -35,9 +36,29 @@ LAYERS = 256
 """Maximum number of layers of a stage: twenty times the largest published network's."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class BundleStage:
+    """View stage of ray bundles, as published."""
+
+    albedo_rays: int
+    """Rays along a side of each pixel that trace its albedo; 0 where radiance is predicted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HitStage:
+    """View stage of traced visible surfaces; ModelConfig describes the fields."""
+
+    hit_rays: int
+    hit_anchors: int
+    gather_rays: int
+    pixel_width: int
+    filter_width: int
+    sky_rays: int
+
+
 @checked("model config")
 class ModelConfig:
-    """Configuration of one network."""
+    """Configuration of one network. Files store it flat; `stage` is the view stage in use."""
 
     PRESETS: ClassVar[Mapping[str, Callable[[], "ModelConfig"]]] = {}
     """Named sizes, which a setting of this type accepts (storage.settings.changes)."""
@@ -152,6 +173,13 @@ class ModelConfig:
         elif self.demodulated != (self.hit_rays > 0):
             expected = "1 or more" if self.demodulated else "0, or demodulated true"
             _wrong(f"hit_rays {self.hit_rays} with view_stage bundles", expected)
+
+    @property
+    def stage(self) -> BundleStage | HitStage:
+        """Sizes of the view stage."""
+        if self.view_stage == "bundles":
+            return BundleStage(albedo_rays=self.hit_rays)
+        return HitStage(**{field.name: getattr(self, field.name) for field in fields(HitStage)})
 
     @property
     def head_width(self) -> int:
@@ -305,6 +333,13 @@ and no name, so that it opens without its size being registered."""
 ModelConfig.PRESETS = SIZES
 
 
+def hit_stage(config: ModelConfig) -> HitStage:
+    """Return the view stage `hits`; raises TrilightError where the network has another one."""
+    if not isinstance(config.stage, HitStage):
+        _wrong(f"view_stage {config.view_stage}", "hits")
+    return config.stage
+
+
 def _check_columns(names: tuple[str, ...]) -> None:
     declared = [column.name for column in material_columns()]
     known = isinstance(names, tuple) and all(name in declared for name in names)
@@ -316,5 +351,5 @@ def _check_columns(names: tuple[str, ...]) -> None:
         )
 
 
-def _wrong(got: str, expected: str) -> None:
+def _wrong(got: str, expected: str) -> NoReturn:
     raise TrilightError(f"model config: {got}; expected {expected}.")

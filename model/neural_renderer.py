@@ -18,6 +18,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from model.config import HitStage
 from model.encoded_scene import EncodedScene
 from model.light_groups import LightGroup, light_groups
 from model.open import find_network
@@ -144,7 +145,7 @@ class NeuralRenderer:
         self._require_memory(scene.num_triangles)
         below_sky = scene
         scene = self._with_known_sky(scene)
-        by_hits = self._model.config.view_stage == "hits"
+        by_hits = isinstance(self._model.config.stage, HitStage)
         all_lights = [LightGroup(scene=scene, fraction=1.0)]
         groups = [
             (_encode(self._model, group.scene, self.device), group.fraction)
@@ -176,7 +177,7 @@ class NeuralRenderer:
         angle = torch.tensor(fov_deg, dtype=torch.float32, device=self.device)
         views = prepared.views
         if resolution not in views:
-            decode = functools.partial(_picture, self._model, prepared.groups, resolution)
+            decode = functools.partial(_predict_picture, self._model, prepared.groups, resolution)
             on_card = self.device.type == "cuda" and any(
                 scene.lit.place for each, _ in prepared.groups for scene in each.traced
             )
@@ -196,7 +197,7 @@ class NeuralRenderer:
     def resolution_notes(self, resolution: int) -> tuple[str, ...]:
         """Return sentences on what pictures of this width by this network lack."""
         trained = self.trained.resolution
-        by_pixel = self._model.config.view_stage == "hits"
+        by_pixel = isinstance(self._model.config.stage, HitStage)
         if trained is None or resolution == trained or by_pixel:
             return ()
         return (
@@ -258,7 +259,7 @@ def _encode(model: RenderFormer, scene: Scene, device: torch.device) -> EncodedS
     return model.encode(map_tensors(batch, lambda tensor: tensor.to(device)))
 
 
-def _picture(
+def _predict_picture(
     model: RenderFormer,
     groups: tuple[tuple[EncodedScene, float], ...],
     resolution: int,

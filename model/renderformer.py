@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from model.config import ModelConfig
+from model.config import BundleStage, HitStage, ModelConfig
 from model.demodulated import albedo_of_cameras, compose_radiance
 from model.encoded_scene import EncodedScene, KeysValues
 from model.hits.decoder import HitDecoder
@@ -51,7 +51,7 @@ class RenderFormer(nn.Module):
             head_width=config.head_width,
         )
         self.encoder: Any = TriangleEncoder(config, rotary) if config.scene_tokens else None
-        stage = HitDecoder if config.view_stage == "hits" else ViewDecoder
+        stage = HitDecoder if isinstance(config.stage, HitStage) else ViewDecoder
         self.decoder: Any = stage(config, rotary)
 
     def forward(self, batch: SceneBatch, resolution: int) -> Tensor:
@@ -61,10 +61,11 @@ class RenderFormer(nn.Module):
             TrilightError: the resolution is not a multiple of `config.picture_px`, or the network
                 does not support the sky of a scene.
         """
-        if batch.albedo_BVRR6 is None and self.config.view_stage == "bundles":
+        stage = self.config.stage
+        if batch.albedo_BVRR6 is None and isinstance(stage, BundleStage):
             return self.decode(self.encode(batch), batch.cameras, resolution)
         self._require_resolution(resolution)
-        if self.config.view_stage == "bundles":
+        if isinstance(stage, BundleStage):
             return self._bundles(
                 self._encode_scenes(batch), batch.cameras, resolution, batch.albedo_BVRR6
             )
@@ -72,7 +73,7 @@ class RenderFormer(nn.Module):
         traced = batch.traced
         if traced is None:
             scenes = traced_batch(batch)
-            traced = traced_cameras(scenes, batch.cameras, resolution, self.config)
+            traced = traced_cameras(scenes, batch.cameras, resolution, stage)
         encoded = self._encode_scenes(batch, scenes, traced.sides_T12, traced.unit_3)
         with tf32(self.tf32):
             pictures: Tensor = self.decoder(encoded, traced)
@@ -80,8 +81,9 @@ class RenderFormer(nn.Module):
 
     def encode(self, batch: SceneBatch) -> EncodedScene:
         """Return the encoded scenes of a batch; its cameras are ignored."""
-        if self.config.view_stage == "bundles":
-            surfaces = lit_scenes(batch) if self.config.demodulated else ()
+        stage = self.config.stage
+        if isinstance(stage, BundleStage):
+            surfaces = lit_scenes(batch) if stage.albedo_rays else ()
             return self._encode_scenes(batch, surfaces=surfaces)
         scenes = traced_batch(batch)
         longest = batch.triangles_BT33.shape[1]
@@ -141,13 +143,14 @@ class RenderFormer(nn.Module):
             TrilightError: the resolution is no such multiple.
         """
         self._require_resolution(resolution)
-        if isinstance(self.decoder, HitDecoder):
+        stage = self.config.stage
+        if isinstance(stage, HitStage):
             with tf32(self.tf32):
-                traced = traced_cameras(scene.traced, cameras, resolution, self.config)
-                return self.decoder(scene, traced)
+                traced = traced_cameras(scene.traced, cameras, resolution, stage)
+                picture: Tensor = self.decoder(scene, traced)
+            return picture
         albedo_BVRR6 = None
-        if self.config.demodulated:
-            rays = self.config.hit_rays
+        if rays := stage.albedo_rays:
             albedo_BVRR6 = albedo_of_cameras(scene.surfaces, cameras, resolution, rays)
         return self._bundles(scene, cameras, resolution, albedo_BVRR6)
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from model.attention import Keys
-from model.config import ModelConfig
+from model.config import HitStage, ModelConfig
 from model.encoded_scene import TokenPositions
 from model.layers import TOKEN_NORM_EPS, EncoderLayer, Norm, dtype_of, run_layer
 from model.packing import Packing, pack_tokens
@@ -42,7 +42,8 @@ class TriangleTokens(nn.Module):
         self.material_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
         self.normal = nn.Linear(encoded_normal_width(self.octaves), config.width)
         self.normal_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
-        self.light = nn.Linear(SIDE_LIGHTS, config.width) if config.view_stage == "hits" else None
+        by_hits = isinstance(config.stage, HitStage)
+        self.light = nn.Linear(SIDE_LIGHTS, config.width) if by_hits else None
 
     def forward(
         self, material_BTM: Tensor, normals_BT33: Tensor, light_BTL: Tensor | None = None

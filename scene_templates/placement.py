@@ -57,7 +57,7 @@ class PlaceableShape(Protocol):
         """Vertices [V, 3] whose hull holds the mesh."""
         ...
 
-    def meets(self, pose: Pose, other: Self, its_pose: Pose) -> bool:
+    def overlaps(self, pose: Pose, other: Self, its_pose: Pose) -> bool:
         """Return whether two meshes in their places share a point, or one holds the other."""
         ...
 
@@ -166,7 +166,7 @@ def _sample_pose(
         if settings.inside and not space.holds(points + centre):
             continue
         pose = Pose(centre=centre, radius=radius, rotation=rotation)
-        if not any(shape.meets(pose, other, at) for other, at in obstacles):
+        if not any(shape.overlaps(pose, other, at) for other, at in obstacles):
             return pose
     return None
 

@@ -148,7 +148,7 @@ class SceneWorker:
         )
         return RenderInput(scene=scene)
 
-    def _composed(self) -> ComposedScenes:
+    def _composed_scenes(self) -> ComposedScenes:
         origin = self._recipe.origin
         assert isinstance(origin, ComposedScenes), "only composed scenes draw objects"
         return origin
@@ -156,12 +156,12 @@ class SceneWorker:
     def _pool(self, split: str) -> Sequence[PooledAsset]:
         """Return the objects of a split, sorted by uid; each is opened on first access."""
         if split not in self._pools:
-            pool = self._composed().pool
+            pool = self._composed_scenes().pool
             self._pools[split] = pool.open_split(split, self._recipe.assets)
         return self._pools[split]
 
     def _maps_of(self, split: str) -> OwnMaps:
         """Return the user's textures and maps of a split; each is read when a scene takes it."""
         if split not in self._maps:
-            self._maps[split] = user_maps(self._composed().maps, split)
+            self._maps[split] = user_maps(self._composed_scenes().maps, split)
         return self._maps[split]

@@ -16,7 +16,11 @@ from numpy.typing import NDArray
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise_arrays
 from pipeline.renders.kept_light import LEAST_PASSES
-from pipeline.renders.noise_floor import LINEAR_STANDARD_ERRORS, MeasuredFloor, floor_db
+from pipeline.renders.noise_floor import (
+    LINEAR_STANDARD_ERRORS,
+    MeasuredFloor,
+    estimate_noise_floor_db,
+)
 from pipeline.renders.pixel_arithmetic import (
     TILE,
     channel_mean,
@@ -125,7 +129,9 @@ class DevicePictures:
         """Return the floor of estimates and surprises of tiles [3, T]: log, linear, of objects."""
         deviations = 1.0, LINEAR_STANDARD_ERRORS, 1.0
         log_db, linear_db, object_log_db = (
-            floor_db(error.sum() / max(count.sum(), 1), float(surprise.max()), error, count, more)
+            estimate_noise_floor_db(
+                error.sum() / max(count.sum(), 1), float(surprise.max()), error, count, more
+            )
             for error, surprise, count, more in zip(
                 errors, most, self._counts, deviations, strict=True
             )

@@ -68,7 +68,7 @@ class MeasuredFloor:
     """Stated error as object_psnr_log_db, in dB: over pixels that show geometry."""
 
 
-def floor_db(
+def estimate_noise_floor_db(
     mean_error: float,
     surprise: float,
     error_sums: NDArray[np.float64],

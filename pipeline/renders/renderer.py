@@ -133,7 +133,7 @@ class SceneRenderer:
         pictures = self._pictures(samples, camera)
         if not self._sees_sky:
             samples.count_over(pictures.visible)
-        look = yield from self._sample_to_targets(samples, pictures)
+        look = yield from self._sample_until_targets(samples, pictures)
         floor = look.floor
         self._refuse_noisy(floor)
         stored = self._to_stored(pictures.finish())
@@ -191,7 +191,7 @@ class SceneRenderer:
         if self._settings.reject_at_cap and missed:
             raise Rejected("floor_not_reached", ", ".join(missed))
 
-    def _sample_to_targets(
+    def _sample_until_targets(
         self, samples: HalfSamples, pictures: ViewPictures
     ) -> Generator[Sampling, None, MeasuredLook]:
         targets_db = self._settings.targets_db

@@ -34,7 +34,7 @@ class MeshShape:
         self.faces = level.faces
         self._tree: tuple[float, Any] | None = None
 
-    def meets(self, pose: Pose, other: "MeshShape", its_pose: Pose) -> bool:
+    def overlaps(self, pose: Pose, other: "MeshShape", its_pose: Pose) -> bool:
         """Return True if two posed meshes share a point, or one's box contains the other's."""
         offset = pose.centre - its_pose.centre
         if np.sum(np.square(offset)) > (pose.radius + its_pose.radius) ** 2:

@@ -42,7 +42,7 @@ from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.train.kit import stepper, tiny_run
 from tests.train.toy import toy_sample
 from train.data.augment import augment_scene
-from train.data.buckets import TrainingBatch, make_batch
+from train.data.buckets import TrainingBatch, collate_batch
 from train.data.scenes import training_scene
 from train.loop.schedule import learning_rate
 from train.loop.state import new_state
@@ -306,7 +306,7 @@ TERMS = [
 
 def batch() -> TrainingBatch:
     """Return two toy scenes."""
-    return make_batch([training_scene(toy_sample(index), 16) for index in range(2)])
+    return collate_batch([training_scene(toy_sample(index), 16) for index in range(2)])
 
 
 RUNS = [*(tiny_run(loss=terms) for terms in TERMS), tiny_run(precision="bfloat16")]

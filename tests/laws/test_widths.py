@@ -20,7 +20,7 @@ from model.hits.tracing import with_traced
 from tests.model.hits.test_decoder import hits_config
 from tests.train.kit import TINY_MODEL, tiny_run
 from tests.train.toy import toy_sample
-from train.data.buckets import TrainingBatch, make_batch
+from train.data.buckets import TrainingBatch, collate_batch
 from train.data.scenes import training_scene
 from train.loop.distributed import DistributedContext
 from train.loop.state import new_state
@@ -89,7 +89,7 @@ def batch_for(config: ModelConfig) -> TrainingBatch:
             dataclasses.replace(scene, tensors=with_traced(scene.tensors, PX, config, 0))
             for scene in scenes
         ]
-    return make_batch(scenes)
+    return collate_batch(scenes)
 
 
 @torch.no_grad()

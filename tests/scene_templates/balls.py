@@ -41,7 +41,7 @@ class Ball:
 
     points = _even_points(48)
 
-    def meets(self, pose: Pose, other: "Ball", its_pose: Pose) -> bool:
+    def overlaps(self, pose: Pose, other: "Ball", its_pose: Pose) -> bool:
         """Return whether the spheres share a point."""
         apart = float(np.linalg.norm(pose.centre - its_pose.centre))
         return apart <= pose.radius + its_pose.radius

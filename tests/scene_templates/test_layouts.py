@@ -79,7 +79,7 @@ def test_a_shape_decides_what_meets() -> None:
     """With shapes that never meet, spheres overlap: nothing but `meets` keeps objects apart."""
 
     class Ghost(Ball):
-        def meets(self, pose: object, other: object, its_pose: object) -> bool:
+        def overlaps(self, pose: object, other: object, its_pose: object) -> bool:
             return False
 
     settings = template_settings("plane", {"families.num_objects": [3, 3]})
@@ -92,9 +92,9 @@ def test_the_largest_object_is_placed_first() -> None:
     later_is_smaller = []
 
     class Watched(Ball):
-        def meets(self, pose: Pose, other: Ball, its_pose: Pose) -> bool:
+        def overlaps(self, pose: Pose, other: Ball, its_pose: Pose) -> bool:
             later_is_smaller.append(pose.radius <= its_pose.radius)
-            return super().meets(pose, other, its_pose)
+            return super().overlaps(pose, other, its_pose)
 
     changes = {"families.num_objects": [3, 3], "placement.overlap_share": 0.0}
     drawn(template_settings("plane", changes), 20, shape=Watched())

@@ -48,7 +48,7 @@ from tests.train.toy import (
     toy_scene,
     write_toy_dataset,
 )
-from train.data.buckets import make_batch
+from train.data.buckets import collate_batch
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.baselines import MEDIAN, NEAREST
 from train.evaluation.evaluate import EvalConfig, judge_views, make_baselines
@@ -80,7 +80,7 @@ def memorised(scenes: list[TrainingScene], model: ModelConfig, steps: int) -> Tr
     )
     state = new_state(settings)
     memorising = stepper(state, settings)
-    batches = [make_batch([scene]) for scene in scenes]
+    batches = [collate_batch([scene]) for scene in scenes]
     for step in range(steps):
         memorising.step(batches, learning_rate(step, settings))
         state.step += 1

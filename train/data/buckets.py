@@ -95,10 +95,10 @@ def bucket_scenes(
                 continue
         buckets.append([scene])
         unpadded_cost = scene_cost
-    return [make_batch(bucket) for bucket in buckets]
+    return [collate_batch(bucket) for bucket in buckets]
 
 
-def make_batch(scenes: Sequence[TrainingScene]) -> TrainingBatch:
+def collate_batch(scenes: Sequence[TrainingScene]) -> TrainingBatch:
     """Collate scenes of equal view count; targets stay lookup rows if all of them are."""
     levels = [scene.levels_L for scene in scenes if scene.levels_L is not None]
     if len(levels) < len(scenes):

@@ -234,15 +234,19 @@ class _SceneMaker:
     def _with_traced_inputs(self, seen: TrainingScene, rng: np.random.Generator) -> TrainingScene:
         """Return a scene with the traced inputs of its network, if it has any."""
         settings = self._settings
-        if settings.network is None or not settings.network.hit_rays:
+        if settings.network is None:
             return seen
         # imported here since they load pydantic
+        from model.config import BundleStage
         from model.demodulated import with_albedo
         from model.hits.tracing import with_traced
 
+        stage = settings.network.stage
         # after the augmentation, which therefore need not transform traced inputs
-        if settings.network.demodulated:
-            tensors = with_albedo(seen.tensors, settings.resolution, settings.network.hit_rays)
+        if isinstance(stage, BundleStage):
+            if not stage.albedo_rays:
+                return seen
+            tensors = with_albedo(seen.tensors, settings.resolution, stage.albedo_rays)
             return dataclasses.replace(seen, tensors=tensors)
         noise = int(rng.integers(2**31))
         tensors = with_traced(seen.tensors, settings.resolution, settings.network, noise)

@@ -12,7 +12,7 @@ from storage.conventions import radiance_from_log10
 from storage.raycast.first_hits import first_hits
 from storage.records.sample import Sample
 from storage.records.scene import Scene
-from train.data.buckets import make_batch
+from train.data.buckets import collate_batch
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.scores import (
     Lead,
@@ -103,7 +103,7 @@ def predict(model: RenderFormer, scene: TrainingScene) -> NDArray[np.float64]:
     The network computes in float32, on its own device.
     """
     device = next(model.parameters()).device
-    batch = make_batch([scene]).to(device)
+    batch = collate_batch([scene]).to(device)
     log10_VRR3 = model(batch.scenes, scene.target_VRR3.shape[1])[0]
     return np.maximum(radiance(log10_VRR3.double()).cpu().numpy(), 0)
 

@@ -11,7 +11,7 @@ from pipeline.renders.noise_floor import (
     Curve,
     MeasuredFloor,
     clamped_radiance,
-    floor_db,
+    estimate_noise_floor_db,
     secant_slope,
 )
 from storage.conventions import log10_radiance
@@ -82,7 +82,7 @@ def _floor_db(
     surprise = float((surprises(a, b, curve) * pixels).max())
     mean = error.sum() / max(int(pixels.sum()), 1)
     counts = _block_sums(pixels.astype(np.float64))
-    return floor_db(mean, surprise, _block_sums(error), counts, standard_errors)
+    return estimate_noise_floor_db(mean, surprise, _block_sums(error), counts, standard_errors)
 
 
 def _block_sums(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from model.config import hit_stage
 from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import SOURCE, DeviceTriangles, build_tree
 from model.hits.tracing import traced_scene, with_traced
@@ -48,7 +49,8 @@ def test_a_view_of_tensors_is_numpys(scene: Scene) -> None:
     numpy_form = traced_scene(lit_scene(scene))
     tensor_form = numpy_form.on_place(DevicePlace(CPU), _OnHost)
     camera = torch.tensor(scene.c2w[0]), torch.tensor(float(scene.fov_deg[0]))
-    given = (*camera, 32, dataclasses.replace(hits_config(), hit_rays=2, gather_rays=4), 0)
+    stage = hit_stage(dataclasses.replace(hits_config(), hit_rays=2, gather_rays=4))
+    given = (*camera, 32, stage, 0)
     expected, got = numpy_form.view(*given), tensor_form.view(*given)
     for name, array in vars(expected).items():
         tensor = getattr(got, name).tensor

@@ -124,8 +124,8 @@ def test_meets_agrees_with_the_slow_twin_and_is_symmetric(pool: list[PooledAsset
         pose, its_pose = _pose(rng, rng.uniform(0.1, 0.5)), _pose(rng, rng.uniform(0.1, 0.5))
         soup, its_soup = _soup(one, pose), _soup(other, its_pose)
         twin = cross(soup, its_soup) or encloses(soup, its_soup)
-        assert one.meets(pose, other, its_pose) == twin
-        assert other.meets(its_pose, one, pose) == twin
+        assert one.overlaps(pose, other, its_pose) == twin
+        assert other.overlaps(its_pose, one, pose) == twin
         found.append(twin)
     assert 12 < sum(found) < 48
 
@@ -137,8 +137,8 @@ def test_a_mesh_inside_another_meets_it() -> None:
     here = Pose(centre=np.zeros(3), radius=0.5, rotation=np.eye(3))
     within = dataclasses.replace(here, radius=0.1)
     assert not cross(_soup(box, here), _soup(ball, within))
-    assert box.meets(here, ball, within)
-    assert ball.meets(within, box, here)
+    assert box.overlaps(here, ball, within)
+    assert ball.overlaps(within, box, here)
 
 
 @pytest.mark.parametrize("gap", [1e-6, 1e-3])
@@ -149,8 +149,8 @@ def test_neighbours_that_do_not_touch_do_not_meet(gap: float) -> None:
     here = Pose(centre=np.zeros(3), radius=0.5, rotation=np.eye(3))
     beside = dataclasses.replace(here, centre=np.array([side + gap, 0, 0]))
     into = dataclasses.replace(here, centre=np.array([side - gap, 0.01, 0.02]))
-    assert not box.meets(here, box, beside)
-    assert box.meets(here, box, into)
+    assert not box.overlaps(here, box, beside)
+    assert box.overlaps(here, box, into)
 
 
 def test_a_shape_may_be_asked_at_any_size() -> None:
@@ -160,8 +160,8 @@ def test_a_shape_may_be_asked_at_any_size() -> None:
         pose = Pose(centre=np.zeros(3), radius=radius, rotation=np.eye(3))
         far = Pose(centre=np.array([radius + 0.21, 0, 0]), radius=0.2, rotation=np.eye(3))
         near = dataclasses.replace(far, centre=np.array([radius + 0.17, 0, 0]))
-        assert not ball.meets(pose, ball, far)
-        assert ball.meets(pose, ball, near)
+        assert not ball.overlaps(pose, ball, far)
+        assert ball.overlaps(pose, ball, near)
 
 
 TOUCH = 1e-6

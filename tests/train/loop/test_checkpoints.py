@@ -26,7 +26,7 @@ from tests.extensions_kit import EXAMPLES, loaded, written
 from tests.for_each import for_each
 from tests.train.kit import ALONE, TINY_MODEL, flip_a_bit, stepper, tiny_run
 from tests.train.toy import toy_sample
-from train.data.buckets import TrainingBatch, make_batch
+from train.data.buckets import TrainingBatch, collate_batch
 from train.data.scenes import training_scene
 from train.folder import RunFolder
 from train.loop.checkpoints import (
@@ -247,7 +247,7 @@ DIGEST = "d" * 64
 
 def stepped(steps: int = 3) -> TrainState:
     state = new_state(tiny_run())
-    batch = make_batch([training_scene(toy_sample(0), 16)])
+    batch = collate_batch([training_scene(toy_sample(0), 16)])
     for _ in range(steps):
         one_step(state, batch)
     return state
@@ -279,7 +279,7 @@ def test_a_loaded_state_goes_on_to_the_bit(tmp_path: Path, steps: int) -> None:
     state = stepped(steps)
     loaded = load(save(tmp_path, state))
     assert (loaded.step, loaded.skipped_steps) == (state.step, state.skipped_steps)
-    batch = make_batch([training_scene(toy_sample(1), 16)])
+    batch = collate_batch([training_scene(toy_sample(1), 16)])
     for each in (state, loaded):
         one_step(each, batch)
     assert equal_weights(state, loaded)
@@ -291,7 +291,7 @@ def test_equal_states_give_equal_bytes_and_skipped_steps_are_no_updates(tmp_path
     state = stepped(2)
     state.step, state.skipped_steps = 5, 3
     loaded = load(save(tmp_path / "c", state))
-    batch = make_batch([training_scene(toy_sample(1), 16)])
+    batch = collate_batch([training_scene(toy_sample(1), 16)])
     one_step(loaded, batch)
     one_step(state, batch)
     # AdamW's steps are the longer the fewer it believes to have done

@@ -16,7 +16,7 @@ from storage.errors import TrilightError
 from tests.model.kit import RESOLUTION, awake, random_scene, tiny_config
 from tests.train.kit import CPU, stepper, tiny_run
 from tests.train.toy import toy_sample
-from train.data.buckets import make_batch
+from train.data.buckets import collate_batch
 from train.data.scenes import training_scene
 from train.loop import compiled
 from train.loop.compiled import compile_parts, compiled_parts, undo_compiling
@@ -157,7 +157,7 @@ def _uncompilable(monkeypatch: pytest.MonkeyPatch, compile: Compile) -> Stepper:
 
 def test_what_cannot_be_compiled_is_trained_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """On an H200 torch 2.11 failed to compile `smoke`, and the run ended before its first step."""
-    batch = make_batch([training_scene(toy_sample(index), 16) for index in (0, 1)])
+    batch = collate_batch([training_scene(toy_sample(index), 16) for index in (0, 1)])
     plain = stepper(new_state(tiny_run()), tiny_run())
     wanted = plain.step([batch], 1e-3)
     with monkeypatch.context() as patch:

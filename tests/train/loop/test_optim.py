@@ -23,7 +23,7 @@ from storage.seeds import rng_for
 from tests.for_each import for_each
 from tests.train.kit import TINY_MODEL, tiny_run
 from tests.train.toy import toy_sample
-from train.data.buckets import MOST_WASTE, TrainingBatch, bucket_scenes, make_batch
+from train.data.buckets import MOST_WASTE, TrainingBatch, bucket_scenes, collate_batch
 from train.data.scenes import TrainingScene, training_scene
 from train.loop.muon import orthogonal
 from train.loop.optim import Updater
@@ -231,7 +231,7 @@ DEEPER = dataclasses.replace(TINY_MODEL, encoder_layers=2, decoder_layers=2)
 
 def counted(config: ModelConfig, scenes: list[TrainingScene]) -> int:
     """Count a real forward and backward pass; the plain attention is the one that counts all."""
-    return counted_batch(config, make_batch(scenes))
+    return counted_batch(config, collate_batch(scenes))
 
 
 def counted_batch(config: ModelConfig, batch: TrainingBatch) -> int:

@@ -22,7 +22,7 @@ from tests.model.kit import awake, tiny_config
 from tests.train.kit import stepper, tiny_run, trained
 from tests.train.loop.test_optim import with_gradients
 from tests.train.toy import toy_sample, write_toy_dataset
-from train.data.buckets import TrainingBatch, bucket_scenes, make_batch
+from train.data.buckets import TrainingBatch, bucket_scenes, collate_batch
 from train.data.scenes import training_scene
 from train.folder import RunFolder
 from train.loop import muon, optim
@@ -64,7 +64,7 @@ def test_buckets_of_any_size_give_the_gradient_of_one_batch() -> None:
     sizes = {len(batch.target_BVRR3) for batch in buckets}
     assert len(sizes) > 1, "equal buckets could not tell a mean over views from one over batches"
     loss, cut = gradients(buckets)
-    whole_loss, whole = gradients([make_batch(drawn)])
+    whole_loss, whole = gradients([collate_batch(drawn)])
     # float32 sums in another order
     assert loss == pytest.approx(whole_loss, rel=1e-5)
     for a, b in zip(cut, whole, strict=True):
@@ -91,7 +91,7 @@ def test_a_step_that_is_not_finite_changes_nothing(
     ruin: Callable[[TrainState, TrainingBatch], None], muon_rate: float, precision: Precision
 ) -> None:
     state = new_state(tiny_run(ema_decay=0.5, muon_rate=muon_rate), muon_precision=precision)
-    batch = make_batch(scenes(2))
+    batch = collate_batch(scenes(2))
     assert step(state, [batch]).applied
     ruin(state, batch)
     assert state.ema_model is not None
@@ -112,7 +112,7 @@ def test_the_mean_follows_the_weights_faster_at_first() -> None:
     settings = tiny_run(ema_decay=0.5)
     state = new_state(settings)
     assert state.ema_model is not None and state.eval_model is state.ema_model
-    batch = make_batch(scenes(2))
+    batch = collate_batch(scenes(2))
     by_hand = state.model.decoder.rays.weight.detach().clone()
     for updates in range(12):
         stepper(state, settings).step([batch], 3e-3)
@@ -132,7 +132,7 @@ def test_bfloat16_rounds_no_position_ray_or_material_nor_the_last_layers(family:
     The published training rounds positions too, to a grid of up to 0.004 m.
     """
     network, found = awake(tiny_config(family), torch.float32), dict[str, str]()
-    positions, batch = list[Tensor](), make_batch(scenes(2))
+    positions, batch = list[Tensor](), collate_batch(scenes(2))
     network.encoder.rotary.register_forward_pre_hook(lambda _, given: positions.append(given[0]))
     exact_picture = predict_log10(network, batch, RESOLUTION, "float32")
 
@@ -160,13 +160,13 @@ def test_a_step_asks_no_generator() -> None:
     """What does not exist need not be saved: a resumed run is the same whatever the state here."""
     state = new_state(tiny_run())
     before = torch.get_rng_state(), np.random.get_state(legacy=True)[1].copy()  # type: ignore[index] # noqa: NPY002
-    step(state, [make_batch(scenes(2))])
+    step(state, [collate_batch(scenes(2))])
     assert torch.equal(torch.get_rng_state(), before[0])
     assert np.array_equal(np.random.get_state(legacy=True)[1], before[1])  # type: ignore[index] # noqa: NPY002
 
 
 def test_the_report_says_how_bright_and_how_long_before_clipping() -> None:
-    batch = make_batch(scenes(2))
+    batch = collate_batch(scenes(2))
     state = new_state(tiny_run())
     report = step(state, [batch])
     mean = batch.target_BVRR3.mean().item()
@@ -217,7 +217,7 @@ def late(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def batch_of(index: int, *, bad: bool = False) -> TrainingBatch:
-    made = make_batch([training_scene(toy_sample(index), 16)])
+    made = collate_batch([training_scene(toy_sample(index), 16)])
     if bad:
         made.target_BVRR3[0, 0, 0, 0, 0] = math.inf
     return made

@@ -27,7 +27,7 @@ from storage.seeds import rng_for
 from tests.for_each import for_each
 from tests.train.kit import CPU, Heard, Killed, stepper, tiny_run, trained
 from tests.train.toy import toy_sample
-from train.data.buckets import make_batch
+from train.data.buckets import collate_batch
 from train.data.scenes import training_scene
 from train.loop.state import new_state
 from train.loop.step import StepReport
@@ -81,7 +81,7 @@ def test_the_figures_are_those_of_an_update_before_clipping(clip: float) -> None
     settings = tiny_run(grad_clip=clip)
     state = new_state(settings)
     watched = stepper(state, settings)
-    batch = make_batch([training_scene(toy_sample(index), 16) for index in range(2)])
+    batch = collate_batch([training_scene(toy_sample(index), 16) for index in range(2)])
     before = copy.deepcopy(dict(state.model.named_parameters()))
     watched.layers.expect_update(True)
     report = watched.step([batch], 3e-3)
