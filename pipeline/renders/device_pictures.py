@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
+from pipeline.renders.denoise_corrections import LEAST_PASSES
 from pipeline.renders.denoiser import denoise_arrays
-from pipeline.renders.kept_light import LEAST_PASSES
 from pipeline.renders.noise_floor import (
     LINEAR_STANDARD_ERRORS,
     MeasuredFloor,
@@ -37,7 +37,7 @@ from pipeline.renders.pixel_arithmetic import (
     with_means_of,
 )
 from pipeline.renders.recorded_calls import KernelInputs, record_launches
-from pipeline.renders.samples import HalfSamples
+from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tiles import TILE_PX, tile_means
 from pipeline.renders.view_pictures import (
@@ -53,7 +53,7 @@ Sums = Sequence[Sequence[Sequence[Any]]]
 """Of each half, and in it of each tracer: `DeviceSum.sums`."""
 
 
-def mean_radiance(samples: HalfSamples) -> float:
+def mean_radiance(samples: DualBuffer) -> float:
     """Return the mean radiance of all pixels so far; raises as `ViewPictures.look`."""
     resolution = len(samples.spp_of(0))
     total, broken = read_numbers(_brightness(KernelInputs(), _sums(samples), resolution))
@@ -70,7 +70,7 @@ class DevicePictures:
     """See `ViewPictures` for the meaning of its methods."""
 
     def __init__(
-        self, samples: HalfSamples, tracer: Any, camera: Camera, settings: RenderSettings
+        self, samples: DualBuffer, tracer: Any, camera: Camera, settings: RenderSettings
     ) -> None:
         """Trace what guides the denoiser.
 
@@ -149,7 +149,7 @@ class DevicePictures:
         return [denoise_arrays(raw, guides, self._resolution, quality) for raw in raws]
 
 
-def _sums(samples: HalfSamples) -> Sums:
+def _sums(samples: DualBuffer) -> Sums:
     return [[each.sums for each in half] for half in samples.sums]  # type: ignore[attr-defined]
 
 

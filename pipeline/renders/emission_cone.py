@@ -34,7 +34,7 @@ class EmissionCone:
         cosine = mi.Frame3f(normal).to_world(flat) * side
         return mi.Vector3f(dr.select(outside, in_cone, cosine))
 
-    def density(self, position: Any, normal: Any, direction: Any) -> Any:
+    def pdf(self, position: Any, normal: Any, direction: Any) -> Any:
         """Return the density (Float, per steradian) with which `sample` draws a direction."""
         axis, height, outside = self._cone(position)
         down = 0.5 * dr.squared_norm(direction - axis)  # 1 - cos, without cancellation

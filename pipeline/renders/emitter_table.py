@@ -30,7 +30,7 @@ class EmitterPoint:
     """Position on the triangle, Point3f in meters."""
     normal: Any
     """Vector3f, unit; its side does not matter."""
-    area_density: Any
+    area_pdf: Any
     """Probability of this point among all emitters, Float per square meter."""
     radiance: Any
     """Emitted radiance, Color3f; equal in all directions."""
@@ -76,11 +76,11 @@ class EmitterTable:
             count = len(order) if lit is None else int(lit.sum())
             raise Rejected("unlit_scene", f"{count} emitting triangles have no area")
         share = power / power.sum()
-        density = np.divide(share, area, out=np.zeros_like(area), where=area > 0)
+        pdf = np.divide(share, area, out=np.zeros_like(area), where=area > 0)
         keep, alias = alias_table(share)
         nothing = np.zeros(len(order))
         rows = np.column_stack(
-            [corners[:, 0], density, edge1, nothing, edge2, nothing, radiance, nothing]
+            [corners[:, 0], pdf, edge1, nothing, edge2, nothing, radiance, nothing]
         )
         self._rows = own_floats(rows)
         self._alias = own_floats(np.column_stack([keep, alias]))
@@ -103,11 +103,11 @@ class EmitterTable:
         return EmitterPoint(
             position=mi.Point3f(mi.Point3f(corner.xyz) + edge1 * weights.x + edge2 * weights.y),
             normal=dr.normalize(dr.cross(edge1, edge2)),
-            area_density=corner.w,
+            area_pdf=corner.w,
             radiance=mi.Color3f(radiance.xyz),
         )
 
-    def density_and_radiance(self, row: Any, active: Any) -> tuple[Any, Any]:
+    def pdf_and_radiance(self, row: Any, active: Any) -> tuple[Any, Any]:
         """Return the probability per area (Float) and the radiance (Color3f) of an emitter."""
         radiance = self._group(row, 3, active)
         return self._group(row, 0, active).w, mi.Color3f(radiance.xyz)

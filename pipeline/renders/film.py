@@ -51,7 +51,7 @@ class Film:
         column = mi.UInt32(dr.select(inside, x, 0))
         return row * self._width + column, inside
 
-    def density(self, direction: Any) -> Any:
+    def pdf(self, direction: Any) -> Any:
         """Return the pixels per steradian (Float) around a unit direction from the pinhole."""
         cosine = -dr.dot(direction, self._backward)
         return dr.square(self._focal) / (cosine * dr.square(cosine))

@@ -91,14 +91,14 @@ def evaluate_bsdf(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> tuple
     masked_out = _stretch(wo.z, lobes.alpha) / wo.z
     mirrored = lobes.specular * (facets / (masked_in + masked_out))
     cosine = _INV_PI * wo.z
-    density = (1 - lobes.weight) * cosine + lobes.weight * facets / (1 + masked_in)
+    pdf = (1 - lobes.weight) * cosine + lobes.weight * facets / (1 + masked_in)
     reflected = lobes.diffuse * cosine + dr.select(dr.dot(wo, geometric) > 0, mirrored, 0)
     # A viewer below has no specular lobe: its terms are 0 times what may be infinite.
     faces = wi.z > 0
     above = wo.z > 0
     reflected = dr.select(faces, reflected, lobes.diffuse * cosine)
-    density = dr.select(faces, density, cosine)
-    return dr.select(above, reflected, 0), dr.select(above, density, 0)
+    pdf = dr.select(faces, pdf, cosine)
+    return dr.select(above, reflected, 0), dr.select(above, pdf, 0)
 
 
 def diffuse_share(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any:
@@ -108,7 +108,7 @@ def diffuse_share(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any:
     return dr.select(reflected > diffuse, diffuse / reflected, 1)
 
 
-def reverse_density(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any:
+def reverse_pdf(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any:
     """Return the density with which `sample`, for a path that comes from wo, draws wi (Float).
 
     Such a path sees the surface from the side of wo. Where that is the triangle's other side, the
@@ -123,9 +123,9 @@ def reverse_density(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any
     """
     distribution = _distribution(dr.normalize(wi + wo), lobes.alpha)
     facets = distribution / (2 * (wo.z + _stretch(wo.z, lobes.alpha)))
-    density = (1 - lobes.weight) * _INV_PI * wi.z + lobes.weight * facets
+    pdf = (1 - lobes.weight) * _INV_PI * wi.z + lobes.weight * facets
     same_side = dr.dot(wo, geometric) > 0
-    above = dr.select(same_side & (wi.z > 0), density, 0)
+    above = dr.select(same_side & (wi.z > 0), pdf, 0)
     return dr.select(same_side, above, _INV_PI * dr.maximum(-wi.z, 0))
 
 

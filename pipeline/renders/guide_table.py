@@ -75,7 +75,7 @@ class GuideTable:
         rough = rough_share(lobes)
         return Guidance(row=row, share=dr.select(row > 0, _SHARE * rough, 0))
 
-    def density(self, guidance: Guidance, direction: Any, active: Any) -> Any:
+    def pdf(self, guidance: Guidance, direction: Any, active: Any) -> Any:
         """Return the density (Float, per steradian) with which `sample` draws a unit Vector3f."""
         index, length = bin_of(direction)
         learnt = active & (guidance.row > 0)
@@ -84,7 +84,7 @@ class GuideTable:
 
     def mixture(self, guidance: Guidance, unguided: Any, direction: Any, active: Any) -> Any:
         """Return the density of a path's direction from that of its BRDF sample alone."""
-        learnt = self.density(guidance, direction, active)
+        learnt = self.pdf(guidance, direction, active)
         return dr.fma(learnt - unguided, guidance.share, unguided)
 
     def sample(self, guidance: Guidance, u: Any, active: Any) -> Any:

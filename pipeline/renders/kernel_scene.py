@@ -19,7 +19,7 @@ MAX_SURVIVAL = 0.95
 SMALLEST_COSINE = 1e-9
 """Cosines that weights divide by are at least this: a path along a surface carries no light."""
 
-MOST_ODDS = 1e18
+MAX_MIS_RATIO = 1e18
 """Ratios of densities are capped here: their squares stay finite, and 0 times those is not NaN."""
 
 _OFFSET = 1500 * 2.0**-24
@@ -72,9 +72,9 @@ class KernelScene:
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
 
-    def to_pick_density(self, density: Any) -> Any:
+    def to_pick_pdf(self, pdf: Any) -> Any:
         """Return a density among lamps (Float) as a density among lamps and sky."""
-        return density if self.sky is None else self.sky.of_lamps(density)
+        return pdf if self.sky is None else self.sky.of_lamps(pdf)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -47,7 +47,7 @@ from pipeline.renders.film import Film
 from pipeline.renders.guide_table import GuideTable
 from pipeline.renders.kernel_parts import KernelParts
 from pipeline.renders.kernel_scene import (
-    MOST_ODDS,
+    MAX_MIS_RATIO,
     SMALLEST_COSINE,
     KernelScene,
     Vertex,
@@ -83,11 +83,11 @@ def trace_light(
         splats: the sum of each lobe, or of both.
     """
     direction = scene.cone.sample(emitter.position, emitter.normal, u_direction)
-    leaving = scene.cone.density(emitter.position, emitter.normal, direction)
+    leaving = scene.cone.pdf(emitter.position, emitter.normal, direction)
     cosine = dr.abs(dr.dot(emitter.normal, direction))
     active = mi.Bool((leaving > 0) & (dr.max(emitter.radiance) > 0))
-    hit_odds = mi.Float(cosine / (emitter.area_density * leaving))
-    strength = dr.max(emitter.radiance) * hit_odds
+    hit_mis_ratio = mi.Float(cosine / (emitter.area_pdf * leaving))
+    strength = dr.max(emitter.radiance) * hit_mis_ratio
     throughput = mi.Color3f(emitter.radiance / dr.max(emitter.radiance))
     start = SurfacePoint(position=emitter.position, geometric_normal=emitter.normal)
     ray = mi.Ray3f(off_surface(start, direction), direction)
@@ -95,19 +95,19 @@ def trace_light(
     active &= hit.is_valid()
     triangle = mi.UInt32(hit.prim_index)
     barycentric = mi.Point2f(hit.prim_uv)
-    pick_odds = mi.Float(scene.to_pick_density(dr.square(hit.t) / leaving))
+    pick_mis_ratio = mi.Float(scene.to_pick_pdf(dr.square(hit.t) / leaving))
     depth = mi.UInt32(1)
     while active:
         point = scene.table.point(triangle, barycentric, active)
         vertex = vertex_at(scene, point, triangle, barycentric, direction, active)
         spread = dr.maximum(dr.dot(vertex.geometric, vertex.incoming), SMALLEST_COSINE)
         throughput = throughput / spread
-        hit_odds = hit_odds / spread
-        pick_odds = pick_odds / spread
+        hit_mis_ratio = hit_mis_ratio / spread
+        pick_mis_ratio = pick_mis_ratio / spread
         visible = active & (triangle < scene.num_surfaces)
         landing = visible & (depth > 1) & (depth < scene.max_depth)
-        odds = dr.minimum(dr.hypot(hit_odds, pick_odds), MOST_ODDS) / light_paths
-        place = film, light_paths, vertex, odds, landing
+        mis_ratio = dr.minimum(dr.hypot(hit_mis_ratio, pick_mis_ratio), MAX_MIS_RATIO) / light_paths
+        place = film, light_paths, vertex, mis_ratio, landing
         value, share, pixel, landing = _connect_to_camera(scene, parts, *place)
         _add(splats, parts.by_lobe(throughput * strength * value, share), pixel, landing)
         depth += 1
@@ -116,9 +116,9 @@ def trace_light(
         u_local = sampler.next_2d(active)
         local, reflected, forward, ratio = bounce(scene, vertex, u_lobe, u_local, active)
         throughput *= reflected * ratio
-        hit_odds = dr.minimum(hit_odds * forward * ratio, MOST_ODDS)
+        hit_mis_ratio = dr.minimum(hit_mis_ratio * forward * ratio, MAX_MIS_RATIO)
         onwards = dr.select(depth == 2, 1, forward)  # from x_(k-1) a path is picked, not drawn
-        pick_odds = dr.minimum(pick_odds * onwards * ratio, MOST_ODDS)
+        pick_mis_ratio = dr.minimum(pick_mis_ratio * onwards * ratio, MAX_MIS_RATIO)
         throughput, active = roulette(scene, throughput, depth, sampler.next_1d(active), active)
         direction = mi.Vector3f(vertex.frame.to_world(local))
         ray = mi.Ray3f(off_surface(point, direction), direction)
@@ -139,7 +139,7 @@ def _connect_to_camera(
     film: Film,
     light_paths: Any,
     vertex: Vertex,
-    odds: Any,
+    mis_ratio: Any,
     active: Any,
 ) -> tuple[Any, Any, Any, Any]:
     """Return the light of a vertex in the picture: value, diffuse share, pixel and visibility.
@@ -147,15 +147,15 @@ def _connect_to_camera(
     The value and the share of the diffuse lobe are Color3f, the pixel UInt32, visibility Bool.
 
     Args:
-        odds: Float, the square root of (hit^2 + pick^2) / land^2, without P and c_1.
+        mis_ratio: Float, the square root of (hit^2 + pick^2) / land^2, without P and c_1.
     """
     to_camera = film.origin - vertex.point.position
     distance_sq = dr.squared_norm(to_camera)
     direction = to_camera * dr.rsqrt(distance_sq)
     local = vertex.frame.to_local(direction)
     reflected, forward, _ = _evaluate_brdf(scene, vertex, local, active, None)
-    pixels = film.density(-direction) * dr.abs(dr.dot(vertex.geometric, local)) / distance_sq
-    share = 1 / (1 + dr.square(pixels * odds * forward))
+    pixels = film.pdf(-direction) * dr.abs(dr.dot(vertex.geometric, local)) / distance_sq
+    share = 1 / (1 + dr.square(pixels * mis_ratio * forward))
     pixel, inside = film.pixel(vertex.point.position)
     active &= inside & (dr.max(reflected) > 0)
     start = off_surface(vertex.point, to_camera)
@@ -187,13 +187,13 @@ def _evaluate_brdf(
     `guide` is the guide table of the viewer's path.
     """
     seen, wo = _flip_to_viewer(scene, vertex, view, active)
-    reflected, density = ggx.evaluate_bsdf(seen.lobes, seen.incoming, wo, seen.geometric)
+    reflected, pdf = ggx.evaluate_bsdf(seen.lobes, seen.incoming, wo, seen.geometric)
     if guide is not None:
         guidance = guide.at(vertex.triangle, vertex.barycentric, seen.front, seen.lobes, active)
         to_light = vertex.frame.to_world(vertex.incoming)
-        density = guide.mixture(guidance, density, to_light, active)
-    back = ggx.reverse_density(seen.lobes, seen.incoming, wo, seen.geometric)
-    return reflected, density, back
+        pdf = guide.mixture(guidance, pdf, to_light, active)
+    back = ggx.reverse_pdf(seen.lobes, seen.incoming, wo, seen.geometric)
+    return reflected, pdf, back
 
 
 def _flip_to_viewer(

@@ -23,7 +23,7 @@ from pipeline.renders.film import Film
 from pipeline.renders.guide_table import Guidance
 from pipeline.renders.kernel_parts import KernelParts
 from pipeline.renders.kernel_scene import (
-    MOST_ODDS,
+    MAX_MIS_RATIO,
     SMALLEST_COSINE,
     KernelScene,
     Vertex,
@@ -58,42 +58,44 @@ def trace(
     radiance = _background(scene, parts, direction, active)
     throughput = mi.Color3f(1)
     share = parts.first_share()
-    density = mi.Float(0)
+    pdf = mi.Float(0)
     depth = mi.UInt32(0)
     guided = mi.Float(1)
     # the ratio L / P * product of C+_i r_i / (c_i C-_(i+1)) of pipeline.renders.light_kernel
-    odds = light_paths * dr.square(distance) / film.density(direction)
+    mis_ratio = light_paths * dr.square(distance) / film.pdf(direction)
     while active:
         point = scene.table.point(triangle, barycentric, active)
-        odds /= dr.maximum(dr.abs(dr.dot(point.geometric_normal, direction)), SMALLEST_COSINE)
+        mis_ratio /= dr.maximum(dr.abs(dr.dot(point.geometric_normal, direction)), SMALLEST_COSINE)
         emits = active & (triangle >= scene.num_surfaces)
-        landing = dr.select(depth > 1, odds, 0)
-        seen = _seen_emission(scene, point, triangle, direction, distance, density, landing, emits)
+        landing = dr.select(depth > 1, mis_ratio, 0)
+        seen = _seen_emission(scene, point, triangle, direction, distance, pdf, landing, emits)
         radiance = parts.add(radiance, throughput * seen, depth, share)
         depth += 1
         active &= depth < scene.max_depth
         vertex = _vertex_from_viewer(scene, point, triangle, barycentric, direction, active)
         guidance = _guidance(scene, vertex, active & (depth > 1))
         u = sampler.next_2d(active)
-        lit, local = _direct_light(scene, vertex, guidance, odds, depth, u, active)
+        lit, local = _direct_light(scene, vertex, guidance, mis_ratio, depth, u, active)
         lit_share = parts.carry_share(vertex, local, depth, share)
         radiance = parts.add(radiance, throughput * lit, depth, lit_share)
         u_lobe = sampler.next_1d(active)
         u_local = sampler.next_2d(active)
         local = _sample_direction(scene, vertex, guidance, u_lobe, u_local, active)
         reflected, unguided = _evaluate_brdf(vertex, local)
-        density = _density(scene, vertex, guidance, unguided, local, active)
+        pdf = _density(scene, vertex, guidance, unguided, local, active)
         share = parts.carry_share(vertex, local, depth, share)
-        active &= density > 0
-        guided *= _ratio(guidance, density, unguided)
-        throughput = dr.select(active, throughput * reflected / density, throughput)
-        odds = dr.minimum(odds * _reverse_pdf_term(vertex, local, depth) / density, MOST_ODDS)
+        active &= pdf > 0
+        guided *= _ratio(guidance, pdf, unguided)
+        throughput = dr.select(active, throughput * reflected / pdf, throughput)
+        mis_ratio = dr.minimum(
+            mis_ratio * _reverse_pdf_term(vertex, local, depth) / pdf, MAX_MIS_RATIO
+        )
         u_end = sampler.next_1d(active)
         throughput, active = roulette(scene, throughput, depth, u_end, active, guided)
         direction = mi.Vector3f(vertex.frame.to_world(local))
         origin = off_surface(point, direction)
         hit = scene.everything.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
-        lit = _sky_emission(scene, direction, density, throughput, active, hit)
+        lit = _sky_emission(scene, direction, pdf, throughput, active, hit)
         radiance = radiance if lit is None else parts.add(radiance, lit, depth, share)
         active &= hit.is_valid()
         distance, triangle, barycentric = _unpack_hit(hit)
@@ -124,19 +126,17 @@ def _seen_emission(
     triangle: Any,
     direction: Any,
     distance: Any,
-    density: Any,
+    pdf: Any,
     landing: Any,
     emits: Any,
 ) -> Any:
     """Return the emission that a sampled direction hit, weighed against the other strategies."""
     row = dr.select(emits, triangle - scene.num_surfaces, 0)
-    area_density, emitted = scene.emitters.density_and_radiance(row, emits)
+    area_pdf, emitted = scene.emitters.pdf_and_radiance(row, emits)
     cosine = dr.abs(dr.dot(point.geometric_normal, direction))
-    emitter_density = scene.to_pick_density(area_density) * dr.square(distance) / cosine
-    leaving = scene.cone.density(point.position, point.geometric_normal, -direction)
-    other_ratios_sq = dr.square(emitter_density / density) + dr.square(
-        landing * area_density * leaving
-    )
+    emitter_density = scene.to_pick_pdf(area_pdf) * dr.square(distance) / cosine
+    leaving = scene.cone.pdf(point.position, point.geometric_normal, -direction)
+    other_ratios_sq = dr.square(emitter_density / pdf) + dr.square(landing * area_pdf * leaving)
     shines = emits & (dr.max(emitted) > 0)  # one that is off has no density: 0/0 at grazing angles
     return dr.select(shines, emitted / (1 + other_ratios_sq), 0)
 
@@ -150,14 +150,14 @@ def _background(scene: KernelScene, parts: KernelParts, direction: Any, is_hit: 
 
 
 def _sky_emission(
-    scene: KernelScene, direction: Any, density: Any, throughput: Any, active: Any, hit: Any
+    scene: KernelScene, direction: Any, pdf: Any, throughput: Any, active: Any, hit: Any
 ) -> Any:
     """Return the sky's light where a sampled direction hits nothing; None without a sky."""
     if scene.sky is None:
         return None
     free = active & ~hit.is_valid()
     radiance, picks = scene.sky.radiance_and_density(direction, free)
-    return throughput * dr.select(free, radiance / (1 + dr.square(picks / density)), 0)
+    return throughput * dr.select(free, radiance / (1 + dr.square(picks / pdf)), 0)
 
 
 def _guidance(scene: KernelScene, vertex: Vertex, active: Any) -> Guidance | None:
@@ -199,9 +199,9 @@ def _density(
     return scene.guide.mixture(guidance, unguided, vertex.frame.to_world(local), active)
 
 
-def _ratio(guidance: Guidance | None, density: Any, unguided: Any) -> Any:
+def _ratio(guidance: Guidance | None, pdf: Any, unguided: Any) -> Any:
     """Return the density of a guided direction over its BRDF density; 1 where that is 0."""
-    return 1 if guidance is None else dr.select(unguided > 0, density / unguided, 1)
+    return 1 if guidance is None else dr.select(unguided > 0, pdf / unguided, 1)
 
 
 def _evaluate_brdf(vertex: Vertex, local: Any) -> tuple[Any, Any]:
@@ -210,7 +210,7 @@ def _evaluate_brdf(vertex: Vertex, local: Any) -> tuple[Any, Any]:
 
 def _reverse_pdf_term(vertex: Vertex, local: Any, depth: Any) -> Any:
     """Return C+ r of a light path that comes from `local`; r is 1 at x1, where it ends."""
-    drawn = ggx.reverse_density(vertex.lobes, vertex.incoming, local, vertex.geometric)
+    drawn = ggx.reverse_pdf(vertex.lobes, vertex.incoming, local, vertex.geometric)
     return dr.abs(dr.dot(vertex.geometric, local)) * dr.select(depth > 1, drawn, 1)
 
 
@@ -218,7 +218,7 @@ def _direct_light(
     scene: KernelScene,
     vertex: Vertex,
     guidance: Guidance | None,
-    odds: Any,
+    mis_ratio: Any,
     depth: Any,
     u: Any,
     active: Any,
@@ -230,13 +230,11 @@ def _direct_light(
     pick = picked_light(scene, vertex.point.position, u, active)
     local = vertex.frame.to_local(pick.direction)
     reflected, unguided = _evaluate_brdf(vertex, local)
-    density = _density(scene, vertex, guidance, unguided, local, active)
-    landing = odds * _reverse_pdf_term(vertex, local, depth) * pick.leaving / pick.distance_sq
-    other_ratios_sq = dr.square(density / pick.density) + dr.square(
-        dr.select(depth > 1, landing, 0)
-    )
-    useful = active & (dr.max(reflected) > 0) & dr.isfinite(pick.density)
+    pdf = _density(scene, vertex, guidance, unguided, local, active)
+    landing = mis_ratio * _reverse_pdf_term(vertex, local, depth) * pick.leaving / pick.distance_sq
+    other_ratios_sq = dr.square(pdf / pick.pdf) + dr.square(dr.select(depth > 1, landing, 0))
+    useful = active & (dr.max(reflected) > 0) & dr.isfinite(pick.pdf)
     shadow_ray = pick.shadow_ray(off_surface(vertex.point, pick.direction))
     lit = useful & ~scene.everything.ray_test(shadow_ray, active=useful)
-    weighed = reflected * pick.radiance / (pick.density * (1 + other_ratios_sq))
+    weighed = reflected * pick.radiance / (pick.pdf * (1 + other_ratios_sq))
     return dr.select(lit, weighed, 0), local

@@ -73,10 +73,10 @@ def trace_photons(
 ) -> None:
     """Add arrivals to `records`; see `trace_light` for the arguments that they share."""
     direction = scene.cone.sample(emitter.position, emitter.normal, u_direction)
-    leaving = scene.cone.density(emitter.position, emitter.normal, direction)
+    leaving = scene.cone.pdf(emitter.position, emitter.normal, direction)
     cosine = dr.abs(dr.dot(emitter.normal, direction))
     active = mi.Bool((leaving > 0) & (dr.max(emitter.radiance) > 0))
-    strength = dr.max(emitter.radiance) * cosine / (emitter.area_density * leaving)
+    strength = dr.max(emitter.radiance) * cosine / (emitter.area_pdf * leaving)
     throughput = mi.Color3f(emitter.radiance / dr.max(emitter.radiance))
     start = SurfacePoint(position=emitter.position, geometric_normal=emitter.normal)
     ray = mi.Ray3f(off_surface(start, direction), direction)

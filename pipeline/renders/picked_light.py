@@ -21,7 +21,7 @@ class PickedLight:
 
     direction: Any
     """Unit direction from the path's vertex, Vector3f."""
-    density: Any
+    pdf: Any
     """Float, per steradian; not finite where no light can come from there."""
     radiance: Any
     """Radiance of the lamp or the sky, Color3f."""
@@ -55,11 +55,11 @@ def picked_light(scene: KernelScene, position: Any, u: Any, active: Any) -> Pick
     lamp = _of_lamps(scene, position, u_lamp, active & ~is_sky)
     sky = scene.sky.sample(u_sky, active & is_sky)
     # A light path leaves a lamp with its density among lamps; picks have only their share of it.
-    leaving = lamp.leaving / dr.maximum(scene.to_pick_density(mi.Float(1)), _LEAST_SHARE)
+    leaving = lamp.leaving / dr.maximum(scene.to_pick_pdf(mi.Float(1)), _LEAST_SHARE)
     return replace(
         lamp,
         direction=mi.Vector3f(dr.select(is_sky, sky.direction, lamp.direction)),
-        density=dr.select(is_sky, sky.density, scene.to_pick_density(lamp.density)),
+        pdf=dr.select(is_sky, sky.pdf, scene.to_pick_pdf(lamp.pdf)),
         radiance=mi.Color3f(dr.select(is_sky, sky.radiance, lamp.radiance)),
         leaving=dr.select(is_sky, 0, leaving),
         distance_sq=dr.select(is_sky, 1, lamp.distance_sq),
@@ -75,9 +75,9 @@ def _of_lamps(scene: KernelScene, position: Any, u: Any, active: Any) -> PickedL
     cosine = dr.abs(dr.dot(emitter.normal, direction))
     return PickedLight(
         direction=direction,
-        density=emitter.area_density * distance_sq / cosine,
+        pdf=emitter.area_pdf * distance_sq / cosine,
         radiance=emitter.radiance,
-        leaving=scene.cone.density(emitter.position, emitter.normal, -direction),
+        leaving=scene.cone.pdf(emitter.position, emitter.normal, -direction),
         distance_sq=distance_sq,
         position=emitter.position,
     )

@@ -1,7 +1,7 @@
 """The formulas of a look as kernels: arithmetic of pixels, and sums over tiles and over all.
 
-They are those of pipeline.renders.noise_floor and pipeline.renders.kept_light. Sums are taken over
-tiles of 64 pixels, then over rows of tiles: in an order of their own, but always the same one.
+They are those of pipeline.renders.noise_floor and pipeline.renders.denoise_corrections. Sums are
+taken over tiles of 64 pixels, then over rows of tiles: in their own order, but always the same one.
 Pictures are Color3f, what is worked out of them is Float64, pixel by pixel.
 """
 
@@ -11,7 +11,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from pipeline.renders.kept_light import DARKER, GLINT, MOST_APART, STANDARD_ERRORS, STANDS_OUT
+from pipeline.renders.denoise_corrections import (
+    DARKER,
+    GLINT,
+    MOST_APART,
+    STANDARD_ERRORS,
+    STANDS_OUT,
+)
 from pipeline.renders.noise_floor import BLOCK_PX, SMALLEST_STEP
 from pipeline.renders.tiles import TILE_PX
 from pipeline.renders.view_pictures import add_up
@@ -30,7 +36,7 @@ def clean(picture: Any, raw: Any, normal: Any) -> Any:
 
 
 def with_means_of(pairs: Sequence[tuple[Any, Any]], resolution: int) -> list[Any]:
-    """Return pictures with the mean brightness of raw ones, as kept_light says: (denoised, raw)."""
+    """Return pictures (denoised, raw) with the mean of the raw ones (see denoise_corrections)."""
     bright = [channel_mean(denoised) > GLINT for denoised, _ in pairs]
     values = [
         dr.select(part, channel_sum(mi.Color3d(picture)), 0)

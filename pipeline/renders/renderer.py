@@ -25,7 +25,7 @@ from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans, HostPict
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.results import GrowingPicture, RenderedView, Sampling, UsedTime
-from pipeline.renders.samples import HalfSamples
+from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.stopping import Floors, Goal, expected_spp, gaps_db, next_spp
 from pipeline.renders.tiles import TileChoice
@@ -78,7 +78,9 @@ class SceneRenderer:
         self._used = UsedTime()
         self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
         if settings.part_names:
-            self._tracer = self._tracer.apart(bounces=settings.split, lobes=settings.split_lobes)
+            self._tracer = self._tracer.split_lights(
+                bounces=settings.split, lobes=settings.split_lobes
+            )
         self._tracers = [self._tracer]
         self._sees_sky = scene.environment is not None and scene.environment.is_seen
         if settings.per_light:
@@ -121,7 +123,7 @@ class SceneRenderer:
         pose = np.asarray(c2w, np.float64)
         camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
         settled = settings.first_spp
-        samples = HalfSamples(
+        samples = DualBuffer(
             self._tracers, camera, seed, first_spp=settled, max_spp=settings.max_spp
         )
         first_pass_of_both = 2 * samples.pass_spp
@@ -148,7 +150,7 @@ class SceneRenderer:
             **stored,
         )
 
-    def _pictures(self, samples: HalfSamples, camera: Camera) -> ViewPictures:
+    def _pictures(self, samples: DualBuffer, camera: Camera) -> ViewPictures:
         if self._settings.arithmetic == "numpy":
             return HostPictures(samples, self._tracer, camera, self._settings)
         from pipeline.renders.device_pictures import DevicePictures  # imports mitsuba
@@ -170,7 +172,7 @@ class SceneRenderer:
             "parts_rgb": dict(named) or None,
         }
 
-    def _refuse_black(self, samples: HalfSamples) -> None:
+    def _refuse_black(self, samples: DualBuffer) -> None:
         if self._settings.arithmetic == "numpy":
             mean = float(HostMeans(samples).mean().sum(axis=0).mean(dtype=np.float64))
         else:
@@ -192,7 +194,7 @@ class SceneRenderer:
             raise Rejected("floor_not_reached", ", ".join(missed))
 
     def _sample_until_targets(
-        self, samples: HalfSamples, pictures: ViewPictures
+        self, samples: DualBuffer, pictures: ViewPictures
     ) -> Generator[Sampling, None, MeasuredLook]:
         targets_db = self._settings.targets_db
         max_spp = self._settings.max_spp
@@ -222,7 +224,7 @@ class SceneRenderer:
 
     def _growing(
         self,
-        samples: HalfSamples,
+        samples: DualBuffer,
         pictures: ViewPictures,
         floor: MeasuredFloor,
         expected_spp: int,

@@ -11,7 +11,7 @@ from pipeline.renders.tracer import Chosen, Tracer
 from storage.seeds import seed_for
 
 
-class HalfSamples:
+class DualBuffer:
     """Two growing sums of passes of one view, with no sample in common.
 
     There are P pictures: those of one tracer of all light, or those of the tracers of each emitter

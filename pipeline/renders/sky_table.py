@@ -28,7 +28,7 @@ class SkySample:
 
     direction: Any
     """Unit direction in world space, Vector3f."""
-    density: Any
+    pdf: Any
     """Density of the direction per steradian, Float; not finite where there is no light."""
     radiance: Any
     """Radiance from the direction, Color3f."""
@@ -48,8 +48,8 @@ class SkyTable:
         angles = row_solid_angles(height)
         flux = texel_means(sky.radiance_rgb.mean(axis=-1, dtype=np.float64)) * angles[:, None]
         rows = flux.sum(axis=1)
-        density = flux / rows.sum() / angles[:, None]
-        self._texels = own_floats(np.concatenate([sky.radiance_rgb, density[..., None]], axis=-1))
+        pdf = flux / rows.sum() / angles[:, None]
+        self._texels = own_floats(np.concatenate([sky.radiance_rgb, pdf[..., None]], axis=-1))
         self._rows = own_floats(np.stack(alias_rows(rows[None]), axis=-1))
         self._columns = own_floats(np.stack(alias_rows(flux), axis=-1))
         self._edges = own_floats(np.cos(np.pi * np.arange(height + 1) / height))
@@ -85,9 +85,9 @@ class SkyTable:
         sine, cosine = dr.sincos(azimuth)
         x, y, up = self._to_world
         direction = mi.Vector3f(dr.normalize(x * (flat * cosine) + y * (flat * sine) + up * z))
-        radiance, density = self.radiance_and_density(direction, active)
-        density = dr.select(density > 0, density, dr.inf)
-        return SkySample(direction=direction, density=density, radiance=radiance)
+        radiance, pdf = self.radiance_and_density(direction, active)
+        pdf = dr.select(pdf > 0, pdf, dr.inf)
+        return SkySample(direction=direction, pdf=pdf, radiance=radiance)
 
     def radiance_and_density(self, direction: Any, active: Any) -> tuple[Any, Any]:
         """Return the radiance (Color3f) that comes from a unit direction of the world.

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.samples import HalfSamples
+from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import PASS_SPP, Filtered
 
 TILE_PX = 8
@@ -52,7 +52,7 @@ class TileChoice:
         self._filter: Filtered | None = None
 
     def learn(
-        self, changes: Sequence[NDArray[np.float64]], samples: HalfSamples, quality: Filtered
+        self, changes: Sequence[NDArray[np.float64]], samples: DualBuffer, quality: Filtered
     ) -> None:
         """Look at both halves as they are now, denoised by a filter of this quality.
 
@@ -72,7 +72,7 @@ class TileChoice:
         self._seen = seen
         self._filter = quality
 
-    def passes(self, samples: HalfSamples, mean_spp: int) -> list[NDArray[np.int64]] | None:
+    def passes(self, samples: DualBuffer, mean_spp: int) -> list[NDArray[np.int64]] | None:
         """Return how many more passes each pixel of each half gets, [R, R]; None: all alike.
 
         Args:
@@ -133,7 +133,7 @@ def passes_of_tiles(
     return passes(high).astype(np.int64)
 
 
-def spp_of_tiles(samples: HalfSamples, half: int) -> NDArray[np.int64]:
+def spp_of_tiles(samples: DualBuffer, half: int) -> NDArray[np.int64]:
     """Return the samples per pixel of one half, [T, T]."""
     return samples.spp_of(half)[::TILE_PX, ::TILE_PX].copy()
 

@@ -85,7 +85,7 @@ class Tracer(Protocol):
             Rejected: "unlit_scene" where it has no area.
         """
 
-    def apart(self, *, bounces: bool, lobes: bool) -> "Tracer":
+    def split_lights(self, *, bounces: bool, lobes: bool) -> "Tracer":
         """Return the same loaded scene, whose sums of passes are by part.
 
         Args:

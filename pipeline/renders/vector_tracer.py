@@ -91,7 +91,7 @@ class VectorTracer:
         tracer._scene.sky = None
         return tracer
 
-    def apart(self, *, bounces: bool, lobes: bool) -> "VectorTracer":
+    def split_lights(self, *, bounces: bool, lobes: bool) -> "VectorTracer":
         tracer = copy.copy(self)
         tracer._parts = KernelParts(bounces=bounces, lobes=lobes)
         return tracer

@@ -45,12 +45,12 @@ def _register() -> None:
         def sample(self, ctx: Any, si: Any, u: Any, u2: Any, active: Any = True) -> Any:
             lobes, wi, geometric, side = self._seen(si, active)
             wo = ggx.sample(lobes, wi, u, u2)
-            reflected, density = ggx.evaluate_bsdf(lobes, wi, wo, geometric)
+            reflected, pdf = ggx.evaluate_bsdf(lobes, wi, wo, geometric)
             drawn: Any = mi.BSDFSample3f(_mirrored(wo, side))
-            drawn.pdf, drawn.eta = density, 1.0
+            drawn.pdf, drawn.eta = pdf, 1.0
             drawn.sampled_type = +mi.BSDFFlags.GlossyReflection
             drawn.sampled_component = 0
-            return drawn, dr.select(density > 0, reflected / density, 0)
+            return drawn, dr.select(pdf > 0, reflected / pdf, 0)
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
             lobes, wi, geometric, side = self._seen(si, active)

@@ -71,7 +71,7 @@ class PluginTracer:
         tracer._background = None
         return tracer
 
-    def apart(self, *, bounces: bool, lobes: bool) -> "PluginTracer":
+    def split_lights(self, *, bounces: bool, lobes: bool) -> "PluginTracer":
         raise NotImplementedError("the stock integrator returns all light together")
 
     def radiance(

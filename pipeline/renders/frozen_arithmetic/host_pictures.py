@@ -7,16 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
+from pipeline.renders.denoise_corrections import LEAST_PASSES
 from pipeline.renders.denoiser import denoise
-from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error
-from pipeline.renders.frozen_arithmetic.kept_light import (
+from pipeline.renders.frozen_arithmetic.denoise_corrections import (
     Pictures,
     keep_converged,
     keep_in_halves,
     with_mean_of,
 )
-from pipeline.renders.kept_light import LEAST_PASSES
-from pipeline.renders.samples import HalfSamples
+from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error
+from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tiles import tile_means
 from pipeline.renders.tracer import Features, Tracer
@@ -34,7 +34,7 @@ class HostPictures:
     """See `ViewPictures` for the meaning of its methods."""
 
     def __init__(
-        self, samples: HalfSamples, tracer: Tracer, camera: Camera, settings: RenderSettings
+        self, samples: DualBuffer, tracer: Tracer, camera: Camera, settings: RenderSettings
     ) -> None:
         self._samples = samples
         self._settings = settings
@@ -89,7 +89,7 @@ class HostPictures:
 class HostMeans:
     """Means of the samples of a view as they are now, read back once."""
 
-    def __init__(self, samples: HalfSamples) -> None:
+    def __init__(self, samples: DualBuffer) -> None:
         self._samples = samples
         self._totals = [np.concatenate([each.read() for each in sums]) for sums in samples.sums]
         require_finite(int((~np.isfinite(self._totals).all(axis=(0, 1, -1))).sum()))

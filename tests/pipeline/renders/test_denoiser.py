@@ -9,18 +9,18 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders import denoiser, variant_probe
+from pipeline.renders.denoise_corrections import LEAST_PASSES
 from pipeline.renders.denoiser import denoise, load_oidn, set_denoiser_device
-from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error
-from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans
-from pipeline.renders.frozen_arithmetic.kept_light import (
+from pipeline.renders.frozen_arithmetic.denoise_corrections import (
     Pictures,
     keep_converged,
     keep_in_halves,
     with_mean_of,
 )
-from pipeline.renders.kept_light import LEAST_PASSES
+from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error
+from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.samples import HalfSamples
+from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tiles import TileChoice
 from pipeline.renders.tracer import Chosen, Features
@@ -229,7 +229,7 @@ def test_the_standard_error_is_that_between_passes() -> None:
     tracer = load_tracer(scene, max_depth=4, rr_depth=2)
     camera = camera_of(scene, 16)
     asked: list[tuple[int, int]] = []
-    samples = HalfSamples([tracer], camera, 3, first_spp=32, max_spp=256)
+    samples = DualBuffer([tracer], camera, 3, first_spp=32, max_spp=256)
     add = type(samples.sums[0][0]).add
 
     def remembered(part: object, *, seed: int, spp: int, chosen: Chosen = None) -> None:

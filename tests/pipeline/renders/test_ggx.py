@@ -65,8 +65,8 @@ def _returned(roughness: float) -> NDArray:
     grid = [np.repeat(middles, side), np.tile(middles, side)]
     u = mi.Point2f(*(mi.Float(np.tile(axis, len(cosines))) for axis in grid))
     wo = ggx.sample(lobes, wi, mi.Float(0), u)
-    reflected, density = ggx.evaluate_bsdf(lobes, wi, wo, mi.Vector3f(*UP))
-    returned = dr.block_sum(dr.select(density > 0, reflected.x / density, 0), count) / count
+    reflected, pdf = ggx.evaluate_bsdf(lobes, wi, wo, mi.Vector3f(*UP))
+    returned = dr.block_sum(dr.select(pdf > 0, reflected.x / pdf, 0), count) / count
     return np.array(returned)
 
 
@@ -75,12 +75,12 @@ def test_no_mirror_reflects_to_below_the_triangle() -> None:
     lobes = kernel_lobes(diffuse=0.3, specular=0.6, roughness=0.8)
     wi, wo = direction(0.5), mi.Vector3f(-0.8, 0.0, 0.6)
     leaning = mi.Vector3f(0.8, 0.0, 0.6)
-    reflected, density = ggx.evaluate_bsdf(seen_at(lobes, wi), wi, wo, leaning)
+    reflected, pdf = ggx.evaluate_bsdf(seen_at(lobes, wi), wi, wo, leaning)
     assert float(reflected.x[0]) == pytest.approx(0.3 * 0.6 / np.pi, rel=1e-6)
-    free, same_density = ggx.evaluate_bsdf(seen_at(lobes, wi), wi, wo, mi.Vector3f(*UP))
+    free, same_pdf = ggx.evaluate_bsdf(seen_at(lobes, wi), wi, wo, mi.Vector3f(*UP))
     assert float(free.x[0]) > 1.5 * float(reflected.x[0])
     # It is still sampled, and what is sampled must be counted.
-    assert float(density[0]) == float(same_density[0])
+    assert float(pdf[0]) == float(same_pdf[0])
 
 
 def test_nothing_is_negative_and_nothing_is_nan() -> None:
@@ -196,17 +196,17 @@ def _chi_square(
     """Return whether samples of `lobes` may follow the density of `claimed`."""
     normal = mi.Vector3f(*geometric)
 
-    def density(wo: Any) -> Any:
+    def pdf(wo: Any) -> Any:
         return ggx.evaluate_bsdf(seen_at(claimed or lobes, wi), wi, wo, normal)[1]
 
     def sample(u: Any) -> tuple[Any, Any]:
         wo = ggx.sample(seen_at(lobes, wi), wi, u[0], mi.Point2f(u[1], u[2]))
-        return wo, dr.select(density(wo) > 0, mi.Float(1), 0)
+        return wo, dr.select(pdf(wo) > 0, mi.Float(1), 0)
 
     test = mi.chi2.ChiSquareTest(
         domain=domain,
         sample_func=sample,
-        pdf_func=lambda wo: density(wo) * area(wo),
+        pdf_func=lambda wo: pdf(wo) * area(wo),
         sample_dim=3,
         sample_count=SAMPLES,
         res=101,

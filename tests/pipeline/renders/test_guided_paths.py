@@ -208,13 +208,11 @@ def test_the_density_is_that_of_a_slow_twin_and_integrates_to_one() -> None:
     directions = rng.normal(size=(1 << 18, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     directions = directions.astype(np.float32)
-    density = np.array(
-        _table(peaks).density(_guidance(), mi.Vector3f(*directions.T.copy()), mi.Bool(True))
-    )
+    pdf = np.array(_table(peaks).pdf(_guidance(), mi.Vector3f(*directions.T.copy()), mi.Bool(True)))
     expected = _twin(directions.astype(np.float64), peaks)
     # Directions within roundings of a bin's rim may fall on either side: one in ten thousand.
-    assert np.isclose(density, expected, rtol=1e-4).mean() > 0.9999
-    integral = 4 * np.pi * density.astype(np.float64)
+    assert np.isclose(pdf, expected, rtol=1e-4).mean() > 0.9999
+    integral = 4 * np.pi * pdf.astype(np.float64)
     assert abs(integral.mean() - 1) < 5 * integral.std() / np.sqrt(len(integral))
 
 
@@ -234,12 +232,12 @@ def test_directions_are_drawn_by_the_density() -> None:
     assert chi_sq < freedom + 5 * np.sqrt(2 * freedom)
     directions = np.array(drawn).T.astype(np.float64)
     # The mean of g / density is the integral of g over the bins that are there.
-    density = np.array(table.density(_guidance(), drawn, mi.Bool(True)), np.float64)
+    pdf = np.array(table.pdf(_guidance(), drawn, mi.Bool(True)), np.float64)
     uniform = rng.normal(size=(count, 3))
     uniform /= np.linalg.norm(uniform, axis=1, keepdims=True)
     inside = _twin(uniform, peaks) > 0
     for moment in (np.ones_like, np.square):
-        by_drawn = (moment(directions[:, 0]) / density)[density > 0]
+        by_drawn = (moment(directions[:, 0]) / pdf)[pdf > 0]
         by_twin = 4 * np.pi * moment(uniform[:, 0]) * inside
         error = np.hypot(by_drawn.std(), by_twin.std()) / np.sqrt(count)
         assert abs(by_drawn.mean() - by_twin.mean()) < 5 * error

@@ -273,11 +273,11 @@ def test_directions_into_the_scene_have_the_density_that_is_claimed(position: li
     count, normal = 1 << 16, dr.normalize(mi.Vector3f(0.3, 0.5, 1.0))
     u = even_numbers(count, even_shifts(7))
     drawn = cone.sample(mi.Point3f(*position), normal, mi.Point2f(u[2], u[3]))
-    density = np.array(cone.density(mi.Point3f(*position), normal, drawn), np.float64)
+    pdf = np.array(cone.pdf(mi.Point3f(*position), normal, drawn), np.float64)
     directions = np.array(drawn).T.astype(np.float64)
-    inside = density > 0
+    inside = pdf > 0
     assert inside.mean() > 0.9999  # all but roundings at the rim
-    directions, density = directions[inside], density[inside]
+    directions, pdf = directions[inside], pdf[inside]
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-6)  # float32
     distance, radius = np.linalg.norm(position), 1.001 * np.sqrt(2)
     axis = -np.array(position) / distance
@@ -285,14 +285,14 @@ def test_directions_into_the_scene_have_the_density_that_is_claimed(position: li
         lowest = np.sqrt(1 - (radius / distance) ** 2)
         solid_angle, first_moment = 2 * np.pi * (1 - lowest), np.pi * (1 - lowest**2)
         assert (directions @ axis > lowest - 1e-6).all()
-        np.testing.assert_allclose(density, 1 / solid_angle, rtol=1e-3)  # 1 - cos in float32
+        np.testing.assert_allclose(pdf, 1 / solid_angle, rtol=1e-3)  # 1 - cos in float32
     else:
         cosine = np.abs(directions @ np.array(normal).ravel())
-        np.testing.assert_allclose(density, cosine / (2 * np.pi), atol=1e-6)
+        np.testing.assert_allclose(pdf, cosine / (2 * np.pi), atol=1e-6)
         first_moment = 0.0
     # Standard errors are some 1 / sqrt(count) = 0.4 %; even points do better.
-    assert abs((directions @ axis / density).mean() - first_moment) < 5e-3 * max(first_moment, 4)
-    assert np.array(cone.density(mi.Point3f(0, 0, 9), normal, mi.Vector3f(0, 0, 1))).item() == 0
+    assert abs((directions @ axis / pdf).mean() - first_moment) < 5e-3 * max(first_moment, 4)
+    assert np.array(cone.pdf(mi.Point3f(0, 0, 9), normal, mi.Vector3f(0, 0, 1))).item() == 0
 
 
 def test_light_starts_are_even_and_their_shift_goes_with_the_seed() -> None:
@@ -335,9 +335,9 @@ def test_pixels_per_steradian_are_those_of_the_rays() -> None:
         ray = np.array(film.rays(columns, rows).d, np.float64)
         along_x, along_y = ray[:, 1] - ray[:, 2], ray[:, 3] - ray[:, 4]
         solid_angle = np.linalg.norm(np.cross(along_x, along_y)) / (2 * step) ** 2
-        density = np.array(film.density(mi.Vector3f(*ray[:, 0].tolist()))).item()
+        pdf = np.array(film.pdf(mi.Vector3f(*ray[:, 0].tolist()))).item()
         # Rays are float32: 1e-7 of a difference of 0.01.
-        np.testing.assert_allclose(density * solid_angle, 1, rtol=1e-3)
+        np.testing.assert_allclose(pdf * solid_angle, 1, rtol=1e-3)
 
 
 @pytest.mark.parametrize("roughness", [0.1, 0.5, 1.0])
@@ -355,7 +355,7 @@ def test_the_way_back_has_the_density_that_a_path_from_there_draws(roughness: fl
     there, back = wo * mirror, wi * mirror
     normal = geometric * mirror * turn
     expected = ggx.evaluate_bsdf(seen_at(lobes, there), there, back, normal)[1]
-    found = ggx.reverse_density(seen_at(lobes, wi), wi, wo, geometric)
+    found = ggx.reverse_pdf(seen_at(lobes, wi), wi, wo, geometric)
     useful = np.array(ggx.evaluate_bsdf(seen_at(lobes, wi), wi, wo, geometric)[1]) > 0
     sides = np.array(turn)[useful]
     assert (sides > 0).sum() > 100 and (sides < 0).sum() > 100

@@ -204,7 +204,7 @@ NEAR_LAMP = [[-0.3, -1.5, 2], [0.3, -1.5, 2], [0, -1, 2.2]]
 
 def _tracer(scene: Scene, *, bounces: bool, lobes: bool, max_depth: int = 10) -> Tracer:
     tracer = load_tracer(scene, max_depth=max_depth, rr_depth=2)
-    return tracer.apart(bounces=bounces, lobes=lobes)
+    return tracer.split_lights(bounces=bounces, lobes=lobes)
 
 
 def _passes(

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from pipeline.renders.denoiser import Quality, denoise
 from pipeline.renders.frozen_arithmetic import host_pictures
+from pipeline.renders.frozen_arithmetic.denoise_corrections import with_mean_of
 from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans
-from pipeline.renders.frozen_arithmetic.kept_light import with_mean_of
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import RenderedView
-from pipeline.renders.samples import HalfSamples
+from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import Features
 from pipeline.renders.vector_tracer import VectorTracer
@@ -256,7 +256,7 @@ def test_lights_apart_add_up_to_one_denoised_picture() -> None:
     scene = lit_scene()
     tracer = load_tracer(scene, max_depth=SETTINGS.max_depth, rr_depth=SETTINGS.rr_depth)
     parts = [tracer.only_light(row) for row in light_rows(scene)]
-    samples = HalfSamples(parts, camera_of(scene, 32), 0, first_spp=32, max_spp=32)
+    samples = DualBuffer(parts, camera_of(scene, 32), 0, first_spp=32, max_spp=32)
     assert len(list(samples.passes_to(SETTINGS.max_spp))) == 2
     features = tracer.features(camera_of(scene, 32), spp=SETTINGS.aux_spp)
     raw = HostMeans(samples).mean().sum(axis=0)
@@ -280,11 +280,13 @@ def test_the_sum_is_the_picture_of_all_lights_at_once(llvm: None) -> None:
     scene = lit_scene()
     tracer = load_tracer(scene, max_depth=6, rr_depth=5)
     lights = [tracer.only_light(row) for row in light_rows(scene)]
-    apart = blocks_of(np.sum([render_passes(one, scene, passes=12) for one in lights], axis=0), 8)
+    separate = blocks_of(
+        np.sum([render_passes(one, scene, passes=12) for one in lights], axis=0), 8
+    )
     together = blocks_of(render_passes(tracer, scene, passes=12), 8)
-    assert_agree(apart, together)
+    assert_agree(separate, together)
     # and the errors are small enough to tell: the lights' own share is far larger
-    assert np.median(np.hypot(apart.error, together.error)) < 0.02 * together.mean.mean()
+    assert np.median(np.hypot(separate.error, together.error)) < 0.02 * together.mean.mean()
 
 
 @pytest.mark.slow("statistics")
@@ -329,6 +331,6 @@ def test_one_light_alone_is_the_picture_but_for_its_rounding() -> None:
     scene = join(parts, eye=(0, -3, 2))
     together = render_view(scene, dataclasses.replace(SETTINGS, per_light=False))
     assert together.lights_rgb is None
-    apart = render_view(scene, SETTINGS)
-    np.testing.assert_array_equal(apart.radiance_rgb, rounded_to_half(together.radiance_rgb))
-    assert apart.noise_floor_db == together.noise_floor_db
+    separate = render_view(scene, SETTINGS)
+    np.testing.assert_array_equal(separate.radiance_rgb, rounded_to_half(together.radiance_rgb))
+    assert separate.noise_floor_db == together.noise_floor_db

@@ -16,7 +16,7 @@ from pipeline.renders.frozen_arithmetic.halves import (
     surprises,
 )
 from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans
-from pipeline.renders.samples import HalfSamples
+from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import NoiseTargets, RenderSettings, one_picture
 from pipeline.renders.stopping import Goal, expected_spp, gaps_db, next_spp, slope_db
 from pipeline.renders.tracer import Chosen
@@ -45,9 +45,9 @@ class Recorder:
         return picture if chosen is None else picture * chosen[..., None]
 
 
-def _passes(first_spp: int, spp: int, max_spp: int) -> tuple[HalfSamples, list[tuple[int, int]]]:
+def _passes(first_spp: int, spp: int, max_spp: int) -> tuple[DualBuffer, list[tuple[int, int]]]:
     tracer = Recorder()
-    samples = HalfSamples([tracer], CAMERA, 0, first_spp=first_spp, max_spp=max_spp)  # type: ignore[list-item]
+    samples = DualBuffer([tracer], CAMERA, 0, first_spp=first_spp, max_spp=max_spp)  # type: ignore[list-item]
     for _ in samples.passes_to(spp):
         pass
     return samples, tracer.asked

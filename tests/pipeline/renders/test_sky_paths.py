@@ -107,7 +107,7 @@ def test_parts_add_up_and_direct_light_is_that_of_one_bounce() -> None:
     camera, found = camera_of(scene, 16), []
     for depth in (10, 2):
         tracer = load_tracer(scene, max_depth=depth, rr_depth=5)
-        total = tracer.apart(bounces=True, lobes=True).pass_sum(camera)
+        total = tracer.split_lights(bounces=True, lobes=True).pass_sum(camera)
         total.add(seed=1, spp=64)
         found.append(total.read() / 64)
         whole = tracer.radiance(camera, seed=1, spp=64)
@@ -166,8 +166,8 @@ def test_directions_come_with_the_density_that_is_stated(number: int) -> None:
     directions = np.array(drawn.direction).T
     assert np.abs(np.linalg.norm(directions, axis=1) - 1).max() < 1e-6
     again = table.radiance_and_density(drawn.direction, mi.Bool(True))[1]
-    np.testing.assert_array_equal(np.array(again), np.array(drawn.density))
-    weighed = np.array(drawn.radiance).T / (np.array(drawn.density)[:, None] / np.float32(0.7))
+    np.testing.assert_array_equal(np.array(again), np.array(drawn.pdf))
+    weighed = np.array(drawn.radiance).T / (np.array(drawn.pdf)[:, None] / np.float32(0.7))
     octant = (directions > 0) @ np.array([1, 2, 4])
     uniform = rng.normal(size=(1 << 16, 3))
     uniform /= np.linalg.norm(uniform, axis=1, keepdims=True)
@@ -185,7 +185,7 @@ def test_a_sun_of_one_texel_is_drawn_by_what_its_neighbours_have_of_it() -> None
     sky = one_sun()
     table, rng = SkyTable(sky, 1.0), np.random.default_rng(6)
     drawn = table.sample(mi.Point2f(rng.random((2, 1 << 16)).astype(np.float32)), mi.Bool(True))
-    weighed = np.array(drawn.radiance)[0] / np.array(drawn.density)
+    weighed = np.array(drawn.radiance)[0] / np.array(drawn.pdf)
     # A tent that is drawn by its means over texels: measured 1.05.
     assert weighed.std() < 1.2 * weighed.mean()
 

@@ -15,7 +15,7 @@ from pipeline.renders.frozen_arithmetic.halves import Half
 from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans, LogChanges
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer, set_threads
-from pipeline.renders.samples import HalfSamples
+from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tiles import TILE_PX, TileChoice, passes_of_tiles
 from pipeline.renders.tracer import Chosen, Tracer
@@ -52,7 +52,7 @@ class RareLight:
         return grey[..., None].repeat(3, axis=-1).astype(np.float32)
 
 
-def _halves(samples: HalfSamples) -> list[Half]:
+def _halves(samples: DualBuffer) -> list[Half]:
     raws = [raw[0] for raw in HostMeans(samples).half_means()]
     return [Half(raw_rgb=raw, denoised_rgb=raw) for raw in raws]
 
@@ -62,8 +62,8 @@ def _adapted(
     seed: int,
     measured_at: Sequence[int],
     counted: NDArray[np.bool_] = EVERYWHERE,
-) -> HalfSamples:
-    samples = HalfSamples([tracer], CAMERA, seed, first_spp=32, max_spp=4096)  # type: ignore[list-item]
+) -> DualBuffer:
+    samples = DualBuffer([tracer], CAMERA, seed, first_spp=32, max_spp=4096)  # type: ignore[list-item]
     samples.count_over(counted)
     tiles, changes = TileChoice(counted), LogChanges()
     for spp in measured_at:

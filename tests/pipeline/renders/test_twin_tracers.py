@@ -199,7 +199,7 @@ def test_sampled_points_lie_on_their_triangle_and_come_by_power() -> None:
     grid = (np.arange(side) + 0.5) / side
     u = mi.Point2f(mi.Float(np.repeat(grid, side)), mi.Float(np.tile(grid, side)))
     point = table.sample(u, mi.Bool(True))
-    dr.eval(point.position, point.radiance, point.area_density)
+    dr.eval(point.position, point.radiance, point.area_pdf)
     radiance = np.array(point.radiance)[0]
     position = np.array(point.position).T.astype(np.float64)
     edge1, edge2 = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
@@ -218,7 +218,7 @@ def test_sampled_points_lie_on_their_triangle_and_come_by_power() -> None:
         np.testing.assert_allclose(back, position[mine], atol=2e-6)
         assert (weights > -1e-5).all() and (weights.sum(0) < 1 + 1e-5).all()
         np.testing.assert_allclose(
-            np.array(point.area_density)[mine], share[row] / area[row], rtol=1e-5
+            np.array(point.area_pdf)[mine], share[row] / area[row], rtol=1e-5
         )
         # Uniform on the triangle: the mean point is the centroid, as far as the row's strata tell.
         np.testing.assert_allclose(weights.mean(1), 1 / 3, atol=1 / (side * share[row]))

@@ -1,4 +1,4 @@
-"""What the denoiser may not change, as numpy has it: see pipeline.renders.kept_light."""
+"""What the denoiser may not change, as numpy has it: see pipeline.renders.denoise_corrections."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,13 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from pipeline.renders.kept_light import DARKER, GLINT, MOST_APART, STANDARD_ERRORS, STANDS_OUT
+from pipeline.renders.denoise_corrections import (
+    DARKER,
+    GLINT,
+    MOST_APART,
+    STANDARD_ERRORS,
+    STANDS_OUT,
+)
 
 Pictures = NDArray[np.float32]
 """[P, R, R, 3] pictures of the parts of light of one view."""
