@@ -1,14 +1,12 @@
 """`--runner threads`: runs tasks on threads of this process, each with its own render child."""
 
-from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.pipeline import make_dataset, make_task
 from pipeline.generation.run import Outcome, ShardJob, TaskResult
-from pipeline.generation.runner import in_window
+from pipeline.generation.runner import Runner
 from pipeline.generation.tasks import Piece
-from storage.dataset.statistics import Statistics
 
 
 def make(order: DatasetOrder, address: str | None) -> Outcome:
@@ -16,28 +14,20 @@ def make(order: DatasetOrder, address: str | None) -> Outcome:
     return make_dataset(order, ThreadRunner())
 
 
-class ThreadRunner:
+class ThreadRunner(Runner[Future[TaskResult]]):
     """Runs each task on one of `job.num_at_once` threads; native code runs in render children."""
 
-    num_at_once = None
-    window = None
+    _pool: ThreadPoolExecutor | None = None
 
-    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskResult]:
-        pool = ThreadPoolExecutor(job.num_at_once)
-        try:
-            yield from in_window(
-                tasks,
-                submit=lambda task: pool.submit(make_task, job, task),
-                first_done=_first_done,
-                result=lambda future: future.result(),
-                window=job.num_at_once,
-            )
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    def submit(self, task: tuple[Piece, ...], job: ShardJob) -> Future[TaskResult]:
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(job.num_at_once)
+        return self._pool.submit(make_task, job, task)
 
-    def finish(self, write_documents: Callable[[], Statistics]) -> Statistics:
-        return write_documents()
+    def wait_any(self, running: list[Future[TaskResult]]) -> Future[TaskResult]:
+        return next(iter(wait(running, return_when=FIRST_COMPLETED).done))
 
-
-def _first_done(running: list["Future[TaskResult]"]) -> "Future[TaskResult]":
-    return next(iter(wait(running, return_when=FIRST_COMPLETED).done))
+    def close(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+            self._pool = None

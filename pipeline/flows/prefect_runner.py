@@ -5,7 +5,7 @@ processes, never in a process pool of Prefect's, which a single segfault breaks 
 """
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 from prefect import task
@@ -18,7 +18,7 @@ from prefect.tasks import Task, exponential_backoff
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
 from pipeline.generation.pipeline import make_task
 from pipeline.generation.run import ShardJob, TaskResult
-from pipeline.generation.runner import in_window
+from pipeline.generation.runner import Runner
 from pipeline.generation.tasks import Piece
 from storage.dataset.statistics import Statistics
 from storage.errors import EnvironmentFailure
@@ -65,7 +65,7 @@ class OpaqueWork:
         self.pieces = pieces
 
 
-class PrefectRunner:
+class PrefectRunner(Runner[PrefectFuture[TaskResult]]):
     """Submits tasks to the task runner of the current flow run."""
 
     def __init__(self, *, window: int | None = None, num_at_once: int | None = None) -> None:
@@ -78,15 +78,12 @@ class PrefectRunner:
         self.window = window
         self.num_at_once = num_at_once
 
-    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskResult]:
-        """Yield results as tasks end; raises the error of a task's last try."""
-        return in_window(
-            tasks,
-            submit=lambda pieces: make_scenes.submit(_task_label(pieces), OpaqueWork(job, pieces)),
-            first_done=_first_done,
-            result=lambda future: future.result(),
-            window=self.window or job.num_at_once,
-        )
+    def submit(self, task: tuple[Piece, ...], job: ShardJob) -> PrefectFuture[TaskResult]:
+        label = f"{task[0].shard_index} from scene {task[0].first}"
+        return make_scenes.submit(label, OpaqueWork(job, task))
+
+    def wait_any(self, running: list[PrefectFuture[TaskResult]]) -> PrefectFuture[TaskResult]:
+        return next(iter(as_completed(running)))
 
     def finish(self, write_documents: Callable[[], Statistics]) -> Statistics:
         """Call `write_documents` as a task run of its own."""
@@ -119,11 +116,3 @@ def _gpu_slot(job: ShardJob) -> contextlib.AbstractContextManager[None]:
     if job.device == "cpu":
         return contextlib.nullcontext()
     return concurrency(GPU_LIMIT, occupy=1, strict=False)
-
-
-def _first_done(running: list[PrefectFuture[TaskResult]]) -> PrefectFuture[TaskResult]:
-    return next(iter(as_completed(running)))
-
-
-def _task_label(pieces: tuple[Piece, ...]) -> str:
-    return f"{pieces[0].shard_index} from scene {pieces[0].first}"

@@ -6,63 +6,68 @@ yields their results as they end: memory does not grow with the number of tasks,
 task waits for a slow one.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
-from typing import Protocol, TypeVar
+from itertools import islice
+from typing import Generic, Protocol, TypeVar
 
 from pipeline.generation.run import ShardJob, TaskResult
 from pipeline.generation.tasks import Piece
 from storage.dataset.statistics import Statistics
 
-Task = TypeVar("Task")
-Waiting = TypeVar("Waiting")
-Result = TypeVar("Result")
+
+class Submitted(Protocol):
+    """Future of a task, such as concurrent.futures.Future."""
+
+    def result(self) -> TaskResult:
+        """Return the result of an ended task, or raise its error."""
+        ...
 
 
-class Runner(Protocol):
+Future = TypeVar("Future", bound=Submitted)
+
+
+class Runner(ABC, Generic[Future]):
     """Runs `pipeline.generation.pipeline.make_task` once for each task, on any machine."""
 
-    @property
-    def num_at_once(self) -> int | None:
-        """Parallel tasks of one process; None leaves the number to the options."""
+    num_at_once: int | None = None
+    """Parallel tasks of one process; None leaves the number to the options."""
+    window: int | None = None
+    """Number of submitted, unfinished tasks; None means as many as run at once."""
 
-    @property
-    def window(self) -> int | None:
-        """Number of submitted, unfinished tasks; None means `num_at_once`."""
+    @abstractmethod
+    def submit(self, task: tuple[Piece, ...], job: ShardJob) -> Future:
+        """Start a task, and return its future at once."""
+
+    @abstractmethod
+    def wait_any(self, running: list[Future]) -> Future:
+        """Wait until one of these tasks has ended, and return it."""
+
+    def close(self) -> None:
+        """Release what submitted tasks hold, also after an error."""
 
     def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskResult]:
         """Yield the result of each task, in the order in which the tasks end.
 
+        The next task is submitted before a result is yielded: the caller may take long over it.
+
         Raises:
             TrilightError: a task failed permanently; finished scenes stay on disk.
         """
+        waiting = iter(tasks)
+        window = self.window or job.num_at_once
+        try:
+            running = [self.submit(task, job) for task in islice(waiting, window)]
+            while running:
+                done = self.wait_any(running)
+                running.remove(done)
+                result = done.result()
+                free = window - len(running)
+                running += [self.submit(task, job) for task in islice(waiting, free)]
+                yield result
+        finally:
+            self.close()
 
     def finish(self, write_documents: Callable[[], Statistics]) -> Statistics:
-        """Call `write_documents`; limit its parallel calls, since each reads the whole dataset."""
-
-
-def in_window(
-    tasks: Iterable[Task],
-    *,
-    submit: Callable[[Task], Waiting],
-    first_done: Callable[[list[Waiting]], Waiting],
-    result: Callable[[Waiting], Result],
-    window: int,
-) -> Iterator[Result]:
-    """Yield results as tasks end, with at most `window` tasks submitted at a time.
-
-    The next task is submitted before a result is yielded, since the caller may take long over it.
-    """
-    waiting = iter(tasks)
-    running: list[Waiting] = []
-
-    def fill() -> None:
-        while len(running) < window and (task := next(waiting, None)) is not None:
-            running.append(submit(task))
-
-    fill()
-    while running:
-        done = first_done(running)
-        running.remove(done)
-        outcome = result(done)
-        fill()
-        yield outcome
+        """Call `write_documents`; an executor may limit its parallel calls, which read all data."""
+        return write_documents()

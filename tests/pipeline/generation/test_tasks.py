@@ -4,6 +4,8 @@ import dataclasses
 import json
 import os
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from hypothesis import given
@@ -12,7 +14,7 @@ from hypothesis import strategies as st
 from infra.cli.changes import parse_changes
 from pipeline.generation.dataset_order import DatasetOrder, generate_words
 from pipeline.generation.machine import available_cores, children_of_gpu
-from pipeline.generation.runner import in_window
+from pipeline.generation.runner import Runner
 from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece, TaskBudget, TaskSizes, cut_tasks
 from pipeline.renders.visible_gpus import visible_gpus
 from storage.dataset.settings import SplitSettings
@@ -159,15 +161,19 @@ def test_words_are_what_was_asked_for_and_no_more() -> None:
 
 
 def test_a_place_that_is_free_is_taken_before_the_result_is_looked_at() -> None:
-    submitted: list[int] = []
+    submitted: list[Any] = []
 
-    def submit(task: int) -> int:
-        submitted.append(task)
-        return task
+    class Inline(Runner[Any]):
+        window = 2
 
-    results = in_window(
-        range(5), submit=submit, first_done=lambda running: running[0], result=abs, window=2
-    )
+        def submit(self, task: Any, job: Any) -> Any:
+            submitted.append(task)
+            return SimpleNamespace(result=lambda: task)
+
+        def wait_any(self, running: list[Any]) -> Any:
+            return running[0]
+
+    results: Any = Inline().run(cast(Any, range(5)), cast(Any, None))
     assert next(results) == 0
     assert submitted == [0, 1, 2]
     assert list(results) == [1, 2, 3, 4]

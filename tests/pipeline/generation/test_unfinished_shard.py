@@ -6,6 +6,7 @@ import os
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -18,6 +19,7 @@ from pipeline.generation.child_pool import ChildPool
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.pipeline import make_dataset, make_piece
 from pipeline.generation.run import Run, ShardJob, TaskResult
+from pipeline.generation.runner import Runner
 from pipeline.generation.scene_worker import SceneAttempt
 from pipeline.generation.tasks import Piece
 from pipeline.generation.unfinished_shard import UnfinishedShard
@@ -207,20 +209,26 @@ def test_a_note_of_an_earlier_shard_is_not_believed(tmp_path: Path) -> None:
     assert noted_shard(folder, NAME).shard == index_shard(tmp_path / NAME) != before.shard
 
 
-class Idle:
+class Idle(Runner[Any]):
     """A runner that finds everything taken, and counts."""
 
     num_at_once = 1
-    window = None
 
     def __init__(self) -> None:
         self.rounds: list[int] = []
 
     def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskResult]:
         self.rounds.append(0)
-        for _ in tasks:
-            self.rounds[-1] += 1
-            yield TaskResult(shards=(), scenes=0, seconds=0.0, core_s=0.0)
+        yield from super().run(tasks, job)
+
+    def submit(self, task: tuple[Piece, ...], job: ShardJob) -> Any:
+        self.rounds[-1] += 1
+        done = Future[TaskResult]()
+        done.set_result(TaskResult(shards=(), scenes=0, seconds=0.0, core_s=0.0))
+        return done
+
+    def wait_any(self, running: list[Any]) -> Any:
+        return running[0]
 
     def finish(self, write_documents: Callable[[], Statistics]) -> Statistics:
         raise AssertionError("not finished")
