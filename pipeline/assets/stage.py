@@ -25,18 +25,20 @@ BorrowChild = Callable[[], AbstractContextManager[IsolatedChild]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PreparedAsset:
-    """An accepted object with its asset file."""
+class PreparedObject:
+    """An object that the mesh stage has accepted, here or on another machine."""
 
     record: ObjectRecord
     """Identity and rights of the object."""
-    path: Path
-    """Path of the asset file in the store."""
+    asset_name: str
+    """Name of the asset file in the store (AssetStore.asset_path)."""
     asset_sha256: str
     """SHA-256 digest of the asset file, in hex."""
     geometry_sha256: str
     """Digest of the cleaned geometry, in hex."""
-    missing_materials_reason: str = ""
+    least_triangles: int
+    """Triangles of the coarsest level."""
+    without_own: str = ""
     """Reason code of missing source materials, where settings keep them; otherwise empty."""
     unread: tuple[str, ...] = ()
     """Short sentences, one for each part of the file that no reader handled."""
@@ -50,7 +52,7 @@ def prepare_assets(
     borrow_child: BorrowChild,
     workers: int,
     done: Callable[[], None],
-) -> tuple[list[PreparedAsset], list[Failure]]:
+) -> tuple[list[PreparedObject], list[Failure]]:
     """Prepare every object in isolated children; returns both lists in the order of `records`.
 
     Args:
@@ -67,7 +69,7 @@ def prepare_assets(
     methods = methods_of(settings.profile)
     _LOG.info("prepare %d objects with %s", len(records), library_versions())
 
-    def prepare(record: ObjectRecord) -> PreparedAsset | Failure:
+    def prepare(record: ObjectRecord) -> PreparedObject | Failure:
         try:
             return _prepare_once(record, settings, store, methods, borrow_child)
         except Rejected as rejection:
@@ -77,7 +79,7 @@ def prepare_assets(
 
     with ThreadPoolExecutor(workers) as threads:
         outcomes = list(threads.map(prepare, records))
-    prepared = [outcome for outcome in outcomes if isinstance(outcome, PreparedAsset)]
+    prepared = [outcome for outcome in outcomes if isinstance(outcome, PreparedObject)]
     return prepared, [outcome for outcome in outcomes if isinstance(outcome, Failure)]
 
 
@@ -87,7 +89,7 @@ def _prepare_once(
     store: AssetStore,
     methods: tuple[str, ...],
     borrow_child: BorrowChild,
-) -> PreparedAsset:
+) -> PreparedObject:
     """Load or compute the outcome of an object; raises Rejected where there is no asset."""
     source = Path(record.path)
     root = Path(record.root) if record.root else None
@@ -106,12 +108,13 @@ def _prepare_once(
             store.save_asset(key, *outcome)
     data = path.read_bytes()
     asset = decode_asset(data)
-    return PreparedAsset(
+    return PreparedObject(
         record=record,
-        path=path,
+        asset_name=key,
         asset_sha256=sha256_hex(data),
         geometry_sha256=asset.geometry_sha256,
-        missing_materials_reason="" if asset.materials is None else asset.materials.reason,
+        least_triangles=min(len(level.faces) for level in asset.levels),
+        without_own="" if asset.materials is None else asset.materials.reason,
         unread=store.unread(key),
     )
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 
+from pipeline.assets.stage import PreparedObject
 from pipeline.builds.settings import BuildSettings
 from pipeline.generation.accept_maps import NO_MAPS, AcceptedMaps
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.object_batches import PreparedObject
 from pipeline.generation.object_options import ObjectOptions
 from pipeline.generation.scene_origin import ComposedScenes, SceneOrigin
 from pipeline.generation.unread_notes import format_unread, write_unread

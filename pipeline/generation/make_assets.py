@@ -16,11 +16,11 @@ from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalize
 from pipeline.assets.preview import preview_source_and_level
 from pipeline.assets.recipe import RECIPE, library_versions
 from pipeline.assets.settings import AssetSettings
-from pipeline.assets.stage import PreparedAsset
+from pipeline.assets.stage import PreparedObject
 from pipeline.documents.attribution import encode_attribution
 from pipeline.documents.quality_page import Pair, encode_quality_page
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.generation.prepare_isolated import asset_child, prepare_isolated
+from pipeline.generation.prepare_isolated import asset_child, asset_store, prepare_isolated
 from pipeline.generation.unread_notes import UnreadNotes, write_unread
 from pipeline.isolation import ChildFailed, call_with_retries, reach
 from pipeline.objects.glb import encode_glb
@@ -30,8 +30,8 @@ from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.digests import canonical_json
 from storage.errors import TrilightError
-from storage.records.asset import AssetRow, Level, decode_asset
-from storage.records.objects import Failure, write_failures
+from storage.records.asset import Asset, AssetRow, Level, decode_asset
+from storage.records.objects import Failure, ObjectRecord, write_failures
 from storage.settings.described import settings_record
 
 _PICTURES = 4
@@ -149,8 +149,9 @@ def make_assets(
     prepared, rejected = prepare_isolated(
         list(listed.records), settings, workers=workers, done=on_object
     )
-    levels = [_only_level(asset) for asset in prepared]
-    rows = [_row(asset, level) for asset, level in zip(prepared, levels, strict=True)]
+    assets = [_read_asset(each) for each in prepared]
+    levels = [asset.levels[0] for asset in assets]
+    rows = [_row(each.record, asset) for each, asset in zip(prepared, assets, strict=True)]
     report = AssetReport(
         rows=tuple(rows),
         failures=tuple(sorted([*listed.failures, *rejected], key=lambda row: row.item)),
@@ -195,9 +196,8 @@ def _target(settings: AssetSettings) -> str:
     return f"{settings.profile}, {within}at most {settings.budgets[0]} triangles"
 
 
-def _only_level(asset: PreparedAsset) -> Level:
-    (level,) = decode_asset(asset.path.read_bytes()).levels
-    return level
+def _read_asset(prepared: PreparedObject) -> Asset:
+    return decode_asset(asset_store().asset_path(prepared.asset_name).read_bytes())
 
 
 def _geometry_sha256(level: Level) -> str:
@@ -207,9 +207,8 @@ def _geometry_sha256(level: Level) -> str:
     return geometry_sha256(clean(normalize(TriangleMesh(positions=positions, faces=faces))))
 
 
-def _row(prepared: PreparedAsset, level: Level) -> AssetRow:
-    record = prepared.record
-    asset = decode_asset(prepared.path.read_bytes())
+def _row(record: ObjectRecord, asset: Asset) -> AssetRow:
+    (level,) = asset.levels
     return AssetRow(
         **record.identity,
         path=f"meshes/{_file_name(record.uid, '.ply' if level.skin is None else '.glb')}",
@@ -261,7 +260,7 @@ def _write(
 
 
 def _pairs(
-    prepared: list[PreparedAsset],
+    prepared: list[PreparedObject],
     rows: list[AssetRow],
     levels: list[Level],
     settings: AssetSettings,

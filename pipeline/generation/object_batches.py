@@ -19,7 +19,7 @@ from typing import Any
 
 from pipeline.assets.recipe import READERS, RECIPE
 from pipeline.assets.settings import AssetSettings
-from pipeline.assets.stage import PreparedAsset
+from pipeline.assets.stage import PreparedObject
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.prepare_isolated import MeshWork
 from pipeline.isolation import is_transient
@@ -29,7 +29,6 @@ from storage.cache import cache_folder
 from storage.claims import WaitNotice
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
-from storage.records.asset import least_triangles_in
 from storage.records.objects import Failure, ObjectRecord
 
 _CACHE = "object-batches"
@@ -45,41 +44,8 @@ _PAUSES_S = (0.2, 10.0)
 """Shortest and longest seconds between two looks at other workers' batches; the pause doubles."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PreparedObject:
-    """An object that the mesh stage has accepted, here or on another machine."""
-
-    record: ObjectRecord
-    """Identity and rights of the object."""
-    asset_name: str
-    """Name of the prepared file in the asset store."""
-    asset_sha256: str
-    """Digest of the prepared file."""
-    geometry_sha256: str
-    """Digest of the object's cleaned geometry."""
-    least_triangles: int
-    """Number of triangles of the coarsest level."""
-    without_own: str = ""
-    """Reason code for missing materials of its own, if they were requested."""
-    unread: tuple[str, ...] = ()
-    """Unread parts of the object's file, in short sentences."""
-
-
 PrepareResult = tuple[list[PreparedObject], list[Failure]]
 Fetch = Callable[[list[ObjectRecord]], Fetched]
-
-
-def prepared_object(asset: PreparedAsset) -> PreparedObject:
-    """Return the record of an asset whose prepared file is on this machine."""
-    return PreparedObject(
-        record=asset.record,
-        asset_name=asset.path.stem,
-        asset_sha256=asset.asset_sha256,
-        geometry_sha256=asset.geometry_sha256,
-        least_triangles=least_triangles_in(asset.path),
-        without_own=asset.missing_materials_reason,
-        unread=asset.unread,
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +116,7 @@ class ObjectBatch:
                 done(len(records))
             else:
                 assets, failures = meshes.prepare(records, lambda: done(1))
-                result = [*map(prepared_object, assets)], [*failures, *lost]
+                result = assets, [*failures, *lost]
             is_final = not _may_change(result[1])
             data = _encode(result)
             if is_final and self._cached:

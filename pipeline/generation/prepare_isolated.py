@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.assets.stage import PreparedAsset, prepare_assets
+from pipeline.assets.stage import PreparedObject, prepare_assets
 from pipeline.assets.store import AssetStore
 from pipeline.generation.child_pool import ChildPool
 from pipeline.isolation import NO_FILES, ChildLimits, IsolatedChild, Reach, preload, reach
@@ -52,7 +52,7 @@ class MeshWork:
 
     def prepare(
         self, records: list[ObjectRecord], done: Callable[[], None]
-    ) -> tuple[list[PreparedAsset], list[Failure]]:
+    ) -> tuple[list[PreparedObject], list[Failure]]:
         """Prepare objects; arguments and errors as `prepare_assets`; from any thread."""
         paths = {path for one in records for path in (one.path, one.root) if path}
         all_files = reach(files=map(Path, sorted(paths)))
@@ -85,7 +85,7 @@ def prepare_isolated(
     *,
     workers: int,
     done: Callable[[], None],
-) -> tuple[list[PreparedAsset], list[Failure]]:
+) -> tuple[list[PreparedObject], list[Failure]]:
     """Prepare objects in `workers` children; arguments and errors as `prepare_assets`."""
     with MeshWork(settings, workers) as work:
         return work.prepare(records, done)

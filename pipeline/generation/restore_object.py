@@ -52,8 +52,8 @@ def restore_object(job: ShardJob, uid: str, asset_name: str) -> None:
         raise object_changed_error(
             display_name, uid, "has changed" if prepared else "is no longer usable"
         )
-    if prepared[0].path != path:  # a later recipe gives it another name
-        write_atomically(path, prepared[0].path.read_bytes())
+    if prepared[0].asset_name != asset_name:  # a later recipe gives it another name
+        write_atomically(path, store.asset_path(prepared[0].asset_name).read_bytes())
 
 
 def _holds(path: Path, sha256: str) -> bool:

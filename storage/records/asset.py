@@ -13,7 +13,6 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,10 +22,7 @@ from safetensors.numpy import save
 from storage.errors import TrilightError
 from storage.records.objects import NamedObject
 from storage.records.safe_read import (
-    MAX_HEADER_BYTES,
-    open_plain,
     read_safetensors,
-    safetensors_header,
 )
 from storage.records.skin import (
     LevelSkin,
@@ -178,25 +174,6 @@ def decode_asset(data: bytes) -> Asset:
             f"asset: a safetensors file with arrays {', '.join(arrays) or 'none'} does not hold "
             f"one ({type(error).__name__}: {error}); expected a file of the asset store. Delete "
             "it, and it is made again."
-        ) from error
-
-
-def least_triangles_in(path: Path) -> int:
-    """Return the triangles of the coarsest level of an asset file, from its header alone.
-
-    Raises:
-        TrilightError: it cannot be read, or is no asset.
-    """
-    try:
-        with open_plain(path) as stream:
-            header = safetensors_header(stream.read(8 + MAX_HEADER_BYTES), name=str(path))
-        return min(
-            int(array["shape"][0]) for name, array in header.items() if name.startswith("faces_")
-        )
-    except (OSError, LookupError, TypeError, ValueError, RecursionError) as error:
-        raise TrilightError(
-            f"{path}: is no asset ({error}); expected a file of the asset store. Delete it, and it "
-            "is made again."
         ) from error
 
 

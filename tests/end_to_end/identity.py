@@ -25,7 +25,7 @@ from pipeline.builds.named import BUILDS, named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.usd.write import write_usd
 from pipeline.generation.environment import vector_extension
-from pipeline.generation.prepare_isolated import prepare_isolated
+from pipeline.generation.prepare_isolated import asset_store, prepare_isolated
 from pipeline.generation.scene_worker import MAX_ATTEMPTS
 from pipeline.objects.generated import generate_objects
 from pipeline.objects.local.folder import list_folder
@@ -83,16 +83,10 @@ def _pool(settings: BuildSettings, folder: Path) -> list[PooledAsset]:
     pool = []
     for asset in prepared:
         locked = LockedObject(
-            uid=asset.record.uid,
-            asset_sha256=asset.asset_sha256,
-            split="test",
-            licence=asset.record.licence,
-            licence_source=asset.record.licence_source,
-            title=asset.record.title,
-            attribution=asset.record.attribution,
-            source_url=asset.record.source_url,
+            **asset.record.identity, asset_sha256=asset.asset_sha256, split="test"
         )
-        pool.append(PooledAsset(locked=locked, asset=decode_asset(asset.path.read_bytes())))
+        data = asset_store().asset_path(asset.asset_name).read_bytes()
+        pool.append(PooledAsset(locked=locked, asset=decode_asset(data)))
     return sorted(pool, key=lambda entry: entry.locked.uid)
 
 

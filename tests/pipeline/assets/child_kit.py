@@ -18,7 +18,7 @@ from typing import Any
 
 from pipeline.assets.attempt import AssetAttempt
 from pipeline.assets.settings import AssetSettings
-from pipeline.assets.stage import PreparedAsset, prepare_assets
+from pipeline.assets.stage import PreparedObject, prepare_assets
 from pipeline.assets.store import AssetStore
 from pipeline.isolation import ChildLimits, IsolatedChild, preload
 from storage.errors import Rejected, TrilightError
@@ -139,7 +139,7 @@ SETTINGS = AssetSettings(budgets=(1000, 500, 340))
 
 def run(
     bench: Bench, *names: str, settings: AssetSettings = SETTINGS, store: str = "store"
-) -> tuple[list[PreparedAsset], list[Failure]]:
+) -> tuple[list[PreparedObject], list[Failure]]:
     """Prepare objects with a store beside the sources."""
     return prepare_assets(
         [bench.record(name) for name in names],
@@ -154,7 +154,12 @@ def run(
 def made(bench: Bench, settings: AssetSettings = SETTINGS) -> Asset:
     (prepared,), failures = run(bench, "knot.obj", settings=settings)
     assert not failures
-    return decode_asset(prepared.path.read_bytes())
+    return stored_asset(bench, prepared)
+
+
+def stored_asset(bench: Bench, prepared: PreparedObject) -> Asset:
+    store = AssetStore(bench.root.parent / "store")
+    return decode_asset(store.asset_path(prepared.asset_name).read_bytes())
 
 
 def methods(asset: Asset) -> list[tuple[int, str]]:

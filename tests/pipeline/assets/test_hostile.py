@@ -127,7 +127,8 @@ def outcome(child: IsolatedChild, tmp_path: Path) -> Outcome:
         )
         if failures:
             return None, failures[0].reason
-        return decode_asset(prepared[0].path.read_bytes()), ""
+        path = AssetStore(tmp_path / "store").asset_path(prepared[0].asset_name)
+        return decode_asset(path.read_bytes()), ""
 
     return prepare
 

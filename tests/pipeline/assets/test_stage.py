@@ -132,7 +132,7 @@ def test_copies_are_made_once_and_keep_their_names(bench: Bench) -> None:
     write_obj(bench.root / "copy.obj", small_knot())
     prepared, _ = run(bench, "knot.obj", "copy.obj")
     assert [asset.record.uid for asset in prepared] == ["knot.obj", "copy.obj"]
-    assert prepared[0].path == prepared[1].path
+    assert prepared[0].asset_name == prepared[1].asset_name
     assert len(bench.calls) == 1
 
 

@@ -8,9 +8,8 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from pipeline.assets.settings import AssetSettings
-from storage.records.asset import decode_asset
 from tests.for_each import for_each
-from tests.pipeline.assets.child_kit import Bench, run
+from tests.pipeline.assets.child_kit import Bench, run, stored_asset
 from tests.pipeline.assets.meshes_by_hand import (
     cube,
     geometry,
@@ -196,9 +195,9 @@ def test_the_stage_makes_it_in_a_child_and_again_when_a_part_changes(bench: Benc
     def made() -> list[str]:
         prepared, failures = run(bench, "a.usda", settings=KEEP)
         assert not failures
-        found = decode_asset(prepared[0].path.read_bytes())
+        found = stored_asset(bench, prepared[0])
         assert found.materials is not None and not found.materials.reason
-        return [prepared[0].path.name, found.source_sha256]
+        return [prepared[0].asset_name, found.source_sha256]
 
     first = made()
     assert made() == first

@@ -9,14 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.assets.stage import PreparedAsset
+from pipeline.assets.stage import PreparedObject
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.generation import object_batches
 from pipeline.generation.begin_dataset import begin
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects, freeze_objects
-from pipeline.generation.object_batches import prepared_object
 from pipeline.generation.object_options import ObjectOptions
 from pipeline.generation.prepare_isolated import asset_store
 from storage.dataset.layout import DatasetFolder
@@ -43,7 +42,7 @@ def _record(uid: str, **stated: str) -> ObjectRecord:
     return ObjectRecord(uid=uid, licence_source="tests", **plain | stated)
 
 
-def prepared(number: int) -> PreparedAsset:
+def prepared(number: int) -> PreparedObject:
     """Put an object of its own geometry into the store; return it as the mesh stage would."""
     asset, uid = _pool()[number % 5].asset, f"object {number:05d}"
     name = hashlib.sha256(uid.encode()).hexdigest()
@@ -53,8 +52,12 @@ def prepared(number: int) -> PreparedAsset:
     path.write_bytes(data)
     title = f"\N{GREEK SMALL LETTER ALPHA} {number}"
     record = _record(uid, title=title, licence=LICENCES[number % len(LICENCES)])
-    return PreparedAsset(
-        record=record, path=path, asset_sha256=sha256_hex(data), geometry_sha256=name
+    return PreparedObject(
+        record=record,
+        asset_name=name[:32],
+        asset_sha256=sha256_hex(data),
+        geometry_sha256=name,
+        least_triangles=min(len(level.faces) for level in asset.levels),
     )
 
 
@@ -68,9 +71,9 @@ def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = Non
     return ObjectOptions(source=source, licence=licence, settings=build(), writer=writer, workers=1)
 
 
-def frozen(writer: DatasetWriter, objects: Sequence[PreparedAsset]) -> AcceptedObjects:
+def frozen(writer: DatasetWriter, objects: Sequence[PreparedObject]) -> AcceptedObjects:
     """Freeze objects, as after the mesh stage."""
-    return freeze_objects(asked(writer), [*map(prepared_object, objects)], [], len(objects))
+    return freeze_objects(asked(writer), [*objects], [], len(objects))
 
 
 class Mesher:
@@ -83,7 +86,7 @@ class Mesher:
 
     def prepare(
         self, records: list[ObjectRecord], done: Callable[[], None]
-    ) -> tuple[list[PreparedAsset], list[Failure]]:
+    ) -> tuple[list[PreparedObject], list[Failure]]:
         assets, failures = [], []
         for record in records:
             self.before_each(record.uid)
@@ -94,7 +97,7 @@ class Mesher:
                 )
             else:
                 made = vars(prepared(int(record.uid[7:]))) | {"record": record}
-                assets.append(PreparedAsset(**made))
+                assets.append(PreparedObject(**made))
             done()
         return assets, failures
 

@@ -72,11 +72,15 @@ def _opened(accepted: AcceptedObjects, split: str = "train") -> SplitPool:
     return accepted.origin.pool.open_split(split, asset_store())
 
 
+def _stored(name: str) -> Asset:
+    return decode_asset(asset_store().asset_path(name).read_bytes())
+
+
 def _whole(writer: DatasetWriter, accepted: AcceptedObjects) -> list[PooledAsset]:
     """The pool as it would be with every object of the split in memory."""
-    by_digest = {p.asset_sha256: p.path for p in map(prepared, range(NUM_OBJECTS))}
+    names = {each.asset_sha256: each.asset_name for each in map(prepared, range(NUM_OBJECTS))}
     return [
-        PooledAsset(locked=row, asset=decode_asset(Path(by_digest[row.asset_sha256]).read_bytes()))
+        PooledAsset(locked=row, asset=_stored(names[row.asset_sha256]))
         for row in read_objects_lock(writer.folder.objects_lock)
         if row.split == "train"
     ]
