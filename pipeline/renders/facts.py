@@ -7,6 +7,7 @@ import time
 from importlib import metadata
 from pathlib import Path
 
+from pipeline.isolation import die_with_parent
 from pipeline.renders.denoiser import open_device
 from pipeline.renders.variant import Variant, activate
 from storage.installation import IMPORT_ROOT, child_environment
@@ -72,4 +73,5 @@ def _view_seconds() -> float:
 
 
 if __name__ == "__main__":
+    die_with_parent()
     sys.stdout.write(json.dumps(_answer(Variant(**json.loads(sys.argv[1])))))
