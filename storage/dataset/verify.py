@@ -202,7 +202,7 @@ def _check_manifest(dataset: Dataset) -> Iterator[str]:
         if (content := dataset.files.read(document)) is None:
             yield f"{document}: missing"
         elif sha256_hex(content) != sha256:
-            yield f"{document}: sha256 differs from the manifest"
+            yield f"{document}: edited since it was written (sha256 differs from the manifest)"
 
 
 def _twice(keys: Sequence[str], shard: ShardEntry, where: dict[str, str]) -> Iterator[str]:
