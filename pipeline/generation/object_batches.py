@@ -30,7 +30,7 @@ from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.asset import least_triangles_in
 from storage.records.objects import Failure, ObjectRecord
-from storage.typed_json import Sha256, read_json_lines
+from storage.typed_json import read_json_lines
 
 _CACHE = "object-batches"
 """Folder of the user's cache with results for later datasets."""
@@ -46,14 +46,16 @@ _PAUSES_S = (0.2, 10.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Prepared:
-    """What the mesh stage says of an accepted object."""
+class PreparedObject:
+    """An object that the mesh stage has accepted, here or on another machine."""
 
+    record: ObjectRecord
+    """Identity and rights of the object."""
     asset_name: str
     """Name of the prepared file in the asset store."""
-    asset_sha256: Sha256
+    asset_sha256: str
     """Digest of the prepared file."""
-    geometry_sha256: Sha256
+    geometry_sha256: str
     """Digest of the object's cleaned geometry."""
     least_triangles: int
     """Number of triangles of the coarsest level."""
@@ -61,21 +63,6 @@ class _Prepared:
     """Reason code for missing materials of its own, if they were requested."""
     unread: tuple[str, ...] = ()
     """Unread parts of the object's file, in short sentences."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PreparedObject(_Prepared):
-    """An object that the mesh stage has accepted, here or on another machine."""
-
-    record: ObjectRecord
-    """Identity and rights of the object."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Row(_Prepared):
-    """An accepted object in the file of a batch."""
-
-    uid: str
 
 
 PrepareResult = tuple[list[PreparedObject], list[Failure]]
@@ -190,24 +177,23 @@ class ObjectBatch:
 
     def _read(self, path: Path) -> PrepareResult | None:
         try:
-            kind: Any = _Row | Failure
-            return self._decode(read_json_lines(path.read_bytes(), kind, str(path)))
+            return self._decode(read_json_lines(path.read_bytes(), dict[str, Any], str(path)))
         except FileNotFoundError:
             return None
         except (KeyError, TypeError, ValueError):
             path.unlink(missing_ok=True)  # damaged: it is made again
             return None
 
-    def _decode(self, rows: Iterable[_Row | Failure]) -> PrepareResult:
+    def _decode(self, rows: Iterable[dict[str, Any]]) -> PrepareResult:
         prepared = list[PreparedObject]()
         failures = list[Failure]()
         for row in rows:
-            if isinstance(row, Failure):
-                failures.append(row)
+            if "reason" in row:
+                failures.append(Failure(**row))
             else:
-                facts = vars(row) | {"record": self._by_uid[row.uid]}
-                del facts["uid"]
-                prepared.append(PreparedObject(**facts))
+                record = self._by_uid[row.pop("uid")]
+                unread = tuple(row.pop("unread", ()))
+                prepared.append(PreparedObject(record=record, unread=unread, **row))
         if len(prepared) + len(failures) != len(self.records):
             raise ValueError("rows are missing")
         return prepared, failures
@@ -309,11 +295,11 @@ def _may_change(failures: Iterable[Failure]) -> bool:
 def _encode(result: PrepareResult) -> bytes:
     """Return a result as a file; the digest in its name covers the rights of objects."""
     prepared, failures = result
-    rows = [*map(_fields, prepared), *map(asdict, failures)]
+    rows = [*map(_row, prepared), *map(asdict, failures)]
     return b"".join(canonical_json(row) + b"\n" for row in rows)
 
 
-def _fields(one: PreparedObject) -> dict[str, Any]:
+def _row(one: PreparedObject) -> dict[str, Any]:
     left_out = {"record"} if one.unread else {"record", "unread"}
     row = {name: value for name, value in vars(one).items() if name not in left_out}
     return {"uid": one.record.uid, **row}
