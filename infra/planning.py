@@ -175,7 +175,7 @@ def describe_run(order: DatasetOrder, folder: DatasetFolder) -> str:
     if order.scenes_from or order.revisits or settings.revisit:
         return ""
     scenes = _num_scenes(order)
-    said = "; how long that takes is known after the first scenes"
+    said = "; how long that takes is known after the first scenes, or before by `trilight plan`"
     if folder.manifest.exists():
         manifest = read_manifest(folder.manifest)
         last = sample_logs(folder).last

@@ -15,6 +15,7 @@ from typing import Any
 
 from infra.bench.experiment import Figures
 from storage.errors import TrilightError
+from storage.typed_json import read_json
 
 
 @dataclass(kw_only=True)
@@ -60,7 +61,7 @@ class Store:
         runs: list[Run] = []
         for number, line in enumerate(self._whole_lines(), 1):
             try:
-                record = json.loads(line)
+                record = read_json(line, dict[str, Any], str(self.path))
                 if "plan" in record:
                     runs.append(Run(plan=record["plan"], date=record["date"]))
                 else:

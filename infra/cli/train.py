@@ -4,7 +4,7 @@ import dataclasses
 import os
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -13,7 +13,7 @@ from rich.progress import TaskID
 from rich.text import Text
 
 from infra.cli.changes import BaseSettings, all_changes, run_record
-from infra.cli.console import console, look_at, print_rows, progress_bars
+from infra.cli.console import console, look_at, next_step, print_rows, progress_bars
 from infra.cli.options import OutputOptions, command
 from infra.run_record import tensorboard_command
 from infra.torch_library import require_torch
@@ -118,7 +118,7 @@ def train(
     if output.json:
         sys.stdout.write(result.folder.summary.read_text())
     else:
-        _report(result)
+        _report(result, order.data)
 
 
 def _launch(order: TrainOptions, watched: WatchSettings, output: OutputOptions) -> NoReturn:
@@ -178,7 +178,7 @@ def _announce(order: TrainOptions, settings: TrainSettings) -> None:
     )
 
 
-def _report(result: "TrainResult") -> None:
+def _report(result: "TrainResult", data: Sequence[str]) -> None:
     rows = [
         (
             "training loss",
@@ -194,6 +194,9 @@ def _report(result: "TrainResult") -> None:
     print_rows("Training finished", rows)
     sheet = "" if result.scores is None else f"Look at {result.folder.sheet}\n"
     look_at(f"{sheet}Curves and pictures: {tensorboard_command(result.folder.root)}")
+    if result.scores is not None:
+        named = [word for each in data for word in ("--data", each)]
+        next_step(["evaluate", str(result.folder.root), *named, "--split", "validation"])
 
 
 def _event_text(event: "Event") -> str:

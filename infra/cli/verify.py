@@ -86,8 +86,9 @@ def _print_repair(verification: Verification, dataset: str) -> None:
         return
     elif not verification.bad_shards:
         look_at(
-            "No shard was found wrong. Verify again what could not be read, and restore other "
-            "named files from a copy."
+            "No shard was found wrong. Verify again what could not be read. A document that was "
+            "edited is written anew by the command that made the dataset (keep notes in a file of "
+            "your own). Restore other named files from a copy."
         )
     elif is_remote:
         look_at(

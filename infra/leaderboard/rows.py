@@ -14,6 +14,7 @@ from typing import Any
 from storage.atomic import write_error
 from storage.errors import TrilightError
 from storage.records.safe_read import read_plain
+from storage.typed_json import read_json
 
 UNKNOWN_MACHINE = "a machine that is not named"
 """Machine of old rows, which do not name theirs."""
@@ -70,9 +71,9 @@ class BoardRows:
             self._append({"set": set_digest})
             return
         try:
-            stored_digest = str(json.loads(lines[0])["set"])
+            stored_digest = read_json(lines[0], dict[str, str], str(path))["set"]
             for line in lines[1:]:
-                self._keep(*_row(json.loads(line)))
+                self._keep(*_row(read_json(line, dict[str, Any], str(path))))
         except (ValueError, KeyError, TypeError) as error:
             raise TrilightError(
                 f"{path}: not the rows of a leaderboard ({error}). Choose another --out, or delete "

@@ -23,6 +23,7 @@ from storage.errors import TrilightError
 from storage.metrics import MAX_DB
 from storage.settings.described import checked, from_record, settings_record
 from storage.settings.ranges import Within
+from storage.typed_json import read_json
 
 SHIPPED = Path(__file__).with_name("previews.json")
 """File that infra.setup.preview_table measures and writes."""
@@ -127,12 +128,12 @@ def known_costs(variant: Variant) -> KnownCosts:
     shipped = shipped_table().costs
     path = machine_costs_path()
     try:
-        record: Any = json.loads(path.read_bytes())
+        record = read_json(path.read_bytes(), dict[str, Any], str(path))
         costs = from_record(PictureCosts, record)
         _require_whole(costs, shipped)
     except FileNotFoundError:
         why = f"costs as shipped: `{MEASURE}` measures this machine"
-    except (OSError, ValueError) as error:  # a TrilightError and undecodable JSON are such
+    except (OSError, ValueError) as error:  # a TrilightError is one
         why = f"costs as shipped, since {path} cannot be used ({error}): `{MEASURE}` writes it anew"
     else:
         if costs.machine == machine_name(variant):

@@ -71,7 +71,7 @@ def options_from_environment() -> KubernetesOptions:
         return KubernetesOptions()
     try:
         record = json.loads(Path(name).read_bytes())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise TrilightError(
             f"{MACHINES}: {name} cannot be read ({error}); expected a file of JSON with options of "
             'machines, such as {"where": "a-namespace", "cores": 8}.'

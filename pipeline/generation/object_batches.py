@@ -8,7 +8,6 @@ workers, and in the user's cache for later datasets. A worker that finds it prep
 """
 
 import contextlib
-import json
 import time
 import uuid
 from collections.abc import Callable, Iterable, Sequence
@@ -30,6 +29,7 @@ from storage.claims import WaitNotice
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
+from storage.typed_json import read_json_lines
 
 _CACHE = "object-batches"
 """Folder of the user's cache with results for later datasets."""
@@ -143,7 +143,7 @@ class ObjectBatch:
 
     def _read(self, path: Path) -> PrepareResult | None:
         try:
-            return self._decode([json.loads(line) for line in path.read_bytes().splitlines()])
+            return self._decode(read_json_lines(path.read_bytes(), dict[str, Any], str(path)))
         except FileNotFoundError:
             return None
         except (KeyError, TypeError, ValueError):

@@ -7,6 +7,7 @@ import time
 from importlib import metadata
 from pathlib import Path
 
+from pipeline.isolation import die_with_parent
 from pipeline.renders.denoiser import open_device
 from pipeline.renders.variant import Variant, activate
 from storage.installation import IMPORT_ROOT, child_environment
@@ -20,18 +21,21 @@ VIEW_SPP = 128
 
 
 def render_facts(variant: Variant) -> dict[str, str]:
-    """Return versions, devices, threads and seconds of a view by name, as far as known."""
+    """Return versions, devices, threads and seconds of a view by name, as far as known in time."""
     facts = {name: metadata.version(name) for name in ("mitsuba", "drjit", "pyoidn")}
     facts |= {"variant": variant.name, "llvm": Path(variant.libllvm).name}
-    result = subprocess.run(
-        [sys.executable, "-m", f"{__package__}.facts", json.dumps(vars(variant))],
-        cwd=IMPORT_ROOT,
-        env=child_environment(),
-        capture_output=True,
-        text=True,
-        timeout=_ASK_S,
-        check=False,
-    )
+    try:
+        result = subprocess.run(
+            [sys.executable, "-m", f"{__package__}.facts", json.dumps(vars(variant))],
+            cwd=IMPORT_ROOT,
+            env=child_environment(),
+            capture_output=True,
+            text=True,
+            timeout=_ASK_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:  # a busy machine
+        return facts
     return facts | json.loads(result.stdout) if result.returncode == 0 else facts
 
 
@@ -72,4 +76,5 @@ def _view_seconds() -> float:
 
 
 if __name__ == "__main__":
+    die_with_parent()
     sys.stdout.write(json.dumps(_answer(Variant(**json.loads(sys.argv[1])))))

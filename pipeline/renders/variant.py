@@ -33,6 +33,7 @@ from storage.cache import cache_folder
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.installation import IMPORT_ROOT, child_environment
+from storage.typed_json import read_json
 
 _PROBE_S = (180, 360)
 """Wall time of a probe, and of a second try where the first gave no answer: many may start at once,
@@ -129,15 +130,18 @@ def _probe_gpu(*, retry_failed: bool) -> "_ProbeResult":
     """
     memory = cache_folder("gpu_probes.json")
     identity = _gpu_identity()
-    known = _read_memory(memory)
-    for text in known:
-        name, problem, denoiser_problem = json.loads(text)
-        if name == identity and not (problem and retry_failed):
+    known: dict[str, tuple[str, str, str]] = {}
+    with contextlib.suppress(TrilightError):  # damaged: probed again
+        for text in _read_memory(memory):
+            row = read_json(text, tuple[str, str, str], str(memory))
+            known[row[0]] = row
+    if last := known.pop(identity, None):
+        _, problem, denoiser_problem = last
+        if not (problem and retry_failed):
             return _ProbeResult(problem=problem, denoiser_problem=denoiser_problem)
     probed = _probe(_GPU)
-    other_rows = [text for text in known if json.loads(text)[0] != identity]
-    row = json.dumps([identity, probed.problem, probed.denoiser_problem])
-    _remember(memory, [*other_rows, row])
+    known[identity] = (identity, probed.problem, probed.denoiser_problem)
+    _remember(memory, [json.dumps(row) for row in known.values()])
     return probed
 
 
@@ -206,10 +210,9 @@ def _remember(memory: Path, known: list[str]) -> None:
 
 def _read_memory(memory: Path) -> list[str]:
     try:
-        known = json.loads(memory.read_bytes())
-    except (OSError, ValueError):
+        return read_json(memory.read_bytes(), list[str], str(memory))
+    except (OSError, TrilightError):
         return []
-    return known if isinstance(known, list) else []
 
 
 def _identity(library: Path) -> str:

@@ -17,6 +17,7 @@ import mitsuba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.isolation import die_with_parent
 from pipeline.renders.denoiser import DenoiserDevice, gpu_is_supported, set_denoiser_device
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
 from storage.conventions import look_at_c2w
@@ -37,6 +38,7 @@ _DEVICES: tuple[DenoiserDevice, ...] = ("CPU", "CUDA")
 
 
 def main() -> None:
+    die_with_parent()
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # an abort is an answer, not an accident
     mitsuba.set_variant(sys.argv[1])
     drjit.set_log_level(drjit.LogLevel.Warn)  # of rays that it leaves out, Dr.Jit says no more

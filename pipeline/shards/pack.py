@@ -12,6 +12,7 @@ from storage.dataset.manifest import (
     Manifest,
     ShardEntry,
     index_shard,
+    read_head,
     read_manifest,
     write_manifest,
 )
@@ -25,7 +26,7 @@ from storage.dataset.shard_notes import (
     rejections_of_shard,
 )
 from storage.dataset.staging import read_staged_scene, stage_members
-from storage.errors import TrilightError
+from storage.errors import EnvironmentFailure, ShardMissing, TrilightError
 from storage.records.map_references import MAP_NAME
 from storage.records.objects import Failure, write_failures
 from storage.records.sample import sample_key
@@ -39,7 +40,8 @@ def pack_shard(
     The rejections are written before the shard, so that every reader of the shard finds them, and
     the staged scenes are deleted after it: a kill in between loses nothing and repeats little.
 
-    An existing shard stays: the first writer wins. A growing one is replaced.
+    An existing shard stays: the first writer wins. A growing one is replaced. Where a file system
+    carries no locks, who comes second returns what the first has packed.
 
     Args:
         folder: the dataset.
@@ -48,19 +50,30 @@ def pack_shard(
         grows: True if the manifest lists the shard as growing; then call while holding its mutex.
 
     Raises:
-        TrilightError: the disk is full or the folder cannot be written.
+        TrilightError: the disk is full, the folder cannot be written, or a staged file vanished.
     """
+    try:
+        return _pack(folder, name, scene_indices, grows=grows)
+    except (
+        FileNotFoundError,
+        ShardMissing,
+    ) as error:  # another process has packed it, and cleared away
+        if folder.shard(name).exists() and name not in read_head(folder.manifest).growing:
+            return index_shard(folder.shard(name))
+        raise EnvironmentFailure(
+            f"{name}: a file vanished while it was packed ({error}); expected one process at it, "
+            "as locks ensure where a file system carries them. What was finished is safe: run "
+            "the same command again."
+        ) from error
+
+
+def _pack(folder: DatasetFolder, name: str, scene_indices: range, *, grows: bool) -> ShardEntry:
     staged_folder = folder.staged_shard(name)
     failures: list[Failure] = []
     samples: list[tuple[str, dict[str, bytes]]] = []
     maps: dict[str, bytes] = {}
     for index in scene_indices:
-        try:
-            staged = read_staged_scene(staged_folder, index)
-        except FileNotFoundError:
-            if folder.shard(name).exists() and not grows:
-                return index_shard(folder.shard(name))  # another machine was first, without claims
-            raise
+        staged = read_staged_scene(staged_folder, index)
         failures.extend(staged.failures)
         if staged.members:
             for member in filter(MAP_NAME.fullmatch, staged.members):  # equal maps share memory

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import BinaryIO, TypeVar
 
 from storage.atomic import atomic_writer
-from storage.errors import TrilightError
+from storage.errors import ShardMissing, TrilightError
 from storage.records.map_references import MAP_NAME, referenced_maps
 from storage.records.safe_read import open_plain
 
@@ -249,7 +249,8 @@ def _open_shard(path: Path) -> BinaryIO:
     try:
         return open_plain(path)
     except OSError as error:
-        raise TrilightError(f"{path.name}: not a readable shard ({error.strerror}).") from error
+        kind = ShardMissing if isinstance(error, FileNotFoundError) else TrilightError
+        raise kind(f"{path.name}: not a readable shard ({error.strerror}).") from error
 
 
 def read_member(stream: BinaryIO, member: Member) -> bytes:

@@ -55,7 +55,7 @@ def is_staged(folder: Path, scene_index: int) -> bool:
 
 
 def read_staged_scene(folder: Path, scene_index: int) -> StagedScene:
-    """Return what became of a finished scene."""
+    """Return what became of a finished scene; raises ShardMissing where it is not staged."""
     ((_, members),) = iterate_samples(_path(folder, scene_index))
     failures = decode_failures(members.pop(_FAILURES))
     return StagedScene(members=members, failures=failures)

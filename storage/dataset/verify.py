@@ -13,7 +13,13 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.dataset.dataset import Dataset, LocalFiles, RemoteDatasetFiles, open_dataset
+from storage.dataset.dataset import (
+    Dataset,
+    LocalFiles,
+    RemoteDatasetFiles,
+    open_dataset,
+    read_beside,
+)
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest, index_stream
 from storage.dataset.planned import is_whole, num_planned
@@ -87,8 +93,8 @@ def verify_dataset(
         shard_done: called with the name of each checked shard.
 
     Raises:
-        TrilightError: there is no readable manifest, so there is nothing to check against, or the
-            disk is full.
+        TrilightError: there is no readable manifest, so there is nothing to check against; a shard
+            differs from one that was written since; or the disk is full.
     """
     dataset = root if isinstance(root, Dataset) else open_dataset(str(root))
     manifest = dataset.manifest
@@ -116,6 +122,11 @@ def verify_dataset(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+    if bad and read_beside(dataset.files, decode_manifest).stored != manifest.stored:
+        raise TrilightError(
+            f"{dataset.display_name}: its manifest was written while the shards were checked, as "
+            "when a dataset grows; expected one that rests. Verify it again."
+        )
     return Verification(
         manifest=manifest,
         problems=problems,
@@ -191,7 +202,7 @@ def _check_manifest(dataset: Dataset) -> Iterator[str]:
         if (content := dataset.files.read(document)) is None:
             yield f"{document}: missing"
         elif sha256_hex(content) != sha256:
-            yield f"{document}: sha256 differs from the manifest"
+            yield f"{document}: edited since it was written (sha256 differs from the manifest)"
 
 
 def _twice(keys: Sequence[str], shard: ShardEntry, where: dict[str, str]) -> Iterator[str]:

@@ -114,7 +114,7 @@ def test_what_a_run_will_make_is_said_before_it_begins(
     without_rendering(monkeypatch)
     order, folder = tiny_order(out=str(tmp_path), scenes=3), DatasetFolder(tmp_path)
     lacking = "no shard is for validation before --scenes 9"
-    unknown = "how long that takes is known after the first scenes"
+    unknown = "how long that takes is known after the first scenes, or before by `trilight plan`"
     assert (
         describe_run(order, folder) == f"3 scenes of 2 views each in 1 shard ({lacking}); {unknown}"
     )

@@ -26,6 +26,7 @@ from storage.remote.fetch import version_of
 from storage.remote.safe_url import printable
 from storage.remote.tries import Interrupted, Pace, TransferFailed, with_tries
 from storage.remote.url import transfer_timeout
+from storage.typed_json import read_json
 
 _MAX_NAME_BYTES = 220
 """File systems allow 255; the rest is for the name of an unfinished file."""
@@ -196,7 +197,7 @@ class _Limit(Callback):
 
 def _is_here(path: Path, note: Path, version: dict[str, str]) -> bool:
     try:
-        known = json.loads(note.read_bytes())
+        known = read_json(note.read_bytes(), dict[str, str], str(note))
         return known == version and str(path.stat().st_size) == known.get(
             "size", str(path.stat().st_size)
         )

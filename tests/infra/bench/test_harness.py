@@ -207,7 +207,7 @@ def _resume(store: Store, wanted: dict) -> Run:
 
 
 def test_another_file_is_refused(tmp_path: Path) -> None:
-    for text in ['{"key": 1}\n', "no json\n", "[]\n", '{"plan": {}}\n']:
+    for text in ['{"key": 1}\n', "no json\n", "[]\n", '{"plan": {}}\n', "[" * 100_000 + "\n"]:
         with case(text):
             path = tmp_path / "other.jsonl"
             path.write_text(text)

@@ -19,7 +19,7 @@ from infra.cli.changes import BaseSettings, all_changes
 from infra.cli.console import progress_bars
 from infra.cli.dataset_changes import with_base_settings
 from infra.cli.settings_file import read_settings_file
-from infra.cli.train import _BarProgress, _QuietProgress, _validation_rows
+from infra.cli.train import _BarProgress, _QuietProgress, _report, _validation_rows
 from model.checkpoint_format import saved_steps
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.generation.dataset_order import DatasetOrder
@@ -33,6 +33,7 @@ from tests.for_each import case
 from tests.pipeline.generation.test_dataset_writer import begin_tiny
 from tests.train.toy import write_toy_dataset
 from train.evaluation.scores import Lead
+from train.folder import RunFolder
 from train.loop.interrupts import SAVED_STATUS
 from train.monitoring.rows import read_rows
 from train.runs import RUNS, named_run
@@ -393,3 +394,16 @@ def test_a_median_picture_without_error_divides_nothing() -> None:
             scores=scores, median_scores=median, lead=lead, beats_median=False
         )
         assert says in _validation_rows(result)[0][1]
+
+
+def test_a_finished_run_names_what_evaluates_it(capsys: pytest.CaptureFixture[str]) -> None:
+    scores = {"log_l1": 0.1, "psnr_log_db_median": 9.0, "psnr_linear_db_median": 9.0}
+    result: Any = SimpleNamespace(
+        **{"scores": scores, "median_scores": scores, "lead": Lead(log_l1=0.1, error=0.1)},
+        **{"beats_median": False, "loss_at_start": 1.0, "loss_at_end": 1.0, "num_steps": 1},
+        **{"skipped_steps": 0, "unusable": (), "history": (), "seconds": 1.0},
+        folder=RunFolder(Path("runs/mine")),
+    )
+    _report(result, ("a", "b c"))
+    shown = "Next: trilight evaluate runs/mine --data a --data 'b c' --split validation\n"
+    assert shown in capsys.readouterr().out

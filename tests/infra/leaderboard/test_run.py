@@ -371,6 +371,7 @@ OTHERS = [
     ('{"set": "another"}\n', r"are of the set another, and SOURCE is set a.*another --out"),
     ("nothing\n", "not the rows of a leaderboard.*another --out, or delete the file"),
     ('{"set": "set a"}\n{"width": 64}\n', "not the rows of a leaderboard"),
+    ("[" * 100_000 + "\n", "not the rows of a leaderboard"),
 ]
 
 

@@ -253,7 +253,8 @@ def _record(**changes: Any) -> bytes:
 
 
 DAMAGED = [
-    (b"", "Expecting value"),
+    (b"", "not JSON"),
+    (b"[" * 100_000, "not JSON"),
     (b"[1, 2]", "expected"),
     (_record(rows=[]), "is missing; expected each part at each width"),
     (_record().replace(b'"width": 64', b'"width": 63.5', 1), "expected a whole number"),

@@ -15,6 +15,7 @@ from pipeline.builds.named import BUILDS, named_build
 from pipeline.generation import pipeline
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.pipeline import make_dataset, prepare_dataset
+from pipeline.shards import pack
 from storage.dataset.dataset import open_dataset, open_listed
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
@@ -28,6 +29,7 @@ from storage.dataset.splits import (
     shards_for,
 )
 from storage.dataset.verify import verify_dataset
+from storage.errors import TrilightError
 from storage.records.objects import Failure
 from storage.records.sample import sample_key
 from tests.for_each import case
@@ -172,6 +174,27 @@ def test_a_shard_that_grows_is_missing_and_readable(tmp_path: Path, made: Counte
     shutil.rmtree(root / ".staging")
     assert make(root, 9, shards="0:1") == whole
     assert verify_dataset(root).problems == []
+
+
+def test_who_packs_a_growing_shard_second_without_locks_has_the_first_ones_result(
+    tmp_path: Path, made: Counter[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make(tmp_path / "set", 3)
+    whole, first = make(tmp_path / "whole", 4), pack.write_shard
+
+    def late(path: Path, samples: Any) -> None:
+        first(path, samples)
+        monkeypatch.setattr(pack, "write_shard", first)
+        if (tmp_path / "set") in path.parents:
+            pack.pack_shard(DatasetFolder(tmp_path / "set"), path.name, range(4), grows=True)
+
+    monkeypatch.setattr(pack, "write_shard", late)
+    assert make(tmp_path / "set", 4) == whole
+    folder = DatasetFolder(tmp_path / "set")
+    with pytest.raises(
+        TrilightError, match=r"train-000001.tar: a file vanished .* run the same command"
+    ):
+        pack.pack_shard(folder, "train-000001.tar", range(4, 8))
 
 
 def test_a_bucket_grows_whoever_dies_when(

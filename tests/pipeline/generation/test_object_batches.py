@@ -168,7 +168,7 @@ def test_a_file_that_has_changed_is_looked_at(mesher: Mesher, tmp_path: Path) ->
 def test_a_damaged_result_is_made_again(mesher: Mesher, tmp_path: Path) -> None:
     records = object_records(tmp_path / "objects", 3)
     expected = _prepare(records, tmp_path / "one")
-    for number, damage in enumerate((b"", b"{}\n", b'{"uid": "x"}\n', b"\xff")):
+    for number, damage in enumerate((b"", b"{}\n", b'{"uid": "x"}\n', b"\xff", b'"uid"\n')):
         for path in (tmp_path / "cache" / "object-batches").rglob("*.jsonl"):
             path.write_bytes(damage)
         assert _prepare(records, tmp_path / f"again{number}") == expected

@@ -285,6 +285,13 @@ def test_facts_name_versions_device_and_threads(variant: Variant) -> None:
     assert float(facts["view_s"]) > 0
 
 
+def test_facts_without_an_answer_in_time_are_fewer(
+    variant: Variant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.renders.facts._ASK_S", 0.01)
+    assert render_facts(variant).keys() == {"mitsuba", "drjit", "pyoidn", "variant", "llvm"}
+
+
 class _Blind:
     """A scene as Dr.Jit leaves it where it disables a ray tracing operation: nothing is hit."""
 

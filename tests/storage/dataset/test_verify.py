@@ -74,6 +74,12 @@ def test_a_manifest_that_a_maker_writes_meanwhile_is_whole(dataset: Dataset) -> 
     assert (found.problems, found.num_samples) == ([], 5)
 
 
+def test_a_shard_that_grows_meanwhile_is_not_called_damaged(dataset: Dataset) -> None:
+    rewrite(dataset, "train-000000.tar", lambda key, members: None, key=lambda key: f"1{key[1:]}")
+    with pytest.raises(TrilightError, match=r"written while the shards .* Verify it again\."):
+        verify_dataset(dataset)
+
+
 def test_only_what_was_read_is_called_damaged() -> None:
     for error, is_damage in ((RecursionError(), True), (Unreadable("no answer."), False)):
         with pytest.raises(TrilightError) as caught, reading("set", "a.tar"):
