@@ -126,6 +126,7 @@ def _temporary_problem() -> list[str]:
 
 
 def _renderer() -> Finding:
+    cache_folder("")  # raises where there is neither a cache nor a home
     text = f"mitsuba {metadata.version('mitsuba')}"
     finding = _probe(
         "renderer",
@@ -234,12 +235,14 @@ def _confinement() -> Finding:
 
 
 def _orchestrator() -> Finding:
+    cache_folder("")  # as the renderer
     return _probe(
         "orchestrator",
-        "import prefect.server.api.server",
+        f"from {module_name('pipeline.flows.prefect_server')} import load_prefect; "
+        "load_prefect(); import prefect.server.api.server",
         summary=f"prefect {metadata.version('prefect')}, fastapi {metadata.version('fastapi')}",
         consequence="no flow can run",
-        mend="make setup" if _has_home() else "export HOME=/a/folder/of/your/own",
+        mend="make setup",
     )
 
 
@@ -291,15 +294,6 @@ def _cache() -> Finding:
         consequence="the orchestrator cannot store its records",
         mend="export TRILIGHT_CACHE=/a/writable/folder",
     )
-
-
-def _has_home() -> bool:
-    """Return whether this user has a home, which Prefect looks for when it is imported."""
-    try:
-        Path.home()
-    except RuntimeError:
-        return False
-    return True
 
 
 def _probe(name: str, code: str, *, summary: str, consequence: str, mend: str) -> Finding:
