@@ -26,8 +26,8 @@ _OUTPUTS = (
     ("_detail/metadata_scene.csv", "images/scene_cam_00_final_hdf5/frame.0000.residual.hdf5"),
     *((f"annotations/instances_{split}.json", f"{split}/?????????.0.png") for split in SPLITS),
 )
-"""Files that mark folders of assets, datasets (finished or not), trainings, leaderboards and exports
-to nerfstudio, Hugging Face, Hypersim and COCO; the last name of each may be a pattern."""
+"""Files that mark folders of assets, datasets (finished or not), trainings, leaderboards, and
+exports to nerfstudio, Hugging Face, Hypersim and COCO; each file's own name may be a pattern."""
 
 _OF_SCENE = re.compile(r"(?P<in>(?:.*/)?)(?:objects|templates/backgrounds)/(?P<scene>[^/]+)")
 _MESH_OF_SCENE = re.compile(r"\d+_.*_\d+\.obj")

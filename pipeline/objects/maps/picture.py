@@ -41,6 +41,15 @@ def picture_values(data: bytes, *, is_color: bool) -> tuple[NDArray[np.float32],
     return (_encode(values) if is_linear and is_color else values), (*unread, *cut)
 
 
+def are_normals(values: NDArray[np.float32]) -> bool:
+    """Return whether nearly all values [H, W, 3] code unit vectors, most of them along +Z."""
+    if values.shape[2] != 3:
+        return False
+    vectors = 2 * values - 1
+    is_unit = np.abs(np.linalg.norm(vectors, axis=2) - 1) < 0.05
+    return bool((is_unit & (vectors[..., 2] > 0)).mean() > 0.98)
+
+
 def _encode(linear: NDArray[np.float32]) -> NDArray[np.float32]:
     encoded = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
     return encoded.astype(np.float32)
