@@ -23,6 +23,7 @@ from pipeline.renders.visible_gpus import query_gpus
 from storage.cache import cache_folder
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.installation import IMPORT_ROOT, child_environment, module_name
+from storage.machine import available_cores, free_memory
 
 State = Literal["ok", "slower", "missing"]
 
@@ -78,9 +79,10 @@ def examine(looking_at: Callable[[str], None] = lambda name: None) -> Iterator[F
 
 def _machine() -> Finding:
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    free = (free_memory() or 0) / 2**30
     text = (
-        f"{os.cpu_count()} cores, {memory:.0f} GiB, {platform.system()} {platform.machine()}, "
-        f"Python {platform.python_version()}"
+        f"{available_cores()} of {os.cpu_count()} cores, {free:.0f} of {memory:.0f} GiB free, "
+        f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"
     )
     return Finding(name="machine", state="ok", found=text)
 

@@ -77,7 +77,8 @@ def clip_to_unit(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], tupl
     """
     if not np.isfinite(values).all():
         raise Rejected("not_a_number", "some of its values are no finite numbers; repair them")
-    low, high = float(values.min(initial=0)), float(values.max(initial=0))
+    low = float(values.min(initial=0))
+    high = float(values.max(initial=0))
     if low >= 0 and high <= 1:
         return values, ()
     return np.clip(values, 0, 1), (f"values beyond [0, 1] ({low:.3g} to {high:.3g})",)

@@ -11,13 +11,13 @@ from infra.planning import MeasuredScenes, describe_run, measure_scenes, predict
 from pipeline.executors.threads import ThreadRunner
 from pipeline.flows import prefect_server
 from pipeline.generation.dataset_order import DatasetOrder
-from pipeline.generation.machine import available_cores
 from pipeline.generation.pipeline import make_dataset
 from pipeline.generation.tasks import MAX_TASKS
 from pipeline.isolation import confinement
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.shard import scan_members
+from storage.machine import available_cores
 from tests.for_each import case
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 

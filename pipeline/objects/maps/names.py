@@ -42,16 +42,16 @@ _WORDS: Mapping[str, str] = {
 
 _OTHER_LANGUAGES: Mapping[str, str] = {
     "base": "(?:grund)?farbe|diffus|couleur(?:[-_ ]?de[-_ ]?base)?|difuso|color[-_ ]?base|diffuso|"
-    "colore(?:[-_ ]?base)?|цвет|颜色|基础色|漫反射|ベースカラー|カラー",
+    "colore(?:[-_ ]?base)?|kolor|kleur|цвет|颜色|基础色|漫反射|ベースカラー|カラー",
     "specular": "spekular|speculaire|especular|speculare",
     "roughness": "rau(?:h?igk|h?h?)eit|rugosite|rugosidade?|rugosita|ruvid(?:ezza|ita)|"
-    "шероховатость|粗糙度?|ラフネス|粗さ",
+    "chropowatosc|ruwheid|шероховатость|粗糙度?|ラフネス|粗さ",
     "metallic": "metall(?:isch|izitat)?|metalli(?:que|cite)|metalic(?:o|idade?)|metallico|"
     "металличность|金属度?|メタリック",
-    "gloss": "glanz(?:grad)?|brillance|brillo|brilho|lucentezza|光泽度?|光沢",
-    "normal": "normale[nrs]?(?:map|karte|textur)?|нормал[иь]|法[线線](?:贴图)?|ノーマル",
+    "gloss": "glanz(?:grad)?|brillance|brillo|brilho|lucentezza|po[lł]ysk|glans|光泽度?|光沢",
+    "normal": "normale[nrs]?(?:map|karte|textur)?|normalna|нормал[иь]|法[线線](?:贴图)?|ノーマル",
     "height": "hohe(?:n(?:map|karte))?|hoehe(?:n(?:map|karte))?|verschiebung|hauteur|"
-    "deplacement|altura|desplazamiento|altezza|spostamento|deslocamento|высота|高度|置换|ハイト",
+    "deplacement|altura|desplazamiento|altezza|wysokosc|hoogte|spostamento|deslocamento|высота|高度|置换|ハイト",
     "occlusion": "(?:umgebungs)?(?:verdeckung|okklusion)|occlusion[-_ ]?ambiante|"
     "oclusion(?:[-_ ]?ambiental)?|occlusione(?:[-_ ]?ambientale)?|oclusao|环境光遮蔽|遮蔽",
     "opacity": "deckkraft|transparen(?:z|ce|cia)|opaci(?:te|dade?|ta)|trasparenza|不透明度?",
@@ -59,8 +59,8 @@ _OTHER_LANGUAGES: Mapping[str, str] = {
     "other": "glanzlicht|reflexion|reflexao|riflessione|高光",
     "preview": "vorschau|apercu|vista[-_ ]?previa|anteprima|预览",
 }
-"""The same in German, French, Spanish, Italian, Portuguese, Russian, Chinese and Japanese, without
-accents."""
+"""The same in German, French, Spanish, Italian, Portuguese, Polish, Dutch, Russian, Chinese and
+Japanese, without accents."""
 
 _PACKED: Mapping[str, Mapping[str, int]] = {
     "orm": {"roughness": 1, "metallic": 2},
