@@ -29,30 +29,21 @@ def available_cores() -> int:
 
 
 def allowed_cores(root: Path = _ROOT) -> float:
-    """Return the cores of the affinity, or the smaller quota of the control groups.
-
-    Args:
-        root: of the file system.
-    """
-    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(_all_cores())
+    """Return the cores of the affinity, or the smaller quota of the control groups below `root`."""
+    if hasattr(os, "sched_getaffinity"):
+        allowed = len(os.sched_getaffinity(0))
+    else:
+        allowed = os.cpu_count() or 1
     groups = _control_groups(root)
-    return min([float(len(allowed)), *(quota for folder in groups for quota in _quotas(folder))])
+    return min([float(allowed), *(quota for folder in groups for quota in _quotas(folder))])
 
 
 def free_memory(root: Path = _ROOT) -> int | None:
-    """Return the free bytes of the machine, or the fewer of its control groups; None if unknown.
-
-    Args:
-        root: of the file system.
-    """
+    """Return the free bytes of the machine, or the fewer of its control groups; None if unknown."""
     free = [size for folder in _control_groups(root) for size in _free_in(folder)]
     available = (line.split() for line in _lines(root / "proc/meminfo"))
     free += [1024 * int(words[1]) for words in available if words[0] == "MemAvailable:"]
     return min(free, default=None)
-
-
-def _all_cores() -> int:
-    return os.cpu_count() or 1
 
 
 def _control_groups(root: Path) -> Iterator[Path]:
