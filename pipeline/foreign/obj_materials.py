@@ -52,8 +52,7 @@ def obj_materials(
         emission: whether emission is read, too.
 
     Raises:
-        Rejected: no_materials where it has none, materials_unreadable (none of them is there, or
-            a number is malformed), or as reading a picture.
+        Rejected: no_materials where it has none, materials_unreadable, or as reading a picture.
     """
     if not names or not files.libraries:
         # records hold these words, and digests hold records

@@ -43,11 +43,9 @@ def picture_values(data: bytes, *, is_color: bool) -> tuple[NDArray[np.float32],
 
 def are_normals(values: NDArray[np.float32]) -> bool:
     """Return whether nearly all values [H, W, 3] code unit vectors, most of them along +Z."""
-    if values.shape[2] != 3:
-        return False
     vectors = 2 * values - 1
     is_unit = np.abs(np.linalg.norm(vectors, axis=2) - 1) < 0.05
-    return bool((is_unit & (vectors[..., 2] > 0)).mean() > 0.98)
+    return values.shape[2] == 3 and bool((is_unit & (vectors[..., 2] > 0)).mean() > 0.98)
 
 
 def _encode(linear: NDArray[np.float32]) -> NDArray[np.float32]:
