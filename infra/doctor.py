@@ -23,6 +23,7 @@ from pipeline.renders.visible_gpus import query_gpus
 from storage.cache import cache_folder
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.installation import IMPORT_ROOT, child_environment, module_name
+from storage.machine import available_cores, free_memory
 
 State = Literal["ok", "slower", "missing"]
 
@@ -78,9 +79,10 @@ def examine(looking_at: Callable[[str], None] = lambda name: None) -> Iterator[F
 
 def _machine() -> Finding:
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    free = (free_memory() or 0) / 2**30
     text = (
-        f"{os.cpu_count()} cores, {memory:.0f} GiB, {platform.system()} {platform.machine()}, "
-        f"Python {platform.python_version()}"
+        f"{available_cores()} of {os.cpu_count()} cores, {free:.0f} of {memory:.0f} GiB free, "
+        f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"
     )
     return Finding(name="machine", state="ok", found=text)
 
@@ -126,6 +128,7 @@ def _temporary_problem() -> list[str]:
 
 
 def _renderer() -> Finding:
+    cache_folder("")  # raises where there is neither a cache nor a home
     text = f"mitsuba {metadata.version('mitsuba')}"
     finding = _probe(
         "renderer",
@@ -234,12 +237,14 @@ def _confinement() -> Finding:
 
 
 def _orchestrator() -> Finding:
+    cache_folder("")  # as the renderer
     return _probe(
         "orchestrator",
-        "import prefect.server.api.server",
+        f"from {module_name('pipeline.flows.prefect_server')} import load_prefect; "
+        "load_prefect(); import prefect.server.api.server",
         summary=f"prefect {metadata.version('prefect')}, fastapi {metadata.version('fastapi')}",
         consequence="no flow can run",
-        mend="make setup" if _has_home() else "export HOME=/a/folder/of/your/own",
+        mend="make setup",
     )
 
 
@@ -291,15 +296,6 @@ def _cache() -> Finding:
         consequence="the orchestrator cannot store its records",
         mend="export TRILIGHT_CACHE=/a/writable/folder",
     )
-
-
-def _has_home() -> bool:
-    """Return whether this user has a home, which Prefect looks for when it is imported."""
-    try:
-        Path.home()
-    except RuntimeError:
-        return False
-    return True
 
 
 def _probe(name: str, code: str, *, summary: str, consequence: str, mend: str) -> Finding:

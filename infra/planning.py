@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.generation.dataset_order import DatasetOrder
-from pipeline.generation.machine import available_cores
 from pipeline.generation.pipeline import make_task, prepare_dataset
 from pipeline.generation.render_children import close_children
 from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece
@@ -28,6 +27,7 @@ from storage.dataset.scene_logs import sample_logs
 from storage.dataset.shard import contents_of
 from storage.dataset.splits import lacks_validation, planned_scenes, shard_name, shards_for
 from storage.dataset.staging import read_staged_scene
+from storage.machine import available_cores
 from storage.records.safe_read import open_plain
 from storage.records.sample import sample_key
 from storage.seeds import rng_for

@@ -15,6 +15,7 @@ from pipeline.renders.settings import NoiseTargets, one_picture
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX, preview_srgb8
 from storage.errors import TrilightError
+from storage.machine import available_cores
 from storage.raycast.first_hits import FirstHits, first_hits
 from storage.records.passes.declared import Pass, declared_passes
 from storage.records.passes.pictures import view_passes
@@ -138,7 +139,7 @@ def render_views(
         ),
         seed=seed,
         variant=choose_variant("auto"),
-        threads=threads or os.cpu_count() or 1,
+        threads=threads or available_cores(),
         on_samples=lambda now: None,
     )
     try:

@@ -29,6 +29,8 @@ def main() -> None:
     os.environ["MPLBACKEND"] = "agg"  # a notebook's or a missing backend fails at the import
     if not os.environ.get("COLUMNS", "80").strip("0"):  # rich prints nothing in no columns
         del os.environ["COLUMNS"]
+    if not os.environ.get("SOURCE_DATE_EPOCH", "0").isdecimal():  # numpy's import would fail
+        del os.environ["SOURCE_DATE_EPOCH"]
     signal.signal(signal.SIGINT, _on_interrupt)
     open_missing_streams()
     if logging.lastResort is not None:

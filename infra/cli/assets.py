@@ -1,6 +1,5 @@
 """`trilight assets`: objects to clean meshes, with a report."""
 
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,6 +21,7 @@ from infra.cli.options import OutputOptions, command
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings, Profile
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from storage.errors import TrilightError
+from storage.machine import available_cores
 from storage.records.objects import count_by_reason
 from storage.remote.safe_url import safe_url
 from storage.settings.described import checked, describe_fields
@@ -80,7 +80,7 @@ def assets(options: AssetOptions, output: OutputOptions) -> None:
             settings,
             allowed_licences=(*DEFAULT_ALLOWED, *options.allow_licences),
             licence=options.licence,
-            workers=options.workers or os.cpu_count() or 1,
+            workers=options.workers or available_cores(),
             on_download=lambda done, total: bars.update(fetched, completed=done, total=total),
             on_plan=lambda total: bars.update(task, total=total),
             on_object=lambda: bars.advance(task),

@@ -18,10 +18,10 @@ from infra.cli.dataset_changes import with_base_settings
 from infra.cli.options import OutputOptions, command
 from infra.cli.process_exit import temporary_folder
 from pipeline.generation.dataset_order import DatasetOrder, generate_words
-from pipeline.generation.machine import available_cores
 from pipeline.generation.price import CorePrice
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
+from storage.machine import available_cores
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 

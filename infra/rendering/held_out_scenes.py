@@ -5,7 +5,6 @@ Previews and methods are evaluated and timed on these scenes.
 """
 
 import dataclasses
-import os
 from pathlib import Path
 
 from pipeline.builds.settings import BuildSettings
@@ -21,6 +20,7 @@ from scene_templates.settings import SceneSettings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.splits import JUDGED_SPLIT
 from storage.errors import Rejected
+from storage.machine import available_cores
 from storage.records.scene import Scene
 from storage.settings.changes import changed
 
@@ -51,7 +51,7 @@ def composing_child(
         variant: Mitsuba variant; None for that of the CPU, or of TRILIGHT_VARIANT.
     """
     variant = variant or choose_variant()
-    workers = threads or os.cpu_count() or 1
+    workers = threads or available_cores()
     publication = begin(
         DatasetFolder(folder), build, environment(variant), 1, accept_environment=False
     )

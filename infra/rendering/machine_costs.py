@@ -7,7 +7,6 @@ differ by a factor of two between scenes, and two scenes are not the table's twe
 
 import contextlib
 import importlib.util
-import os
 import tempfile
 import time
 from collections.abc import Mapping
@@ -29,6 +28,7 @@ from pipeline.objects.generated import BENCHMARK
 from pipeline.renders.preview_parts import timed_parts
 from pipeline.renders.renderer import set_threads
 from pipeline.renders.variant import choose_variant
+from storage.machine import available_cores
 from storage.records.scene import Scene
 
 PROBES = (1, 2)
@@ -43,7 +43,7 @@ PartSeconds = dict[tuple[int, int], Mapping[str, float]]
 
 def measure_costs(table: WayTable) -> PictureCosts:
     """Return the costs of the parts here; takes less than a minute on an idle machine."""
-    cores = os.cpu_count() or 1
+    cores = available_cores()
     variant = choose_variant("auto")
     with tempfile.TemporaryDirectory() as name:
         child = composing_child(held_out_build(), BENCHMARK, Path(name), variant=variant)

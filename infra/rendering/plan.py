@@ -1,7 +1,6 @@
 """Plan of one call of `trilight render`: all decisions, before any picture is rendered."""
 
 import importlib.util
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from pipeline.renders.preview import PreviewSettings, usual_filter
 from pipeline.renders.settings import RenderSettings, one_picture
 from pipeline.renders.variant import choose_variant
 from storage.errors import TrilightError
+from storage.machine import available_cores
 
 _RESOLUTION = 512
 
@@ -185,7 +185,7 @@ def _mitsuba(options: RenderOptions, settings: RenderSettings | PreviewSettings)
     return MitsubaPlan(
         settings=settings,
         seed=options.seed,
-        threads=options.threads or os.cpu_count() or 1,
+        threads=options.threads or available_cores(),
         variant=choose_variant("auto"),
     )
 
@@ -208,7 +208,7 @@ def _choice(
         return None
     table = shipped_table()
     known = known_costs(choose_variant("auto"))
-    cores = os.cpu_count() or 1
+    cores = available_cores()
     candidates = priced_ways(
         table,
         known.costs,

@@ -39,11 +39,11 @@ from pipeline.flows.prefect_server import (
     quiet_prefect,
     wait_until_healthy,
 )
-from pipeline.generation.machine import available_cores
 from pipeline.renders.visible_gpus import visible_gpus
 from storage.atomic import write_atomically
 from storage.cache import open_private
 from storage.errors import TrilightError
+from storage.machine import available_cores
 
 POOL = "local"
 _FLOWS = {

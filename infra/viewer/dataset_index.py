@@ -133,7 +133,7 @@ def _row(
         key=key,
         shard=shard,
         split=split,
-        template=str(record["provenance"]["template"]),
+        template=str(record["provenance"].get("template", "unknown")),
         views=len(views),
         triangles=_num_triangles(stream, members),
         lights=sum(entry["kind"] == "emitter" for entry in record["objects"]),

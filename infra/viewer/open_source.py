@@ -1,6 +1,5 @@
 """Opens the source of `trilight view`: a scene, a folder of scenes, or a dataset."""
 
-import os
 from pathlib import Path
 
 from infra.viewer.dataset_handlers import DatasetHandlers
@@ -12,6 +11,7 @@ from pipeline.exchange.reader import SceneReader
 from pipeline.generation.progressive_tracer import ProgressiveTracer
 from pipeline.renders.variant import choose_variant
 from storage.dataset.dataset import open_dataset
+from storage.machine import available_cores
 
 
 def open_handlers(source: str, *, checkpoint: str | None, threads: int | None) -> PageHandlers:
@@ -41,4 +41,4 @@ def open_handlers(source: str, *, checkpoint: str | None, threads: int | None) -
 
 
 def _tracer(threads: int | None) -> ProgressiveTracer:
-    return ProgressiveTracer(variant=choose_variant("auto"), threads=threads or os.cpu_count() or 1)
+    return ProgressiveTracer(variant=choose_variant("auto"), threads=threads or available_cores())

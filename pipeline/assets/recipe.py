@@ -38,7 +38,7 @@ RECIPE = (
 )
 """Recipe name in asset files; it is part of their keys in the asset store."""
 
-READERS = 3
+READERS = 4
 """Version of the readers' results: part of cache keys and of no asset, so that a fixed reader reads
 its files again."""
 

@@ -164,7 +164,7 @@ class _Tally:
 
     def add(self, record: SceneRecord, split: str) -> Mapping[str, Values]:
         """Count one scene and return its values."""
-        self.scenes[str(record.scene.provenance["template"]), split] += 1
+        self.scenes[record.scene.provenance.get("template", "unknown"), split] += 1
         self.map_uses.update(locked_uids((), record.scene.provenance))
         self.views_at_cap[split] += sum(bool(view.at_cap) for view in record.views)
         for surface in surfaces(record.scene):

@@ -118,7 +118,7 @@ def _draw_cell(sheet: Image.Image, sample: Sample, split: str, left_px: int, top
     excursion = origin.get("excursion")
     beyond = f"  {excursion['axis']} {excursion['value']:g}" if excursion else ""
     _write(sheet, left_px, top, f"{sample.key}  {split}{beyond}", 13)
-    triangles = f"{origin['template']}  {sample.scene.num_triangles} triangles"
+    triangles = f"{origin.get('template', 'unknown')}  {sample.scene.num_triangles} triangles"
     _write(sheet, left_px, top + 16, triangles, 13)
     exposed = sample.radiance_rgb * preview_gain(sample.radiance_rgb)
     for view, (picture, record) in enumerate(zip(exposed, sample.views, strict=True)):
@@ -144,7 +144,7 @@ def _first_scenes(dataset: Dataset, per_template: int) -> Mapping[str, dict[str,
     rows: dict[str, dict[str, ShardEntry]] = {}
     for shard in described_shards(dataset):
         for record in dataset.read_scenes(shard):
-            scenes = rows.setdefault(str(record.scene.provenance["template"]), {})
+            scenes = rows.setdefault(record.scene.provenance.get("template", "unknown"), {})
             if len(scenes) < per_template:
                 scenes[record.key] = shard
     return rows

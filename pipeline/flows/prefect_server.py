@@ -66,16 +66,24 @@ def quiet_prefect() -> None:
     }
     for name, value in quiet.items():
         os.environ.setdefault(name, value)
+    _ensure_home()
+
+
+def _ensure_home() -> None:
+    """Set HOME, which Prefect needs on import, where neither it nor a passwd entry states one."""
+    if os.path.expanduser("~") == "~":
+        os.environ["HOME"] = str(cache_folder("home"))
 
 
 def load_prefect() -> None:
     """Import Prefect, which reads its settings from environment, profile and working folder.
 
     Raises:
-        TrilightError: Prefect refuses a setting.
+        TrilightError: Prefect refuses a setting, or there is neither a home nor a cache.
     """
     existing = [os.environ.get(name) for name in ("no_proxy", "NO_PROXY")]
     os.environ["no_proxy"] = ",".join([*filter(None, existing), "localhost", "127.0.0.1"])
+    _ensure_home()
     try:
         with contextlib.redirect_stderr(io.StringIO()):  # it prints the error too
             from prefect.settings import get_current_settings

@@ -69,6 +69,21 @@ def as_rec709(rgb: NDArray[np.float32], primaries: Sequence[float]) -> NDArray[n
     return np.where((rgb >= 0).all(axis=-1, keepdims=True), np.maximum(converted, 0), converted)
 
 
+def clip_to_unit(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+    """Return values in [0, 1], and a note where some are beyond.
+
+    Raises:
+        Rejected: not_a_number.
+    """
+    if not np.isfinite(values).all():
+        raise Rejected("not_a_number", "some of its values are no finite numbers; repair them")
+    low = float(values.min(initial=0))
+    high = float(values.max(initial=0))
+    if low >= 0 and high <= 1:
+        return values, ()
+    return np.clip(values, 0, 1), (f"values beyond [0, 1] ({low:.3g} to {high:.3g})",)
+
+
 def _to_xyz(primaries: Sequence[float]) -> NDArray[np.float64]:
     points = np.asarray(primaries, np.float64).reshape(4, 2)
     with np.errstate(all="ignore"):

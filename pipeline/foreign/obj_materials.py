@@ -63,22 +63,28 @@ def obj_materials(
         if library in files.data:
             known = {**read_mtl(files.data[library]), **known}
     absent = [name for name in files.libraries if name not in files.data]
-    if missing := [name for name in names if name not in known]:
+    if not known.keys() & set(names):
         if absent:
             files.require(absent[0])
-        raise Rejected("materials_unreadable", f"no library has the material {missing[0]!r:.80}")
+        raise Rejected("materials_unreadable", f"no library has the material {names[0]!r:.80}")
     reader = _Reader(files, decode)
+    chosen = [known.get(name, {}) for name in names]
     try:
-        materials = [reader.material(known[name]) for name in names]
+        materials = [reader.material(fields) for fields in chosen]
         if emission:
             materials = [
-                reader.add_emission(one, known[name])
-                for one, name in zip(materials, names, strict=True)
+                reader.add_emission(one, fields)
+                for one, fields in zip(materials, chosen, strict=True)
             ]
     except Malformed as error:
         raise Rejected("materials_unreadable", f"the MTL is malformed ({error!s:.200})") from error
     unread = [f"library {name[:60]!r}: it is not there" for name in absent]
-    unread += [text for name in names for text in _list_unread(known[name])]
+    unread += [
+        f"material {name[:60]!r}: no library has it; its faces have MTL's defaults"
+        for name in names
+        if name not in known
+    ]
+    unread += [text for fields in chosen for text in _list_unread(fields)]
     return materials, list(dict.fromkeys(unread))
 
 

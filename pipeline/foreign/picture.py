@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from pipeline.foreign.light_pictures import read_linear_picture
+from pipeline.foreign.linear_picture import LinearPicture, clip_to_unit
 from storage.conventions import linear_from_srgb, linear_from_srgb8
 from storage.errors import Rejected
 
@@ -38,36 +39,43 @@ class Decoder:
 
     def __init__(self, max_pixels: int) -> None:
         self._pixels_left = max_pixels
+        self.notes: list[str] = []
+        """Sentences on parts of the pictures that are not read."""
 
     def __call__(self, data: bytes, name: str) -> NDArray:
         """Return `decode_image` within the pixels that are left."""
-        values = decode_image(data, name, self._pixels_left)
+        values = decode_image(data, name, self._pixels_left, self.notes)
         self._pixels_left -= values.shape[0] * values.shape[1]
         return values
 
 
-def decode_image(data: bytes, name: str, max_pixels: int) -> NDArray:
+def decode_image(data: bytes, name: str, max_pixels: int, notes: list[str]) -> NDArray:
     """Return a picture [H, W, 4], row 0 at the bottom: uint8, or uint16 for grays of 16 bits.
 
     Palettes, grays, transparency and CMYK become RGBA; colors of 16 bits are reduced to 8. OpenEXR
-    and Radiance are float16, clipped to [0, 1].
+    and Radiance are float16, clipped to [0, 1]. `notes` receives sentences on what is not read.
 
     Raises:
         Rejected: texture_too_large or texture_unreadable.
     """
     try:
-        if (linear := read_linear_picture(data, max_pixels)) is not None:
-            return np.ascontiguousarray(_unit_values(linear.values)[::-1])
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # ours is stricter
-            with Image.open(io.BytesIO(data), formats=FORMATS) as image:
-                if image.width * image.height > max_pixels:
-                    raise Rejected(
-                        "texture_too_large",
-                        f"{image.width} x {image.height}; at most {max_pixels} "
-                        "pixels are left. Make it smaller, or raise own_materials.max_pixels",
-                    )
-                return np.ascontiguousarray(_decode_values(image)[::-1])
+        linear = read_linear_picture(data, max_pixels)
+        if linear is None:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # ours is stricter
+                with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+                    if image.width * image.height > max_pixels:
+                        raise Rejected(
+                            "texture_too_large",
+                            f"{image.width} x {image.height}; at most {max_pixels} "
+                            "pixels are left. Make it smaller, or raise own_materials.max_pixels",
+                        )
+                    if image.mode != "F":
+                        return np.ascontiguousarray(_decode_values(image)[::-1])
+                    linear = LinearPicture(values=np.asarray(image, np.float32)[..., None])
+        rgba, cut = _unit_rgba(linear.values)
+        notes.extend(f"picture {name[:60]!r}: {note}" for note in (*linear.unread, *cut))
+        return np.ascontiguousarray(rgba[::-1])
     except MemoryError:
         raise
     except Rejected as error:
@@ -97,21 +105,18 @@ def has_colors(data: bytes) -> bool:
         return False
 
 
-def _unit_values(values: NDArray[np.float32]) -> NDArray[np.float16]:
-    """Return RGBA [H, W, 4] of linear values [H, W, 1 to 4]."""
-    if not np.isfinite(values).all():
-        raise Rejected("texture_unreadable", "some of its values are no finite numbers")
+def _unit_rgba(values: NDArray[np.float32]) -> tuple[NDArray[np.float16], tuple[str, ...]]:
+    """Return RGBA [H, W, 4] of linear values [H, W, 1 to 4], and a note where some are cut."""
+    values, cut = clip_to_unit(values)
     count = values.shape[2]
     rgba = np.ones((*values.shape[:2], 4), np.float16)
-    rgba[..., :3] = np.clip(values[..., :3] if count >= 3 else values[..., :1], 0, 1)
+    rgba[..., :3] = values[..., :3] if count >= 3 else values[..., :1]
     if count in (2, 4):
-        rgba[..., 3] = np.clip(values[..., -1], 0, 1)
-    return rgba
+        rgba[..., 3] = values[..., -1]
+    return rgba, cut
 
 
 def _decode_values(image: Image.Image) -> NDArray:
-    if image.mode == "F":
-        return _unit_values(np.asarray(image, np.float32)[..., None])
     if image.mode.startswith("I"):
         gray = np.clip(np.asarray(image), 0, 65535).astype(np.uint16)
         return np.stack([gray, gray, gray, np.full_like(gray, 65535)], axis=-1)

@@ -46,7 +46,6 @@ from pipeline.generation.bucket_dataset_writer import hold_membership
 from pipeline.generation.dataset_order import DatasetOrder, generate_words
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects
-from pipeline.generation.machine import available_cores
 from pipeline.generation.object_options import ObjectOptions
 from pipeline.generation.render_children import (
     close_children,
@@ -75,6 +74,7 @@ from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.statistics import Statistics
 from storage.errors import Rejected, TrilightError
+from storage.machine import available_cores
 from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
 from storage.records.scene import Scene

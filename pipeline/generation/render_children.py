@@ -15,7 +15,6 @@ from pipeline.builds.settings import differences
 from pipeline.exchange.scene_files import SceneFiles
 from pipeline.generation.child_pool import ChildPool
 from pipeline.generation.environment import environment
-from pipeline.generation.machine import available_cores
 from pipeline.generation.prepare_isolated import asset_child
 from pipeline.generation.run import ShardJob
 from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
@@ -24,6 +23,7 @@ from pipeline.renders.variant import choose_variant
 from pipeline.renders.visible_gpus import visible_gpus
 from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions
+from storage.machine import available_cores
 from storage.records.scene import Scene
 
 _RENDER_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child=200)

@@ -4,6 +4,7 @@ Both are left out, each with one printed note. Copies are files that collections
 object: for collisions, with less detail, or in another format.
 """
 
+import fnmatch
 import functools
 import logging
 import re
@@ -11,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
+from storage.conventions import SPLITS
 from storage.remote.safe_url import printable
 
 _OUTPUTS = (
@@ -20,9 +22,12 @@ _OUTPUTS = (
     ("settings.json", "metrics.jsonl"),
     ("leaderboard.md", "pairs.csv"),
     ("transforms.json", "images/0.png", "depths/0.npy"),
+    ("metadata.jsonl", "*.0.triangle.tiff"),
+    ("_detail/metadata_scene.csv", "images/scene_cam_00_final_hdf5/frame.0000.residual.hdf5"),
+    *((f"annotations/instances_{split}.json", f"{split}/?????????.0.png") for split in SPLITS),
 )
-"""Files that mark folders of assets, datasets (finished or not), trainings, leaderboards and
-nerfstudio exports."""
+"""Files that mark folders of assets, datasets (finished or not), trainings, leaderboards, and
+exports to nerfstudio, Hugging Face, Hypersim and COCO; each file's own name may be a pattern."""
 
 _OF_SCENE = re.compile(r"(?P<in>(?:.*/)?)(?:objects|templates/backgrounds)/(?P<scene>[^/]+)")
 _MESH_OF_SCENE = re.compile(r"\d+_.*_\d+\.obj")
@@ -34,6 +39,7 @@ _GLB_SCENE = (b'"generator": "trilight"', b'"cameras": [')
 """Texts in every GLB of a Trilight scene, and in no GLB of a Trilight object."""
 _MOST_HEAD = 1 << 14
 _MOST_TAIL = 1 << 20
+_MOST_TREE = 1 << 26
 
 _MESH = re.compile(r".*-[0-9a-f]{8}\.(?:ply|glb)")
 """Mesh names of `assets`."""
@@ -79,7 +85,8 @@ def drop_outputs(names: Iterable[str]) -> list[str]:
     inside: dict[str, set[str]] = defaultdict(set)
     for name in names:
         inside[_folder(name)].add(name.rpartition("/")[2])
-    outputs = {folder for folder in inside if folder and _is_output(folder, inside)}
+    folders = {str(folder) for name in inside for folder in PurePosixPath(name, "x").parents}
+    outputs = {folder for folder in folders - {"."} if _is_output(folder, inside)}
     remaining = [
         name for name in names if outputs.isdisjoint(map(str, PurePosixPath(name).parents))
     ]
@@ -98,7 +105,8 @@ def _is_output(folder: str, inside: Mapping[str, set[str]]) -> bool:
         return all(map(_MESH_OF_SCENE.fullmatch, inside[folder]))
     return any(
         all(
-            mark.rpartition("/")[2] in inside.get(_folder(f"{folder}/{mark}"), ()) for mark in marks
+            fnmatch.filter(inside.get(_folder(f"{folder}/{mark}"), ()), mark.rpartition("/")[2])
+            for mark in marks
         )
         for marks in _OUTPUTS
     )
@@ -129,7 +137,7 @@ def _is_scene(path: Path) -> bool:
         with path.open("rb") as file:
             head = file.read(_MOST_HEAD)
             if head.startswith(b"glTF"):
-                tree = head + file.read(_MOST_TAIL)
+                tree = head + file.read(min(int.from_bytes(head[12:16], "little"), _MOST_TREE))
                 return all(mark in tree for mark in _GLB_SCENE)
             file.seek(max(0, path.stat().st_size - _MOST_TAIL))
             return _SCENE in head or (not head.startswith(b"#usda") and _SCENE in file.read())

@@ -83,7 +83,7 @@ def with_new_lights(
     Raises:
         Rejected: "no_layout" if the template of the scene is no known layout.
     """
-    name = scene.provenance["template"]
+    name = scene.provenance.get("template", "unknown")
     if name not in TEMPLATES:
         raise Rejected("no_layout", f"{name!r} is no layout that draws lights; keep its lights")
     kinds = np.array([entry.kind for entry in scene.objects])

@@ -125,7 +125,7 @@ def _accepted_proposals(
 def _proposal(scene: Scene, settings: SceneSettings, view: int, attempt: int) -> ViewCamera:
     """Return proposal number `attempt` of a view (scene_templates.cameras.sample_camera)."""
     origin = scene.provenance
-    template = origin["template"]
+    template = origin.get("template", "unknown")
     names = (origin["scene_index"], origin["attempt"], view, attempt)
     if (new := origin.get("new_cameras")) is None:
         rng = rng_for(origin["seed"], "camera", *names)

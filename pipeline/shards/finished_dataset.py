@@ -149,7 +149,7 @@ def _facts(
         return SceneFacts(
             shard=shard,
             key=key,
-            template=str(record["provenance"]["template"]),
+            template=str(record["provenance"].get("template", "unknown")),
             noise_floor_db=min(float(view["noise_floor_db"]) for view in record["views"]),
             uids=tuple(
                 locked_uids(

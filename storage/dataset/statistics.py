@@ -17,6 +17,7 @@ from storage.dataset.shard import read_member, scan_members
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
+from storage.records.scene_file import scene_provenance
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -163,8 +164,9 @@ def _count_shard(stream: BinaryIO, shard: ShardEntry, tally: _Tally) -> None:
             tally.scene_members[scene] = sha256_hex(unpack_arrays({member.suffix: data}))
             continue
         record = json.loads(data)
-        tally.templates[record["provenance"]["template"]] += 1
-        if excursion := record["provenance"].get("excursion"):
+        provenance = scene_provenance(record["provenance"])
+        tally.templates[provenance.get("template", "unknown")] += 1
+        if excursion := provenance.get("excursion"):
             tally.excursions[excursion["axis"]] += 1
         tally.add_views(record["views"])
 

@@ -1,7 +1,6 @@
 """Checks a dataset against its manifest: every hash, every member, and the laws of every sample."""
 
 import io
-import os
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -27,6 +26,7 @@ from storage.dataset.shard import contents_of, samples_of
 from storage.digests import seal_of, sha256_hex
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.licences import mixed_share_alike
+from storage.machine import available_cores
 from storage.records.held_maps import HeldMaps
 from storage.records.lights import sum_of_lights
 from storage.records.objects import LockedObject, decode_objects_lock, locked_uids
@@ -105,7 +105,7 @@ def verify_dataset(
     problems += [f"{name}: not in the manifest" for name in _list_unlisted(dataset)]
     where: dict[str, str] = {}
     bad: list[str] = []
-    threads = os.cpu_count() or 1 if isinstance(dataset.files, LocalFiles) else REMOTE_THREADS
+    threads = available_cores() if isinstance(dataset.files, LocalFiles) else REMOTE_THREADS
     with ThreadPoolExecutor(threads) as pool:
         checks = _ahead(
             pool, lambda shard: _check_shard(dataset, shard, locked, fast=fast), manifest.shards

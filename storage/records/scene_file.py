@@ -224,9 +224,22 @@ def scene_objects(value: Any) -> tuple[SceneObject, ...]:
 
 
 def scene_provenance(value: Any) -> Mapping[str, Any]:
-    """Return the provenance of a JSON value; raises TrilightError where it is no object."""
+    """Return the provenance of a JSON value.
+
+    Raises:
+        TrilightError: it is no object, or its template or excursion is malformed.
+    """
     if not isinstance(value, dict):
         _broken("provenance", value, "a JSON object")
+    if not isinstance(value.get("template", ""), str):
+        _broken("provenance.template", value["template"], "text")
+    excursion = value.get("excursion")
+    if excursion and not (
+        isinstance(excursion, dict)
+        and isinstance(excursion.get("axis"), str)
+        and isinstance(excursion.get("value"), int | float)
+    ):
+        _broken("provenance.excursion", excursion, "an axis and a value")
     return value
 
 

@@ -1,6 +1,7 @@
 """What is said before work begins: predictions of a dataset, and what a machine lacks."""
 
 import dataclasses
+import os
 from pathlib import Path
 
 import pytest
@@ -8,14 +9,15 @@ import pytest
 from infra import doctor
 from infra.planning import MeasuredScenes, describe_run, measure_scenes, predict
 from pipeline.executors.threads import ThreadRunner
+from pipeline.flows import prefect_server
 from pipeline.generation.dataset_order import DatasetOrder
-from pipeline.generation.machine import available_cores
 from pipeline.generation.pipeline import make_dataset
 from pipeline.generation.tasks import MAX_TASKS
 from pipeline.isolation import confinement
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.shard import scan_members
+from storage.machine import available_cores
 from tests.for_each import case
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
@@ -151,6 +153,22 @@ def test_a_machine_on_which_all_probes_end_well_lacks_nothing(
 @pytest.mark.slow("packaging")
 def test_a_machine_that_passes_tests_lacks_nothing() -> None:
     assert [finding for finding in doctor.examine() if finding.state == "missing"] == []
+
+
+def test_a_user_without_a_home_has_one_in_the_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", "/x")
+    monkeypatch.delenv("HOME")
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path))
+    prefect_server._ensure_home()
+    assert os.environ["HOME"] == str(tmp_path / "home")
+    for name in ("TRILIGHT_CACHE", "HOME"):
+        monkeypatch.delenv(name)
+    monkeypatch.setattr(doctor, "CHECKS", {"orchestrator": doctor._orchestrator})
+    (finding,) = doctor.examine()
+    assert "has no home directory" in finding.found
 
 
 def test_each_finding_comes_before_the_next_look() -> None:

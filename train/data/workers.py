@@ -4,10 +4,11 @@ Batches do not depend on it, so that every start decides again.
 """
 
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from storage.machine import allowed_cores, free_memory
 
 if TYPE_CHECKING:
     from train.settings import TrainSettings
@@ -20,8 +21,6 @@ SCENES_AT_WORK = 4
 """Memory of a thread, in scenes as a batch holds them: decoded and waiting ones."""
 
 _BYTES_OF_PIXEL = 12
-_NO_LIMIT = 1 << 60
-"""Threshold of memory limits: old control groups store a larger number for no limit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,15 +47,9 @@ class WorkerResult:
 
 def detect_machine(root: Path = Path("/")) -> Machine:
     """Detect cores, memory and processes of this node; `root` is that of the file system."""
-    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(_all_cores())
-    groups = list(_control_groups(root))
-    quotas = [quota for folder in groups for quota in _quotas(folder)]
-    free = [size for folder in groups for size in _free_in(folder)]
-    available = (line.split() for line in _lines(root / "proc/meminfo"))
-    free += [1024 * int(words[1]) for words in available if words[0] == "MemAvailable:"]
     return Machine(
-        cores=min([float(len(allowed)), *quotas]),
-        free_bytes=min(free, default=None),
+        cores=allowed_cores(root),
+        free_bytes=free_memory(root),
         processes=max(int(os.environ.get("LOCAL_WORLD_SIZE", "1")), 1),
     )
 
@@ -86,56 +79,3 @@ def choose_workers(
             reason += f" and {machine.free_bytes / 2**30:.1f} GiB of free memory"
     decision = "1 thread decodes" if threads == 1 else f"{threads} threads decode"
     return WorkerResult(threads=threads, reason=f"{decision} samples, by {reason}")
-
-
-def _all_cores() -> int:
-    return os.cpu_count() or 1
-
-
-def _control_groups(root: Path) -> Iterator[Path]:
-    """Yield the folders of this process's control group and its parents, versions 1 and 2."""
-    base = root / "sys/fs/cgroup"
-    yield from (base, base / "cpu", base / "memory")
-    for line in _lines(root / "proc/self/cgroup"):
-        number, _, path = line.split(":", 2)
-        if number == "0":
-            inside = base / path.strip("/")
-            yield from (each for each in (inside, *inside.parents) if base in each.parents)
-
-
-def _quotas(folder: Path) -> Iterator[float]:
-    """Yield the CPU quotas of a control group, in cores."""
-    for line in _lines(folder / "cpu.max"):
-        quota, period = line.split()
-        if quota != "max":
-            yield int(quota) / int(period)
-    old = [_lines(folder / f"cpu.cfs_{name}_us") for name in ("quota", "period")]
-    if all(old) and int(old[0][0]) > 0:
-        yield int(old[0][0]) / int(old[1][0])
-
-
-def _free_in(folder: Path) -> Iterator[int]:
-    """Yield the free and reclaimable bytes of a control group that has a memory limit."""
-    old = ("memory.limit_in_bytes", "memory.usage_in_bytes")
-    for limit, used in (("memory.max", "memory.current"), old):
-        lines = [_lines(folder / name) for name in (limit, used)]
-        if all(lines) and lines[0][0] != "max" and int(lines[0][0]) < _NO_LIMIT:
-            held = int(lines[1][0]) - _files_held(folder)
-            yield max(int(lines[0][0]) - held, 0)
-
-
-def _files_held(folder: Path) -> int:
-    """Return the reclaimable bytes of cached files in a control group.
-
-    The kernel counts them as used: after an epoch, cached shards fill every group.
-    """
-    words = (line.split() for line in _lines(folder / "memory.stat"))
-    counts = {name: int(value) for name, value in words}
-    return counts.get("total_inactive_file", counts.get("inactive_file", 0))
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text().splitlines()
-    except OSError:
-        return []

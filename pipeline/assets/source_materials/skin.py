@@ -102,7 +102,9 @@ def open_skin_baker(
             texture_too_large, texture_unreadable, no_texture_coordinates or
             texture_coordinates_not_finite.
     """
-    parts = _parts(source, Decoder(settings.max_pixels), emission=settings.emission)
+    decode = Decoder(settings.max_pixels)
+    parts = _parts(source, decode, emission=settings.emission)
+    source.notes.extend(decode.notes)
     lost = {word for material in parts.materials for word in material.lost}
     lost -= {"emission"} if settings.emission else set()
     surface = match_source_surface(mesh, parts)

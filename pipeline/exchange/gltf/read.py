@@ -139,7 +139,7 @@ class _GltfReader:
 
     def _decode(self, data: bytes, name: str) -> NDArray:
         try:
-            return decode_image(data, name, MAX_PIXELS)
+            return decode_image(data, name, MAX_PIXELS, self.lost)
         except Rejected as why:
             if why.reason != "texture_too_large":
                 raise

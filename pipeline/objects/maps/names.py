@@ -7,7 +7,8 @@ names have one, it is a color only where they belong to it, and otherwise it is 
 """
 
 import re
-from collections import defaultdict
+import unicodedata
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -39,6 +40,28 @@ _WORDS: Mapping[str, str] = {
 }
 """Words in file names, by the component that they stand for."""
 
+_OTHER_LANGUAGES: Mapping[str, str] = {
+    "base": "(?:grund)?farbe|diffus|couleur(?:[-_ ]?de[-_ ]?base)?|difuso|color[-_ ]?base|diffuso|"
+    "colore(?:[-_ ]?base)?|kolor|kleur|цвет|颜色|基础色|漫反射|ベースカラー|カラー",
+    "specular": "spekular|speculaire|especular|speculare",
+    "roughness": "rau(?:h?igk|h?h?)eit|rugosite|rugosidade?|rugosita|ruvid(?:ezza|ita)|"
+    "chropowatosc|ruwheid|шероховатость|粗糙度?|ラフネス|粗さ",
+    "metallic": "metall(?:isch|izitat)?|metalli(?:que|cite)|metalic(?:o|idade?)|metallico|"
+    "металличность|金属度?|メタリック",
+    "gloss": "glanz(?:grad)?|brillance|brillo|brilho|lucentezza|po[lł]ysk|glans|光泽度?|光沢",
+    "normal": "normale[nrs]?(?:map|karte|textur)?|normalna|нормал[иь]|法[线線](?:贴图)?|ノーマル",
+    "height": "hohe(?:n(?:map|karte))?|hoehe(?:n(?:map|karte))?|verschiebung|hauteur|"
+    "deplacement|altura|desplazamiento|altezza|wysokosc|hoogte|spostamento|deslocamento|высота|高度|置换|ハイト",
+    "occlusion": "(?:umgebungs)?(?:verdeckung|okklusion)|occlusion[-_ ]?ambiante|"
+    "oclusion(?:[-_ ]?ambiental)?|occlusione(?:[-_ ]?ambientale)?|oclusao|环境光遮蔽|遮蔽",
+    "opacity": "deckkraft|transparen(?:z|ce|cia)|opaci(?:te|dade?|ta)|trasparenza|不透明度?",
+    "emission": "leuchten|leuchtkraft|emissiv|emision|emissione|emissao|自发光|発光",
+    "other": "glanzlicht|reflexion|reflexao|riflessione|高光",
+    "preview": "vorschau|apercu|vista[-_ ]?previa|anteprima|预览",
+}
+"""The same in German, French, Spanish, Italian, Portuguese, Polish, Dutch, Russian, Chinese and
+Japanese, without accents."""
+
 _PACKED: Mapping[str, Mapping[str, int]] = {
     "orm": {"roughness": 1, "metallic": 2},
     "rma": {"roughness": 0, "metallic": 1},
@@ -60,7 +83,7 @@ PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".tga", ".webp", "
 """Suffixes of pictures, in lower case; of two pictures of one component, the earlier suffix wins.
 """
 
-_PLAIN = re.compile("(?i)metal|mask|alpha|depth|glow|emit|thickness|id")
+_PLAIN = re.compile("(?i)metall?|mask|alpha|depth|glow|emit|thickness|id")
 """Words that may also be the whole name of a color picture."""
 
 _LATER = (".webp", ".exr")
@@ -74,9 +97,12 @@ _TAIL = (
     rf"(?P<kind>(?:{_BETWEEN}(?:var)?\d{{1,2}})?)"
     rf"(?P<tail>(?:{_BETWEEN}(?:{_SIZE}|{_NOTHING}))*(?:{_BETWEEN}(?:metalness|specular|lod\d))?)"
 )
-_PARTS = "|".join(f"(?P<{part}>{words})" for part, words in _WORDS.items())
+_PARTS = "|".join(
+    f"(?P<{part}>{words}|{_OTHER_LANGUAGES.get(part, words)})" for part, words in _WORDS.items()
+)
 _NAME = re.compile(rf"(?i)(?:(?P<set>.+?){_BETWEEN})?(?:{_PARTS}){_TAIL}")
 _LETTER = re.compile(rf"(?i)(?P<set>.+?){_BETWEEN}(?P<letter>[a-z]){_TAIL}")
+_LAST_WORD = re.compile(r"(?P<set>.+)[-_. /]+(?P<word>[^\W\d_]{3,})")
 _FOLDERS = re.compile(
     r"(?i)(?:(?P<base>base[-_ ]?colou?rs?|albedos?|diffuse)|(?P<roughness>roughness)|(?P<metallic>"
     r"metallic|metalness)|(?P<gloss>gloss|glossiness)|(?P<normal>normals?)|(?P<height>heights?|"
@@ -85,11 +111,13 @@ _FOLDERS = re.compile(
 """Names of folders with one component each, whose files have the names of textures."""
 _CAMEL = re.compile(
     "(?<=[a-z0-9])(?=(?:Roughness|Normal|Albedo|BaseColou?r|Metallic|Metalness|Specular|Diffuse|"
-    "Displacement|Height|AmbientOcclusion|Glossiness|Opacity|Emissive|Colou?r|Rough)(?![a-z]))"
+    "Displacement|Height|AmbientOcclusion|Glossiness|Opacity|Emissive|Colou?r|Rough|"
+    "Farbe|Rauheit|Rauigkeit|Normale|Couleur|Rugosite|Rugosidad|Ruvidezza)(?![a-z]))"
 )
 _NO_COLOR = re.compile(
     r"(?i)(?:.*[-_. (])?(?:normals?(?:map)?|nrm|nmap|roughness|metallic|metalness|displacement|"
-    r"ao|height(?:map)?|specular|glossiness|opacity|emissive|d3d|dx(?:9|11)?|directx|opengl)"
+    r"ao|height(?:map)?|specular|glossiness|opacity|emissive|d3d|dx(?:9|11)?|directx|opengl|"
+    r"rauheit|rauigkeit|normale|rugosi\w+|hauteur|metalli(?:que|sch)|deckkraft|法[线線]|粗糙度?|金属度)"
     r"(?:[-_. )].*)?"
 )
 """Names with a word that rules out a color picture."""
@@ -146,7 +174,7 @@ def group_textures(
         else:
             parts[at][entry.part] = name
     for name in bare.unknown:
-        message = "its name says no part, beside names that do; end it in _color, or move it away"
+        message = "its name says no part that is known; end it in _color, or move it away"
         unused[name] = ("unknown_map", message)
     _drop_packed(parts.values(), unused)
     textures = {}
@@ -174,21 +202,41 @@ class _UnlabeledFiles:
         self.colors: dict[str, str] = {}
         """Stems by file name."""
         self.unknown: list[str] = []
+        repeated = _find_repeated(stem for name, stem in stems.items() if name not in named)
         for name, stem in stems.items():
             if name in named:
                 continue
             is_alone = stem.rpartition("/")[0] not in folders and not name.lower().endswith(".exr")
-            is_alone &= not _NO_COLOR.fullmatch(stem.rpartition("/")[2])
+            is_alone &= stem not in repeated
+            is_alone &= not _NO_COLOR.fullmatch(_without_accents(stem.rpartition("/")[2]))
             if is_alone or (stem in keys and stem not in with_color):
                 self.colors[name] = stem
             else:
                 self.unknown.append(name)
 
 
+def _find_repeated(stems: Iterable[str]) -> set[str]:
+    """Return the names of which several sets end in the same three words or more: parts, no colors.
+
+    The words may be of any language.
+    """
+    sets: dict[str, dict[str, str]] = defaultdict(dict)
+    for stem in stems:
+        if match := _LAST_WORD.fullmatch(stem):
+            sets[match["set"]][match["word"].lower()] = stem
+    counts = Counter(frozenset(words) for words in sets.values())
+    return {
+        stem
+        for words in sets.values()
+        for stem in words.values()
+        if len(words) > 2 and counts[frozenset(words)] > 1
+    }
+
+
 def _parse_name(path: str) -> _ParsedName | None:
     folder, slash, name = path.rpartition("/")
     inner = f"{folder}{slash}"
-    match = _NAME.fullmatch(_CAMEL.sub("_", name))
+    match = _match_name(name) or _match_name(_without_accents(name))
     if match is not None:
         part = next(part for part in _WORDS if match[part])
         if match["set"] is not None:
@@ -204,6 +252,14 @@ def _parse_name(path: str) -> _ParsedName | None:
         part = next(part for part, word in within.groupdict().items() if word)
         return _ParsedName(f"{above}{slash}{name}", path, part)
     return None
+
+
+def _match_name(name: str) -> re.Match[str] | None:
+    return _NAME.fullmatch(_CAMEL.sub("_", name))
+
+
+def _without_accents(name: str) -> str:
+    return "".join(c for c in unicodedata.normalize("NFD", name) if not unicodedata.combining(c))
 
 
 def _add_letters(stems: Mapping[str, str], named: dict[str, _ParsedName]) -> None:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from pipeline.foreign.light_pictures import read_linear_picture
+from pipeline.foreign.linear_picture import clip_to_unit
 from pipeline.foreign.picture import UNREADABLE_PICTURE
 from storage.errors import Rejected
 from storage.records.texture import MAX_SIDE
@@ -29,18 +30,22 @@ def picture_values(data: bytes, *, is_color: bool) -> tuple[NDArray[np.float32],
     linear = read_linear_picture(data, MAX_PIXELS, is_color=is_color)
     if linear is None:
         values, is_linear = _plain_values(data)
-        return (_encode(values) if is_linear and is_color else values), ()
-    values = linear.values[..., : 3 if linear.values.shape[2] >= 3 else 1]
-    if max(values.shape) > MAX_SIDE:
-        raise _too_large(values.shape[1], values.shape[0])
-    values = _unit_values(values)
-    return (_encode(values) if is_color else values), linear.unread
+        unread: tuple[str, ...] = ()
+    else:
+        values = linear.values[..., : 3 if linear.values.shape[2] >= 3 else 1]
+        is_linear = True
+        unread = linear.unread
+        if max(values.shape) > MAX_SIDE:
+            raise _too_large(values.shape[1], values.shape[0])
+    values, cut = clip_to_unit(values)
+    return (_encode(values) if is_linear and is_color else values), (*unread, *cut)
 
 
-def _unit_values(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    if not np.isfinite(values).all():
-        raise Rejected("not_a_number", "some of its values are no finite numbers; repair them")
-    return np.clip(values, 0, 1)
+def are_normals(values: NDArray[np.float32]) -> bool:
+    """Return whether nearly all values [H, W, 3] code unit vectors, most of them along +Z."""
+    vectors = 2 * values - 1
+    is_unit = np.abs(np.linalg.norm(vectors, axis=2) - 1) < 0.05
+    return values.shape[2] == 3 and bool((is_unit & (vectors[..., 2] > 0)).mean() > 0.98)
 
 
 def _encode(linear: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -66,7 +71,7 @@ def _plain_values(data: bytes) -> tuple[NDArray[np.float32], bool]:
             if image.mode in _MOST:
                 values = np.asarray(image, np.float32) / np.float32(_MOST[image.mode])
             elif image.mode == "F":
-                values = _unit_values(np.asarray(image, np.float32))
+                values = np.asarray(image, np.float32)
                 is_linear = True
             else:
                 mode = "L" if image.mode in ("1", "L", "LA") else "RGB"

@@ -14,7 +14,7 @@ from safetensors.numpy import save
 
 from pipeline.foreign.light_pictures import read_linear_picture
 from pipeline.objects.maps.names import TEXTURE_PARTS, packed_channels
-from pipeline.objects.maps.picture import picture_values
+from pipeline.objects.maps.picture import are_normals, picture_values
 from pipeline.objects.maps.radiance import usable_map
 from pipeline.objects.maps.texture_set import texture_set
 from storage.digests import canonical_json, sha256_hex
@@ -29,7 +29,7 @@ MOST_BYTES = 1 << 30
 MOST_ROWS = 4096
 """Largest number of rows of a map; columns are at most twice as many."""
 
-_RECIPE = 2
+_RECIPE = 3
 """Version of the outcomes; raise it when the result for a file changes."""
 
 _MOST_HEADER = 1 << 12
@@ -95,6 +95,10 @@ def prepare_map(map_files: MapFiles) -> tuple[bytes, tuple[str, ...]]:
         if packed_channels(part) and values.shape[2] < 3:
             unread.append(f"its {part}, which is grey: it has no channels")
         pictures[part] = values
+    if "base" in pictures and are_normals(pictures["base"]):
+        raise Rejected(
+            "unknown_map", "its values are unit vectors, as of a normal map; end it in _normal"
+        )
     result = texture_set(unpack_parts(pictures), map_files.size)
     maps = {"diffuse": result.diffuse_rgb, "specular": result.specular_rgb}
     if result.roughness is not None:

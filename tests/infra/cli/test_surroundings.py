@@ -76,11 +76,14 @@ def test_what_a_shell_leaves_a_run_is_one_sentence_or_works(tmp_path: Path) -> N
         f"{program} verify \"$(printf 'e\\033]0')\"": (1, r"e\x1b]0: no manifest.json here"),
         f"COLUMNS=0 MPLBACKEND=none PYTHONIOENCODING=ascii {program} convert s.json ö.glb | "
         r"grep -q '\\xf6.glb'": (0, ""),
+        f"SOURCE_DATE_EPOCH=abc {program} assets m --out n": (0, ""),
         f"{program} assets '~nobody-of-this-name/x' --out o": (1, "does not exist"),
         f"ulimit -n 9; {program} convert s.json s.glb": (1, "Too many open files); see"),
         f"ulimit -v 4000000; TMPDIR=$PWD/{'t' * 120} {program} convert s.json s.glb": (0, ""),
     }
     write_scene(tiny_scene(), tmp_path / "s.json")
+    (tmp_path / "m").mkdir()
+    (tmp_path / "m/m.obj").write_text(MESH)
     (tmp_path / ("t" * 120)).mkdir()
     for line, (status, said) in cases.items():
         with case(line):

@@ -22,6 +22,7 @@ from pipeline.foreign.polygons import triangulate
 from pipeline.foreign.source_file import SourceFile, read_source
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected
+from storage.records.exr import encode_channels
 from tests.for_each import case, for_each
 from tests.pipeline.assets.source_materials import textured_kit as kit
 from tests.pipeline.foreign.dialects import WRITERS, Polygons, Rng, draw_polygons
@@ -258,6 +259,19 @@ def test_statements_of_an_mtl_are_read_or_named(tmp_path: Path) -> None:
     assert made.unread == ("statement 'sparkle'", "ks above 1")
     red, green, blue = kit.seen_at(made.asset, 0, 0)
     assert red > 0.9 and max(green, blue) < 0.02
+
+
+def test_a_missing_material_and_cut_values_are_named_and_cost_nothing_else(tmp_path: Path) -> None:
+    wide = encode_channels({"RGB": np.full((4, 4, 3), 1.5, np.float32)})
+    files = {"m.mtl": b"newmtl m\nmap_Kd w.exr\n", "w.exr": wide}
+    path = placed(tmp_path, b"mtllib m.mtl\nusemtl m\nf 1/1 2/2 3/3\nusemtl gone\n", files)
+    read = read_source(path, ReadLimits(with_materials=True), tmp_path)
+    decode = Decoder(1 << 20)
+    parts = read_textured_mesh(read, decode, emission=False)
+    bases = [parts.materials[row].base for row in parts.material]
+    assert sorted(base is None for base in bases) == [False, True, True]
+    assert read.notes == ["material 'gone': no library has it; its faces have MTL's defaults"]
+    assert decode.notes == ["picture 'w.exr': values beyond [0, 1] (0 to 1.5)"]
 
 
 SHAPES: dict[str, tuple[int, float | None]] = {

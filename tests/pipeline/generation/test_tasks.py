@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 
 from infra.cli.changes import parse_changes
 from pipeline.generation.dataset_order import DatasetOrder, generate_words
-from pipeline.generation.machine import available_cores, children_of_gpu
+from pipeline.generation.machine import children_of_gpu
 from pipeline.generation.runner import Runner
 from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece, TaskBudget, TaskSizes, cut_tasks
 from pipeline.renders.visible_gpus import visible_gpus
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure, TrilightError
+from storage.machine import available_cores
 from tests.command_line import trilight
 from tests.for_each import for_each
 

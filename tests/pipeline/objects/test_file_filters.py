@@ -22,6 +22,8 @@ OUTPUTS = [
     "d/manifest.json d/logs/asked.json d/contact_sheet.png",
     "objects/y/0_light_0_6.obj templates/backgrounds/y/4_box_4.obj",
     "run/settings.json run/metrics.jsonl run/validation_sheet.png",
+    "coco/annotations/instances_test.json coco/test/000000003.0.png",
+    "hf/train/metadata.jsonl hf/train/000000003.0.png hf/train/000000003.0.triangle.tiff",
 ]
 
 
@@ -35,7 +37,7 @@ def test_outputs_of_ours_are_left_out_with_a_note(
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
             assert drop_outputs([*mine, *names.split()]) == mine
-    folder = re.split("/(?:assets|manifest|settings|0_light)", names)[0]
+    folder = re.split("/(?:assets|manifest|settings|0_light|annotations|metadata)", names)[0]
     (said,) = caplog.messages
     assert said.startswith(f"left out as outputs of Trilight: {folder}")
     for name in (*mine, *names.split()):

@@ -112,6 +112,11 @@ def test_a_file_without_our_metadata_is_no_scene() -> None:
         ({"objects": [1, 2]}, r"objects\[0\] is 1"),
         ({"objects": [{"name": "x", "kind": "shell"}]}, "exactly the fields attribution"),
         ({"provenance": []}, r"provenance is \[\]"),
+        ({"provenance": {"template": [5]}}, r"provenance.template is \[5\]; expected text"),
+        (
+            {"provenance": {"excursion": {"axis": "x"}}},
+            "excursion is .* expected an axis",
+        ),
         ({"provenance": {"x": float("nan")}}, "NaN is no JSON number"),
     ],
 )

@@ -81,6 +81,10 @@ def _find(folder: Path, kind: str = TEXTURE, licence: str | None = None) -> Foun
             tiles_color_2048x2048             tiles_2048x2048          base
             x_BaseColor.1001                  x.1001                   base
             OakRoughness                      Oak                      roughness
+            Holz_Höhe_2k                      Holz_2k                  height
+            HolzRauheit                       Holz                     roughness
+            bois_rugosité                     bois                     roughness
+            木_法线                           木                       normal
             oak_metalness                     oak                      metallic
             oak                               oak                      base
             metal                             metal                    base
@@ -133,6 +137,9 @@ def test_sets_are_found_and_the_rest_is_said(tmp_path: Path) -> None:
         ("m.png m_n.png m_s.png", {"m": "m.png"}, "m_n.png:map_not_used m_s.png:map_not_used"),
         ("Albedo_W.png Normal_W.png rock_n_dx11.png", {"Albedo_W": "Albedo_W.png"},
          "Normal_W.png:unknown_map rock_n_dx11.png:unknown_map"),
+        ("a_xx0.png b/aaa.png b/bbb.png b/ccc.png c/aaa.png c/bbb.png c/ccc.png",
+         {"a_xx0": "a_xx0.png"},
+         " ".join(f"{s}/{w * 3}.png:unknown_map" for s in "bc" for w in "abc")),
         ("rough_wall.png metal.png", {"metal": "metal.png", "rough_wall": "rough_wall.png"}, ""),
         ("albedo/o.png roughness/o.png", {"albedo/o": "albedo/o.png roughness/o.png"}, ""),
         ("o_diff.exr o_diff.png o_rough.exr o.png", {"o": "o_diff.png o_rough.exr"},
@@ -167,6 +174,12 @@ def test_packed_pictures_gloss_and_floats_are_parts(tmp_path: Path) -> None:
     ]
     eight, half = (decode_prepared(data, "a").arrays["diffuse"] for data in prepared)
     np.testing.assert_allclose(eight, half, rtol=1e-5)
+    wide = exr(tmp_path / "w.exr", np.full((4, 4, 3), 1.5, np.float32))
+    _, unread = prepare_map(MapFiles(kind=TEXTURE, files={"base": wide}, size=4))
+    assert unread == ("values beyond [0, 1] (0 to 1.5) of its base",)
+    up = png(tmp_path / "n.png", np.broadcast_to(np.array([140, 120, 254], np.uint8), (4, 4, 3)))
+    with pytest.raises(Rejected, match="unit vectors, as of a normal map"):
+        prepare_map(MapFiles(kind=TEXTURE, files={"base": up}, size=4))
 
 
 def test_a_catalogue_states_licences_and_silence_is_refused(tmp_path: Path) -> None:
