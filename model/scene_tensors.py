@@ -27,7 +27,11 @@ from storage.conventions import log10_radiance
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import PUBLISHED_COLUMNS, chosen_columns, laid_out, material_columns
-from storage.records.scene import MAX_POSITION_M, Scene
+from storage.records.scene import Scene
+
+MAX_NETWORK_M = 1000.0
+"""Farthest vertex coordinate that a network reads. At 11 radians per metre, float32 knows rotary
+angles so far out to half a thousandth of a radian; far beyond, pictures are wrong."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -132,14 +136,14 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
             None for all declared columns.
 
     Raises:
-        TrilightError: a vertex is farther than MAX_POSITION_M from the origin along an axis, or a
+        TrilightError: a vertex is farther than MAX_NETWORK_M from the origin along an axis, or a
             column is not declared.
     """
     farthest = np.abs(scene.vertex_positions).max()
-    if not farthest <= MAX_POSITION_M:  # also true for NaN
+    if not farthest <= MAX_NETWORK_M:  # also true for NaN
         raise TrilightError(
             f"scene: a vertex stands {farthest:g} m from the origin; the network reads up to "
-            f"{MAX_POSITION_M:g} m. Move the scene, with its cameras, towards the origin."
+            f"{MAX_NETWORK_M:g} m. Move the scene, with its cameras, towards the origin."
         )
     faces = scene.faces.astype(np.int64)
     if columns is None:

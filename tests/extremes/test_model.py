@@ -15,10 +15,9 @@ from model.config import SIZES
 from model.layers import LAYER_NORM_EPS, Norm
 from model.open import BUILTIN_TOKENS, open_network
 from model.positions import TriangleRotary
-from model.scene_tensors import SceneBatch, batch_scenes, scene_tensors
+from model.scene_tensors import MAX_NETWORK_M, SceneBatch, batch_scenes, scene_tensors
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
-from storage.records.scene import MAX_POSITION_M
 from tests.model.attention_reference import attend_reference
 from tests.model.kit import FAMILIES, awake, random_scene, tiny_config
 from tests.train.toy import toy_scene
@@ -76,7 +75,7 @@ def test_pictures_and_gradients_are_finite(family: str) -> None:
             assert torch.isfinite(weight.grad).all(), (emission, name)
 
 
-@pytest.mark.parametrize("distance", [1.0, 30.0, MAX_POSITION_M])
+@pytest.mark.parametrize("distance", [1.0, 30.0, MAX_NETWORK_M])
 def test_angles_keep_their_digits_to_the_farthest_position(distance: float) -> None:
     rotary = TriangleRotary(num_freqs=6, max_freq=11.0, head_width=128)
     exact = TriangleRotary(num_freqs=6, max_freq=11.0, head_width=128).double()
@@ -90,9 +89,9 @@ def test_angles_keep_their_digits_to_the_farthest_position(distance: float) -> N
 def test_a_vertex_beyond_is_refused_with_its_distance() -> None:
     scene = toy_scene(0)
     positions = scene.vertex_positions.copy()
-    positions[0, 0] = np.nextafter(np.float32(MAX_POSITION_M), np.float32(np.inf))
+    positions[0, 0] = np.nextafter(np.float32(MAX_NETWORK_M), np.float32(np.inf))
     at_the_end = positions.copy()
-    at_the_end[0, 0] = -MAX_POSITION_M
+    at_the_end[0, 0] = -MAX_NETWORK_M
     scene_tensors(dataclasses.replace(scene, vertex_positions=at_the_end))
     with pytest.raises(TrilightError, match="a vertex stands 1000 m from the origin"):
         scene_tensors(dataclasses.replace(scene, vertex_positions=positions))

@@ -86,7 +86,6 @@ BESIDE: dict[tuple[str, End], dict[str, Any]] = {
 NO_SCENE: dict[tuple[str, End], str] = {
     ("families.object_scale", "high"): "no_room",
     ("families.shell.scale", "low"): "no_room",
-    ("families.shell.scale", "high"): "law_broken",  # a vertex beyond MAX_POSITION_M
     ("families.shell.shift", "high"): "no_room",
     ("lights.scale", "high"): "emitter_inside",
     ("lights.distance", "low"): "emitter_inside",

@@ -268,7 +268,7 @@ def test_no_engine_takes_a_vertex_beyond_the_farthest_position(
     sources: tuple[str | Path, ...] = (described, f"{shard}::000000012")
     for engine, source in itertools.product(("mitsuba", "neural"), sources):
         told = mistake(source, "--engine", engine, "--out", tmp_path / "x.exr", *SMALL)
-        assert "vertex_positions[0, 0] is " in told and "expected from -1000 to 1000 m" in told
+        assert "vertex_positions[0, 0] is " in told and "expected from -10000 to 10000 m" in told
     assert not (tmp_path / "x.exr").exists()
 
 
