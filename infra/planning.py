@@ -20,6 +20,7 @@ from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.pipeline import make_task, prepare_dataset
 from pipeline.generation.render_children import close_children
 from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece
+from pipeline.renders.visible_gpus import visible_gpus
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
 from storage.dataset.progress import read_progress
@@ -38,6 +39,8 @@ _BYTES_PER_TASK_RUN = 19_400
 _BYTES_PER_SHARD = 180
 """Bytes of a row of the manifest: 172 for train-000123.tar, 178 for one in a subfolder."""
 _LONG_TASK_MINUTES = 10
+_VIEW_CORE_S = (38.0, 5.5), (46.0, 15.5)
+"""CPU seconds of a view of 256 pixels at two noise targets in dB: `make dataset`, and study S36."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,7 +178,7 @@ def describe_run(order: DatasetOrder, folder: DatasetFolder) -> str:
     if order.scenes_from or order.revisits or settings.revisit:
         return ""
     scenes = _num_scenes(order)
-    said = "; how long that takes is known after the first scenes, or before by `trilight plan`"
+    said = f"; {_rough_time(settings, scenes)}; `trilight plan` measures it"
     if folder.manifest.exists():
         manifest = read_manifest(folder.manifest)
         last = sample_logs(folder).last
@@ -197,6 +200,23 @@ def describe_run(order: DatasetOrder, folder: DatasetFolder) -> str:
     views = f"{settings.scenes.num_views} views each"
     counts = f"{_count_text(scenes, 'scene')} of {views} in {_count_text(shards, 'shard')}"
     return f"{counts}{lacking}{part}{said}"
+
+
+def _rough_time(settings: BuildSettings, scenes: int) -> str:
+    """Return about how long scenes take here, by the cost of scenes elsewhere."""
+    if visible_gpus():
+        return "how long that takes is known after the first scenes"
+    (low_db, low_s), (high_db, high_s) = _VIEW_CORE_S
+    target_db = settings.renders.targets_db.get("psnr_log_db", low_db)
+    power = (target_db - low_db) / (high_db - low_db)
+    pixels = (settings.renders.resolution / 256) ** 2
+    views = scenes * settings.scenes.num_views
+    cores = available_cores()
+    minutes = views * pixels * low_s * (high_s / low_s) ** power / cores / 60
+    said = (
+        _count_text(math.ceil(minutes), "minute") if minutes < 100 else f"{minutes / 60:,.0f} hours"
+    )
+    return f"roughly {said} on {_count_text(cores, 'core')}, where scenes cost what ours did"
 
 
 def _count_text(count: int, noun: str) -> str:

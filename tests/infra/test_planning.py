@@ -116,10 +116,13 @@ def test_what_a_run_will_make_is_said_before_it_begins(
     without_rendering(monkeypatch)
     order, folder = tiny_order(out=str(tmp_path), scenes=3), DatasetFolder(tmp_path)
     lacking = "no shard is for validation before --scenes 9"
-    unknown = "how long that takes is known after the first scenes, or before by `trilight plan`"
-    assert (
-        describe_run(order, folder) == f"3 scenes of 2 views each in 1 shard ({lacking}); {unknown}"
-    )
+    monkeypatch.setenv("TRILIGHT_CORES", "3")
+    rough = "roughly 1 minute on 3 cores, where scenes cost what ours did"
+    scenes = f"3 scenes of 2 views each in 1 shard ({lacking})"
+    assert describe_run(order, folder) == f"{scenes}; {rough}; `trilight plan` measures it"
+    for build, said in (("smoke", "3 minutes"), ("textured-256", "94 hours")):
+        text = describe_run(DatasetOrder(build=build, out=str(tmp_path / build)), folder)
+        assert f"roughly {said} on 3 cores" in text
     assert lacking in make_dataset(order, ThreadRunner()).notes
     said = describe_run(dataclasses.replace(order, scenes=9, shards="1:3"), folder)
     assert said.startswith("9 scenes of 2 views each in 3 shards, of which this run makes 1:3")
