@@ -15,6 +15,7 @@ import matplotlib.style
 import matplotlib.ticker
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
@@ -84,7 +85,9 @@ def panels(count: int, *, columns: int = 2, polar: Sequence[int] = ()) -> tuple[
 def encode_figure(figure: Figure, alt: str) -> Markup:
     """Return the figure as a picture for a page."""
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=_DPI, metadata={"Software": None})
+    figure.set_dpi(_DPI)
+    # by its canvas: `savefig` draws all once more for the layout, and a report has seven figures
+    FigureCanvasAgg(figure).print_png(stream, metadata={"Software": None})
     return image(data_uri(stream.getvalue()), alt, class_="wide")
 
 
