@@ -72,8 +72,9 @@ def _order_files(items: list[pytest.Item]) -> list[pytest.Item]:
     kinds = list(SLOW_KINDS)
     longest: dict[Path, tuple[float, int]] = {}
     for item in items:
-        ranks = [-kinds.index(mark.args[0]) for mark in item.iter_markers("slow")]
-        found = (_patience_s(item), max(ranks))
+        found = (_patience_s(item), -len(kinds))
+        for mark in item.iter_markers("slow"):
+            found = max(found, (_patience_s(item), -kinds.index(mark.args[0])))
         longest[item.path] = max(longest.get(item.path, found), found)
     return sorted(items, key=lambda item: longest[item.path], reverse=True)
 
