@@ -100,7 +100,9 @@ def test_one_picture_is_learned_by_heart() -> None:
     seen = whole.with_cameras(whole.c2w[:1], whole.fov_deg[:1])
     scene = training_scene(toy_sample_of(seen, 0, 64), 64)
     state = memorised([scene], smoke_model(), steps=500)
-    assert score(state, scene, scene) > 32  # measured: 36.0; 44.7 after 1200 steps, highlights and all
+    assert (
+        score(state, scene, scene) > 32
+    )  # measured: 36.0; 44.7 after 1200 steps, highlights and all
 
 
 @pytest.mark.slow("training")
