@@ -234,7 +234,7 @@ def test_a_run_of_one_s_own_file_by_the_real_command(
     made = trilight("generate", f"{build.name}:sunsets", *TINY, "--out", "d")
     assert made.returncode == 0, made.stderr
     quick = ("--set", "resolution=32", "--set", "views_per_scene=1", "--data", "d", "--out", "r")
-    train = ("train", f"{path.name}:quick_lights", "--steps", "12", *quick)
+    train = ("train", f"{path.name}:quick_lights", "--steps", "4", *quick)
     assert trilight(*train).returncode == 0
     resumed = trilight(*train, "--resume")
     assert resumed.returncode == 0, resumed.stderr
