@@ -71,11 +71,8 @@ def write_report(
     """
     folder = out or dataset.folder
     gallery = write_gallery(dataset, distributions.failures, folder, max_scenes)
-    made = (
-        {name: make(distributions) for name, make in _SECTIONS.items()}
-        if distributions.scenes
-        else {}
-    )
+    sections = _SECTIONS if distributions.scenes else {}
+    made = {name: make(distributions) for name, make in sections.items()}
     anchors = ["gallery", *(name for name, section in made.items() if section), "settings"]
     body = [
         element("h1", f"Dataset {dataset.manifest.build}"),
