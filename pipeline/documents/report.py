@@ -87,8 +87,7 @@ def write_report(
         _settings(dataset),
     ]
     title = f"Dataset {dataset.manifest.build}"
-    style = _STYLE + CONTROLS_STYLE
-    data = page(title, join_markup(body), style=style, script=CONTROLS_SCRIPT)
+    data = page(title, join_markup(body), style=_STYLE + CONTROLS_STYLE, script=CONTROLS_SCRIPT)
     write_atomically(folder.report, data)
     return folder.report
 
