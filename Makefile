@@ -7,6 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PATH := $(abspath $(BIN)):$(PATH)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export PYTHONDONTWRITEBYTECODE :=  # hundreds of processes would each compile 300 modules anew
 
 .PHONY: help setup setup-all dataset test test-slow test-elsewhere train release serve stop lint lock docs clean
 

@@ -17,21 +17,21 @@ BUDGET = json.loads((ROOT / "tests/architecture/budget.json").read_bytes())
 """What lines, words, options and the quick tests' seconds may be (test_budget.py)."""
 
 SLOW_KINDS = {
-    "benchmarks": "an experiment measured for real",
-    "browser": "a page in headless Chromium",
+    "servers": "Prefect, a database, a cluster or a bucket",
     "commands": "what documents tell a reader to type, as processes",
     "every": "every preset, object or example scene, where quick tests take two",
-    "gpu": "steps on a GPU that is not there",
-    "hostile": "hundreds of hostile inputs",
+    "training": "networks that learn, are compiled, or train in several processes",
+    "benchmarks": "an experiment measured for real",
     "kills": "processes that are killed, stopped or starved",
-    "memory": "sizes at the end of a range, and memory that must stay flat",
     "packaging": "the wheel, the site, the machine's own report",
     "references": "pictures and scenes compared with another program's",
-    "servers": "Prefect, a database, a cluster or a bucket",
+    "memory": "sizes at the end of a range, and memory that must stay flat",
     "statistics": "means over many samples or draws",
-    "training": "networks that learn, are compiled, or train in several processes",
+    "gpu": "steps on a GPU that is not there",
+    "hostile": "hundreds of hostile inputs",
+    "browser": "a page in headless Chromium",
 }
-"""The argument of every `slow` mark: why a test cannot be quick."""
+"""The argument of every `slow` mark: why a test cannot be quick; the longest kinds first."""
 
 
 @pytest.fixture
@@ -65,11 +65,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _order_files(items: list[pytest.Item]) -> list[pytest.Item]:
-    """Put files first that may last long; whole files are dealt, for they share servers."""
-    longest: dict[Path, float] = {}
+    """Put files first that may last long; whole files are dealt, for they share servers.
+
+    Among equal timeouts the kind decides: four minutes that come last keep the others waiting.
+    """
+    kinds = list(SLOW_KINDS)
+    longest: dict[Path, tuple[float, int]] = {}
     for item in items:
-        longest[item.path] = max(longest.get(item.path, 0.0), _patience_s(item))
-    return sorted(items, key=lambda item: -longest[item.path])
+        found = (_patience_s(item), -len(kinds))
+        for mark in item.iter_markers("slow"):
+            found = max(found, (_patience_s(item), -kinds.index(mark.args[0])))
+        longest[item.path] = max(longest.get(item.path, found), found)
+    return sorted(items, key=lambda item: longest[item.path], reverse=True)
 
 
 def _deal_items(items: list[pytest.Item], workers: int) -> list[pytest.Item]:

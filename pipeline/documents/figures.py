@@ -15,6 +15,7 @@ import matplotlib.style
 import matplotlib.ticker
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
@@ -72,7 +73,7 @@ def panels(count: int, *, columns: int = 2, polar: Sequence[int] = ()) -> tuple[
     """Return a figure of `count` panels; those in `polar` have polar axes."""
     rows = -(-count // columns)
     width, height = _PANEL_INCHES
-    figure = Figure(figsize=(columns * width, rows * height))
+    figure = Figure(figsize=(columns * width, rows * height), dpi=_DPI)
     figure.set_layout_engine("constrained", w_pad=0.07, h_pad=0.06, wspace=0.04)
     axes = [
         figure.add_subplot(rows, columns, k + 1, projection="polar" if k in polar else None)
@@ -84,7 +85,8 @@ def panels(count: int, *, columns: int = 2, polar: Sequence[int] = ()) -> tuple[
 def encode_figure(figure: Figure, alt: str) -> Markup:
     """Return the figure as a picture for a page."""
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=_DPI, metadata={"Software": None})
+    # by its canvas: `savefig` draws all once more for the layout, and a report has seven figures
+    FigureCanvasAgg(figure).print_png(stream, metadata={"Software": None})
     return image(data_uri(stream.getvalue()), alt, class_="wide")
 
 
@@ -156,7 +158,8 @@ def stacked_bars(
         xlabel: label of the lengths.
     """
     width, height = _PANEL_INCHES
-    figure = Figure(figsize=(2 * width, max(height, 0.8 + 0.21 * len(bars))), layout="constrained")
+    size = (2 * width, max(height, 0.8 + 0.21 * len(bars)))
+    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
     axes = figure.add_subplot()
     offset = np.zeros(len(bars))
     rows = np.arange(len(bars))

@@ -71,11 +71,8 @@ def write_report(
     """
     folder = out or dataset.folder
     gallery = write_gallery(dataset, distributions.failures, folder, max_scenes)
-    made = (
-        {name: make(distributions) for name, make in _SECTIONS.items()}
-        if distributions.scenes
-        else {}
-    )
+    sections = _SECTIONS if distributions.scenes else {}
+    made = {name: make(distributions) for name, make in sections.items()}
     anchors = ["gallery", *(name for name, section in made.items() if section), "settings"]
     body = [
         element("h1", f"Dataset {dataset.manifest.build}"),
@@ -90,8 +87,7 @@ def write_report(
         _settings(dataset),
     ]
     title = f"Dataset {dataset.manifest.build}"
-    style = _STYLE + CONTROLS_STYLE
-    data = page(title, join_markup(body), style=style, script=CONTROLS_SCRIPT)
+    data = page(title, join_markup(body), style=_STYLE + CONTROLS_STYLE, script=CONTROLS_SCRIPT)
     write_atomically(folder.report, data)
     return folder.report
 

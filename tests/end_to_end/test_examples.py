@@ -179,9 +179,7 @@ def test_an_executor_is_a_runner(copied: Callable[[str], Path]) -> None:
                 load_extensions(nothing)
 
 
-TINY = (
-    "--resolution", "32", *FEW_SAMPLES, "--set", "splits.scenes_per_shard=1",
-)  # fmt: skip
+TINY = ("--resolution", "32", "--scenes", "4", *FEW_SAMPLES)
 
 
 @pytest.mark.slow("commands")
@@ -189,12 +187,15 @@ TINY = (
 def test_data_of_one_s_own_files_by_the_real_command(
     copied: Callable[[str], Path], trilight: Trilight, tmp_path: Path
 ) -> None:
-    """Executor, source, template, family: the same bytes by another executor; then the checks."""
+    """Executor, source, template, family: the same bytes by another executor; then the checks.
+
+    Two shards, both for training: the executor starts a process for each.
+    """
     for name in FILES:
         copied(name)
     own = ("--extend", "template.py", "--extend", "object_source.py")
-    families = ("--set", 'scenes.families=["corridor", "plane-single"]')
-    asked = ("generate", "smoke", *own, "--objects", "dice:40", "--scenes", "6", *TINY, *families)
+    drawn = ("--set", 'scenes.families=["corridor", "plane-single"]', "--objects", "dice:40")
+    asked = ("generate", "smoke", *own, *TINY, *drawn, "--set", "splits.scenes_per_shard=2")
     ran = trilight(*asked, "--extend", "executor.py", "--runner", "commands", "--out", "a")
     assert ran.returncode == 0, ran.stderr
     assert trilight(*asked, "--out", "b").returncode == 0
@@ -218,7 +219,8 @@ def test_data_of_one_s_own_files_by_the_real_command(
     assert trained.returncode == 0, trained.stderr
     record = json.loads((tmp_path / "r" / "settings.json").read_text())
     assert list(record["extensions"]) == ["model_size.py"]
-    judged = trilight("evaluate", "r", "--data", "a", "--extend", "metric.py", "--out", "j")
+    data = ("--data", "a", "--split", "train")
+    judged = trilight("evaluate", "r", *data, "--extend", "metric.py", "--out", "j")
     assert judged.returncode == 0, judged.stderr
     assert "relative_mse" in (tmp_path / "j" / "evaluation.md").read_text()
 
@@ -229,10 +231,10 @@ def test_a_run_of_one_s_own_file_by_the_real_command(
     copied: Callable[[str], Path], trilight: Trilight, tmp_path: Path
 ) -> None:
     path, build = copied("run.py"), copied("build.py")
-    made = trilight("generate", f"{build.name}:sunsets", *TINY, "--scenes", "6", "--out", "d")
+    made = trilight("generate", f"{build.name}:sunsets", *TINY, "--out", "d")
     assert made.returncode == 0, made.stderr
     quick = ("--set", "resolution=32", "--set", "views_per_scene=1", "--data", "d", "--out", "r")
-    train = ("train", f"{path.name}:quick_lights", "--steps", "12", *quick)
+    train = ("train", f"{path.name}:quick_lights", "--steps", "4", *quick)
     assert trilight(*train).returncode == 0
     resumed = trilight(*train, "--resume")
     assert resumed.returncode == 0, resumed.stderr

@@ -1,5 +1,6 @@
 """What commands say first and last: words before work, and next steps that run as printed."""
 
+import json
 import os
 import shlex
 import signal
@@ -142,12 +143,19 @@ def test_what_generate_names_runs_for_eight_scenes(trilight: Trilight, tmp_path:
     assert _ran(trilight, "shards", "select", MINE, *halves) == [["verify", "data/a part"]]
     _ran(trilight, "verify", "data/a part")
 
-    shard = tmp_path / MINE / "train-000001.tar"
-    shard.write_bytes(shard.read_bytes()[:-1])
+    root = tmp_path / MINE
+    whole = {path.name: path.read_bytes() for path in root.glob("*.tar")}
+    kept, shard = (root / f"train-00000{number}.tar" for number in range(2))
+    manifest, made_ns = read_manifest(root / "manifest.json"), kept.stat().st_mtime_ns
+    shard.write_bytes(whole[shard.name][:-1])
     (repair,) = _ran(trilight, "verify", MINE, status=1)
     assert repair == ["verify", MINE, "--repair"]
+    assert json.loads(trilight("verify", MINE, "--json").stdout)["bad_shards"] == [shard.name]
     assert _ran(trilight, *repair) == []
-    _ran(trilight, "verify", MINE)
+    assert {path.name: path.read_bytes() for path in root.glob("*.tar")} == whole
+    assert read_manifest(root / "manifest.json") == manifest
+    assert kept.stat().st_mtime_ns == made_ns, "only the bad one is made anew"
+    assert not list(root.glob("*.bad"))
     _ran(trilight, *train, "--steps", "4")
 
 

@@ -1,4 +1,4 @@
-"""`trilight generate` on real files, shards made anew, and mistakes that one line answers."""
+"""`trilight generate` on real files, and mistakes that one line answers."""
 
 import json
 import shutil
@@ -51,6 +51,7 @@ BAD_INPUT = [
         "'TRILIGHT_SOURCE_X' is not set",
     ),
     (("verify", "empty"), "no manifest.json"),
+    (("verify", "http://127.0.0.1:1/set", "--repair"), "cannot be read"),
     (("train", "smoke", "--data", "empty"), "no manifest.json"),
     (("shards", "select", "empty", "--out", "c", "--split", "no"), "--split is 'no'"),
 ]
@@ -67,41 +68,6 @@ def test_bad_input_is_one_clear_line(refused: Callable[..., str], tmp_path: Path
     (tmp_path / "twice" / "objects.jsonl").write_text(2 * (json.dumps(row) + "\n"))
     for arguments, message in BAD_INPUT:
         assert message in refused(*arguments), arguments
-
-
-TWO_SHARDS = (
-    "--scenes", "8", "--seed", "3", "--resolution", "32", "--noise-floor", "20", *SIXTEEN_SAMPLES,
-    "--set", "scenes.num_views=2", "--set", "scenes.families.0.weight=2",
-)  # fmt: skip
-
-
-@pytest.mark.slow("commands")
-def test_bad_and_missing_shards_are_made_anew(
-    trilight: Trilight, refused: Callable[..., str], tmp_path: Path
-) -> None:
-    made = trilight("generate", "smoke", "--out", "set", *TWO_SHARDS)
-    assert made.returncode == 0, made.stderr
-    root = tmp_path / "set"
-    names = sorted(path.name for path in root.glob("*.tar"))
-    assert len(names) == 2
-    whole = {name: (root / name).read_bytes() for name in names}
-    manifest = json.loads((root / "manifest.json").read_text())
-    times = {name: (root / name).stat().st_mtime_ns for name in names}
-
-    damaged = bytearray(whole[names[1]])
-    damaged[len(damaged) // 2] ^= 1
-    (root / names[1]).write_bytes(damaged)
-    found = trilight("verify", "set", "--json")
-    assert found.returncode == 1
-    assert json.loads(found.stdout)["bad_shards"] == [names[1]]
-
-    repaired = trilight("verify", "set", "--repair")
-    assert repaired.returncode == 0, repaired.stdout + repaired.stderr
-    assert {name: (root / name).read_bytes() for name in names} == whole
-    assert json.loads((root / "manifest.json").read_text()) == manifest
-    assert (root / names[0]).stat().st_mtime_ns == times[names[0]]
-    assert not list(root.glob("*.bad"))
-    assert "cannot be read" in refused("verify", "http://127.0.0.1:1/set", "--repair")
 
 
 EXACT = (

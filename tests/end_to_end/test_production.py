@@ -5,7 +5,6 @@ import json
 import os
 import shlex
 import subprocess
-import sys
 import time
 import urllib.request
 from pathlib import Path
@@ -169,21 +168,3 @@ def _refuses_secrets(tmp_path: Path, environment: dict[str, str], database: Post
     for place in (tmp_path / "state", tmp_path / "prefect"):
         for path in place.rglob("*"):
             assert not path.is_file() or CANARY.encode() not in path.read_bytes(), path
-
-
-@pytest.mark.slow("servers")
-def test_ranges_at_the_same_time_and_who_is_last_finishes(
-    tmp_path: Path,
-) -> None:
-    command = [sys.executable, "-m", "trilight", "generate", "smoke", *OPTIONS]
-    command += ["--scenes", str(SCENES)]
-    runs = [
-        subprocess.Popen([*command, "--out", str(tmp_path / "set"), "--shards", shards])
-        for shards in ("0:1", "0:2")
-    ]
-    assert [run.wait(RUN_S) for run in runs] == [0, 0]
-    _generate(tmp_path / "plain")
-    assert _verified(tmp_path / "set") == _verified(tmp_path / "plain")
-    # nothing was made twice
-    rows = [line for path in (tmp_path / "set" / "logs").glob("*.jsonl") for line in path.open()]
-    assert len(rows) == SCENES

@@ -289,7 +289,7 @@ def test_the_lines_of_the_readme_need_nothing_exported(server: Server, tmp_path:
     """The server has started; a run ends as its documents say."""
     checkout = server.folder.parent
     run = documented_run(
-        objects="builtin:24",
+        objects="builtin:6",
         scenes=4,
         resolution=64,
         changes=json.dumps(FEW_SAMPLES_CHANGES),

@@ -99,8 +99,10 @@ def test_one_picture_is_learned_by_heart() -> None:
     whole = toy_scene(0)
     seen = whole.with_cameras(whole.c2w[:1], whole.fov_deg[:1])
     scene = training_scene(toy_sample_of(seen, 0, 64), 64)
-    state = memorised([scene], smoke_model(), steps=1200)
-    assert score(state, scene, scene) > 40  # measured: 44.7, highlights and all
+    state = memorised([scene], smoke_model(), steps=500)
+    assert (
+        score(state, scene, scene) > 32
+    )  # measured: 36.0; 44.7 after 1200 steps, highlights and all
 
 
 @pytest.mark.slow("training")

@@ -30,7 +30,7 @@ from tests.command_line import trilight
 from tests.for_each import case
 
 TINY = dataclasses.replace(
-    QUICK, scenes=1, resolution=32, max_spp=128, reference_spp=128, picture_px=64, objects=2,
+    QUICK, scenes=1, resolution=32, max_spp=128, reference_spp=128, picture_px=64, objects=1,
     repeats=1, steps=2, held_out=2, growth=1,
 )  # fmt: skip
 

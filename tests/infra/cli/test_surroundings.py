@@ -102,8 +102,7 @@ def test_no_command_runs_a_file_of_the_folder(tmp_path: Path) -> None:
     fresh = str(tmp_path / "cache")  # so that renderers are tried anew
     torchrun = command("train", "smoke", "--data", "set", "--steps", "1", "--processes", "2")
     for words in (
-        [*GENERATE, "set"],
-        [*GENERATE, "served", "--runner", "prefect"],
+        [*GENERATE, "set", "--runner", "prefect"],
         command("assets", ".", "--own-materials", "--out", "meshes"),
         command("doctor"),
         command("convert", "scene.json", "scene.glb"),

@@ -276,7 +276,7 @@ def records(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Obje
 
 
 def test_a_cross_section_of_them(records: list[ObjectRecord]) -> None:
-    """One in twenty-seven, a scan among them; all of them are a slow test."""
+    """One in twenty-seven, a scan among them; half of them are a slow test."""
     for record in records[::27]:
         check(prepare(Path(record.path), SETTINGS))
 
@@ -294,7 +294,8 @@ def test_copies_in_other_colours_share_their_geometry(records: list[ObjectRecord
 
 
 @pytest.mark.slow("every")
-def test_all_of_them(records: list[ObjectRecord]) -> None:
+def test_half_of_them(records: list[ObjectRecord]) -> None:
+    """Of the other half tests/end_to_end/identity.py holds the bytes."""
     assert len(records) == 148
-    for record in records:
+    for record in records[1::2]:
         check(prepare(Path(record.path), SETTINGS))
