@@ -3,12 +3,12 @@
 It holds no time, machine or order of work: equal datasets give equal cards.
 """
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from pipeline.documents.distributions import MEASURED, Distributions
 from pipeline.documents.markdown import code, front_matter, table, text
-from pipeline.documents.report_maps import maps_in_words
 from pipeline.documents.rights import Rights, hub_licence, rights_markdown
 from storage.dataset.derived import Derivation, derivation_of
 from storage.dataset.layout import DatasetFolder
@@ -187,11 +187,41 @@ def _contents(manifest: Manifest, distributions: Distributions) -> str:
             f"{len(distributions.failures)}, each with its reason in failures.jsonl",
         ),
     ]
-    rows[1:1] = list(maps_in_words(distributions).items())
+    rows[1:1] = _maps(distributions)
     if triangles["count"]:
         spread = f"median {triangles['median']:.0f}, most {triangles['max']:.0f}"
         rows.insert(1, ("triangles of a scene", spread))
     return table(("", ""), rows)
+
+
+def _maps(distributions: Distributions) -> list[tuple[str, str]]:
+    """Return a row for textures and one for skies, if there are any."""
+    scenes = sum(distributions.scenes.values())
+    textures = distributions.all("textures_per_scene")
+    skies = distributions.all("skies_per_scene")
+    families = Counter(kind for kind, _ in distributions.maps)
+    rows = []
+    if (textures > 0).any():
+        words = (
+            f"{int((textures > 0).sum())} of {scenes} scenes, {int(textures.sum())} maps of "
+            f"{families['texture']} families, {_range(distributions, 'texture_width', 0)} texels "
+            "wide"
+        )
+        rows.append(("textures", words))
+    if (skies > 0).any():
+        words = (
+            f"{int((skies > 0).sum())} of {scenes} scenes, {families['sky']} families, mean "
+            f"radiance {_range(distributions, 'sky_radiance', 2)}; half of the light of one comes "
+            f"from {_range(distributions, 'sky_half_light_deg', 1)} degrees"
+        )
+        rows.append(("skies", words))
+    return rows
+
+
+def _range(distributions: Distributions, name: str, digits: int) -> str:
+    values = distributions.all(name)
+    low, high = (f"{value:.{digits}f}" for value in (values.min(), values.max()))
+    return low if low == high else f"{low} to {high}"
 
 
 def _user_maps(distributions: Distributions) -> list[tuple[str, str]]:

@@ -1,0 +1,86 @@
+"""HTML pages from the templates in `templates/`; they load nothing, and all text is escaped.
+
+Only the text of a template is markup. Every page has the same style and may run one script.
+"""
+
+import base64
+import hashlib
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import urlsplit
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from pipeline.documents.png import encode_png
+
+
+class Figure(NamedTuple):
+    """Picture that can be enlarged."""
+
+    source: str
+    """Address of the picture."""
+    name: str
+    """Text in place of the picture."""
+    caption: str
+
+
+_TEMPLATES = Path(__file__).with_name("templates")
+_SCRIPT = (_TEMPLATES / "page.js").read_text()
+
+
+def render_page(template: str, title: str, **values: object) -> bytes:
+    """Return a page.
+
+    Args:
+        template: name of a file of `templates/`.
+        title: title of the page.
+        values: what the template shows.
+    """
+    text = _ENVIRONMENT.get_template(template).render(title=title, **values)
+    # a lone surrogate, which untrusted JSON may hold, has no UTF-8
+    return text.encode(errors="replace")
+
+
+def is_address(url: str) -> bool:
+    """Return True where an untrusted text is a plain http or https address, fit for a link."""
+    try:
+        parts = urlsplit(url)
+        harmless = parts.scheme in ("http", "https") and bool(parts.hostname)
+    except ValueError:
+        return False
+    return harmless and "@" not in parts.netloc and url.isprintable() and " " not in url
+
+
+def png_uri(pixels: NDArray[np.uint8]) -> str:
+    """Return a picture, [H, W] grey or [H, W, 3] RGB, as a data URI."""
+    return data_uri(encode_png(pixels))
+
+
+def data_uri(png: bytes) -> str:
+    """Return the bytes of a PNG file as a data URI."""
+    return "data:image/png;base64," + base64.b64encode(png).decode()
+
+
+def _make_environment() -> Environment:
+    made = Environment(
+        loader=FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.tests["address"] = is_address
+    made.filters["png"] = png_uri
+    digest = hashlib.sha256(_SCRIPT.encode()).digest()
+    made.globals |= {
+        "style": Markup((_TEMPLATES / "page.css").read_text()),
+        "script": Markup(_SCRIPT),
+        "script_sha256": base64.b64encode(digest).decode(),
+    }
+    return made
+
+
+_ENVIRONMENT = _make_environment()
