@@ -62,7 +62,7 @@ class Panel:
     label: str
     """Label below the histogram, or above the rose."""
     unit: str = ""
-    """What is counted: label of the vertical axis."""
+    """Label of the vertical axis: the things that are counted."""
     marks: Mapping[str, float] = field(default_factory=dict)
     """Vertical lines at values, by name."""
     bounds: tuple[float, float] | None = None

@@ -47,7 +47,7 @@ class Card:
     layout: str
     """Template of the scene; empty if unknown."""
     views: str
-    """Whether a view stopped at the cap."""
+    """Choice by the sampling of the views: one stopped at the cap, or none."""
     orders: Sequence[float]
     """Values to sort by, one for each order; the least value comes first."""
 

@@ -21,7 +21,7 @@ class Figure(NamedTuple):
     """Picture that can be enlarged."""
 
     source: str
-    """Address of the picture."""
+    """Address, often of the data itself."""
     name: str
     """Text in place of the picture."""
     caption: str

@@ -20,15 +20,6 @@ _ATTEMPTS = {
     "later": (4, math.inf),
 }
 """First and last attempt by column."""
-_COUNTED = {
-    "scene": "scenes",
-    "object": "objects",
-    "surface": "surfaces",
-    "texture": "textures",
-    "light": "lights",
-    "sky": "skies",
-    "view": "views",
-}
 _LIMITS = {
     "triangles_per_scene": ("budget", "max_triangles"),
     "spp": ("cap", "max_spp"),
@@ -53,58 +44,36 @@ class Part(NamedTuple):
     """Figure with tables and notes beside it."""
 
     figure: str
-    """Address of the picture; empty for none."""
+    """Data URI; empty for none."""
     alt: str
     tables: Sequence[Table]
     notes: Sequence[str] = ()
 
 
-class Section(NamedTuple):
-    """Parts below a heading."""
-
-    name: str
-    """Anchor of the heading."""
-    title: str
-    parts: Sequence[Part]
-
-
-def report_sections(distributions: Distributions) -> list[Section]:
-    """Return the sections; none without scenes, and without maps none on maps."""
+def report_sections(distributions: Distributions) -> dict[str, list[Part]]:
+    """Return the parts below each title; none without scenes, and without maps none on maps."""
     if not distributions.scenes:
-        return []
-    lit = ("lights_per_scene", "total_emission", "light_distance", "light_size")
-    seen = ("camera_distance", "elevation_deg", "fov_deg", "azimuth_deg")
+        return {}
+    triangles = ("triangles_per_scene", "triangles_per_object")
+    emitted = ("lights_per_scene", "total_emission", "light_distance", "light_size")
+    seen_from = ("camera_distance", "elevation_deg", "fov_deg", "azimuth_deg")
     measured = (*MEASURED.values(), "spp", "coverage")
     replaced = int((distributions.all("camera_attempt") > 0).sum())
-    triangles = ("triangles_per_scene", "triangles_per_object")
-    return [
-        Section("scenes", "Scenes", [_scenes(distributions)]),
-        Section("objects", "Objects", [_objects(distributions)]),
-        Section("triangles", "Triangles", [_histograms(distributions, triangles)]),
-        Section("materials", "Materials", [_materials(distributions)]),
-        *(
-            [Section("maps", "Textures and skies", [_maps(distributions), _sizes(distributions)])]
-            if distributions.maps
-            else []
-        ),
-        Section("lights", "Lights", [_histograms(distributions, lit)]),
-        Section(
-            "cameras",
-            "Cameras",
-            [
-                _histograms(
-                    distributions, seen, notes=[f"{replaced} cameras stand in for rejected ones."]
-                )
-            ],
-        ),
-        Section(
-            "pictures",
-            "Pictures",
-            [_histograms(distributions, measured, tables=[_floors_by_split(distributions)])],
-        ),
-        Section("rejections", "Rejections", [_rejections(distributions)]),
-        Section("licences", "Licences", [_licences(distributions)]),
-    ]
+    note = f"{replaced} cameras stand in for rejected ones."
+    floors = _floors_by_split(distributions)
+    maps = [_maps(distributions), _map_sizes(distributions)] if distributions.maps else []
+    return {
+        "Scenes": [_scenes(distributions)],
+        "Objects": [_objects(distributions)],
+        "Triangles": [_histograms(distributions, triangles)],
+        "Materials": [_materials(distributions)],
+        **({"Textures and skies": maps} if maps else {}),
+        "Lights": [_histograms(distributions, emitted)],
+        "Cameras": [_histograms(distributions, seen_from, notes=[note])],
+        "Pictures": [_histograms(distributions, measured, tables=[floors])],
+        "Rejections": [_rejections(distributions)],
+        "Licences": [_licences(distributions)],
+    }
 
 
 def _histograms(
@@ -134,7 +103,7 @@ def _panel(distributions: Distributions, name: str) -> Panel:
     return Panel(
         values=distributions.all(name),
         label=quantity.label,
-        unit=_COUNTED[quantity.per],
+        unit={"sky": "skies"}.get(quantity.per, f"{quantity.per}s"),
         marks={} if limit is None else {f"{word} {limit:g}": limit},
         bounds=(0, 1) if quantity.per == "surface" else None,
         is_log=name == "sky_peak",
@@ -157,21 +126,17 @@ def _bars(names: Sequence[str], parts: Mapping[str, Sequence[int]], label: str) 
 
 
 def _scenes(distributions: Distributions) -> Part:
+    names = distributions.templates
     counts = {
-        split: [distributions.scenes.get((name, split), 0) for name in distributions.templates]
+        split: [distributions.scenes.get((name, split), 0) for name in names]
         for split in distributions.splits
     }
-    columns = {**counts, "all": [sum(row) for row in zip(*counts.values(), strict=True)]}
     rows = [
-        [name, *row]
-        for name, row in zip(
-            [*distributions.templates, "all"],
-            zip(*([*column, sum(column)] for column in columns.values()), strict=True),
-            strict=True,
-        )
+        [name, *(of_split[row] for of_split in counts.values())] for row, name in enumerate(names)
     ]
-    figure = _bars(distributions.templates, counts, "scenes")
-    return Part(figure, "scenes by template and split", [Table(["template"], [*columns], rows)])
+    rows.append(["all", *map(sum, counts.values())])
+    table = Table(["template"], [*counts, "all"], [[*row, sum(row[1:])] for row in rows])
+    return Part(_bars(names, counts, "scenes"), "scenes by template and split", [table])
 
 
 def _objects(distributions: Distributions) -> Part:
@@ -224,7 +189,7 @@ def _maps(distributions: Distributions) -> Part:
     return Part(figure, "scenes by family of texture and of sky", tables)
 
 
-def _sizes(distributions: Distributions) -> Part:
+def _map_sizes(distributions: Distributions) -> Part:
     textured, sky_lit = (len(distributions.all(name)) for name in ("texture_width", "sky_radiance"))
     names = (
         *(("textures_per_scene", "texture_width") if textured else ()),

@@ -22,9 +22,9 @@ class ShownMap(NamedTuple):
     """A texture or a sky, as a page shows it."""
 
     source: MapSource
-    """Its name and rights."""
+    """Name, licence and author."""
     what: str
-    """Use of the map."""
+    """Columns of the material that it gives, or whether cameras see the sky."""
     size: str
     """Width and height in texels."""
     caption: str

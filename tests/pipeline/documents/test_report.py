@@ -219,7 +219,7 @@ def test_the_report_and_the_card_count_maps_and_scenes_show_them(mapped: Dataset
     assert "objects textured 0 floors and walls textured 2 66.7%" in text
     assert "texture colours 0 2 texture roughness 2" in text and "sky sky 0 1" in text
     assert "mean radiance of a sky 1 0.250 0.250 0.250 0.250 0.250 0.250" in text
-    assert "#maps" in page.links
+    assert "#textures-and-skies" in page.links
     found = dataset_distributions(mapped)
     card = encode_card(mapped.folder, mapped.manifest, found, rights_of(found.objects)).decode()
     assert "2 of 3 scenes, 4 maps of 2 families, 2 to 6 texels wide" in card
@@ -235,7 +235,7 @@ def test_a_plain_dataset_has_no_such_section(dataset: Dataset, five: dict[str, T
     found = dataset_distributions(dataset)
     card = encode_card(dataset.folder, dataset.manifest, found, rights_of(found.objects))
     assert b"textures" not in card and b"skies" not in card
-    assert "#maps" not in five["report"].links
+    assert "#textures-and-skies" not in five["report"].links
 
 
 def test_a_texture_is_shown_as_it_lies() -> None:
