@@ -90,6 +90,13 @@ class Distributions:
         return [split for split in SPLITS if split in self.values]
 
     @property
+    def scenes_by_split(self) -> dict[str, int]:
+        return {
+            split: sum(count for (_, of), count in self.scenes.items() if of == split)
+            for split in self.splits
+        }
+
+    @property
     def templates(self) -> list[str]:
         return sorted({template for template, _ in self.scenes})
 

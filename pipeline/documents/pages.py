@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup  # of jinja2
 from numpy.typing import NDArray
 
 from pipeline.documents.png import encode_png

@@ -42,16 +42,21 @@ def write_report(
     folder = out or dataset.folder
     manifest = dataset.manifest
     cards = write_gallery(dataset, distributions.failures, folder, max_scenes)
+    floors = {
+        QUANTITIES[name].label.removesuffix(", dB"): summary(distributions.all(name))
+        for name in MEASURED.values()
+    }
     # those of the sources of a derived dataset stand in the manifest
     settings = {name: value for name, value in manifest.settings.items() if name != "derived"}
     page = render_page(
         "report.html",
         f"Dataset {manifest.build}",
         manifest=manifest,
-        summary=_in_one_line(dataset, distributions),
+        found=distributions,
+        num_views=len(distributions.all("noise_floor_db")),
+        floors={label: numbers for label, numbers in floors.items() if numbers["count"]},
         cards=cards,
         filters=gallery_filters(cards),
-        overview=list(_overview(dataset, distributions)),
         passes_command=passes_command(),
         sections=report_sections(distributions),
         most_used=_most_used(distributions),
@@ -60,38 +65,6 @@ def write_report(
     )
     write_atomically(folder.report, page)
     return folder.report
-
-
-def _in_one_line(dataset: Dataset, distributions: Distributions) -> str:
-    """Return the summary line of the dataset, shown above its pictures."""
-    manifest = dataset.manifest
-    floors = summary(distributions.all("noise_floor_db"))
-    median = f", median noise floor {floors['median']:.1f} dB" if floors["count"] else ""
-    views = len(distributions.all("noise_floor_db"))
-    return (
-        f"{manifest.num_samples} scenes, {views} views{median}, {manifest.num_bytes / 1e6:.1f} MB"
-    )
-
-
-def _overview(dataset: Dataset, distributions: Distributions) -> Iterator[tuple[str, str]]:
-    """Yield facts of the dataset, as names and values."""
-    if distributions.sample:
-        yield "what follows is", distributions.sample
-    counts = {split: 0 for split in distributions.splits}
-    for (_, split), count in distributions.scenes.items():
-        counts[split] += count
-    scenes = ", ".join(f"{count} {split}" for split, count in counts.items())
-    yield "scenes", f"{sum(counts.values())} ({scenes or 'none'})"
-    views = len(distributions.all("noise_floor_db"))
-    yield "views", f"{views}, {dataset.manifest.num_views} of each scene"
-    for name in MEASURED.values():
-        floors = summary(distributions.all(name))
-        if floors["count"]:
-            text = f"median {floors['median']:.1f} dB, 5th percentile {floors['p5']:.1f} dB"
-            yield QUANTITIES[name].label.removesuffix(", dB"), text
-    in_scenes = f"{len(distributions.placements)} of them in scenes"
-    yield "objects", f"{len(distributions.objects)}, {in_scenes}"
-    yield "rejections", str(len(distributions.failures))
 
 
 def _most_used(distributions: Distributions) -> list[tuple[str, str, str, int]]:
