@@ -28,7 +28,8 @@ _MOST_CHOICES = 12
 _MOST_DB = 1e9
 """Shown for the noise floor of a picture without any error: JSON has no infinity."""
 
-_WITHIN, _AT_CAP = "within the target", "at the cap"
+_WITHIN = "within the target"
+_AT_CAP = "at the cap"
 _WHERE = {_WITHIN: "not any(at_cap)", _AT_CAP: "any(at_cap)"}
 _OPTIONS = {"split": "--split", "layout": "--template", "views": "--where"}
 """Option that selects the scenes of a choice, by the name of its filter."""

@@ -22,7 +22,6 @@ class ShownMap(NamedTuple):
     """A texture or a sky, as a page shows it."""
 
     source: MapSource
-    """Name, licence and author."""
     what: str
     """Columns of the material that it gives, or whether cameras see the sky."""
     size: str

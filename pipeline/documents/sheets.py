@@ -71,7 +71,8 @@ def write_first_pictures(folder: DatasetFolder, sample: Sample, *, build: str, s
     Raises:
         TrilightError: the folder cannot be written.
     """
-    title, state = f"{build}: the first scene", "the dataset is still being made"
+    title = f"{build}: the first scene"
+    state = "the dataset is still being made"
     sheet = _draw_sheet(title, state, [(sample, split)], 1, len(sample.views))
     write_atomically(folder.contact_sheet, sheet)
 

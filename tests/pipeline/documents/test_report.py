@@ -249,7 +249,7 @@ def test_a_texture_is_shown_as_it_lies() -> None:
     assert pictures[0].tolist() == [[[0] * 3] * 2, [[0] * 3, [200, 100, 50]]]
     assert pictures[2].shape == (112, 224, 3) and pictures[2].max() == 255
     links = Neighbours(report="", before=None, after=None)
-    page = read(encode_scene_page(sample(0, scene), "train", (), links))
+    page = read(encode_scene_page(sample(0, scene.with_provenance({})), "train", (), links))
     assert "".join(page.text).count(HARM) == 2
 
 
