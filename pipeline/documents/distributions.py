@@ -189,7 +189,7 @@ def dataset_distributions(
         TrilightError: a shard is missing, or a sample is unreadable or breaks a law.
     """
     locked = dataset.objects_lock()
-    found = Distributions(
+    distributions = Distributions(
         num_scenes=dataset.manifest.num_samples,
         objects=[entry for entry in locked if entry.kind == OBJECT],
         user_maps=[entry for entry in locked if entry.kind != OBJECT],
@@ -199,10 +199,10 @@ def dataset_distributions(
     chunks: dict[str, list[Mapping[str, Values]]] = {}
     for shard in described_shards(dataset):
         rows = []
-        found.packings.update(dataset.suffixes(shard) & {PLAIN, PACKED})
+        distributions.packings.update(dataset.suffixes(shard) & {PLAIN, PACKED})
         for record in dataset.read_scenes(shard):
             try:
-                rows.append(found.add(record, shard.split))
+                rows.append(distributions.add(record, shard.split))
             except (KeyError, TypeError, ValueError) as error:
                 raise TrilightError(
                     f"sample {record.key}: its JSON member is not as expected ({error!r}); run "
@@ -211,8 +211,8 @@ def dataset_distributions(
         if rows:
             chunks.setdefault(shard.split, []).append(_concatenate(rows))
         shard_done(shard.name)
-    found.values.update({split: _concatenate(rows) for split, rows in chunks.items()})
-    return found
+    distributions.values.update({split: _concatenate(rows) for split, rows in chunks.items()})
+    return distributions
 
 
 def _concatenate(rows: Sequence[Mapping[str, Values]]) -> Mapping[str, Values]:

@@ -115,8 +115,8 @@ def draw_bars(bars: Sequence[str], parts: Mapping[str, ArrayLike], *, label: str
     height = max(_PANEL_INCHES[1], 0.8 + 0.21 * len(bars))
     with drawing():
         figure = Figure(figsize=(width, height))
-        left = 0.15 + _LETTER_INCHES * max(map(len, names), default=0)
-        axes = _add_axes(figure, (left, 0.45, width - left - 0.15, height - 0.7))
+        margin = 0.15 + _LETTER_INCHES * max(map(len, names), default=0)
+        axes = _add_axes(figure, (margin, 0.45, width - margin - 0.15, height - 0.7))
         offset = np.zeros(len(bars))
         rows = np.arange(len(bars))
         for number, (name, lengths) in enumerate(parts.items()):
@@ -163,8 +163,8 @@ def draw_histogram(axes: Axes, panel: Panel) -> None:
 
 def _draw_rose(axes: Axes, panel: Panel) -> None:
     """Draw 24 petals whose areas are the counts."""
-    turn = 2 * np.pi
-    counts, edges = np.histogram(np.radians(_finite_values(panel.values)) % turn, 24, (0, turn))
+    full = 2 * np.pi
+    counts, edges = np.histogram(np.radians(_finite_values(panel.values)) % full, 24, (0, full))
     width = float(edges[1])
     axes.bar(edges[:-1] + width / 2, np.sqrt(counts), width=0.94 * width, color=PATH_TRACER)
     axes.set_xticks(np.radians([0, 90, 180, 270]), ["+X", "+Y", "-X", "-Y"])
@@ -180,12 +180,13 @@ def short_label(text: str) -> str:
     return line if len(line) <= _LONGEST_LABEL else line[: _LONGEST_LABEL - 1] + "…"
 
 
-def _add_axes(figure: Figure, box: tuple[float, float, float, float], **options: str) -> Axes:
+def _add_axes(
+    figure: Figure, box: tuple[float, float, float, float], projection: str | None = None
+) -> Axes:
     """Add axes at left, bottom, width and height in inches."""
-    scale = (*figure.get_size_inches(), *figure.get_size_inches())
-    return figure.add_axes(
-        [part / all_of_it for part, all_of_it in zip(box, scale, strict=True)], **options
-    )
+    width, height = figure.get_size_inches()
+    rect = (box[0] / width, box[1] / height, box[2] / width, box[3] / height)
+    return figure.add_axes(rect, projection=projection)
 
 
 def _encode(figure: Figure) -> bytes:

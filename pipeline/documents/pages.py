@@ -1,12 +1,13 @@
-"""HTML pages from the templates in `templates/`; they load nothing, and all text is escaped.
+"""Pages and Markdown from the templates in `templates/`, in which all text is escaped.
 
-Only the text of a template is markup. Every page has the same style and may run one script.
+Only the text of a template is markup. Pages load nothing; all have the same style and may run one
+script.
 """
 
 import base64
 import hashlib
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -14,6 +15,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup  # of jinja2
 from numpy.typing import NDArray
 
+from pipeline.documents.markdown import code, text
 from pipeline.documents.png import encode_png
 
 
@@ -39,9 +41,14 @@ def render_page(template: str, title: str, **values: object) -> bytes:
         title: title of the page.
         values: what the template shows.
     """
-    text = _ENVIRONMENT.get_template(template).render(title=title, **values)
+    page = _PAGES.get_template(template).render(title=title, **values)
     # a lone surrogate, which untrusted JSON may hold, has no UTF-8
-    return text.encode(errors="replace")
+    return page.encode(errors="replace")
+
+
+def render_markdown(template: str, **values: object) -> bytes:
+    """Return a document in Markdown; arguments are those of `render_page`."""
+    return _MARKDOWN.get_template(template).render(**values).encode(errors="replace")
 
 
 def is_address(url: str) -> bool:
@@ -64,23 +71,27 @@ def data_uri(png: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(png).decode()
 
 
-def _make_environment() -> Environment:
-    made = Environment(
+def _make_environment(**options: Any) -> Environment:
+    return Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        **options,
     )
-    made.tests["address"] = is_address
-    made.filters["png"] = png_uri
-    digest = hashlib.sha256(_SCRIPT.encode()).digest()
-    made.globals |= {
-        "style": Markup((_TEMPLATES / "page.css").read_text()),
-        "script": Markup(_SCRIPT),
-        "script_sha256": base64.b64encode(digest).decode(),
-    }
-    return made
 
 
-_ENVIRONMENT = _make_environment()
+_PAGES = _make_environment()
+_PAGES.tests["address"] = is_address
+_PAGES.filters["png"] = png_uri
+_PAGES.globals |= {
+    "style": Markup((_TEMPLATES / "page.css").read_text()),
+    "script": Markup(_SCRIPT),
+    "script_sha256": base64.b64encode(hashlib.sha256(_SCRIPT.encode()).digest()).decode(),
+}
+_MARKDOWN = _make_environment(
+    keep_trailing_newline=True,
+    finalize=lambda value: value if isinstance(value, Markup) else Markup(text(value)),
+)
+_MARKDOWN.filters["code"] = lambda value: Markup(code(value))

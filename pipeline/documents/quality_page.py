@@ -48,7 +48,7 @@ def encode_quality_page(
         budget: most triangles of an object.
         target: target of the mesh stage, in words.
     """
-    asked = [row.materials for row in rows if row.materials is not None]
+    requests = [row.materials for row in rows if row.materials is not None]
     return render_page(
         "quality.html",
         "Assets",
@@ -58,9 +58,9 @@ def encode_quality_page(
         groups=pairs,
         unread=unread,
         licences=Counter(row.licence for row in rows),
-        asked=asked,
-        reasons=Counter(materials.reason for materials in asked if materials.reason),
-        lost=Counter(word for materials in asked for word in materials.lost),
+        asked=requests,
+        reasons=Counter(materials.reason for materials in requests if materials.reason),
+        lost=Counter(word for materials in requests for word in materials.lost),
         figure=data_uri(_draw_histograms(rows, budget)) if rows else "",
     )
 

@@ -121,8 +121,8 @@ def _statistic(numbers: Mapping[str, float], name: str, digits: int) -> str:
 
 def _bars(names: Sequence[str], parts: Mapping[str, Sequence[int]], label: str) -> str:
     """Return the address of a figure of stacked bars, the first ones of many."""
-    shown = {name: lengths[:_MOST_BARS] for name, lengths in parts.items() if any(lengths)}
-    return data_uri(draw_bars(names[:_MOST_BARS], shown, label=label))
+    first = {name: lengths[:_MOST_BARS] for name, lengths in parts.items() if any(lengths)}
+    return data_uri(draw_bars(names[:_MOST_BARS], first, label=label))
 
 
 def _scenes(distributions: Distributions) -> Part:
@@ -131,11 +131,13 @@ def _scenes(distributions: Distributions) -> Part:
         split: [distributions.scenes.get((name, split), 0) for name in names]
         for split in distributions.splits
     }
+    columns = {split: [*lengths, sum(lengths)] for split, lengths in counts.items()}
+    columns["all"] = [sum(row) for row in zip(*columns.values(), strict=True)]
     rows = [
-        [name, *(of_split[row] for of_split in counts.values())] for row, name in enumerate(names)
+        [name, *(column[row] for column in columns.values())]
+        for row, name in enumerate([*names, "all"])
     ]
-    rows.append(["all", *map(sum, counts.values())])
-    table = Table(["template"], [*counts, "all"], [[*row, sum(row[1:])] for row in rows])
+    table = Table(["template"], [*columns], rows)
     return Part(_bars(names, counts, "scenes"), "scenes by template and split", [table])
 
 

@@ -62,7 +62,7 @@ def encode_scene_page(
         parts=list(_parts(sample)),
         pass_px=PREVIEW_PX,
         passes=pass_figures(sample),
-        passes_command=passes_command(scene=sample.key, shown=True),
+        passes_command=passes_command(scene=sample.key, for_page=True),
         objects=[
             (entry, id_colors(row), shading.get(row, ""), counts[row])
             for row, entry in enumerate(scene.objects)
@@ -100,9 +100,11 @@ def _pictures(sample: Sample) -> Iterator[Figure]:
 
 def _parts(sample: Sample) -> Iterator[tuple[int, str, PartFloor, Figure]]:
     """Yield view, name, noise floors and picture of each stored light component."""
+    if sample.parts_rgb is None:
+        return
     gain = preview_gain(sample.radiance_rgb)
     for view, record in enumerate(sample.views):
-        for part, floor in (record.parts or {}).items() if sample.parts_rgb else ():
+        for part, floor in (record.parts or {}).items():
             picture = sample.parts_rgb[part][view]
             together = picture.sum(axis=0) if picture.ndim == 4 else picture
             name = f"view {view}, {part}"

@@ -78,16 +78,16 @@ PASS_VIEWS = (
 )
 
 
-def passes_command(*, scene: str | None = None, shown: bool = False) -> str:
+def passes_command(*, scene: str | None = None, for_page: bool = False) -> str:
     """Return the command that writes passes beside a dataset; it is run in the dataset's folder.
 
     Args:
         scene: key of the only scene; None for all.
-        shown: True for the passes of a scene's page; False for those that the command chooses.
+        for_page: True for the passes of a scene's page; False for those that the command chooses.
     """
     one = "" if scene is None else f" --scene {scene}"
     words = ",".join(pass_view.word for pass_view in PASS_VIEWS)
-    return f"trilight passes .{one}{f' --passes {words}' if shown else ''} --out ../passes"
+    return f"trilight passes .{one}{f' --passes {words}' if for_page else ''} --out ../passes"
 
 
 def pass_figures(sample: Sample) -> list[list[Figure]]:

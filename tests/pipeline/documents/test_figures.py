@@ -1,6 +1,7 @@
 """Figures: any values, names from outside, whoever draws them."""
 
 import io
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -33,9 +34,10 @@ def picture(png: bytes) -> Image.Image:
 
 def test_any_values_can_be_drawn() -> None:
     marks = {"a": 3.0, "c": np.nan}
+    kinds: tuple[dict[str, Any], ...] = ({"is_rose": True}, {"is_log": True}, {"marks": marks})
     panels = [
-        Panel(values=values, label=name, unit="y", **more)  # type: ignore[arg-type]
-        for more in ({"is_rose": True}, {"is_log": True}, {"marks": marks})
+        Panel(values=values, label=name, unit="y", **more)
+        for more in kinds
         for name, values in VALUES.items()
     ]
     drawn = picture(draw_panels(panels))
