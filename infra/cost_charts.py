@@ -29,9 +29,9 @@ class SeriesPoint:
 
 def colors_of(points: Sequence[SeriesPoint]) -> dict[str, str]:
     """Return the color of each kind: a way's own, or the next one."""
-    others = itertools.cycle(OTHERS)
+    next_colors = itertools.cycle(OTHERS)
     kinds = dict.fromkeys(one.kind for one in points)
-    return {name: WAYS.get(name.partition(",")[0]) or next(others) for name in kinds}
+    return {name: WAYS.get(name.partition(",")[0]) or next(next_colors) for name in kinds}
 
 
 def draw_points(axes: Any, points: Sequence[SeriesPoint], colors: Mapping[str, str]) -> None:
