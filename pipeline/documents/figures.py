@@ -154,6 +154,7 @@ def draw_histogram(axes: Axes, panel: Panel) -> None:
             high = int(finite.max())
             axes.set_xticks(range(low, high + 1, 1 + (high - low) // 9))
     axes.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator(4, integer=True))
+    axes.yaxis.set_major_formatter(matplotlib.ticker.EngFormatter(sep=""))  # 300k fits
     for name, value in panel.marks.items():
         if math.isfinite(value):
             axes.axvline(value, color=LIMIT, linewidth=1.2, label=name)
