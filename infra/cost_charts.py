@@ -3,12 +3,12 @@
 A point is drawn at each of its costs, always at the height of its error, with a line between.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-_COLORS = ("#c0392b", "#2e7d32", "#1f5fa8", "#7d5a00", "#6a3d9a")
-"""Colors of kinds in order of appearance; dark enough for small markers on white."""
+from storage.palette import OTHERS, WAYS
 
 _FONT = 9
 
@@ -28,9 +28,10 @@ class SeriesPoint:
 
 
 def colors_of(points: Sequence[SeriesPoint]) -> dict[str, str]:
-    """Return the color of each kind, in order of appearance."""
-    kinds = list(dict.fromkeys(one.kind for one in points))
-    return {name: _COLORS[row % len(_COLORS)] for row, name in enumerate(kinds)}
+    """Return the color of each kind: a way's own, or the next one."""
+    next_colors = itertools.cycle(OTHERS)
+    kinds = dict.fromkeys(one.kind for one in points)
+    return {name: WAYS.get(name.partition(",")[0]) or next(next_colors) for name in kinds}
 
 
 def draw_points(axes: Any, points: Sequence[SeriesPoint], colors: Mapping[str, str]) -> None:

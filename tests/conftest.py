@@ -37,7 +37,7 @@ SLOW_KINDS = {
 @pytest.fixture
 def bare_reports(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the figures out of reports: they take seconds, and tests.documents looks at them."""
-    monkeypatch.setattr("pipeline.documents.report._SECTIONS", {})
+    monkeypatch.setattr("pipeline.documents.report.report_sections", lambda found: {})
 
 
 @pytest.fixture(scope="session")

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from infra.bench.experiment import Experiment
 from infra.bench.rows import Row, rows_of
 from infra.bench.store import Run
@@ -16,6 +18,7 @@ from infra.cost_charts import (
     name_points,
     plain_log,
 )
+from pipeline.documents.figures import drawing
 
 _WIDE = 7.0
 _HIGH = 5.2
@@ -28,36 +31,29 @@ _SPREAD = 20
 
 def plot(experiment: Experiment, run: Run, path: Path) -> None:
     """Draw a run into a PNG file."""
-    import matplotlib
-
-    matplotlib.use("Agg")  # before pyplot: no display is needed
-    import matplotlib.pyplot as plt
-
     rows = rows_of(experiment, run)
     has_sizes = any(row.point.size is not None for row in rows)
     draw = _draw_growth if has_sizes else _draw_errors if experiment.error else _draw_bars
-    with matplotlib.rc_context({"text.parse_math": False}):  # names may hold dollar signs
-        figure = draw(plt, experiment, rows)
+    with drawing():
+        figure = draw(experiment, rows)
         figure.suptitle(experiment.title, fontsize=_FONT + 3)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, metadata={"Software": None})
-    plt.close(figure)
 
 
-def _panels(plt: Any, count: int, high: float = _HIGH) -> tuple[Any, Sequence[Any]]:
-    figure, panels = plt.subplots(
-        1, count, figsize=(_WIDE * count, high), dpi=_DPI, squeeze=False, layout="constrained"
-    )
+def _panels(count: int, high: float = _HIGH) -> tuple[Figure, Sequence[Any]]:
+    figure = Figure(figsize=(_WIDE * count, high), dpi=_DPI, layout="constrained")
+    panels = figure.subplots(1, count, squeeze=False)
     for axes in panels[0]:
         axes.grid(alpha=0.25)
         axes.tick_params(labelsize=_FONT - 1)
     return figure, panels[0]
 
 
-def _draw_growth(plt: Any, experiment: Experiment, rows: Sequence[Row]) -> Any:
+def _draw_growth(experiment: Experiment, rows: Sequence[Row]) -> Figure:
     """Draw each cost against the size in a panel, with a line for each kind."""
     costs = (experiment.cost.name, *experiment.also_cost)
-    figure, panels = _panels(plt, len(costs))
+    figure, panels = _panels(len(costs))
     for axes, cost in zip(panels, costs, strict=True):
         lines = defaultdict[str, list[tuple[float, float]]](list)
         for row in rows:
@@ -74,7 +70,7 @@ def _draw_growth(plt: Any, experiment: Experiment, rows: Sequence[Row]) -> Any:
     return figure
 
 
-def _draw_errors(plt: Any, experiment: Experiment, rows: Sequence[Row]) -> Any:
+def _draw_errors(experiment: Experiment, rows: Sequence[Row]) -> Figure:
     """Draw errors against costs, each group in a panel and each kind in a color."""
     assert experiment.error is not None
     error = experiment.error.name
@@ -88,7 +84,7 @@ def _draw_errors(plt: Any, experiment: Experiment, rows: Sequence[Row]) -> Any:
             groups[row.point.group].append(
                 SeriesPoint(name=name, kind=kind, costs=values, error=row.values[error])
             )
-    figure, panels = _panels(plt, len(groups))
+    figure, panels = _panels(len(groups))
     colors = colors_of([point for points in groups.values() for point in points])
     for axes, (group, points) in zip(panels, groups.items(), strict=True):
         axes.set_title(group, fontsize=_FONT + 1)
@@ -102,9 +98,9 @@ def _draw_errors(plt: Any, experiment: Experiment, rows: Sequence[Row]) -> Any:
     return figure
 
 
-def _draw_bars(plt: Any, experiment: Experiment, rows: Sequence[Row]) -> Any:
+def _draw_bars(experiment: Experiment, rows: Sequence[Row]) -> Figure:
     """Draw the cost of each point as a bar, with its range over the trials."""
-    figure, (axes,) = _panels(plt, 1, high=1.4 + 0.28 * len(rows))
+    figure, (axes,) = _panels(1, high=1.4 + 0.28 * len(rows))
     costs = [row.values[experiment.cost.name] for row in rows]
     ends = [row.cost_range or (cost, cost) for row, cost in zip(rows, costs, strict=True)]
     lows = [max(0.0, cost - low) for cost, (low, _) in zip(costs, ends, strict=True)]

@@ -1,13 +1,13 @@
 """Page of a release: traced, network, error and few samples side by side; works from disk."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from infra.release.pictures import NETWORK, SceneComparison
-from pipeline.documents.html import Markup, element, enlargeable, join_markup, page, table
 from pipeline.documents.markdown import front_matter
+from pipeline.documents.pages import Figure, render_page
 from pipeline.documents.png import encode_png
 from storage.atomic import write_atomically
 from storage.conventions import preview_srgb8
@@ -15,14 +15,6 @@ from train.evaluation.sheet import ERROR_WHITE, error_picture
 
 _TITLE = "Trilight: traced, learned and filtered"
 _PICTURES = "pictures"
-
-_STYLE = """
-.row { display: grid; grid-template-columns: repeat(auto-fill, minmax(9rem, 1fr)); gap: .6rem;
-  margin-bottom: .4rem }
-figure { margin: 0 } figure img { display: block; width: 100%; background: #111;
-  image-rendering: pixelated }
-figcaption { font-size: .85rem; color: var(--soft); margin-top: .2rem }
-"""
 
 
 def write_page(
@@ -42,17 +34,16 @@ def write_page(
     """
     for old in sorted((folder / _PICTURES).glob("[0-9]" * 9 + "-*.png")):
         old.unlink()
-    rows = [part for each in comparisons for part in _scene(folder, each)]
-    body = [
-        element("h1", _TITLE),
-        element("p", _EXPLAINED),
-        table((), about, class_="narrow"),
-        element("h2", "In the median"),
-        _medians(comparisons),
-        *rows,
-    ]
+    page = render_page(
+        "release.html",
+        _TITLE,
+        explained=_EXPLAINED,
+        about=about,
+        medians=list(_medians(comparisons)),
+        scenes=[(each, list(_pictures(folder, each))) for each in comparisons],
+    )
     path = folder / "index.html"
-    write_atomically(path, page(_TITLE, join_markup(body), style=_STYLE))
+    write_atomically(path, page)
     card = front_matter({"title": _TITLE, "sdk": "static", "license": "cc0-1.0"})
     write_atomically(folder / "README.md", f"{card}\n# {_TITLE}\n\n{_EXPLAINED}\n".encode())
     return path
@@ -65,7 +56,8 @@ _EXPLAINED = (
 )
 
 
-def _scene(folder: Path, each: SceneComparison) -> list[Markup]:
+def _pictures(folder: Path, each: SceneComparison) -> Iterator[Figure]:
+    """Write the pictures of a scene, and yield them."""
     error = error_picture(each.pictures_rgb[NETWORK], each.target_rgb)
     pictures = [
         ("traced", preview_srgb8(each.target_rgb), f"traced, noise floor {each.floor_db:.1f} dB")
@@ -75,23 +67,16 @@ def _scene(folder: Path, each: SceneComparison) -> list[Markup]:
         pictures.append((str(place), preview_srgb8(radiance_rgb), caption))
         if name == NETWORK:
             pictures.append(("error", error, "error of the network"))
-    figures = []
     for name, pixels, caption in pictures:
         relative = f"{_PICTURES}/{each.key}-{name}.png"
         write_atomically(folder / relative, encode_png(pixels))
-        figure = enlargeable(relative, f"{each.key}, {caption}")
-        figures.append(element("figure", figure, element("figcaption", caption)))
-    heading = element("h3", f"Scene {each.key}: {each.caption}")
-    return [heading, element("div", *figures, class_="row")]
+        yield Figure(relative, f"{each.key}, {caption}", caption)
 
 
-def _medians(comparisons: Sequence[SceneComparison]) -> Markup:
-    names = list(comparisons[0].psnr_db)
-    rows = []
-    for name in names:
+def _medians(comparisons: Sequence[SceneComparison]) -> Iterator[tuple[str, float, float, str]]:
+    """Yield each picture's name, median and worst PSNR, and how often it beats the network."""
+    for name in comparisons[0].psnr_db:
         values = [each.psnr_db[name] for each in comparisons]
         better = sum(each.psnr_db[name] > each.psnr_db[NETWORK] for each in comparisons)
         beaten = "" if name == NETWORK else f"{better} of {len(comparisons)}"
-        rows.append((name, f"{np.median(values):.1f}", f"{np.min(values):.1f}", beaten))
-    head = ("picture", "median psnr_log_db, dB", "worst, dB", "better than the network in")
-    return table(head, rows, numbers=3, class_="narrow")
+        yield name, float(np.median(values)), min(values), beaten

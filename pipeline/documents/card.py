@@ -3,14 +3,17 @@
 It holds no time, machine or order of work: equal datasets give equal cards.
 """
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
+from markupsafe import Markup
+
 from pipeline.documents.distributions import MEASURED, Distributions
-from pipeline.documents.markdown import code, front_matter, table, text
-from pipeline.documents.report_maps import maps_in_words
-from pipeline.documents.rights import Rights, hub_licence, rights_markdown
-from storage.dataset.derived import Derivation, derivation_of
+from pipeline.documents.markdown import front_matter
+from pipeline.documents.pages import render_markdown
+from pipeline.documents.rights import Rights, hub_licence, licence_facts
+from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest
 from storage.records.objects import SKY, TEXTURE
@@ -36,6 +39,7 @@ _SETTINGS = (
     ("profile", "storage.profile"),
 )
 """Labels and names of the settings that the card shows; the manifest has all of them."""
+_ENVIRONMENT = (("Mitsuba variant", "mitsuba_variant"), ("processor", "processor"))
 
 
 def encode_card(
@@ -50,47 +54,29 @@ def encode_card(
         rights: rights to its objects.
     """
     title = f"Trilight dataset {manifest.build}"
-    parts = [
-        front_matter(_front(folder, manifest, rights, title)),
-        f"# {text(title)}",
-        _lead(manifest),
-        f"![some of the scenes]({folder.contact_sheet.name})",
-        "## What it holds",
-        f"Views, errors and contents are those {distributions.sample}."
-        if distributions.sample
-        else "",
-        _by_split(manifest, distributions),
-        _NOISE_FLOOR,
-        _contents(manifest, distributions),
-        "## How it was made",
-        _generation(manifest),
-        "## Licences",
-        rights_markdown(rights),
-        "## How to read it",
-        _reading(manifest, distributions.packings),
-        "## How to check it",
-        _CHECK.format(digest=manifest.dataset_digest),
-    ]
-    return ("\n\n".join(part for part in parts if part) + "\n").encode(errors="replace")
-
-
-_NOISE_FLOOR = (
-    "The **noise floor** of a view is the measured error of its picture, as the PSNR of "
-    "log10(1 + radiance): differences below it say nothing about a model. The same error is also "
-    "stated as PSNR of linear radiance clamped to [0, 1] (linear), and over the pixels that show "
-    "geometry (objects). All three stand in each scene's JSON; `report.html` shows all "
-    "distributions."
-)
-_PICTURES = (
-    "Pictures are path-traced with Mitsuba 3 and denoised. The noise floor comes from two "
-    "independent halves of the samples, each denoised by itself."
-)
-_CHECK = """The dataset digest covers shards, objects and settings:
-
-    {digest}
-
-`trilight verify .` checks every hash, member and law. Without Trilight, `manifest.json` has size
-and sha256 of each shard."""
+    layouts = Counter[str]()
+    for (template, _), count in sorted(distributions.scenes.items()):
+        layouts[template] += count
+    settings = [(label, _setting(manifest.settings, name)) for label, name in _SETTINGS]
+    settings += [(label, manifest.environment.get(name)) for label, name in _ENVIRONMENT]
+    return render_markdown(
+        "card.jinja",
+        front=Markup(front_matter(_front(folder, manifest, rights, title))),
+        title=title,
+        folder=folder,
+        manifest=manifest,
+        found=distributions,
+        resolution=_setting(manifest.settings, "renders.resolution"),
+        splits=_by_split(manifest, distributions),
+        layouts=layouts,
+        triangles=summary(distributions.all("triangles_per_scene")),
+        maps=_maps(distributions),
+        user_maps=_user_maps(distributions),
+        derivation=derivation_of(manifest.settings),
+        settings=[(label, value) for label, value in settings if value is not None],
+        arrays=" or ".join(_arrays(distributions.packings)),
+        **licence_facts(rights),
+    )
 
 
 def _front(folder: DatasetFolder, manifest: Manifest, rights: Rights, title: str) -> dict[str, Any]:
@@ -126,19 +112,8 @@ def _size_category(num_scenes: int) -> str:
     return "n>10M"
 
 
-def _lead(manifest: Manifest) -> str:
-    resolution = _setting(manifest.settings, "renders.resolution")
-    size = f" of {text(resolution)} x {text(resolution)} pixels" if resolution else ""
-    pictures = "picture" if manifest.num_views == 1 else "pictures"
-    return (
-        f"{manifest.num_samples} scenes of triangles with materials, lights and cameras, and "
-        f"{text(manifest.num_views)} path-traced HDR {pictures}{size} of each, to train and judge "
-        f"neural renderers in the manner of RenderFormer. {manifest.num_bytes / 1e6:.1f} MB in "
-        f"{len(manifest.shards)} shards. Made by Trilight."
-    )
-
-
-def _by_split(manifest: Manifest, distributions: Distributions) -> str:
+def _by_split(manifest: Manifest, distributions: Distributions) -> list[Sequence[object]]:
+    """Return the cells of each split's row."""
     rows: list[Sequence[object]] = []
     for split in distributions.splits:
         floors = {name: summary(distributions.values[split][name]) for name in MEASURED.values()}
@@ -156,11 +131,7 @@ def _by_split(manifest: Manifest, distributions: Distributions) -> str:
                 f"{distributions.views_at_cap.get(split, 0) / max(num_views, 1):.0%}",
             )
         )
-    head = (
-        "split", "scenes", "views", "shards", "median noise floor, dB (linear, objects)",
-        "5th percentile", "reach the target", "stopped at the cap",
-    )  # fmt: skip
-    return table(head, rows, numbers=7)
+    return rows
 
 
 def _three(floors: Mapping[str, Mapping[str, float]], statistic: str) -> str:
@@ -168,92 +139,44 @@ def _three(floors: Mapping[str, Mapping[str, float]], statistic: str) -> str:
     return f"{log:.1f} ({linear:.1f}, {objects:.1f})"
 
 
-def _contents(manifest: Manifest, distributions: Distributions) -> str:
-    templates: dict[str, int] = {}
-    for (template, _), count in sorted(distributions.scenes.items()):
-        templates[template] = templates.get(template, 0) + count
-    triangles = summary(distributions.all("triangles_per_scene"))
-    layouts = ", ".join(f"{count} {code(name)}" for name, count in templates.items())
-    rows = [
-        ("scenes by layout", layouts or "none"),
-        (
-            "objects",
-            f"{len(distributions.objects)}, of which {len(distributions.placements)} stand in "
-            "scenes",
-        ),
-        *_user_maps(distributions),
-        (
-            "rejected on the way",
-            f"{len(distributions.failures)}, each with its reason in failures.jsonl",
-        ),
-    ]
-    rows[1:1] = list(maps_in_words(distributions).items())
-    if triangles["count"]:
-        spread = f"median {triangles['median']:.0f}, most {triangles['max']:.0f}"
-        rows.insert(1, ("triangles of a scene", spread))
-    return table(("", ""), rows)
-
-
-def _user_maps(distributions: Distributions) -> list[tuple[str, str]]:
-    """Return a row for the user's textures, and one for the user's maps, if there are any."""
+def _maps(distributions: Distributions) -> list[tuple[str, str]]:
+    """Return a row for textures and one for skies, if there are any."""
+    scenes = sum(distributions.scenes.values())
+    textures = distributions.all("textures_per_scene")
+    skies = distributions.all("skies_per_scene")
+    families = Counter(kind for kind, _ in distributions.maps)
     rows = []
-    for kind, name in ((TEXTURE, "textures, not procedural"), (SKY, "skies, not procedural")):
-        uids = {entry.uid for entry in distributions.user_maps if entry.kind == kind}
-        if uids:
-            rows.append(
-                (name, f"{len(uids)}, of which {len(uids & set(distributions.map_uses))} are used")
-            )
+    if (textures > 0).any():
+        words = (
+            f"{int((textures > 0).sum())} of {scenes} scenes, {int(textures.sum())} maps of "
+            f"{families['texture']} families, {_range(distributions, 'texture_width', 0)} texels "
+            "wide"
+        )
+        rows.append(("textures", words))
+    if (skies > 0).any():
+        words = (
+            f"{int((skies > 0).sum())} of {scenes} scenes, {families['sky']} families, mean "
+            f"radiance {_range(distributions, 'sky_radiance', 2)}; half of the light of one comes "
+            f"from {_range(distributions, 'sky_half_light_deg', 1)} degrees"
+        )
+        rows.append(("skies", words))
     return rows
 
 
-def _generation(manifest: Manifest) -> str:
-    derivation = derivation_of(manifest.settings)
-    how = _derivation(derivation) if derivation else code(f"trilight generate {manifest.build}")
+def _range(distributions: Distributions, name: str, digits: int) -> str:
+    values = distributions.all(name)
+    low, high = (f"{value:.{digits}f}" for value in (values.min(), values.max()))
+    return low if low == high else f"{low} to {high}"
+
+
+def _user_maps(distributions: Distributions) -> list[tuple[str, int, int]]:
+    """Return how many of the user's textures and of the maps there are and are used, if any."""
     rows = []
-    for label, name in _SETTINGS:
-        value = _setting(manifest.settings, name)
-        if value is not None:
-            cell = value if isinstance(value, int | float) else code(value)
-            rows.append((label, cell))
-    for label, name in (("Mitsuba variant", "mitsuba_variant"), ("processor", "processor")):
-        if name in manifest.environment:
-            rows.append((label, code(manifest.environment[name])))
-    more = "All settings and library versions stand in `manifest.json`."
-    return "\n\n".join([how, _PICTURES, table(("setting", "value"), rows), more])
-
-
-def _derivation(derivation: Derivation) -> str:
-    rows = [
-        (code(source["build"]), source["num_scenes"], source["key_offset"], code(source["digest"]))
-        for source in derivation.sources
-    ]
-    arguments = ", ".join(code(f"{name}={value}") for name, value in derivation.arguments.items())
-    of = f" with {arguments}" if arguments else ""
-    head = ("made of build", "its scenes", "added to keys", "its dataset digest")
-    command = code(f"trilight shards {derivation.operation}")
-    return f"{command}{of}.\n\n{table(head, rows)}"
-
-
-def _reading(manifest: Manifest, packings: Collection[str]) -> str:
-    if not manifest.shards:
-        return "There is no shard yet."
-    split = manifest.shards[0].split
-    arrays = " or ".join(_arrays(packings))
-    return f"""Any WebDataset reader opens the shards:
-
-```python
-import glob, io, OpenEXR, webdataset
-from safetensors.numpy import load
-
-shards = sorted(glob.glob("**/{split}-*.tar", recursive=True))
-for sample in webdataset.WebDataset(shards, shardshuffle=False).decode():
-    arrays = load({arrays})
-    picture = OpenEXR.File(io.BytesIO(sample["0.exr"])).channels()["RGB"].pixels
-```
-
-`sample["json"]` holds the objects with their licences, and for each view its samples and noise
-floor. Lengths are metres, +Z is up, colours are linear Rec.709 radiance, cameras look along -Z.
-`trilight train RUN --data .` trains on it."""
+    for kind, name in ((TEXTURE, "textures"), (SKY, "skies")):
+        uids = {entry.uid for entry in distributions.user_maps if entry.kind == kind}
+        if uids:
+            rows.append((name, len(uids), len(uids & set(distributions.map_uses))))
+    return rows
 
 
 def _arrays(packings: Collection[str]) -> list[str]:

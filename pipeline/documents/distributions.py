@@ -1,7 +1,7 @@
 """Distributions of a dataset's contents: reads it scene by scene, without the pictures."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,23 +25,23 @@ from storage.records.scene_facts import Values, scene_values, surfaces
 class Distributions:
     """Counts and values over all scenes of a dataset."""
 
-    values: Mapping[str, Mapping[str, Values]]
-    """All values, float32, by split, then by name (storage.records.quantities)."""
     num_scenes: int
-    """Number of scenes of the dataset; if only a sample was read, the other fields describe it."""
-    scenes: Mapping[tuple[str, str], int]
+    """Number of scenes of the dataset; if only a sample was read, the counts describe it."""
+    values: dict[str, Mapping[str, Values]] = field(default_factory=dict)
+    """All values, float32, by split, then by name (storage.records.quantities)."""
+    scenes: Counter[tuple[str, str]] = field(default_factory=Counter)
     """Number of scenes by (template, split)."""
-    placements: Mapping[str, int]
+    placements: Counter[str] = field(default_factory=Counter)
     """Number of placements of each object in scenes, by uid; unused objects are missing."""
-    map_uses: Mapping[str, int]
+    map_uses: Counter[str] = field(default_factory=Counter)
     """Number of scenes with each of the user's textures and maps, by uid; unused are missing."""
-    surfaces: Mapping[tuple[str, str], int]
+    surfaces: Counter[tuple[str, str]] = field(default_factory=Counter)
     """Number of surfaces by (object or shell; all, smooth, many_colours or textured)."""
-    maps: Mapping[tuple[str, str], int]
+    maps: Counter[tuple[str, str]] = field(default_factory=Counter)
     """Number of scenes by (texture or sky; its family, or the name of its map)."""
-    views_at_cap: Mapping[str, int]
+    views_at_cap: Counter[str] = field(default_factory=Counter)
     """Views whose sampling ended at the cap, by split."""
-    packings: Collection[str]
+    packings: set[str] = field(default_factory=set)
     """Suffixes under which samples have their arrays (storage.records.profiles)."""
     objects: Sequence[LockedObject]
     """The objects that scenes may draw from."""
@@ -52,6 +52,23 @@ class Distributions:
     targets: Mapping[str, float | None]
     """Target values of the settings: max_triangles, the three noise floors, min_spp, max_spp; None
     if the manifest lacks one."""
+
+    def add(self, record: SceneRecord, split: str) -> Mapping[str, Values]:
+        """Count one scene and return its values."""
+        self.scenes[str(record.scene.provenance.get("template", "unknown")), split] += 1
+        self.map_uses.update(locked_uids((), record.scene.provenance))
+        self.views_at_cap[split] += sum(bool(view.at_cap) for view in record.views)
+        for surface in surfaces(record.scene):
+            self.surfaces[surface.kind, "all"] += 1
+            self.surfaces[surface.kind, "smooth"] += surface.smooth
+            self.surfaces[surface.kind, "many_colours"] += surface.num_colours > 1
+            self.surfaces[surface.kind, "textured"] += surface.textured
+            if surface.kind == "object":
+                self.placements[str(record.scene.objects[surface.row].uid)] += 1
+        self.maps.update(("texture", name) for name in texture_families(record.scene))
+        if (sky := record.scene.environment) is not None:
+            self.maps["sky", sky.source.name] += 1
+        return scene_values(record)
 
     def all(self, name: str) -> Values:
         """Return the values of one quantity over all splits."""
@@ -71,6 +88,13 @@ class Distributions:
     def splits(self) -> list[str]:
         """The splits that have scenes, in their usual order."""
         return [split for split in SPLITS if split in self.values]
+
+    @property
+    def scenes_by_split(self) -> dict[str, int]:
+        return {
+            split: sum(count for (_, of), count in self.scenes.items() if of == split)
+            for split in self.splits
+        }
 
     @property
     def templates(self) -> list[str]:
@@ -149,37 +173,6 @@ MEASURED = {
 """Measured quantity of a view, by the name of its target in the settings of renders."""
 
 
-@dataclass(kw_only=True, eq=False)
-class _Tally:
-    """Counts of the scenes that were read so far."""
-
-    values: dict[str, list[Mapping[str, Values]]] = field(default_factory=dict)
-    scenes: Counter[tuple[str, str]] = field(default_factory=Counter)
-    placements: Counter[str] = field(default_factory=Counter)
-    map_uses: Counter[str] = field(default_factory=Counter)
-    surfaces: Counter[tuple[str, str]] = field(default_factory=Counter)
-    maps: Counter[tuple[str, str]] = field(default_factory=Counter)
-    views_at_cap: Counter[str] = field(default_factory=Counter)
-    packings: set[str] = field(default_factory=set)
-
-    def add(self, record: SceneRecord, split: str) -> Mapping[str, Values]:
-        """Count one scene and return its values."""
-        self.scenes[record.scene.provenance.get("template", "unknown"), split] += 1
-        self.map_uses.update(locked_uids((), record.scene.provenance))
-        self.views_at_cap[split] += sum(bool(view.at_cap) for view in record.views)
-        for surface in surfaces(record.scene):
-            self.surfaces[surface.kind, "all"] += 1
-            self.surfaces[surface.kind, "smooth"] += surface.smooth
-            self.surfaces[surface.kind, "many_colours"] += surface.num_colours > 1
-            self.surfaces[surface.kind, "textured"] += surface.textured
-            if surface.kind == "object":
-                self.placements[str(record.scene.objects[surface.row].uid)] += 1
-        self.maps.update(("texture", name) for name in texture_families(record.scene))
-        if (sky := record.scene.environment) is not None:
-            self.maps["sky", sky.source.name] += 1
-        return scene_values(record)
-
-
 def dataset_distributions(
     dataset: Dataset, *, shard_done: Callable[[str], None] = lambda name: None
 ) -> Distributions:
@@ -195,37 +188,31 @@ def dataset_distributions(
     Raises:
         TrilightError: a shard is missing, or a sample is unreadable or breaks a law.
     """
-    tally = _Tally()
+    locked = dataset.objects_lock()
+    distributions = Distributions(
+        num_scenes=dataset.manifest.num_samples,
+        objects=[entry for entry in locked if entry.kind == OBJECT],
+        user_maps=[entry for entry in locked if entry.kind != OBJECT],
+        failures=dataset.failures(),
+        targets=_targets(dataset.manifest),
+    )
+    chunks: dict[str, list[Mapping[str, Values]]] = {}
     for shard in described_shards(dataset):
         rows = []
-        tally.packings |= dataset.suffixes(shard) & {PLAIN, PACKED}
+        distributions.packings.update(dataset.suffixes(shard) & {PLAIN, PACKED})
         for record in dataset.read_scenes(shard):
             try:
-                rows.append(tally.add(record, shard.split))
+                rows.append(distributions.add(record, shard.split))
             except (KeyError, TypeError, ValueError) as error:
                 raise TrilightError(
                     f"sample {record.key}: its JSON member is not as expected ({error!r}); run "
                     "`trilight verify`."
                 ) from error
         if rows:
-            tally.values.setdefault(shard.split, []).append(_concatenate(rows))
+            chunks.setdefault(shard.split, []).append(_concatenate(rows))
         shard_done(shard.name)
-    locked = dataset.objects_lock()
-    return Distributions(
-        values={split: _concatenate(chunks) for split, chunks in tally.values.items()},
-        num_scenes=dataset.manifest.num_samples,
-        scenes=tally.scenes,
-        placements=tally.placements,
-        map_uses=tally.map_uses,
-        surfaces=tally.surfaces,
-        maps=tally.maps,
-        views_at_cap=tally.views_at_cap,
-        packings=tally.packings,
-        objects=[entry for entry in locked if entry.kind == OBJECT],
-        user_maps=[entry for entry in locked if entry.kind != OBJECT],
-        failures=dataset.failures(),
-        targets=_targets(dataset.manifest),
-    )
+    distributions.values.update({split: _concatenate(rows) for split, rows in chunks.items()})
+    return distributions
 
 
 def _concatenate(rows: Sequence[Mapping[str, Values]]) -> Mapping[str, Values]:

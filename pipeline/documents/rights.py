@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from pipeline.documents.markdown import code, table
+from pipeline.documents.pages import render_markdown
 from storage.licences import DUTIES, duties_of, licence_url, union_of_duties
 from storage.records.objects import LockedObject
 
@@ -72,47 +72,16 @@ def hub_licence(rights: Rights, *, link: str) -> dict[str, str]:
     return {"license": "other", "license_name": slug or "unnamed", "license_link": link}
 
 
-def rights_markdown(rights: Rights) -> str:
-    """Return the licences with their counts and duties, and the union of these."""
-    rows = [
-        (_licence_link(name), _duties(name), count)
-        for name, count in rights.objects_by_licence.items()
-    ]
-    parts = [table(("licence", "asks for", "objects"), rows, numbers=1)]
-    if rights.duties:
-        parts.append("Users of the whole dataset have to keep all of these:")
-        parts.append("\n".join(f"- **{duty}**: {DUTIES[duty]}" for duty in rights.duties))
-    elif rights.licences and not rights.unknown:
-        parts.append("None of them asks for anything.")
-    if rights.unknown:
-        names = ", ".join(code(name) for name in rights.unknown)
-        parts.append(
-            f"The duties of {names} are **not known here**: ask the maker of the dataset before "
-            "you use or share it."
-        )
-    if "share-alike" in rights.duties:
-        parts.append("No scene holds objects under two different share-alike licences.")
-    parts.append("`attribution.csv` names the author of each object, and what was changed.")
-    return "\n\n".join(parts)
+def licence_facts(rights: Rights) -> dict[str, object]:
+    """Return what `licences.jinja` shows."""
+    return {
+        "rights": rights,
+        "licence_url": licence_url,
+        "duties_of": duties_of,
+        "duty_texts": DUTIES,
+    }
 
 
 def encode_licences(rights: Rights) -> bytes:
     """Return the file LICENSE.md."""
-    head = (
-        "# Licences of this dataset\n\nIts scenes are made of 3D objects, and perhaps of textures "
-        "and environment maps, each under the licence of its author. This is a summary; the "
-        "licences themselves decide."
-    )
-    return f"{head}\n\n{rights_markdown(rights)}\n".encode(errors="replace")
-
-
-def _licence_link(licence: str) -> str:
-    url = licence_url(licence)
-    return f"[{code(licence)}]({url})" if url else code(licence)
-
-
-def _duties(licence: str) -> str:
-    duties = duties_of(licence)
-    if duties is None:
-        return "not known here"
-    return ", ".join(duties) or "nothing"
+    return render_markdown("license.jinja", **licence_facts(rights))

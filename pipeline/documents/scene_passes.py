@@ -4,13 +4,13 @@ They are computed from the scene when the page is written, so that a dataset sto
 them. At 96 pixels a side, all views of a scene cost about half as much as the rest of its page.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.documents.html import Markup, element, enlargeable, png_uri
+from pipeline.documents.pages import Figure, png_uri
 from pipeline.documents.pass_colors import (
     albedo_colors,
     depth_grays,
@@ -24,15 +24,7 @@ from storage.records.passes.declared import pass_names
 from storage.records.passes.pictures import view_passes
 from storage.records.sample import Sample
 
-PASSES_STYLE = """
-.passes { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fill, 192px);
-  margin-bottom: 1.2rem } .passes img { width: 100%; image-rendering: pixelated }
-@media (max-width: 32rem) { .passes { grid-template-columns: 1fr 1fr } }
-section code { display: block; overflow-x: auto; white-space: nowrap; margin-bottom: 1rem }
-"""
-"""Style sheet of `passes_section`."""
-
-_PREVIEW_PX = 96
+PREVIEW_PX = 96
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,41 +78,31 @@ PASS_VIEWS = (
 )
 
 
-def passes_section(sample: Sample) -> Markup:
-    """Return small pictures of the passes of each view, and the command that writes the numbers."""
-    words = [pass_view.word for pass_view in PASS_VIEWS]
-    intro = element(
-        "p",
-        f"What each view sees through the centres of {_PREVIEW_PX} x {_PREVIEW_PX} pixels, "
-        "computed from the scene for this page. Lights are hidden from cameras; where no surface "
-        "is met, the pictures are black. In the dataset's folder, this command writes the numbers:",
-    )
-    command = element("code", passes_command(words, scene=sample.key))
-    views = [_view(sample, view, words) for view in range(sample.scene.num_views)]
-    return element("section", element("h2", "Passes"), intro, command, *views)
-
-
-def passes_command(words: Sequence[str] = (), *, scene: str | None = None) -> str:
+def passes_command(*, scene: str | None = None, for_page: bool = False) -> str:
     """Return the command that writes passes beside a dataset; it is run in the dataset's folder.
 
     Args:
-        words: passes, as `trilight passes` takes them; empty for its default.
         scene: key of the only scene; None for all.
+        for_page: True for the passes of a scene's page; False for those that the command chooses.
     """
     one = "" if scene is None else f" --scene {scene}"
-    chosen = f" --passes {','.join(words)}" if words else ""
-    return f"trilight passes .{one}{chosen} --out ../passes"
+    words = ",".join(pass_view.word for pass_view in PASS_VIEWS)
+    return f"trilight passes .{one}{f' --passes {words}' if for_page else ''} --out ../passes"
 
 
-def _view(sample: Sample, view: int, words: Sequence[str]) -> Markup:
-    names = [pass_names([word])[0] for word in words]
-    passes = view_passes(sample.scene, names, view=view, resolution=_PREVIEW_PX)
+def pass_figures(sample: Sample) -> list[list[Figure]]:
+    """Return small pictures of the passes, for each view."""
+    return [_figures_of_view(sample, view) for view in range(sample.scene.num_views)]
+
+
+def _figures_of_view(sample: Sample, view: int) -> list[Figure]:
+    names = [pass_names([pass_view.word])[0] for pass_view in PASS_VIEWS]
+    passes = view_passes(sample.scene, names, view=view, resolution=PREVIEW_PX)
     figures = []
     for pass_view, name in zip(PASS_VIEWS, names, strict=True):
         values = passes[name]
         is_hit = np.any(values != MISS if values.dtype == np.int32 else np.isfinite(values))
         means = pass_view.caption(values) if is_hit else "nothing is met"
         title = f"view {view}, {pass_view.title}"
-        picture = enlargeable(png_uri(pass_view.pixels(values)), title)
-        figures.append(element("figure", picture, element("figcaption", f"{title}: {means}")))
-    return element("div", *figures, class_="passes")
+        figures.append(Figure(png_uri(pass_view.pixels(values)), title, f"{title}: {means}"))
+    return figures

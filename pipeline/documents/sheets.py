@@ -1,6 +1,6 @@
 """Sheets: one picture with many pictures of a dataset, tone-mapped by `preview_srgb8`."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,23 +50,13 @@ def write_contact_sheet(
     chosen = choose_scenes(dataset, max_scenes)
     if not chosen:
         return
-    views = dataset.manifest.num_views
-    per_row = min(max(1, _TILES_PER_ROW // views), len(chosen))
-    row_width = per_row * (views * _TILE_PX + 2 * _MARGIN_PX)
-    rows = -(-len(chosen) // per_row)
-    row_height = _TILE_PX + _CAPTION_PX + _MARGIN_PX
-    sheet = Image.new("RGB", (row_width, _TITLE_PX + rows * row_height), _BACKGROUND)
     values = dict(statistics.lines())
     title = f"{dataset.manifest.build}: {values['scenes']}, {values['views']} views"
-    _write(sheet, _MARGIN_PX, 8, title, 20)
     floors = f"noise floor {values['noise floor']}; at the cap {values['views at the cap']}; "
     floors += "bright scenes are shown darker"
-    _write(sheet, _MARGIN_PX, 36, floors, 14, _FAINT)
-    for number, (entry, sample) in enumerate(read_chosen(dataset, chosen)):
-        row, column = divmod(number, per_row)
-        left_px = column * (row_width // per_row) + _MARGIN_PX
-        _draw_cell(sheet, sample, entry.split, left_px, _TITLE_PX + row * row_height)
-    write_atomically((out or dataset.folder).contact_sheet, encode_png(np.asarray(sheet)))
+    cells = ((sample, entry.split) for entry, sample in read_chosen(dataset, chosen))
+    sheet = _draw_sheet(title, floors, cells, len(chosen), dataset.manifest.num_views)
+    write_atomically((out or dataset.folder).contact_sheet, sheet)
 
 
 def write_first_pictures(folder: DatasetFolder, sample: Sample, *, build: str, split: str) -> None:
@@ -81,13 +71,10 @@ def write_first_pictures(folder: DatasetFolder, sample: Sample, *, build: str, s
     Raises:
         TrilightError: the folder cannot be written.
     """
-    width = len(sample.views) * _TILE_PX + 2 * _MARGIN_PX
-    height = _TITLE_PX + _TILE_PX + _CAPTION_PX + _MARGIN_PX
-    sheet = Image.new("RGB", (width, height), _BACKGROUND)
-    _write(sheet, _MARGIN_PX, 8, f"{build}: the first scene", 20)
-    _write(sheet, _MARGIN_PX, 36, "the dataset is still being made", 14, _FAINT)
-    _draw_cell(sheet, sample, split, _MARGIN_PX, _TITLE_PX)
-    write_atomically(folder.contact_sheet, encode_png(np.asarray(sheet)))
+    title = f"{build}: the first scene"
+    state = "the dataset is still being made"
+    sheet = _draw_sheet(title, state, [(sample, split)], 1, len(sample.views))
+    write_atomically(folder.contact_sheet, sheet)
 
 
 def write_template_sheet(
@@ -111,6 +98,24 @@ def write_template_sheet(
                 picture = sample.radiance_rgb[0] * preview_gain(sample.radiance_rgb)
                 sheet.paste(_tile(picture), (left_px, top + _LABEL_PX))
     write_atomically((out or dataset.folder).template_sheet, encode_png(np.asarray(sheet)))
+
+
+def _draw_sheet(
+    title: str, line: str, cells: Iterable[tuple[Sample, str]], count: int, num_views: int
+) -> bytes:
+    """Return the PNG file of `count` scenes with their splits, below a title and a line."""
+    per_row = min(max(1, _TILES_PER_ROW // num_views), count)
+    cell_width = num_views * _TILE_PX + 2 * _MARGIN_PX
+    row_height = _TILE_PX + _CAPTION_PX + _MARGIN_PX
+    size = (per_row * cell_width, _TITLE_PX - (-count // per_row) * row_height)
+    sheet = Image.new("RGB", size, _BACKGROUND)
+    _write(sheet, _MARGIN_PX, 8, title, 20)
+    _write(sheet, _MARGIN_PX, 36, line, 14, _FAINT)
+    for number, (sample, split) in enumerate(cells):
+        row, column = divmod(number, per_row)
+        left_px = column * cell_width + _MARGIN_PX
+        _draw_cell(sheet, sample, split, left_px, _TITLE_PX + row * row_height)
+    return encode_png(np.asarray(sheet))
 
 
 def _draw_cell(sheet: Image.Image, sample: Sample, split: str, left_px: int, top: int) -> None:

@@ -53,6 +53,11 @@ class Light:
     """World units squared, one side."""
 
     @property
+    def distance(self) -> float:
+        """Distance from the origin in world units."""
+        return float(np.sqrt(np.sum(np.square(self.centre))))
+
+    @property
     def emission(self) -> float:
         """Mean of the channels of its radiance: the unit of the setting `total_emission`."""
         return sum(self.radiance_rgb) / 3
@@ -165,7 +170,7 @@ def scene_values(record: SceneRecord) -> Mapping[str, Values]:
         "texture_width": [texture.texels.shape[1] for texture in scene.textures],
         "lights_per_scene": [len(emitting)],
         "total_emission": [sum(light.emission for light in emitting)],
-        "light_distance": [float(np.sqrt(np.sum(np.square(light.centre)))) for light in emitting],
+        "light_distance": [light.distance for light in emitting],
         "light_size": [float(np.sqrt(light.area)) for light in emitting],
         "skies_per_scene": [len(skies)],
         "sky_radiance": [sky.mean_radiance for sky in skies],

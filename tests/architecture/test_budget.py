@@ -14,7 +14,7 @@ from collections import Counter
 from infra.setup.command_line_page import every_command
 from tests.conftest import BUDGET, ROOT
 
-PROGRAMS = (".py", ".js", ".html", ".css", ".sh", ".sbatch")
+PROGRAMS = (".py", ".js", ".html", ".jinja", ".css", ".sh", ".sbatch")
 VENDORED = ("infra/viewer/static/three/", "docs/assets/")
 BENCH = "infra/bench"
 """Counted apart from the rest of infra."""

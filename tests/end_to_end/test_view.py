@@ -30,7 +30,7 @@ from tests.pipeline.documents.dataset_by_hand import (
     write_dataset,
 )
 from tests.pipeline.documents.rows_by_hand import row as mesh_row
-from tests.pipeline.documents.test_quality_page import failure
+from tests.pipeline.documents.test_pages import failure
 from tests.scenes_by_hand import tiny_scene
 
 pytestmark = [pytest.mark.slow("browser"), pytest.mark.timeout(900)]

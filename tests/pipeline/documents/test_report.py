@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.documents import report
 from pipeline.documents.card import encode_card
 from pipeline.documents.distributions import dataset_distributions
 from pipeline.documents.gallery import write_gallery
 from pipeline.documents.report import write_report
-from pipeline.documents.report_maps import maps_in_words, maps_section
-from pipeline.documents.report_sections import rejections_section
+from pipeline.documents.report_sections import _rejections
 from pipeline.documents.rights import rights_of
-from pipeline.documents.scene_maps import maps_section as maps_of_scene
+from pipeline.documents.scene_maps import shown_maps
+from pipeline.documents.scene_page import Neighbours, encode_scene_page
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError
@@ -136,7 +135,7 @@ def test_the_numbers_of_a_dataset_and_of_a_scene_are_on_their_pages(five: dict[s
     assert "views 10, 2 of each scene" in text
     assert "objects 4, 3 of them in scenes" in text
     assert "plane 3 0 3 wall 1 1 2 all 4 1 5" in text
-    assert "triangles of a scene 5 3 5 5.4 7" in text
+    assert "triangles of a scene 5 3 3 5 5.4 7 7" in text
     assert "objects 6 0.0% 100.0%" in text  # smooth, many colours
     assert "floors and walls 5 100.0% 0.0%" in text
     assert "train 8 41.5 38.0 75.0% 25.0%" in text
@@ -165,8 +164,7 @@ def test_one_scene_or_none_at_all(tmp_path: Path) -> None:
     assert shown[tmp_path / "report" / "000000009.html"].links[0] == "../report.html#gallery"
     assert "before" not in text_of(shown[tmp_path / "report" / "000000009.html"])
     assert "1 of 1 scenes" in text_of(shown[tmp_path / "report.html"])
-    nothing = rejections_section(dataset_distributions(dataset))
-    assert "Nothing was rejected" in nothing
+    assert _rejections(dataset_distributions(dataset)).notes == ["Nothing was rejected."]
     shown = pages(report_of(write_dataset(tmp_path / "none", {})))
     assert "scenes 0 (none)" in text_of(shown[tmp_path / "none" / "report.html"])
 
@@ -210,9 +208,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     scenes = [textured_scene(environment=dusk), textured_scene(), tiny_scene()]
     shards = {"train-000000.tar": [sample(key, scene) for key, scene in enumerate(scenes)]}
     dataset = write_dataset(tmp_path_factory.mktemp("maps"), shards)
-    with pytest.MonkeyPatch.context() as patch:  # the other figures take seconds
-        patch.setattr(report, "_SECTIONS", {"maps": report._SECTIONS["maps"]})
-        report_of(dataset)
+    report_of(dataset)
     return dataset
 
 
@@ -220,10 +216,10 @@ def test_the_report_and_the_card_count_maps_and_scenes_show_them(mapped: Dataset
     page = read(mapped.folder.report.read_bytes())
     text = text_of(page)
     assert "scenes textured 2 66.7% scenes below a sky 1 33.3%" in text
-    assert "objects textured 0 0.0% floors and walls textured 2 66.7%" in text
+    assert "objects textured 0 floors and walls textured 2 66.7%" in text
     assert "texture colours 0 2 texture roughness 2" in text and "sky sky 0 1" in text
-    assert "mean radiance of a sky 1 0.250 0.250 0.250 0.250" in text
-    assert "#maps" in page.links
+    assert "mean radiance of a sky 1 0.250 0.250 0.250 0.250 0.250 0.250" in text
+    assert "#textures-and-skies" in page.links
     found = dataset_distributions(mapped)
     card = encode_card(mapped.folder, mapped.manifest, found, rights_of(found.objects)).decode()
     assert "2 of 3 scenes, 4 maps of 2 families, 2 to 6 texels wide" in card
@@ -237,8 +233,9 @@ def test_the_report_and_the_card_count_maps_and_scenes_show_them(mapped: Dataset
 
 def test_a_plain_dataset_has_no_such_section(dataset: Dataset, five: dict[str, Tags]) -> None:
     found = dataset_distributions(dataset)
-    assert (maps_section(found), maps_in_words(found)) == ("", {})
-    assert "#maps" not in five["report"].links
+    card = encode_card(dataset.folder, dataset.manifest, found, rights_of(found.objects))
+    assert b"textures" not in card and b"skies" not in card
+    assert "#textures-and-skies" not in five["report"].links
 
 
 def test_a_texture_is_shown_as_it_lies() -> None:
@@ -247,13 +244,13 @@ def test_a_texture_is_shown_as_it_lies() -> None:
     texels[0, 1] = [200, 100, 50]
     texture = Texture(texels=texels, is_srgb=True, source=MapSource(name=HARM))
     number = Texture(texels=np.full((1, 1, 1), 128, np.uint8))
-    found = read(
-        "".join(maps_of_scene(textured_scene(0, texture, number, environment=sky()))).encode()
-    )
-    pictures = [_pixels(link) for link in found.links if link.startswith("data:")]
+    scene = textured_scene(0, texture, number, environment=sky())
+    pictures = [_pixels(shown.picture or "") for shown in shown_maps(scene)]
     assert pictures[0].tolist() == [[[0] * 3] * 2, [[0] * 3, [200, 100, 50]]]
     assert pictures[2].shape == (112, 224, 3) and pictures[2].max() == 255
-    assert "".join(found.text).count(HARM) == 2
+    links = Neighbours(report="", before=None, after=None)
+    page = read(encode_scene_page(sample(0, scene.with_provenance({})), "train", (), links))
+    assert "".join(page.text).count(HARM) == 2
 
 
 def _pixels(link: str) -> np.ndarray:

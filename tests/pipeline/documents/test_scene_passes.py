@@ -21,7 +21,6 @@ from pipeline.documents.pass_colors import (
 )
 from pipeline.documents.report import write_report
 from pipeline.documents.scene_page import Neighbours, encode_scene_page
-from pipeline.documents.scene_passes import passes_section
 from storage.conventions import look_at_c2w
 from storage.dataset.dataset import open_dataset
 from storage.dataset.manifest import write_manifest
@@ -45,7 +44,7 @@ def page_of(shown: Sample) -> str:
 def figures(page: str) -> dict[str, tuple[NDArray[np.uint8], str]]:
     """Return the pictures of a page with their captions, by what stands for them."""
     picture = r'<img alt="([^"]+?)" src="data:image/png;base64,([^"]+?)"></label>'
-    form = rf"<figure><label><input [^>]+>{picture}<figcaption>(.+?)</"
+    form = rf"<figure><label><input [^>]+>\n{picture}<figcaption>(.+?)</"
     return {
         alt: (np.asarray(Image.open(io.BytesIO(base64.b64decode(data)))), caption)
         for alt, data, caption in re.findall(form, page)
@@ -53,7 +52,9 @@ def figures(page: str) -> dict[str, tuple[NDArray[np.uint8], str]]:
 
 
 def commands(page: str) -> list[str]:
-    return [html.unescape(text) for text in re.findall("<code>(.+?)</code>", page)]
+    return [
+        html.unescape(text) for text in re.findall("<code[^>]*>(trilight passes .+?)</code>", page)
+    ]
 
 
 def looking_away() -> Scene:
@@ -65,7 +66,7 @@ def looking_away() -> Scene:
 
 def test_colours_and_captions_say_the_value() -> None:
     scene = furnished(["a"])
-    shown = figures(passes_section(sample(0, scene)))
+    shown = figures(page_of(sample(0, scene)))
     names = ["depth_axis_m", "shading_normal", "object", "material_diffuse", "material_roughness"]
     for view in range(scene.num_views):
         depth_m, normal, ids, _, roughness = view_passes(

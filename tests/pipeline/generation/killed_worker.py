@@ -60,7 +60,7 @@ if __name__ == "__main__":
     if sys.argv[1] == "generate":
         patch = pytest.MonkeyPatch()
         without_rendering(patch, _made)
-        patch.setattr("pipeline.documents.report._SECTIONS", {})
+        patch.setattr("pipeline.documents.report.report_sections", lambda found: {})
         main()
     else:
         without_probe(pytest.MonkeyPatch())

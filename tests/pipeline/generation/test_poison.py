@@ -43,7 +43,7 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         write_obj(folder / "objects" / f"knot{number}.obj", knot(segments=20 + number, sides=6))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TRILIGHT_CACHE", str(folder / "cache"))
-        patch.setattr("pipeline.documents.report._SECTIONS", {})
+        patch.setattr("pipeline.documents.report.report_sections", lambda found: {})
         make(folder, folder / "plain")
         yield folder
 
