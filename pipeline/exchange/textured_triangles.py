@@ -4,7 +4,7 @@ Each triangle has three separate corners. Corners of equal position and normal b
 and equal materials one row. Textures of one color become constants.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,9 +22,6 @@ TextureSet = tuple[Texture | None, Texture | None, Texture | None]
 """Textures in the order of TEXTURED; None where the material column is the value."""
 
 NO_TEXTURES: TextureSet = (None, None, None)
-
-_SMALLEST_DOUBLE_AREA = 1e-12
-"""Twice the area of a triangle, in square meters, below which it counts as empty."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,6 +53,28 @@ class TexturedTriangles:
         )
 
 
+def join_triangles(
+    parts: Sequence[TexturedTriangles], places: Sequence[NDArray[np.int64]]
+) -> TexturedTriangles:
+    """Return the triangles of several parts, in the order of `places` [T], which they cover."""
+    order = np.argsort(np.concatenate(places), kind="stable")
+    starts = np.cumsum([0, *(len(part.texture_sets) for part in parts)])
+
+    def join(arrays: Iterable[NDArray]) -> NDArray:
+        return np.concatenate(list(arrays))[order]
+
+    return TexturedTriangles(
+        positions=join(part.positions for part in parts),
+        normals=join(part.normals for part in parts),
+        rows=join(part.rows for part in parts),
+        uv=join(part.uv for part in parts),
+        texture_set_index=join(
+            part.texture_set_index + start for part, start in zip(parts, starts, strict=False)
+        ),
+        texture_sets=[each for part in parts for each in part.texture_sets],
+    )
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TexturedPiece:
     """An object of a scene with its textures."""
@@ -66,16 +85,6 @@ class TexturedPiece:
     """[T, 3, 2] texture coordinates of the corners."""
     texture_sets: tuple[TextureSet, ...]
     """Texture set of each material row of `piece`."""
-
-
-def have_areas(corners: NDArray[np.floating], cross: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return a mask [T] of the triangles [T, 3, 3] with an area.
-
-    `cross` [T, 3] are the cross products of their edges. In a mesh smaller than a meter the limit
-    shrinks with its size: triangles of a watch are small.
-    """
-    size = min(float(np.ptp(corners.reshape(-1, 3), axis=0).max()), 1.0) if corners.size else 1.0
-    return np.asarray(np.linalg.norm(cross, axis=1) > _SMALLEST_DOUBLE_AREA * size**2)
 
 
 def split_by_kind(triangles: TexturedTriangles) -> list[tuple[ObjectKind, TexturedTriangles]]:

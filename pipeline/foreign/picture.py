@@ -31,6 +31,8 @@ UNREADABLE_PICTURE = (
 """Text that records hold for such a picture, since they never quote a library."""
 
 _STRIP = 256  # rows; an even number, since pairs of rows are averaged
+_MOST = 65504.0
+"""Largest number of a half float."""
 
 
 class Decoder:
@@ -46,18 +48,27 @@ class Decoder:
         return values
 
 
-def decode_image(data: bytes, name: str, max_pixels: int) -> NDArray:
+def decode_image(
+    data: bytes, name: str, max_pixels: int, notes: list[str] | None = None
+) -> NDArray:
     """Return a picture [H, W, 4], row 0 at the bottom: uint8, or uint16 for grays of 16 bits.
 
     Palettes, grays, transparency and CMYK become RGBA; colors of 16 bits are reduced to 8. OpenEXR
-    and Radiance are float16, clipped to [0, 1].
+    and Radiance are float16, clipped to 0 from below; emission may exceed 1.
+    `notes` receives sentences on what is not read, or replaced; without them, that is refused.
 
     Raises:
         Rejected: texture_too_large or texture_unreadable.
     """
     try:
         if (linear := read_linear_picture(data, max_pixels)) is not None:
-            return np.ascontiguousarray(_unit_values(linear.values)[::-1])
+            if notes is not None:
+                notes += [f"{name!r:.100}: {sentence}" for sentence in linear.unread]
+            values = linear.values
+            if notes is not None and not np.isfinite(values).all():
+                notes.append(f"{name!r:.100}: texels that are no finite numbers: NaN replaced by 0")
+                values = np.nan_to_num(values, nan=0.0)
+            return np.ascontiguousarray(_unit_values(values)[::-1])
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # ours is stricter
             with Image.open(io.BytesIO(data), formats=FORMATS) as image:
@@ -103,7 +114,7 @@ def _unit_values(values: NDArray[np.float32]) -> NDArray[np.float16]:
         raise Rejected("texture_unreadable", "some of its values are no finite numbers")
     count = values.shape[2]
     rgba = np.ones((*values.shape[:2], 4), np.float16)
-    rgba[..., :3] = np.clip(values[..., :3] if count >= 3 else values[..., :1], 0, 1)
+    rgba[..., :3] = np.clip(values[..., :3] if count >= 3 else values[..., :1], 0, _MOST)
     if count in (2, 4):
         rgba[..., 3] = np.clip(values[..., -1], 0, 1)
     return rgba
@@ -120,7 +131,7 @@ def _decode_values(image: Image.Image) -> NDArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Picture:
-    """Values in [0, 1] over texture coordinates, u to the right and v up."""
+    """Values over texture coordinates, u to the right and v up; those of floats may exceed 1."""
 
     values: NDArray
     """[H, W, 4] as `decode_image` returns them, or linear float32."""
@@ -202,6 +213,13 @@ class Picture:
         values: NDArray[np.float32] = ((1 - across) * low + across * high).astype(np.float32)
         values[beyond] = 0
         return values
+
+
+def spread_points(steps: int = 8) -> NDArray[np.float64]:
+    """Return barycentric coordinates [P, 3] of points evenly over a triangle, `steps` an edge."""
+    rows = [(i, j) for i in range(steps) for j in range(steps - i)]
+    u, v = (np.array(rows, np.float64).T + 1 / 3) / steps
+    return np.stack([u, v, 1 - u - v], axis=1)
 
 
 def _halve(values: NDArray[np.float32]) -> NDArray[np.float32]:

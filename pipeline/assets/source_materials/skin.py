@@ -20,7 +20,7 @@ from pipeline.foreign.numbers import FINITE
 from pipeline.foreign.picture import Decoder
 from pipeline.foreign.source_file import SourceFile
 from pipeline.foreign.textured_mesh import TexturedMesh
-from pipeline.foreign.usd.object_materials import usd_textured_mesh
+from pipeline.foreign.usd.materials import usd_textured_mesh
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level
 from storage.records.packed_maps import pack_texture

@@ -19,9 +19,8 @@ from pipeline.exchange.gltf.cameras_and_lights import (
     light_triangles,
     read_camera,
 )
-from pipeline.exchange.gltf.materials import apply_material
-from pipeline.exchange.gltf.meshes import WorldTriangles
-from pipeline.exchange.pictures import MAX_PIXELS
+from pipeline.exchange.part_materials import convert_part
+from pipeline.exchange.pictures import decode_values
 from pipeline.exchange.textured_triangles import (
     TexturedPiece,
     TexturedTriangles,
@@ -37,7 +36,7 @@ from pipeline.foreign.gltf.nodes import PlacedNode, entry, extension, placed_nod
 from pipeline.foreign.gltf.primitives import PlacedPrimitive, placed_primitives
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material import SourceMaterial
-from pipeline.foreign.picture import decode_image
+from pipeline.foreign.part import Part, drop_empty, unit_normals
 from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import ObjectKind, Scene, SceneObject
@@ -135,17 +134,10 @@ class _GltfReader:
 
     @cached_property
     def _materials(self) -> GltfMaterials:
-        return GltfMaterials(self.document, self._decode, emission=True, notes=self.lost)
+        def decode(data: bytes, name: str) -> NDArray:
+            return decode_values(data, name, self.lost)
 
-    def _decode(self, data: bytes, name: str) -> NDArray:
-        try:
-            return decode_image(data, name, MAX_PIXELS)
-        except Rejected as why:
-            if why.reason != "texture_too_large":
-                raise
-            raise TrilightError(
-                f"{self.name}: {name}: expected at most {MAX_PIXELS} pixels."
-            ) from why
+        return GltfMaterials(self.document, decode, emission=True, notes=self.lost)
 
     def _material(self, number: int | None) -> SourceMaterial:
         material = DEFAULT if number is None else self._materials.material(number)
@@ -153,17 +145,35 @@ class _GltfReader:
         return material
 
     def _triangles(self, primitive: PlacedPrimitive) -> TexturedTriangles:
-        triangles = WorldTriangles(primitive)
-        if triangles.num_without_area:
+        corners = primitive.positions[primitive.faces]
+        if not np.isfinite(corners).all():
+            raise Rejected("nonfinite_vertices", "positions are not finite")
+        positions, flat, has_area = drop_empty(corners)
+        if not has_area.all():
             self.lost.append("triangles without an area")
+
+        def select(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+            return None if values is None else values[has_area]
+
+        def coordinates(number: int) -> NDArray[np.float64] | None:
+            uv = select(primitive.coordinates(number))
+            if uv is not None and not np.isfinite(uv).all():
+                raise Rejected("texture_coordinates_not_finite", f"TEXCOORD_{number} is not finite")
+            return uv
+
         number = primitive.primitive.material
         row = {} if number is None else entry(self.document.tree, "materials", number)
-        source = MapSource(
-            name=str(row.get("name", ""))[:200],
-            licence=self.licence,
-            attribution=self._attribution(),
+        part = Part(
+            where="",
+            material=self._material(number),
+            positions=positions,
+            normals=unit_normals(select(primitive.normals), flat),
+            coordinates=coordinates,
+            colors=select(primitive.colors),
         )
-        return apply_material(self._material(number), triangles, source, self.lost)
+        name = str(row.get("name", ""))[:200]
+        source = MapSource(name=name, licence=self.licence, attribution=self._attribution())
+        return convert_part(part, source, self.lost)
 
     def _light(self, placed: PlacedNode) -> dict[str, Any] | None:
         """Return the JSON of a node's light; None where it has none."""

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.exchange.textured_triangles import (
     NO_TEXTURES,
@@ -19,9 +18,10 @@ from pipeline.exchange.textured_triangles import (
 from pipeline.exchange.usd.dome import read_foreign_dome
 from pipeline.exchange.usd.foreign_cameras import fit_camera, read_stage_cameras
 from pipeline.exchange.usd.foreign_lights import compute_radiance, light_triangles
-from pipeline.exchange.usd.foreign_materials import read_surface_materials
-from pipeline.exchange.usd.foreign_meshes import TriangleSoup, read_mesh
+from pipeline.exchange.usd.foreign_materials import StageSurfaces
+from pipeline.exchange.usd.foreign_meshes import read_mesh
 from pipeline.exchange.usd.names import FOV_DEG, INDEX, OBJECT_TEXTS, parse_camera_row
+from pipeline.foreign.usd.object_stage import UsdStage
 from pipeline.foreign.usd.placed import DOMES, PlacedPrim, placed_prims
 from pipeline.foreign.usd.solids import SOLIDS
 from pipeline.foreign.usd.stage import OpenedStage
@@ -44,15 +44,29 @@ def build_stage_scene(stage: Any, time: Any, opened: OpenedStage, licence: str) 
             triangles or light.
     """
     placed = sorted(placed_prims(stage, time, opened.lost), key=_read_row)
+    meshes = tuple(each for each in placed if each.prim.GetTypeName() in ("Mesh", *SOLIDS))
+    surfaces = StageSurfaces(
+        UsdStage(opened=opened, composed=stage, meshes=meshes, time=time), licence
+    )
+    numbers = iter(range(len(meshes)))
     pieces: list[TexturedPiece] = []
     names: set[str] = set()
-    triangles = 0
+    num_triangles = 0
     for each in placed:
         if each.prim.GetTypeName() in ("Camera", *DOMES):
             continue
-        new_pieces = _pieces(each, time, opened, licence, names)
-        triangles += sum(len(one.piece.mesh.faces) for one in new_pieces)
-        if triangles > MAX_TRIANGLES:
+        if each.prim.GetTypeName() in ("Mesh", *SOLIDS):
+            triangles = _convert_mesh(each, next(numbers), surfaces, time, opened.lost)
+        else:
+            triangles = _convert_light(each, time, opened.lost)
+        if triangles is None:
+            continue
+        new_pieces = [
+            build_piece(_entry(each.prim, kind, licence, names), part)
+            for kind, part in split_by_kind(triangles)
+        ]
+        num_triangles += sum(len(one.piece.mesh.faces) for one in new_pieces)
+        if num_triangles > MAX_TRIANGLES:
             raise TrilightError(f"more than {MAX_TRIANGLES} triangles.")
         pieces += new_pieces
         if len(pieces) > MAX_ROWS:
@@ -118,28 +132,14 @@ def _read_environment(
     return sky
 
 
-def _pieces(
-    each: PlacedPrim, time: Any, opened: OpenedStage, licence: str, names: set[str]
-) -> list[TexturedPiece]:
-    prim = each.prim
-    if prim.GetTypeName() not in ("Mesh", *SOLIDS):
-        triangles = light_triangles(each, time, opened.lost)
-        if triangles is None:
-            return []
-        light = compute_radiance(each, triangles, time, opened.lost)
-        return _split(each, _build_light(triangles, light), licence, names)
-    soup = read_mesh(each, time, opened.lost)
-    if not len(soup.positions):
-        opened.lost.append(f"{prim.GetPath()}: no triangle with an area")
-        return []
-    return _split(each, _build_mesh(each, soup, time, opened, licence), licence, names)
-
-
-def _build_light(triangles: NDArray[np.float32], light: NDArray[np.float32]) -> TexturedTriangles:
+def _convert_light(each: PlacedPrim, time: Any, lost: list[str]) -> TexturedTriangles | None:
+    triangles = light_triangles(each, time, lost)
+    if triangles is None:
+        return None
     count = len(triangles)
     rows = default_rows(count)
     rows[:, ROUGHNESS] = 1
-    rows[:, EMISSION] = light
+    rows[:, EMISSION] = compute_radiance(each, triangles, time, lost)
     corners = triangles.reshape(-1, 3)
     flat = flat_shaded(corners, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3))
     return TexturedTriangles(
@@ -152,40 +152,27 @@ def _build_light(triangles: NDArray[np.float32], light: NDArray[np.float32]) -> 
     )
 
 
-def _build_mesh(
-    placed: PlacedPrim, soup: TriangleSoup, time: Any, opened: OpenedStage, licence: str
-) -> TexturedTriangles:
+def _convert_mesh(
+    placed: PlacedPrim, number: int, surfaces: StageSurfaces, time: Any, lost: list[str]
+) -> TexturedTriangles | None:
     prim = placed.prim
-    materials = read_surface_materials(soup, time, opened, licence)
-    rows = materials.rows
+    soup = read_mesh(placed, time, lost)
+    if not len(soup.positions):
+        lost.append(f"{prim.GetPath()}: no triangle with an area")
+        return None
+    triangles = surfaces.convert(number, soup)
+    rows = triangles.rows
     if prim.HasAPI("MeshLightAPI"):
-        light = compute_radiance(placed, soup.positions, time, opened.lost)
+        light = compute_radiance(placed, soup.positions, time, lost)
         mode = prim.GetAttribute("light:materialSyncMode").Get(time)
         glows = rows[:, EMISSION].any()
         tints = mode == "materialGlowTintsLight" and glows
         rows[:, EMISSION] = rows[:, EMISSION] * light if tints else light
         if mode == "materialGlowTintsLight" and not glows:
-            opened.lost.append(
+            lost.append(
                 f"{prim.GetPath()}: its material emits nothing; the radiance of the light is used"
             )
-    return TexturedTriangles(
-        positions=soup.positions,
-        normals=soup.normals,
-        rows=rows,
-        uv=materials.uv,
-        texture_set_index=materials.texture_set_index,
-        texture_sets=materials.texture_sets,
-    )
-
-
-def _split(
-    each: PlacedPrim, triangles: TexturedTriangles, licence: str, names: set[str]
-) -> list[TexturedPiece]:
-    """Build an object of the triangles that reflect, and one of those that emit."""
-    return [
-        build_piece(_entry(each.prim, kind, licence, names), part)
-        for kind, part in split_by_kind(triangles)
-    ]
+    return triangles
 
 
 def _entry(prim: Any, kind: ObjectKind, licence: str, names: set[str]) -> SceneObject:

@@ -10,7 +10,6 @@ from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.usd.object_stage import UsdStage
 from pipeline.foreign.usd.polygons import CutMesh, cut_mesh, mesh_polygons, place_points
-from pipeline.foreign.usd.texture_nodes import UvChart, chart_corners
 from storage.errors import Rejected
 
 _MAX_OFFSET = 1e5
@@ -33,7 +32,7 @@ class PlacedMesh:
         """Return the values [T, S, 3, 2] of primvars at corners; NaN where there are none."""
         uv = np.full((len(self.cut.corners), len(primvars), 3, 2), np.nan)
         for row, name in enumerate(primvars):
-            values = chart_corners(UvChart(primvar=name, transforms=()), self.cut, time)
+            values = self.cut.read_coordinates(name, time)
             if values is not None:
                 uv[:, row] = values
         return uv

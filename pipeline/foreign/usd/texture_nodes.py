@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.numbers import read_number, read_numbers
-from pipeline.foreign.usd.polygons import CutMesh
 from pipeline.foreign.usd.stage import OpenedStage, file_and_member
 from storage.errors import TrilightError
 
@@ -137,17 +136,6 @@ def read_chart(shader: Any, time: Any, lost: list[str]) -> UvChart:
             lost.append(f"{node.GetPath()}: not read; texture coordinates {primvar!r:.60} taken")
         break
     return UvChart(primvar=primvar, transforms=tuple(reversed(moves)))
-
-
-def chart_corners(chart: UvChart, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:
-    """Return the coordinates [T, 3, 2] of a chart before its transforms; some may not be finite.
-
-    None where the mesh has none, or not for every corner.
-    """
-    values = cut.read_primvar(chart.primvar, time)
-    if values is None or values.ndim != 3 or values.shape[2] < 2:
-        return None
-    return np.asarray(values[..., :2], np.float64)
 
 
 def asset_bytes(resolved: str, max_bytes: int) -> bytes | None:

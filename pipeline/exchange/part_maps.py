@@ -4,7 +4,7 @@ A material has one set of coordinates here: that of its first picture. A picture
 becomes its mean.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.linear_maps import Map, constant_map
 from pipeline.exchange.wrapping import choose_tiles, expand_tiles, shift_near_zero
-from pipeline.foreign.material import Slot, SourceMaterial
+from pipeline.foreign.material import Slot
+from pipeline.foreign.part import Part
 
 SLOTS: Mapping[str, str] = {
     "base": "base",
@@ -23,9 +24,6 @@ SLOTS: Mapping[str, str] = {
     "glossiness": "glossiness",
 }
 """Slot of `SourceMaterial` for each field of `MaterialSamples`."""
-
-Coordinates = Callable[[int], NDArray[np.float64] | None]
-"""Function from the number of a set to its texture coordinates [T, 3, 2], v up."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,24 +36,21 @@ class SampledMaps:
     """[T, 3, 2] coordinates in the maps; None where all maps are constants."""
 
 
-def sample_slots(
-    material: SourceMaterial, coordinates: Coordinates, lost: list[str]
-) -> SampledMaps:
-    """Return the maps of a material.
+def sample_slots(part: Part, lost: list[str]) -> SampledMaps:
+    """Return the maps of a part's material; its first picture decides on the coordinates.
 
-    Args:
-        material: the material; its first slot decides on the coordinates.
-        coordinates: function that returns a set of coordinates of the mesh.
-        lost: receives a sentence for each loss.
+    `lost` receives a sentence for each loss.
     """
-    stated = {name: getattr(material, field) for name, field in SLOTS.items()}
+    stated = {name: getattr(part.material, field) for name, field in SLOTS.items()}
     slots: dict[str, Slot] = {name: slot for name, slot in stated.items() if slot is not None}
     pictures = {name: slot.picture.linear(slot.picture.values) for name, slot in slots.items()}
     first = next(iter(slots.values()), None)
-    plain = None if first is None else coordinates(first.uv_set)
+    plain = None if first is None else part.coordinates(first.uv_set)
     uv = None if first is None or plain is None else plain @ first.uv_matrix.T + first.uv_offset
     if slots and uv is None:
-        lost.append("textures of a mesh without texture coordinates: replaced by their means")
+        lost.append(
+            f"{part.where}textures of a mesh without texture coordinates: replaced by their means"
+        )
     same_chart = [
         name
         for name, slot in slots.items()
@@ -63,7 +58,8 @@ def sample_slots(
     ]
     if uv is not None and len(same_chart) < len(slots):
         lost.append(
-            "textures with other coordinates than the first of a material: replaced by means"
+            f"{part.where}textures with other coordinates than the first of a material: replaced "
+            "by means"
         )
     maps = {name: constant_map(picture.mean(axis=(0, 1))) for name, picture in pictures.items()}
     if uv is None:
@@ -86,7 +82,9 @@ def sample_slots(
     ]
     near, all_near = shift_near_zero(moved)
     if not (is_exact and all_near):
-        lost.append("coordinates far outside [0, 1]: some textures look different there")
+        lost.append(
+            f"{part.where}coordinates far outside [0, 1]: some textures look different there"
+        )
     return SampledMaps(maps=maps, uv=near.astype(np.float32))
 
 

@@ -1,7 +1,7 @@
-"""Converts glTF materials on a mesh to textures and material rows, as for objects.
+"""Converts parts of any format to textures and material rows, as for objects.
 
-glTF reflects more at grazing angles, by Schlick's curve; a scene's material reflects the mean of
-that curve at all angles (pipeline.foreign.material).
+Other formats reflect more at grazing angles, by Schlick's curve; a scene's material reflects the
+mean of that curve at all angles (pipeline.foreign.material).
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,8 +9,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.gltf.meshes import WorldTriangles
-from pipeline.exchange.gltf.textures import SLOTS, SampledMaps, sample_slots
 from pipeline.exchange.linear_maps import (
     Map,
     color_textures,
@@ -18,14 +16,20 @@ from pipeline.exchange.linear_maps import (
     number_texture,
     resample_to_largest,
 )
+from pipeline.exchange.part_maps import SLOTS, SampledMaps, sample_slots
 from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles, TextureSet
 from pipeline.foreign.material import MaterialSamples, SourceMaterial, source_columns
+from pipeline.foreign.part import Part
+from pipeline.foreign.picture import spread_points
 from storage.conventions import srgb8
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.records.texture import MapSource
 
 _STRIP = 256
 """Number of texel rows whose material columns are computed at a time."""
+
+_TRIANGLES = 4096
+"""Number of triangles whose emission is sampled at a time."""
 
 _MOST_TINTS = 256
 """Maximum number of vertex colors that become separate materials; more become a texture."""
@@ -36,28 +40,26 @@ _MOST_TINTED = 1 << 25
 _ROUGH = ("roughness", "glossiness")
 
 
-def apply_material(
-    material: SourceMaterial, triangles: WorldTriangles, source: MapSource, lost: list[str]
-) -> TexturedTriangles:
-    """Return triangles with the textures and rows of a material.
+def convert_part(part: Part, source: MapSource, lost: list[str]) -> TexturedTriangles:
+    """Return the triangles of a part with the textures and rows of its material.
 
     Args:
-        material: the material as the file states it.
-        triangles: the triangles, with coordinates and colors.
+        part: the triangles, with coordinates, colors and a material.
         source: name and rights of the textures.
         lost: receives a sentence for each loss.
     """
-    count = len(triangles.positions)
+    material = part.material
+    count = len(part.positions)
     most = _MOST_TINTED
-    sampled = sample_slots(material, triangles.coordinates, lost)
+    sampled = sample_slots(part, lost)
     if sampled.uv is not None:
         texels = max(values[..., 0].size for values in sampled.maps.values())
         most = min(max(_MOST_TINTED // texels, 1), _MOST_TINTS)
-    tints, tint_index = _tints(triangles.colors, count, most, lost)
+    tints, tint_index = _tints(part, most, lost)
     if sampled.uv is None and len(tints) > _MOST_TINTS:
         sampled, tints, tint_index = _with_palette(sampled, tints, tint_index)
     rows = default_rows(count)
-    rows[:, EMISSION] = _emission(material, lost)
+    rows[:, EMISSION] = _emission(part, lost)
     texture_sets: Sequence[TextureSet] = (NO_TEXTURES,)
     if sampled.uv is not None:
         texture_sets = [_textures(material, sampled.maps, tint, source) for tint in tints]
@@ -67,8 +69,8 @@ def apply_material(
         rows[:, SPECULAR] = values[:, 3:6]
         rows[:, ROUGHNESS] = values[:, 6]
     return TexturedTriangles(
-        positions=triangles.positions,
-        normals=triangles.normals,
+        positions=part.positions,
+        normals=part.normals,
         rows=rows,
         uv=np.zeros((count, 3, 2), np.float32) if sampled.uv is None else sampled.uv,
         texture_set_index=tint_index % len(texture_sets),
@@ -128,14 +130,13 @@ def _collapse_constant(values: NDArray[np.float32]) -> Map:
     return values[:1, :1] if (values == values[0, 0]).all() else values
 
 
-def _tints(
-    colors: NDArray[np.float64] | None, count: int, most: int, lost: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _tints(part: Part, most: int, lost: list[str]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return at most `most` colors [K, 3], and the index [T] of the color of each triangle."""
-    if colors is None or not count:
-        return np.ones((1, 3)), np.zeros(count, np.int64)
+    colors = part.colors
+    if colors is None or not len(colors):
+        return np.ones((1, 3)), np.zeros(len(part.positions), np.int64)
     if np.ptp(colors, axis=1).max() > 1 / 255:
-        lost.append("colors of vertices: replaced by the mean of each triangle")
+        lost.append(f"{part.where}colors of vertices: replaced by the mean of each triangle")
     plain = np.clip(np.nan_to_num(colors.mean(axis=1)), 0, 1)
     tints, tint_index = _group_colors(plain, np.round(plain * 1e6).astype(np.int64))
     coded = srgb8(plain).astype(np.int64)
@@ -144,7 +145,7 @@ def _tints(
         tints, tint_index = _group_colors(plain, coded >> shift)
         shift += 1
     if shift:
-        lost.append("colors of vertices over textures: rounded to a few")
+        lost.append(f"{part.where}colors of vertices over textures: rounded to a few")
     return tints, tint_index
 
 
@@ -172,11 +173,21 @@ def _with_palette(
     return with_palette, np.ones((1, 3)), np.zeros(len(tint_index), np.int64)
 
 
-def _emission(material: SourceMaterial, lost: list[str]) -> NDArray[np.float64]:
-    """Return the radiance [3] of a material; a texture counts by its mean."""
-    radiance: NDArray[np.float64] = np.array(material.emission_rgb)
-    if material.emission is not None:
-        picture = material.emission.picture
-        lost.append("textures of emission: replaced by their means")
-        radiance = radiance * picture.linear(picture.values).mean(axis=(0, 1))[:3]
+def _emission(part: Part, lost: list[str]) -> NDArray[np.float64]:
+    """Return the radiance [T, 3] of triangles; a texture counts by its mean over each."""
+    radiance = np.tile(part.material.emission_rgb, (len(part.positions), 1))
+    slot = part.material.emission
+    if slot is None or not part.material.emits:
+        return radiance
+    lost.append(f"{part.where}textures of emission: one value for each triangle")
+    picture = slot.picture
+    uv = part.coordinates(slot.uv_set)
+    if uv is None:
+        return radiance * picture.linear(picture.values).mean(axis=(0, 1))[:3]
+    for first in range(0, len(uv), _TRIANGLES):
+        corners = uv[first : first + _TRIANGLES] @ slot.uv_matrix.T + slot.uv_offset
+        points = np.einsum("pk,tkc->tpc", spread_points(), corners)
+        flat = points.reshape(-1, 2)
+        values = picture.sample(flat, np.zeros(len(flat), np.int64)).reshape(*points.shape[:2], 4)
+        radiance[first : first + _TRIANGLES] *= values.mean(axis=1)[:, :3]
     return radiance
