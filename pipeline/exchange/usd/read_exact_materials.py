@@ -8,24 +8,13 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.usd import names
-from pipeline.exchange.usd.authoring import has_attributes
-from pipeline.exchange.usd.exact_layer import (
-    children_by_row,
-    drop_absent,
-    require,
-    require_children,
-    require_plain,
-)
+from pipeline.exchange.usd.exact_layer import list_by_row, require
 from pipeline.exchange.usd.texture_files import decode_texture
-from pipeline.exchange.usd.write_materials import material_tables
-from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, SHADERS, Used, material_links
+from pipeline.exchange.usd.write_textures import SHADERS
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.records.material import PUBLISHED_COLUMNS, declared_column, default_rows, laid_out
 from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
-
-_ADDED = {"inputs:ior", COAT_ROUGHNESS, "outputs:r", *map(names.texture_attribute, TEXTURED)}
-"""Properties that older Trilights did not write; their roughness textures have `outputs:r`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,7 +40,7 @@ def read_exact_materials(folder: Any, opened: OpenedStage | None) -> ExactMateri
         UndeclaredColumn: a material has a column that is not declared here.
         Changed, LookupError, TypeError, ValueError: the materials are not as export writes them.
     """
-    prims = children_by_row(folder, names.material_name)
+    prims = list_by_row(folder, names.material_name)
     rows = default_rows(len(prims))
     columns = _list_columns(prims[0])
     index = np.full((len(prims), len(TEXTURED)), CONSTANT, np.int32)
@@ -61,9 +50,8 @@ def read_exact_materials(folder: Any, opened: OpenedStage | None) -> ExactMateri
             if column.name in columns:
                 rows[row, part] = prim.attributes[names.column_attribute(column.name)].default
         used = _read_textures(prim, textures, opened)
-        for name, (texture, _) in used.items():
+        for name, texture in used.items():
             index[row, TEXTURED.index(name)] = texture
-        _require_prims(prim, rows[row], columns, used)
     return ExactMaterials(
         rows=rows,
         textures=tuple(textures[row] for row in range(len(textures))),
@@ -71,30 +59,10 @@ def read_exact_materials(folder: Any, opened: OpenedStage | None) -> ExactMateri
     )
 
 
-def _require_prims(
-    prim: Any, values: NDArray[np.float32], columns: tuple[str, ...], used: Used
-) -> None:
-    """Require that a material's prims are exactly those that export writes for its row."""
-    tables = material_tables(values, columns, used)
-    links = material_links(list(used))
-    require_children(
-        prim, {relative_path.removeprefix("/") for relative_path in tables if relative_path}
-    )
-    root_path = prim.path.StripAllVariantSelections()
-    for relative_path in tables:
-        child = prim.nameChildren[relative_path.removeprefix("/")] if relative_path else prim
-        table = drop_absent(child, tables[relative_path], _ADDED)
-        linked = drop_absent(child, links[relative_path], _ADDED)
-        require(has_attributes(child, table))
-        require_plain(child, {*table, *linked})
-        for attribute in child.attributes:
-            source = linked.get(attribute.name, ("", None))[1]
-            connections = [str(path) for path in attribute.connectionPathList.explicitItems]
-            require(connections == ([] if source is None else [f"{root_path}/{source}"]))
-
-
-def _read_textures(prim: Any, textures: dict[int, Texture], opened: OpenedStage | None) -> Used:
-    """Return the textures of a material, and add new ones to `textures`."""
+def _read_textures(
+    prim: Any, textures: dict[int, Texture], opened: OpenedStage | None
+) -> dict[str, int]:
+    """Return the texture rows of a material's columns, and add new ones to `textures`."""
     used = {}
     for name, shader in SHADERS.items():
         if shader not in prim.nameChildren:
@@ -105,7 +73,7 @@ def _read_textures(prim: Any, textures: dict[int, Texture], opened: OpenedStage 
         row = attributes[names.TEXTURE_ROW].default
         if row not in textures:
             textures[row] = _read_texture(attributes, prim.layer, opened)
-        used[name] = (row, textures[row])
+        used[name] = row
     return used
 
 
