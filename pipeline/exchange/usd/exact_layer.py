@@ -33,13 +33,15 @@ def require_same(found: Any, expected: Any) -> None:
 
 
 def _require_same(found: Any, expected: Any, roots: tuple[str, str]) -> None:
-    properties = set(found.properties.keys())
-    wanted = set(expected.properties.keys())
-    require(properties <= wanted and wanted - properties <= _ADDED)
+    properties = {each.name: each for each in found.properties}
+    wanted = {each.name: each for each in expected.properties}
+    missing = wanted.keys() - properties.keys()
+    require(properties.keys() <= wanted.keys() and missing <= _ADDED)
     require(found.typeName == expected.typeName and set(found.ListInfoKeys()) <= _PLAIN_INFO)
-    is_old = CENTER in wanted - properties  # its points are positions
-    for name in properties - ({"points", "extent"} if is_old else set()):
-        _require_same_property(found.properties[name], expected.properties[name], roots)
+    is_old = CENTER in missing  # its points are positions
+    for name, each in properties.items():
+        if not is_old or name not in ("points", "extent"):
+            _require_same_property(each, wanted[name], roots)
     prims = {prim.name: prim for prim in found.nameChildren}
     require(prims.keys() == {prim.name for prim in expected.nameChildren})
     for prim in expected.nameChildren:
@@ -47,12 +49,15 @@ def _require_same(found: Any, expected: Any, roots: tuple[str, str]) -> None:
 
 
 def _require_same_property(found: Any, expected: Any, roots: tuple[str, str]) -> None:
-    require(type(found) is type(expected) and not found.HasInfo("timeSamples"))
+    require(type(found) is type(expected))
     links = "targetPathList"
     if hasattr(expected, "connectionPathList"):
         links = "connectionPathList"
         require(found.typeName == expected.typeName and found.default == expected.default)
+        require(not found.HasInfo("timeSamples"))
         require(found.GetInfo("interpolation") == expected.GetInfo("interpolation"))
+        if not (found.HasInfo("connectionPaths") or expected.HasInfo("connectionPaths")):
+            return
     paths, wanted = (
         [str(path).removeprefix(root) for path in getattr(each, links).explicitItems]
         for each, root in zip((found, expected), roots, strict=True)
