@@ -7,15 +7,13 @@ equals one picture: the tiles side by side, looked up at coordinates shifted and
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.foreign.picture import Wrap
 from storage.records.exr import MAX_RESOLUTION
 from storage.records.scene_maps import MAX_UV
-
-Wrap = Literal["repeat", "mirror", "clamp", "black"]
 
 MAX_TILES = 8
 """Maximum number of tiles along a side."""

@@ -6,6 +6,7 @@ and roughness is linear, whatever profile or gamma the file names.
 
 import io
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -20,6 +21,9 @@ from storage.errors import Rejected
 
 Wrap = Literal["repeat", "clamp", "mirror", "black"]
 """Wrap modes; `black` is 0 beyond the picture, alpha included."""
+
+Decode = Callable[[bytes, str], NDArray]
+"""Function that returns the values of a picture's bytes; the name is for messages."""
 
 FORMATS = ("PNG", "JPEG", "WEBP", "TGA", "BMP", "TIFF")
 """Formats that are decoded; a file of another one is refused by its content."""

@@ -7,11 +7,13 @@ it. Where anything differs, it returns None and the file is read as a foreign on
 """
 
 import json
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import MAX_ROWS
 from pipeline.exchange.usd import names
 from pipeline.exchange.usd.dome import read_exact_dome
@@ -23,16 +25,24 @@ from pipeline.exchange.usd.exact_layer import (
     require,
     require_same,
 )
-from pipeline.exchange.usd.read_exact_materials import read_exact_materials
+from pipeline.exchange.usd.texture_files import decode_texture
 from pipeline.exchange.usd.write import ENVIRONMENT, author_scene, new_layer
 from pipeline.exchange.usd.write_meshes import CENTER, sum_positions
-from pipeline.exchange.usd.write_textures import ST
+from pipeline.exchange.usd.write_textures import SHADERS, ST
 from pipeline.foreign.usd.stage import OpenedStage
+from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.conventions import require_readable
 from storage.errors import TrilightError
-from storage.records.material import UndeclaredColumn
+from storage.records.material import (
+    PUBLISHED_COLUMNS,
+    UndeclaredColumn,
+    declared_column,
+    default_rows,
+    laid_out,
+)
 from storage.records.scene import OBJECT_KINDS, Scene, SceneObject
 from storage.records.scene_file import scene_digest, scene_provenance
+from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
 
 
 def scene_keys(layer: Any) -> list[str] | None:
@@ -107,7 +117,7 @@ def _read_scene(root: Any, opened: OpenedStage | None) -> Scene:
         require(opened is not None)
         assert opened is not None
         sky = read_exact_dome(folders[ENVIRONMENT], root.layer, opened)
-    materials = read_exact_materials(folders["Materials"], opened)
+    materials = _read_materials(folders["Materials"], opened)
     prims = sorted(folders["Objects"].nameChildren, key=lambda p: p.attributes[names.INDEX].default)
     objects = tuple(_read_object(prim) for prim in prims)
     meshes = [prim for prim in prims if prim.typeName == "Mesh"]
@@ -204,3 +214,76 @@ def _read_cameras(folder: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]
         c2w[row] = np.array(prim.attributes["xformOp:transform"].default).T
         fov_deg[row] = prim.attributes[names.FOV_DEG].default
     return c2w, fov_deg
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Materials:
+    """Material arrays of a scene, as the prims of all materials hold them."""
+
+    rows: NDArray[np.float32]
+    """[M, 10 or more] rows of `Scene.materials`."""
+    textures: tuple[Texture, ...]
+    """Distinct textures, the value of `Scene.textures`."""
+    material_textures: NDArray[np.int32] | None
+    """[M, 3] the value of `Scene.material_textures`; None without textures."""
+
+
+def _read_materials(folder: Any, opened: OpenedStage | None) -> _Materials:
+    """Read the materials below a prim; raises UndeclaredColumn."""
+    prims = list_by_row(folder, names.material_name)
+    rows = default_rows(len(prims))
+    columns = _list_columns(prims[0])
+    index = np.full((len(prims), len(TEXTURED)), CONSTANT, np.int32)
+    textures: dict[int, Texture] = {}
+    for row, prim in enumerate(prims):
+        for column, part in laid_out():
+            if column.name in columns:
+                rows[row, part] = prim.attributes[names.column_attribute(column.name)].default
+        used = _read_textures(prim, textures, opened)
+        for name, texture in used.items():
+            index[row, TEXTURED.index(name)] = texture
+    return _Materials(
+        rows=rows,
+        textures=tuple(textures[row] for row in range(len(textures))),
+        material_textures=index if textures else None,
+    )
+
+
+def _read_textures(
+    prim: Any, textures: dict[int, Texture], opened: OpenedStage | None
+) -> dict[str, int]:
+    """Return the texture rows of a material's columns, and add new ones to `textures`."""
+    used = {}
+    for name, shader in SHADERS.items():
+        if shader not in prim.nameChildren:
+            continue
+        require(opened is not None)
+        assert opened is not None
+        attributes = prim.nameChildren[shader].attributes
+        row = attributes[names.TEXTURE_ROW].default
+        if row not in textures:
+            textures[row] = _read_texture(attributes, prim.layer, opened)
+        used[name] = row
+    return used
+
+
+def _read_texture(attributes: Any, layer: Any, opened: OpenedStage) -> Texture:
+    named = attributes["inputs:file"].default.path
+    resolved = opened.resolve(layer, named)
+    data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
+    if data is None:
+        raise LookupError(named)
+    texts = {field: attributes[name].default for field, name in names.MAP_TEXTS.items()}
+    return decode_texture(
+        data,
+        is_exr=named.endswith(".exr"),
+        is_srgb=attributes["inputs:sourceColorSpace"].default == "sRGB",
+        source=MapSource(**texts),
+    )
+
+
+def _list_columns(prim: Any) -> tuple[str, ...]:
+    """Return the column names of a material; raises UndeclaredColumn."""
+    added_or_none = (names.added_column(attribute.name) for attribute in prim.attributes)
+    added = [name for name in added_or_none if name is not None]
+    return (*PUBLISHED_COLUMNS, *(declared_column(name).name for name in added))

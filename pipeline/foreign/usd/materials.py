@@ -5,14 +5,14 @@ defines, and metadata of the picture are ignored.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.material import MOST_UV_SETS, RGB, WHITE, Slot, SourceMaterial
 from pipeline.foreign.material_files import MaterialFiles
-from pipeline.foreign.picture import Picture, has_colors
+from pipeline.foreign.picture import Decode, Picture, has_colors
 from pipeline.foreign.textured_mesh import TexturedMesh
 from pipeline.foreign.usd.object_source import UsdSource
 from pipeline.foreign.usd.polygons import CutMesh
@@ -33,8 +33,6 @@ _MOST_VARIED = 4096
 """Maximum number of materials made of the primvars of one; more values become their mean."""
 _UNBOUND = 0.18
 """Gray of a mesh without material and display color, as USD shows it."""
-
-Decode = Callable[[bytes, str], NDArray]
 
 
 def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = False) -> TexturedMesh:
