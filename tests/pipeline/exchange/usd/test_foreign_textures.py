@@ -81,39 +81,6 @@ def test_an_edit_of_our_own_file_keeps_its_textures(tmp_path: Path) -> None:
     assert np.array_equal(found.scene.uv[:6], textured_scene().uv[:6])  # type: ignore[index]
 
 
-def test_what_a_colour_space_says_is_taken_as_said(tmp_path: Path) -> None:
-    """Colours that are called raw are not decoded, numbers that are called sRGB are."""
-    raw = changed(tmp_path, token("sourceColorSpace", "raw"))
-    expected = (1 - F) * np.array(RED) / 255
-    assert row_at(raw.scene, -0.5, -0.5)[:3] == pytest.approx(expected, abs=CODED)
-    grey = np.array([[10, 200]], np.uint8)
-    encoded = changed(tmp_path, token("sourceColorSpace", "sRGB"), grey)
-    assert row_at(encoded.scene, 0.5, 0)[0] == pytest.approx(linear((200, 0, 0))[0], abs=CODED)
-    plain = changed(tmp_path, None, grey)
-    assert row_at(plain.scene, 0.5, 0)[0] == pytest.approx((1 - F) * 200 / 255, abs=CODED)
-
-
-def test_a_transform_scales_then_turns_then_moves(tmp_path: Path) -> None:
-    """u' = -v / 2 + 1, v' = u / 2 for 90 degrees, half, and a shift by 1."""
-
-    def edit(stage: Any, preview: Any, texture: UsdShade.Shader) -> None:
-        node = UsdShade.Shader.Define(stage, "/W/mat/move")
-        node.CreateIdAttr("UsdTransform2d")
-        types = Sdf.ValueTypeNames
-        reader = UsdShade.Shader.Get(stage, "/W/mat/reader")
-        node.CreateInput("in", types.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
-        node.CreateInput("scale", types.Float2).Set(Gf.Vec2f(0.5, 0.5))
-        node.CreateInput("rotation", types.Float).Set(90.0)
-        node.CreateInput("translation", types.Float2).Set(Gf.Vec2f(1, 0))
-        texture.GetInput("st").ConnectToSource(node.ConnectableAPI(), "result")
-
-    scene = changed(tmp_path, edit).scene
-    assert scene.uv is not None
-    corners = {tuple(uv) for uv in np.round(scene.uv[:6].astype(np.float64), 6).tolist()}
-    assert corners == {(1, 0), (1, 0.5), (0.5, 0.5), (0.5, 0)}
-    assert row_at(scene, 0, 0)[:3] == pytest.approx(linear(GREY), abs=CODED)  # at (0.75, 0.25)
-
-
 @for_each(
     "mode, colour", [("repeat", RED), ("clamp", GREEN), ("mirror", GREEN), ("black", (0, 0, 0))]
 )
@@ -128,26 +95,6 @@ def test_coordinates_beyond_the_picture(tmp_path: Path, mode: str, colour: Any) 
     scene = changed(tmp_path, edit).scene
     assert row_at(scene, 0.25, -0.5)[:3] == pytest.approx(linear(colour), abs=CODED)
     assert row_at(scene, -0.75, -0.5)[:3] == pytest.approx(linear(RED), abs=CODED)
-
-
-@pytest.mark.parametrize("output", ["r", "g", "b"])
-def test_a_single_channel_feeds_roughness(tmp_path: Path, output: str) -> None:
-    """Not decoded, since the shader says so; bytes again."""
-
-    def edit(stage: Any, preview: UsdShade.Shader, texture: UsdShade.Shader) -> None:
-        token("sourceColorSpace", "raw")(stage, preview, texture)
-        preview.GetInput("diffuseColor").ClearSources()
-        preview.GetInput("diffuseColor").Set((0.5, 0.5, 0.5))
-        texture.CreateOutput(output, Sdf.ValueTypeNames.Float)
-        preview.GetInput("roughness").ConnectToSource(texture.ConnectableAPI(), output)
-
-    scene = changed(tmp_path, edit).scene
-    (texture,) = scene.textures
-    assert texture.texels.dtype == np.uint8 and texture.channels == 1
-    half = 0.5 * (1 - F)
-    for (x, y), colour in CORNERS.items():
-        value = colour["rgb".index(output)] / 255
-        assert row_at(scene, x, y)[[0, 6]] == pytest.approx([half, value], abs=1e-6)
 
 
 def test_scale_and_bias_are_applied_in_linear_light_and_bounded(tmp_path: Path) -> None:
