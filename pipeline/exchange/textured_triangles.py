@@ -219,8 +219,8 @@ class SceneParts:
             TrilightError: more than MAX_TRIANGLES triangles, or MAX_ROWS objects or materials.
         """
         for kind, part in split_by_kind(triangles):
-            kept = entry.kind if kind == "object" and entry.kind == "shell" else kind
-            unique = dataclasses.replace(entry, name=self._make_unique(entry.name), kind=kept)
+            new_kind = entry.kind if kind == "object" and entry.kind == "shell" else kind
+            unique = dataclasses.replace(entry, name=self._make_unique(entry.name), kind=new_kind)
             piece = build_piece(unique, part)
             self._pieces.append(piece)
             self._surfaces += [] if is_lamp else [piece]

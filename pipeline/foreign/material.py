@@ -130,7 +130,8 @@ def source_columns(
     dielectric = np.minimum(material.f0 * tint, 1) * strength
     # a surface without reflectance at normal incidence is meant to have no specular lobe at all
     grazing = np.where(dielectric.max(axis=1, keepdims=True) > 0, np.clip(strength, 0, 1), 0)
-    diffuse, specular = np.minimum(base, 1 - dielectric), dielectric
+    specular = dielectric
+    diffuse = np.minimum(base, 1 - dielectric)
     if material.has_fresnel:
         diffuse, specular = constant_albedos(base, metal, dielectric, grazing)
     return np.concatenate([diffuse, specular, np.clip(rough, least_roughness, 1)], axis=1)

@@ -19,7 +19,7 @@ class Part:
     where: str
     """Beginning of notes, such as the path of a mesh with a colon; may be empty."""
     material: SourceMaterial
-    """Material of all triangles."""
+    """Material of every triangle, as the file states it."""
     positions: NDArray[np.float32]
     """[T, 3, 3] corners in world space; every triangle has an area."""
     normals: NDArray[np.float32]

@@ -27,42 +27,42 @@ class Changed(Exception):
     """The layer is not as export wrote it."""
 
 
-def require_same(found: Any, expected: Any) -> None:
+def require_same(stored: Any, expected: Any) -> None:
     """Require that a prim and all below it are as the prim that export writes."""
-    _require_same(found, expected, (_plain_path(found), _plain_path(expected)))
+    _require_same(stored, expected, (_plain_path(stored), _plain_path(expected)))
 
 
-def _require_same(found: Any, expected: Any, roots: tuple[str, str]) -> None:
-    properties = {each.name: each for each in found.properties}
-    wanted = {each.name: each for each in expected.properties}
-    missing = wanted.keys() - properties.keys()
-    require(properties.keys() <= wanted.keys() and missing <= _ADDED)
-    require(found.typeName == expected.typeName and set(found.ListInfoKeys()) <= _PLAIN_INFO)
+def _require_same(stored: Any, expected: Any, roots: tuple[str, str]) -> None:
+    properties = {each.name: each for each in stored.properties}
+    expected_properties = {each.name: each for each in expected.properties}
+    missing = expected_properties.keys() - properties.keys()
+    require(properties.keys() <= expected_properties.keys() and missing <= _ADDED)
+    require(stored.typeName == expected.typeName and set(stored.ListInfoKeys()) <= _PLAIN_INFO)
     is_old = CENTER in missing  # its points are positions
     for name, each in properties.items():
         if not is_old or name not in ("points", "extent"):
-            _require_same_property(each, wanted[name], roots)
-    prims = {prim.name: prim for prim in found.nameChildren}
+            _require_same_property(each, expected_properties[name], roots)
+    prims = {prim.name: prim for prim in stored.nameChildren}
     require(prims.keys() == {prim.name for prim in expected.nameChildren})
     for prim in expected.nameChildren:
         _require_same(prims[prim.name], prim, roots)
 
 
-def _require_same_property(found: Any, expected: Any, roots: tuple[str, str]) -> None:
-    require(type(found) is type(expected))
+def _require_same_property(stored: Any, expected: Any, roots: tuple[str, str]) -> None:
+    require(type(stored) is type(expected))
     links = "targetPathList"
     if hasattr(expected, "connectionPathList"):
         links = "connectionPathList"
-        require(found.typeName == expected.typeName and found.default == expected.default)
-        require(not found.HasInfo("timeSamples"))
-        require(found.GetInfo("interpolation") == expected.GetInfo("interpolation"))
-        if not (found.HasInfo("connectionPaths") or expected.HasInfo("connectionPaths")):
+        require(stored.typeName == expected.typeName and stored.default == expected.default)
+        require(not stored.HasInfo("timeSamples"))
+        require(stored.GetInfo("interpolation") == expected.GetInfo("interpolation"))
+        if not (stored.HasInfo("connectionPaths") or expected.HasInfo("connectionPaths")):
             return
-    paths, wanted = (
+    paths, expected_paths = (
         [str(path).removeprefix(root) for path in getattr(each, links).explicitItems]
-        for each, root in zip((found, expected), roots, strict=True)
+        for each, root in zip((stored, expected), roots, strict=True)
     )
-    require(paths == wanted)
+    require(paths == expected_paths)
 
 
 def _plain_path(prim: Any) -> str:

@@ -43,11 +43,11 @@ _MAX_PICTURE_BYTES = 4 << 30
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Kept:
+class _Extras:
     """What a material has beyond the inputs of its shader."""
 
     name: str
-    """Name of its prim."""
+    """Name of its prim, which its textures get."""
     added: Mapping[str, NDArray[np.float64]]
     """Values of columns beyond the published ones."""
     exact: Mapping[str, Texture] | None
@@ -72,7 +72,7 @@ class StageSurfaces:
         self._lost = stage.opened.lost
         self._opened = stage.opened
         self._licence = licence
-        self._kept: list[_Kept] = []
+        self._extras: list[_Extras] = []
         self._looks = MeshMaterials(
             read_stage_materials(stage, _MAX_PICTURE_BYTES, self._read),
             lambda data, name: decode_values(data, name, self._lost),
@@ -80,7 +80,7 @@ class StageSurfaces:
             emission=True,
             notes=self._lost,
         )
-        self._kept.append(_Kept(name="", added={}, exact=None))
+        self._extras.append(_Extras(name="", added={}, exact=None))
 
     def convert(self, number: int, soup: TriangleSoup) -> TexturedTriangles:
         """Return the triangles of a mesh, by its index within the stage."""
@@ -103,7 +103,7 @@ class StageSurfaces:
                 return None
             return uv[mask]
 
-        kept = self._kept[self._looks.origins[row]]
+        extra = self._extras[self._looks.origins[row]]
         part = Part(
             where=f"{where}: ",
             material=self._looks.materials[row],
@@ -112,14 +112,14 @@ class StageSurfaces:
             coordinates=coordinates,
             colors=None if (tints[mask] == 1).all() else tints[mask],
         )
-        source = MapSource(name=kept.name, licence=self._licence)
+        source = MapSource(name=extra.name, licence=self._licence)
         triangles = convert_part(part, source, self._lost)
         for column, columns in laid_out():
-            if column.name in kept.added:
-                triangles.rows[:, columns] = kept.added[column.name]
-        if kept.exact is None:
+            if column.name in extra.added:
+                triangles.rows[:, columns] = extra.added[column.name]
+        if extra.exact is None:
             return triangles
-        return keep_exact(triangles, kept.exact, where, self._lost)
+        return keep_exact(triangles, extra.exact, where, self._lost)
 
     def _read(self, material: Any) -> StatedMaterial | None:
         """Return the inputs of a material; None, with a note, where none are understood."""
@@ -136,7 +136,7 @@ class StageSurfaces:
             )
             return None
         added = _read_added_columns(material, self._time, self._lost)
-        self._kept.append(_Kept(name=stated.name, added=added, exact=exact))
+        self._extras.append(_Extras(name=stated.name, added=added, exact=exact))
         return stated
 
     def _read_held(
