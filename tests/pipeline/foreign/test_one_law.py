@@ -94,6 +94,7 @@ SCALED = {"scale": Gf.Vec4f(1, 0.5, 0.75, 1), "bias": Gf.Vec4f(0, 0.25, -0.125, 
         (stated(usd_kit.SHADER, {"useSpecularWorkflow": 1}), {"specularColor": "rgb"}),
         (stated(usd_kit.TEXTURE, {"wrapS": "mirror"}), {"diffuseColor": "rgb"}),
         (stated(usd_kit.TEXTURE, {"wrapS": "clamp"}), {"diffuseColor": "rgb"}),
+        (stated(usd_kit.TEXTURE, {"wrapS": "black"}), {"diffuseColor": "rgb"}),
         (turned, {"diffuseColor": "rgb"}),
         (tinted, {"diffuseColor": "rgb"}),
     ],
@@ -117,6 +118,14 @@ def test_usd(
         {"pbrMetallicRoughness": {"metallicFactor": 1, "baseColorFactor": [0.9, 0.4, 0.2, 1]}},
         {"extensions": {"KHR_materials_unlit": {}}},
         {"extensions": {"KHR_materials_ior": {"ior": 2.0}}},
+        {
+            "extensions": {
+                "KHR_materials_specular": {
+                    "specularFactor": 0.5,
+                    "specularColorFactor": [1, 0.5, 0],
+                }
+            }
+        },
         {
             "extensions": {
                 "KHR_materials_pbrSpecularGlossiness": {

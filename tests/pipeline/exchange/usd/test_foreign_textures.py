@@ -81,22 +81,6 @@ def test_an_edit_of_our_own_file_keeps_its_textures(tmp_path: Path) -> None:
     assert np.array_equal(found.scene.uv[:6], textured_scene().uv[:6])  # type: ignore[index]
 
 
-@for_each(
-    "mode, colour", [("repeat", RED), ("clamp", GREEN), ("mirror", GREEN), ("black", (0, 0, 0))]
-)
-def test_coordinates_beyond_the_picture(tmp_path: Path, mode: str, colour: Any) -> None:
-    """u from 0 to 2: at x = 0.25 it is 1.25, in the row of red and green."""
-
-    def edit(stage: Any, preview: Any, texture: UsdShade.Shader) -> None:
-        token("wrapS", mode)(stage, preview, texture)
-        primvar = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/W/Grid")).GetPrimvar("st")
-        primvar.Set([(0, 0), (2, 0), (2, 1), (0, 1)])
-
-    scene = changed(tmp_path, edit).scene
-    assert row_at(scene, 0.25, -0.5)[:3] == pytest.approx(linear(colour), abs=CODED)
-    assert row_at(scene, -0.75, -0.5)[:3] == pytest.approx(linear(RED), abs=CODED)
-
-
 def test_scale_and_bias_are_applied_in_linear_light_and_bounded(tmp_path: Path) -> None:
     def edit(stage: Any, preview: Any, texture: UsdShade.Shader) -> None:
         for name, value in (("scale", (2, 0.5, 0.5, 1)), ("bias", (0, 0.25, -1, 0))):
