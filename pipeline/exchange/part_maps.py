@@ -1,19 +1,24 @@
 """Samples the pictures of a material as linear maps over the coordinates of a mesh.
 
 A material has one set of coordinates here: that of its first picture. A picture with another set
-becomes its mean.
+becomes its mean. Textures of a scene repeat along u and v; those of other formats may be mirrored
+in every second tile, or continue as their border or as black. Over the finitely many tiles that a
+mesh uses, each equals one picture: the tiles side by side, looked up at coordinates shifted and
+scaled to [0, 1].
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.linear_maps import Map, constant_map
-from pipeline.exchange.wrapping import choose_tiles, expand_tiles, shift_near_zero
 from pipeline.foreign.material import Slot
 from pipeline.foreign.part import Part
+from pipeline.foreign.picture import Wrap
+from storage.records.exr import MAX_RESOLUTION
+from storage.records.scene_maps import MAX_UV
 
 SLOTS: Mapping[str, str] = {
     "base": "base",
@@ -24,6 +29,23 @@ SLOTS: Mapping[str, str] = {
     "glossiness": "glossiness",
 }
 """Slot of `SourceMaterial` for each field of `MaterialSamples`."""
+
+
+_MAX_TILES = 8
+"""Maximum number of tiles along a side."""
+
+_INSIDE = 1e-4
+"""Tolerance for coordinates that leave [0, 1] by rounding."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Tiles:
+    """Range of tiles along u or v that a picture covers."""
+
+    first: int
+    """Number of the first tile; tile 0 is [0, 1]."""
+    count: int
+    """Number of tiles from the first on."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,18 +91,18 @@ def sample_slots(part: Part, lost: list[str]) -> SampledMaps:
     for axis in range(2):
         texels = max(pictures[name].shape[1 - axis] for name in same_chart)
         wraps = [slots[name].picture.wrap[axis] for name in same_chart]
-        tiles, fits = choose_tiles(wraps, uv[..., axis], texels)
+        tiles, fits = _choose_tiles(wraps, uv[..., axis], texels)
         tiles_by_axis.append(tiles)
         is_exact &= fits
     for name in same_chart:
         wrap = slots[name].picture.wrap
-        across = expand_tiles(pictures[name], wrap[0], tiles_by_axis[0], 1)
-        maps[name] = expand_tiles(across, wrap[1], tiles_by_axis[1], 0)
+        across = _expand_tiles(pictures[name], wrap[0], tiles_by_axis[0], 1)
+        maps[name] = _expand_tiles(across, wrap[1], tiles_by_axis[1], 0)
     moved = (uv - [tiles_by_axis[0].first, tiles_by_axis[1].first]) / [
         tiles_by_axis[0].count,
         tiles_by_axis[1].count,
     ]
-    near, all_near = shift_near_zero(moved)
+    near, all_near = _shift_near_zero(moved)
     if not (is_exact and all_near):
         lost.append(
             f"{part.where}coordinates far outside [0, 1]: some textures look different there"
@@ -91,3 +113,64 @@ def sample_slots(part: Part, lost: list[str]) -> SampledMaps:
 def _chart(slot: Slot) -> tuple[int, bytes, bytes]:
     """Return a key that is equal for pictures with the same coordinates."""
     return (slot.uv_set, slot.uv_matrix.tobytes(), slot.uv_offset.tobytes())
+
+
+def _choose_tiles(
+    wraps: Sequence[Wrap], at: NDArray[np.floating], most_texels: int
+) -> tuple[_Tiles, bool]:
+    """Return the tiles of one material's textures along an axis, and whether they suffice.
+
+    One tile where all textures repeat, no coordinate leaves [0, 1], or too many would be needed.
+
+    Args:
+        wraps: wrap mode of each texture.
+        at: coordinates of all corners along the axis.
+        most_texels: maximum number of texels of a texture along the axis.
+    """
+    needed_tiles = _needed_tiles(wraps, at)
+    if needed_tiles.count <= _MAX_TILES and needed_tiles.count * most_texels <= MAX_RESOLUTION:
+        return needed_tiles, True
+    return _Tiles(first=0, count=1), needed_tiles.count == 1
+
+
+def _needed_tiles(wraps: Sequence[Wrap], at: NDArray[np.floating]) -> _Tiles:
+    low, high = (float(at.min()), float(at.max())) if at.size else (0.0, 1.0)
+    modes = {wrap for wrap in wraps if wrap != "repeat"}
+    if not modes or (low >= -_INSIDE and high <= 1 + _INSIDE):
+        return _Tiles(first=0, count=1)
+    if modes == {"mirror"}:
+        return _Tiles(first=0, count=2)
+    first = int(np.floor(low))
+    last = int(np.ceil(high))
+    return _Tiles(first=first, count=last - first)
+
+
+def _expand_tiles(values: NDArray, wrap: Wrap, tiles: _Tiles, axis: int) -> NDArray:
+    """Return the tiles of a picture [H, W, C] side by side along axis 0 (v) or 1 (u)."""
+    tile_values = [
+        _tile(values, wrap, number, axis)
+        for number in range(tiles.first, tiles.first + tiles.count)
+    ]
+    return np.concatenate(tile_values, axis=axis) if len(tile_values) > 1 else tile_values[0]
+
+
+def _shift_near_zero(uv: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+    """Return coordinates [T, 3, 2] within MAX_UV, and whether they look up the same texels.
+
+    A triangle far out is shifted by whole periods of the texture.
+    """
+    if not uv.size or np.abs(uv).max() <= MAX_UV:
+        return uv, True
+    near = uv - np.floor(uv.min(axis=1, keepdims=True))
+    return np.clip(near, -MAX_UV, MAX_UV), bool(near.max() <= MAX_UV)
+
+
+def _tile(values: NDArray, wrap: Wrap, number: int, axis: int) -> NDArray:
+    if wrap == "repeat" or number == 0:
+        return values
+    if wrap == "mirror":
+        return np.flip(values, axis) if number % 2 else values
+    if wrap == "black":
+        return np.zeros_like(values)
+    border = np.take(values, [0 if number < 0 else values.shape[axis] - 1], axis)
+    return np.repeat(border, values.shape[axis], axis)
