@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pipeline.exchange.linear_maps import Map, constant_map
 from pipeline.foreign.material import Slot
 from pipeline.foreign.part import Part
-from pipeline.foreign.picture import Wrap
+from pipeline.foreign.picture import Picture, Wrap
 from storage.records.exr import MAX_RESOLUTION
 from storage.records.scene_maps import MAX_UV
 
@@ -49,65 +49,73 @@ class _Tiles:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SampledMaps:
-    """Linear maps of a material's pictures, and the coordinates of a mesh in them."""
+class PlacedSlots:
+    """Pictures of a material, and the coordinates of a mesh in their maps."""
 
-    maps: Mapping[str, Map]
-    """[H, W, 4] linear values by the field of `MaterialSamples`, the bottom row first."""
+    slots: Mapping[str, Slot]
+    """Slots by the field of `MaterialSamples`."""
+    same_chart: Sequence[str]
+    """Names of the slots whose maps vary over the mesh; others are their means."""
+    tiles: tuple[_Tiles, _Tiles] | None
+    """Tiles of these maps along u and v; None where all maps are constants."""
     uv: NDArray[np.float32] | None
     """[T, 3, 2] coordinates in the maps; None where all maps are constants."""
 
+    @property
+    def texels(self) -> int:
+        """Return the number of texels of the largest map."""
+        shapes = [self.slots[name].picture.values.shape for name in self.same_chart]
+        tiles = 1 if self.tiles is None else self.tiles[0].count * self.tiles[1].count
+        return max((shape[0] * shape[1] * tiles for shape in shapes), default=1)
 
-def sample_slots(part: Part, lost: list[str]) -> SampledMaps:
-    """Return the maps of a part's material; its first picture decides on the coordinates.
+    def build_maps(self) -> dict[str, Map]:
+        """Return linear maps [H, W, 4] by the names of slots, the bottom row first."""
+        maps = {}
+        for name, slot in self.slots.items():
+            values = slot.picture.linear(slot.picture.values)
+            if self.tiles is None or name not in self.same_chart:
+                maps[name] = constant_map(values.mean(axis=(0, 1)))
+                continue
+            across = _expand_tiles(values, slot.picture.wrap[0], self.tiles[0], 1)
+            maps[name] = _expand_tiles(across, slot.picture.wrap[1], self.tiles[1], 0)
+        return maps
+
+
+def place_slots(part: Part, lost: list[str]) -> PlacedSlots:
+    """Return the pictures of a part's material; the first one decides on the coordinates.
 
     `lost` receives a sentence for each loss.
     """
     stated = {name: getattr(part.material, field) for name, field in SLOTS.items()}
     slots: dict[str, Slot] = {name: slot for name, slot in stated.items() if slot is not None}
-    pictures = {name: slot.picture.linear(slot.picture.values) for name, slot in slots.items()}
     first = next(iter(slots.values()), None)
     plain = None if first is None else part.coordinates(first.uv_set)
-    uv = None if first is None or plain is None else plain @ first.uv_matrix.T + first.uv_offset
-    if slots and uv is None:
-        lost.append(
-            f"{part.where}textures of a mesh without texture coordinates: replaced by their means"
-        )
-    same_chart = [
-        name
-        for name, slot in slots.items()
-        if first and uv is not None and _chart(slot) == _chart(first)
-    ]
-    if uv is not None and len(same_chart) < len(slots):
+    if first is None or plain is None:
+        if slots:
+            lost.append(
+                f"{part.where}textures of a mesh without texture coordinates: replaced by their "
+                "means"
+            )
+        return PlacedSlots(slots=slots, same_chart=(), tiles=None, uv=None)
+    uv = plain @ first.uv_matrix.T + first.uv_offset
+    same_chart = [name for name, slot in slots.items() if _chart(slot) == _chart(first)]
+    if len(same_chart) < len(slots):
         lost.append(
             f"{part.where}textures with other coordinates than the first of a material: replaced "
             "by means"
         )
-    maps = {name: constant_map(picture.mean(axis=(0, 1))) for name, picture in pictures.items()}
-    if uv is None:
-        return SampledMaps(maps=maps, uv=None)
-    tiles_by_axis = []
-    is_exact = True
-    for axis in range(2):
-        texels = max(pictures[name].shape[1 - axis] for name in same_chart)
-        wraps = [slots[name].picture.wrap[axis] for name in same_chart]
-        tiles, fits = _choose_tiles(wraps, uv[..., axis], texels)
-        tiles_by_axis.append(tiles)
-        is_exact &= fits
-    for name in same_chart:
-        wrap = slots[name].picture.wrap
-        across = _expand_tiles(pictures[name], wrap[0], tiles_by_axis[0], 1)
-        maps[name] = _expand_tiles(across, wrap[1], tiles_by_axis[1], 0)
-    moved = (uv - [tiles_by_axis[0].first, tiles_by_axis[1].first]) / [
-        tiles_by_axis[0].count,
-        tiles_by_axis[1].count,
-    ]
+    across, up = (
+        _choose_tiles([slots[name].picture for name in same_chart], uv[..., axis], axis)
+        for axis in range(2)
+    )
+    tiles = across[0], up[0]
+    moved = (uv - [each.first for each in tiles]) / [each.count for each in tiles]
     near, all_near = _shift_near_zero(moved)
-    if not (is_exact and all_near):
+    if not (across[1] and up[1] and all_near):
         lost.append(
             f"{part.where}coordinates far outside [0, 1]: some textures look different there"
         )
-    return SampledMaps(maps=maps, uv=near.astype(np.float32))
+    return PlacedSlots(slots=slots, same_chart=same_chart, tiles=tiles, uv=near.astype(np.float32))
 
 
 def _chart(slot: Slot) -> tuple[int, bytes, bytes]:
@@ -116,18 +124,19 @@ def _chart(slot: Slot) -> tuple[int, bytes, bytes]:
 
 
 def _choose_tiles(
-    wraps: Sequence[Wrap], at: NDArray[np.floating], most_texels: int
+    pictures: Sequence[Picture], at: NDArray[np.floating], axis: int
 ) -> tuple[_Tiles, bool]:
-    """Return the tiles of one material's textures along an axis, and whether they suffice.
+    """Return the tiles of one material's pictures along an axis, and whether they suffice.
 
-    One tile where all textures repeat, no coordinate leaves [0, 1], or too many would be needed.
+    One tile where all pictures repeat, no coordinate leaves [0, 1], or too many would be needed.
 
     Args:
-        wraps: wrap mode of each texture.
+        pictures: pictures of equal coordinates.
         at: coordinates of all corners along the axis.
-        most_texels: maximum number of texels of a texture along the axis.
+        axis: 0 for u, 1 for v.
     """
-    needed_tiles = _needed_tiles(wraps, at)
+    most_texels = max(picture.values.shape[1 - axis] for picture in pictures)
+    needed_tiles = _needed_tiles([picture.wrap[axis] for picture in pictures], at)
     if needed_tiles.count <= _MAX_TILES and needed_tiles.count * most_texels <= MAX_RESOLUTION:
         return needed_tiles, True
     return _Tiles(first=0, count=1), needed_tiles.count == 1

@@ -16,7 +16,7 @@ from pipeline.exchange.linear_maps import (
     number_texture,
     resample_to_largest,
 )
-from pipeline.exchange.part_maps import SLOTS, SampledMaps, sample_slots
+from pipeline.exchange.part_maps import SLOTS, PlacedSlots, place_slots
 from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles, TextureSet
 from pipeline.foreign.material import MaterialSamples, SourceMaterial, source_columns
 from pipeline.foreign.part import Part
@@ -40,42 +40,70 @@ _MOST_TINTED = 1 << 25
 _ROUGH = ("roughness", "glossiness")
 
 
-def convert_part(part: Part, source: MapSource, lost: list[str]) -> TexturedTriangles:
-    """Return the triangles of a part with the textures and rows of its material.
+class PartConverter:
+    """Converts parts to triangles with textures, which parts of one material share."""
 
-    Args:
-        part: the triangles, with coordinates, colors and a material.
-        source: name and rights of the textures.
-        lost: receives a sentence for each loss.
-    """
-    material = part.material
-    count = len(part.positions)
-    most = _MOST_TINTED
-    sampled = sample_slots(part, lost)
-    if sampled.uv is not None:
-        texels = max(values[..., 0].size for values in sampled.maps.values())
-        most = min(max(_MOST_TINTED // texels, 1), _MOST_TINTS)
-    tints, tint_index = _tints(part, most, lost)
-    if sampled.uv is None and len(tints) > _MOST_TINTS:
-        sampled, tints, tint_index = _with_palette(sampled, tints, tint_index)
-    rows = default_rows(count)
-    rows[:, EMISSION] = _emission(part, lost)
-    texture_sets: Sequence[TextureSet] = (NO_TEXTURES,)
-    if sampled.uv is not None:
-        texture_sets = [_textures(material, sampled.maps, tint, source) for tint in tints]
-    else:
-        values = _columns(material, sampled.maps, np.asarray(tints)[None])[0, tint_index]
-        rows[:, DIFFUSE] = values[:, :3]
-        rows[:, SPECULAR] = values[:, 3:6]
-        rows[:, ROUGHNESS] = values[:, 6]
-    return TexturedTriangles(
-        positions=part.positions,
-        normals=part.normals,
-        rows=rows,
-        uv=np.zeros((count, 3, 2), np.float32) if sampled.uv is None else sampled.uv,
-        texture_set_index=tint_index % len(texture_sets),
-        texture_sets=texture_sets,
-    )
+    def __init__(self, lost: list[str]) -> None:
+        """Keep `lost`, which receives a sentence for each loss."""
+        self._lost = lost
+        self._textures: dict[tuple[object, ...], TextureSet] = {}
+        self._means: dict[int, Mapping[str, Map]] = {}
+
+    def convert(self, part: Part, source: MapSource) -> TexturedTriangles:
+        """Return the triangles of a part with the textures and rows of its material.
+
+        Args:
+            part: the triangles; its material is the same object as of others that share textures.
+            source: name and rights of the textures.
+        """
+        count = len(part.positions)
+        placed = place_slots(part, self._lost)
+        uv = placed.uv
+        most = _MOST_TINTED
+        if uv is not None:
+            most = min(max(_MOST_TINTED // placed.texels, 1), _MOST_TINTS)
+        tints, tint_index = _tints(part, most, self._lost)
+        rows = default_rows(count)
+        rows[:, EMISSION] = _emission(part, self._lost)
+        texture_sets: Sequence[TextureSet] = (NO_TEXTURES,)
+        if uv is not None:
+            texture_sets = self._build_textures(part.material, placed, tints, source)
+        else:
+            if id(part.material) not in self._means:
+                self._means[id(part.material)] = placed.build_maps()
+            means = self._means[id(part.material)]
+            if len(tints) > _MOST_TINTS:
+                means, uv = _build_palette(means, tints, tint_index)
+                white = np.ones(3)
+                texture_sets = [_textures(part.material, means, white, source)]
+            else:
+                values = _columns(part.material, means, np.asarray(tints)[None])[0, tint_index]
+                rows[:, DIFFUSE] = values[:, :3]
+                rows[:, SPECULAR] = values[:, 3:6]
+                rows[:, ROUGHNESS] = values[:, 6]
+        return TexturedTriangles(
+            positions=part.positions,
+            normals=part.normals,
+            rows=rows,
+            uv=np.zeros((count, 3, 2), np.float32) if uv is None else uv,
+            texture_set_index=tint_index % len(texture_sets),
+            texture_sets=texture_sets,
+        )
+
+    def _build_textures(
+        self,
+        material: SourceMaterial,
+        placed: PlacedSlots,
+        tints: NDArray[np.float64],
+        source: MapSource,
+    ) -> list[TextureSet]:
+        """Return the textures of a material for each tint [K, 3]."""
+        keys = [(id(material), placed.tiles, source, tint.tobytes()) for tint in tints]
+        if not self._textures.keys() >= set(keys):
+            maps = placed.build_maps()
+            for key, tint in zip(keys, tints, strict=True):
+                self._textures[key] = _textures(material, maps, tint, source)
+        return [self._textures[key] for key in keys]
 
 
 def _textures(
@@ -159,18 +187,16 @@ def _group_colors(
     return np.stack(sums, axis=1) / counts[:, None], group_index.astype(np.int64)
 
 
-def _with_palette(
-    sampled: SampledMaps, tints: NDArray[np.float64], tint_index: NDArray[np.int64]
-) -> tuple[SampledMaps, NDArray[np.float64], NDArray[np.int64]]:
-    """Return many colors as a texture with one texel each, looked up at texel centers."""
+def _build_palette(
+    means: Mapping[str, Map], tints: NDArray[np.float64], tint_index: NDArray[np.int64]
+) -> tuple[dict[str, Map], NDArray[np.float32]]:
+    """Return maps with one texel for each of many colors, and coordinates [T, 3, 2] of these."""
     side = int(np.ceil(np.sqrt(len(tints))))
     texels = np.ones((side * side, 4), np.float32)
     texels[: len(tints), :3] = tints
-    base = sampled.maps.get("base", constant_map([1, 1, 1, 1])) * texels.reshape(side, side, 4)
+    base = means.get("base", constant_map([1, 1, 1, 1])) * texels.reshape(side, side, 4)
     centers = (np.stack([tint_index % side, tint_index // side], axis=1) + 0.5) / side
-    uv = np.repeat(centers[:, None], 3, axis=1).astype(np.float32)
-    with_palette = SampledMaps(maps={**sampled.maps, "base": base}, uv=uv)
-    return with_palette, np.ones((1, 3)), np.zeros(len(tint_index), np.int64)
+    return {**means, "base": base}, np.repeat(centers[:, None], 3, axis=1).astype(np.float32)
 
 
 def _emission(part: Part, lost: list[str]) -> NDArray[np.float64]:

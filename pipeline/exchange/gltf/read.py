@@ -18,7 +18,7 @@ from pipeline.exchange.gltf.cameras_and_lights import (
     light_triangles,
     read_camera,
 )
-from pipeline.exchange.part_materials import convert_part
+from pipeline.exchange.part_materials import PartConverter
 from pipeline.exchange.pictures import decode_values
 from pipeline.exchange.textured_triangles import SceneParts, TexturedTriangles
 from pipeline.foreign.gltf.document import GltfDocument, refuse_malformed
@@ -120,6 +120,10 @@ class _GltfReader:
 
         return GltfMaterials(self.document, decode, emission=True, notes=self.lost)
 
+    @cached_property
+    def _converter(self) -> PartConverter:
+        return PartConverter(self.lost)
+
     def _material(self, number: int | None) -> SourceMaterial:
         material = DEFAULT if number is None else self._materials.material(number)
         self.lost += [f"{word} of materials" for word in material.lost if word != "emission"]
@@ -154,7 +158,7 @@ class _GltfReader:
         )
         name = str(row.get("name", ""))[:200]
         source = MapSource(name=name, licence=self.licence, attribution=self._attribution())
-        return convert_part(part, source, self.lost)
+        return self._converter.convert(part, source)
 
     def _light(self, placed: PlacedNode) -> dict[str, Any] | None:
         """Return the JSON of a node's light; None where it has none."""

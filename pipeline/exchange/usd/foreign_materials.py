@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.part_materials import convert_part
+from pipeline.exchange.part_materials import PartConverter
 from pipeline.exchange.pictures import decode_values
 from pipeline.exchange.textured_triangles import TexturedTriangles, join_triangles
 from pipeline.exchange.usd.foreign_meshes import TriangleSoup
@@ -72,6 +72,7 @@ class StageSurfaces:
         self._lost = stage.opened.lost
         self._opened = stage.opened
         self._licence = licence
+        self._converter = PartConverter(self._lost)
         self._extras: list[_Extras] = []
         self._looks = MeshMaterials(
             read_stage_materials(stage, _MAX_PICTURE_BYTES, self._read),
@@ -113,7 +114,7 @@ class StageSurfaces:
             colors=None if (tints[mask] == 1).all() else tints[mask],
         )
         source = MapSource(name=extra.name, licence=self._licence)
-        triangles = convert_part(part, source, self._lost)
+        triangles = self._converter.convert(part, source)
         for column, columns in laid_out():
             if column.name in extra.added:
                 triangles.rows[:, columns] = extra.added[column.name]
