@@ -4,16 +4,27 @@ Each triangle has three separate corners. Corners of equal position and normal b
 and equal materials one row. Textures of one color become constants.
 """
 
-from collections.abc import Sequence
+import dataclasses
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.cameras import fit_camera
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
-from pipeline.scenes.shading import ShadedMesh
-from storage.records.material import EMISSION, distinct_rows, laid_out
+from pipeline.scenes.shading import ShadedMesh, flat_shaded
+from storage.errors import TrilightError
+from storage.records.environment import Environment
+from storage.records.material import (
+    EMISSION,
+    ROUGHNESS,
+    default_rows,
+    distinct_rows,
+    laid_out,
+)
 from storage.records.retextured import AnyScene, with_textures
 from storage.records.scene import ObjectKind, Scene, SceneObject
 from storage.records.texture import CONSTANT, TEXTURED, Texture
@@ -23,8 +34,9 @@ TextureSet = tuple[Texture | None, Texture | None, Texture | None]
 
 NO_TEXTURES: TextureSet = (None, None, None)
 
-_SMALLEST_DOUBLE_AREA = 1e-12
-"""Twice the area of a triangle, in square meters, below which it counts as empty."""
+MAX_TRIANGLES = 1_500_000
+MAX_ROWS = 1 << 16
+"""Maximum number of objects, and of materials, in a scene."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,6 +68,28 @@ class TexturedTriangles:
         )
 
 
+def join_triangles(
+    parts: Sequence[TexturedTriangles], places: Sequence[NDArray[np.int64]]
+) -> TexturedTriangles:
+    """Return the triangles of several parts, in the order of `places` [T], which they cover."""
+    order = np.argsort(np.concatenate(places), kind="stable")
+    starts = np.cumsum([0, *(len(part.texture_sets) for part in parts)])
+
+    def join(arrays: Iterable[NDArray]) -> NDArray:
+        return np.concatenate(list(arrays))[order]
+
+    return TexturedTriangles(
+        positions=join(part.positions for part in parts),
+        normals=join(part.normals for part in parts),
+        rows=join(part.rows for part in parts),
+        uv=join(part.uv for part in parts),
+        texture_set_index=join(
+            part.texture_set_index + start for part, start in zip(parts, starts, strict=False)
+        ),
+        texture_sets=[each for part in parts for each in part.texture_sets],
+    )
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TexturedPiece:
     """An object of a scene with its textures."""
@@ -66,16 +100,6 @@ class TexturedPiece:
     """[T, 3, 2] texture coordinates of the corners."""
     texture_sets: tuple[TextureSet, ...]
     """Texture set of each material row of `piece`."""
-
-
-def have_areas(corners: NDArray[np.floating], cross: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return a mask [T] of the triangles [T, 3, 3] with an area.
-
-    `cross` [T, 3] are the cross products of their edges. In a mesh smaller than a meter the limit
-    shrinks with its size: triangles of a watch are small.
-    """
-    size = min(float(np.ptp(corners.reshape(-1, 3), axis=0).max()), 1.0) if corners.size else 1.0
-    return np.asarray(np.linalg.norm(cross, axis=1) > _SMALLEST_DOUBLE_AREA * size**2)
 
 
 def split_by_kind(triangles: TexturedTriangles) -> list[tuple[ObjectKind, TexturedTriangles]]:
@@ -115,9 +139,24 @@ def build_piece(entry: SceneObject, triangles: TexturedTriangles) -> TexturedPie
     )
 
 
-def join_arrays(pieces: Sequence[TexturedPiece]) -> dict[str, Any]:
-    """Return the geometry and material arrays of a Scene, without textures."""
-    return concatenate_pieces([each.piece for each in pieces])
+def build_lamp(
+    positions: NDArray[np.float32], radiance_rgb: NDArray[np.floating]
+) -> TexturedTriangles:
+    """Return black triangles [T, 3, 3] that emit a radiance [3]."""
+    count = len(positions)
+    rows = default_rows(count)
+    rows[:, ROUGHNESS] = 1
+    rows[:, EMISSION] = radiance_rgb
+    corners = positions.reshape(-1, 3)
+    flat = flat_shaded(corners, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3))
+    return TexturedTriangles(
+        positions=positions,
+        normals=flat.normals.reshape(-1, 3, 3),
+        rows=rows,
+        uv=np.zeros((count, 3, 2), np.float32),
+        texture_set_index=np.zeros(count, np.int64),
+        texture_sets=(NO_TEXTURES,),
+    )
 
 
 def with_texture_sets(scene: AnyScene, pieces: Sequence[TexturedPiece]) -> AnyScene:
@@ -161,11 +200,91 @@ def _drop_constant_textures(textures: TextureSet) -> TextureSet:
     return one, two, three
 
 
-def build_textured_scene(
-    arrays: dict[str, Any], pieces: Sequence[TexturedPiece], **more: Any
-) -> Scene:
-    """Build and check the scene of joined arrays, textures and further members."""
-    scene = Scene(**arrays, objects=tuple(each.piece.entry for each in pieces), **more)
-    scene = with_texture_sets(scene, pieces)
-    scene.check()
-    return scene
+class SceneParts:
+    """Collects the objects of a scene under unique names, within limits."""
+
+    def __init__(self, file: str) -> None:
+        self._file = file
+        self._names: dict[str, int] = {}
+        self._pieces: list[TexturedPiece] = []
+        self._surfaces: list[TexturedPiece] = []
+        self._counts = Counter[str]()
+
+    def add(
+        self, entry: SceneObject, triangles: TexturedTriangles, *, is_lamp: bool = False
+    ) -> None:
+        """Add the triangles of an object: those that reflect, and those that emit.
+
+        Raises:
+            TrilightError: more than MAX_TRIANGLES triangles, or MAX_ROWS objects or materials.
+        """
+        for kind, part in split_by_kind(triangles):
+            new_kind = entry.kind if kind == "object" and entry.kind == "shell" else kind
+            unique = dataclasses.replace(entry, name=self._make_unique(entry.name), kind=new_kind)
+            piece = build_piece(unique, part)
+            self._pieces.append(piece)
+            self._surfaces += [] if is_lamp else [piece]
+            self._counts["triangles"] += len(piece.piece.mesh.faces)
+            self._counts["materials"] += len(piece.piece.materials)
+            self._counts["objects"] += 1
+        for what, count in self._counts.items():
+            most = MAX_TRIANGLES if what == "triangles" else MAX_ROWS
+            if count > most:
+                raise TrilightError(f"{self._file}: more than {most} {what}.")
+
+    @property
+    def has_emitters(self) -> bool:
+        """Return whether any triangle emits."""
+        return any(one.piece.entry.kind == "emitter" for one in self._pieces)
+
+    def surface_points(self) -> NDArray[np.float32]:
+        """Return the vertices [V, 3] of all objects; lamps count where nothing else is.
+
+        Raises:
+            TrilightError: there are no objects.
+        """
+        pieces = self._surfaces or self._pieces
+        if not pieces:
+            raise TrilightError(f"{self._file}: no triangle with an area is placed.")
+        return np.concatenate([one.piece.mesh.positions for one in pieces])
+
+    def build(
+        self,
+        cameras: Sequence[tuple[NDArray[np.float64], float]],
+        sky: Environment | None,
+        provenance: Mapping[str, Any],
+        lost: list[str],
+    ) -> Scene:
+        """Build and check the scene; a camera that sees everything is added where there is none.
+
+        Args:
+            cameras: pose [4, 4] and full angle in degrees of each.
+            sky: its environment, if any.
+            provenance: template and file.
+            lost: receives a sentence for each loss.
+        """
+        points = self.surface_points()
+        if not cameras:
+            lost.append("no camera: one was added that sees everything")
+            cameras = [fit_camera(points)]
+        scene = Scene(
+            **concatenate_pieces([one.piece for one in self._pieces]),
+            objects=tuple(one.piece.entry for one in self._pieces),
+            c2w=np.stack([pose for pose, _ in cameras]).astype(np.float32),
+            fov_deg=np.array([angle for _, angle in cameras], np.float32),
+            provenance=provenance,
+            environment=sky,
+        )
+        scene = with_texture_sets(scene, self._pieces)
+        scene.check()
+        return scene
+
+    def _make_unique(self, base: str) -> str:
+        count = self._names.get(base, 0) + 1
+        name = base if count == 1 else f"{base}.{count}"
+        while count > 1 and name in self._names:
+            count += 1
+            name = f"{base}.{count}"
+        self._names[base] = count
+        self._names.setdefault(name, 1)
+        return name

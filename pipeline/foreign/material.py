@@ -57,6 +57,8 @@ class SourceMaterial:
     specular_strength: float = 1.0
     specular_strength_map: Slot | None = None
     """Linear picture, in alpha, multiplied with `specular_strength`."""
+    has_fresnel: bool = True
+    """False where the surface reflects the same at every angle, as Trilight's own materials do."""
     glossiness: Slot | None = None
     """Linear picture of the specular workflow: roughness is 1 - (1 - roughness) x alpha."""
     emission_rgb: RGB = (0.0, 0.0, 0.0)
@@ -128,5 +130,8 @@ def source_columns(
     dielectric = np.minimum(material.f0 * tint, 1) * strength
     # a surface without reflectance at normal incidence is meant to have no specular lobe at all
     grazing = np.where(dielectric.max(axis=1, keepdims=True) > 0, np.clip(strength, 0, 1), 0)
-    diffuse, specular = constant_albedos(base, metal, dielectric, grazing)
+    specular = dielectric
+    diffuse = np.minimum(base, 1 - dielectric)
+    if material.has_fresnel:
+        diffuse, specular = constant_albedos(base, metal, dielectric, grazing)
     return np.concatenate([diffuse, specular, np.clip(rough, least_roughness, 1)], axis=1)

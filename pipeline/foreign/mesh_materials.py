@@ -1,18 +1,13 @@
 """Materials of single-mesh files: the MTL of an OBJ, the pictures of a PLY, or colors."""
 
 import dataclasses
-from collections.abc import Callable
-
-from numpy.typing import NDArray
 
 from pipeline.foreign.material import Slot, SourceMaterial
 from pipeline.foreign.obj_materials import obj_materials
-from pipeline.foreign.picture import Picture
+from pipeline.foreign.picture import Decode, Picture
 from pipeline.foreign.source_file import SourceFile
 from pipeline.foreign.textured_mesh import TexturedMesh, build_textured_mesh
 from storage.errors import Rejected
-
-Decode = Callable[[bytes, str], NDArray]
 
 
 def read_textured_mesh(source: SourceFile, decode: Decode, *, emission: bool) -> TexturedMesh:

@@ -6,6 +6,7 @@ and roughness is linear, whatever profile or gamma the file names.
 
 import io
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -22,6 +23,9 @@ from storage.errors import Rejected
 Wrap = Literal["repeat", "clamp", "mirror", "black"]
 """Wrap modes; `black` is 0 beyond the picture, alpha included."""
 
+Decode = Callable[[bytes, str], NDArray]
+"""Function that returns the values of a picture's bytes; the name is for messages."""
+
 FORMATS = ("PNG", "JPEG", "WEBP", "TGA", "BMP", "TIFF")
 """Formats that are decoded; a file of another one is refused by its content."""
 
@@ -32,6 +36,8 @@ UNREADABLE_PICTURE = (
 """Text that records hold for such a picture, since they never quote a library."""
 
 _STRIP = 256  # rows; an even number, since pairs of rows are averaged
+_MOST = 65504.0
+"""Largest number of a half float."""
 
 
 class Decoder:
@@ -49,11 +55,15 @@ class Decoder:
         return values
 
 
-def decode_image(data: bytes, name: str, max_pixels: int, notes: list[str]) -> NDArray:
+def decode_image(
+    data: bytes, name: str, max_pixels: int, notes: list[str], *, replaces_nan: bool = False
+) -> NDArray:
     """Return a picture [H, W, 4], row 0 at the bottom: uint8, or uint16 for grays of 16 bits.
 
     Palettes, grays, transparency and CMYK become RGBA; colors of 16 bits are reduced to 8. OpenEXR
-    and Radiance are float16, clipped to [0, 1]. `notes` receives sentences on what is not read.
+    and Radiance are float16, clipped to 0 from below; emission may exceed 1, other slots cut it.
+    `notes` receives sentences on what is not read, cut, or replaced. With `replaces_nan` NaN
+    becomes 0; without, it is refused.
 
     Raises:
         Rejected: texture_too_large or texture_unreadable.
@@ -73,9 +83,14 @@ def decode_image(data: bytes, name: str, max_pixels: int, notes: list[str]) -> N
                     if image.mode != "F":
                         return np.ascontiguousarray(_decode_values(image)[::-1])
                     linear = LinearPicture(values=np.asarray(image, np.float32)[..., None])
-        rgba, cut = _unit_rgba(linear.values)
-        notes.extend(f"picture {name[:60]!r}: {note}" for note in (*linear.unread, *cut))
-        return np.ascontiguousarray(rgba[::-1])
+        values = linear.values
+        sentences = list(linear.unread)
+        if replaces_nan and not np.isfinite(values).all():
+            sentences.append("texels that are no finite numbers: NaN replaced by 0")
+            values = np.nan_to_num(values, nan=0.0)
+        sentences += clip_to_unit(values)[1]
+        notes.extend(f"picture {name[:60]!r}: {note}" for note in sentences)
+        return np.ascontiguousarray(_to_rgba(values)[::-1])
     except MemoryError:
         raise
     except Rejected as error:
@@ -105,15 +120,14 @@ def has_colors(data: bytes) -> bool:
         return False
 
 
-def _unit_rgba(values: NDArray[np.float32]) -> tuple[NDArray[np.float16], tuple[str, ...]]:
-    """Return RGBA [H, W, 4] of linear values [H, W, 1 to 4], and a note where some are cut."""
-    values, cut = clip_to_unit(values)
+def _to_rgba(values: NDArray[np.float32]) -> NDArray[np.float16]:
+    """Return RGBA [H, W, 4] of linear values [H, W, 1 to 4]; alpha is clipped to [0, 1]."""
     count = values.shape[2]
     rgba = np.ones((*values.shape[:2], 4), np.float16)
-    rgba[..., :3] = values[..., :3] if count >= 3 else values[..., :1]
+    rgba[..., :3] = np.clip(values[..., :3] if count >= 3 else values[..., :1], 0, _MOST)
     if count in (2, 4):
-        rgba[..., 3] = values[..., -1]
-    return rgba, cut
+        rgba[..., 3] = np.clip(values[..., -1], 0, 1)
+    return rgba
 
 
 def _decode_values(image: Image.Image) -> NDArray:
@@ -125,7 +139,7 @@ def _decode_values(image: Image.Image) -> NDArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Picture:
-    """Values in [0, 1] over texture coordinates, u to the right and v up."""
+    """Values over texture coordinates, u to the right and v up; those of floats may exceed 1."""
 
     values: NDArray
     """[H, W, 4] as `decode_image` returns them, or linear float32."""
@@ -207,6 +221,13 @@ class Picture:
         values: NDArray[np.float32] = ((1 - across) * low + across * high).astype(np.float32)
         values[beyond] = 0
         return values
+
+
+def spread_points(steps: int = 8) -> NDArray[np.float64]:
+    """Return barycentric coordinates [P, 3] of points evenly over a triangle, `steps` an edge."""
+    rows = [(i, j) for i in range(steps) for j in range(steps - i)]
+    u, v = (np.array(rows, np.float64).T + 1 / 3) / steps
+    return np.stack([u, v, 1 - u - v], axis=1)
 
 
 def _halve(values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -19,11 +19,11 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedObject
 from pipeline.documents.attribution import encode_attribution
 from pipeline.documents.quality_page import Pair, encode_quality_page
+from pipeline.exchange.gltf.write import encode_mesh_glb
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.generation.prepare_isolated import asset_child, asset_store, prepare_isolated
 from pipeline.generation.unread_notes import UnreadNotes, write_unread
 from pipeline.isolation import ChildFailed, call_with_retries, reach
-from pipeline.objects.glb import encode_glb
 from pipeline.objects.ply import encode_ply
 from pipeline.objects.sources import find_objects
 from storage.atomic import write_atomically
@@ -231,7 +231,7 @@ def _encode_mesh(level: Level) -> bytes:
     """Return a mesh as a PLY file, or as GLB if it has its own materials."""
     if level.skin is None:
         return encode_ply(level.positions, level.faces)
-    return encode_glb(level.positions, level.faces, level.skin.uv, level.skin.textures)
+    return encode_mesh_glb(level.positions, level.faces, level.skin.uv, level.skin.textures)
 
 
 def _write(

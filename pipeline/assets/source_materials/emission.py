@@ -6,10 +6,9 @@ from numpy.typing import NDArray
 from pipeline.assets.source_materials.nearest import SurfaceLookup
 from pipeline.assets.source_materials.source_surface import SourceSurface
 from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.picture import spread_points
 from storage.errors import Rejected
 
-_STEPS = 8
-"""Points along an edge of the grid over a triangle; (8 + 1) 8 / 2 points in all."""
 _LEAST = 0.05
 """Fraction of the brightest triangle's radiance below which a triangle emits nothing."""
 _MOST = 1e30
@@ -32,7 +31,7 @@ def level_emission(
     """
     if not source.emits:
         return None
-    weights = _grid()
+    weights = spread_points()
     corners = level.corners
     points = np.einsum("pc,fcd->fpd", weights, corners)
     normal = level.double_area_vectors
@@ -47,10 +46,3 @@ def level_emission(
     brightness = mean.mean(axis=1)
     mean[brightness < _LEAST * brightness.max()] = 0
     return mean.astype(np.float32) if mean.any() else None
-
-
-def _grid() -> NDArray[np.float64]:
-    """Return barycentric coordinates [P, 3] of points spread evenly over a triangle."""
-    rows = [(i, j) for i in range(_STEPS) for j in range(_STEPS - i)]
-    u, v = (np.array(rows, np.float64).T + 1 / 3) / _STEPS
-    return np.stack([u, v, 1 - u - v], axis=1)

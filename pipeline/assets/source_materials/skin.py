@@ -1,7 +1,7 @@
 """`SkinBaker`: source materials of one object, from its file to the skins of its levels."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,10 @@ from pipeline.foreign.gltf.objects import gltf_textured_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.mesh_materials import read_textured_mesh
 from pipeline.foreign.numbers import FINITE
-from pipeline.foreign.picture import Decoder
+from pipeline.foreign.picture import Decode, Decoder
 from pipeline.foreign.source_file import SourceFile
 from pipeline.foreign.textured_mesh import TexturedMesh
-from pipeline.foreign.usd.object_materials import usd_textured_mesh
+from pipeline.foreign.usd.materials import usd_textured_mesh
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level
 from storage.records.packed_maps import pack_texture
@@ -111,9 +111,7 @@ def open_skin_baker(
     return SkinBaker(surface, settings), OwnMaterials(lost=tuple(sorted(lost)))
 
 
-def _parts(
-    source: SourceFile, decode: Callable[[bytes, str], NDArray], *, emission: bool
-) -> TexturedMesh:
+def _parts(source: SourceFile, decode: Decode, *, emission: bool) -> TexturedMesh:
     if source.usd is not None:
         return usd_textured_mesh(source.usd, decode, emission=emission)
     if source.gltf is not None:

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles
-from pipeline.exchange.usd.foreign_cameras import rigid_pose
+from pipeline.exchange.cameras import rigid_pose
+from pipeline.exchange.textured_triangles import TexturedTriangles, build_lamp
+from pipeline.exchange.usd.foreign_lights import octahedron, sum_area
 from pipeline.foreign.gltf.nodes import PlacedNode
 from pipeline.foreign.numbers import read_number, read_numbers
 from storage.conventions import latlong_direction, latlong_uv
 from storage.records.environment import Environment
-from storage.records.material import EMISSION, ROUGHNESS, default_rows
 from storage.records.texture import MapSource
 
 DIRECTIONAL = "directional"
@@ -68,26 +68,13 @@ def light_triangles(
     if "range" in light:
         lost.append("ranges of lights: they reach everywhere")
     radius = max(_SIZE * reach, 1e-4)
-    positions = (placed.to_world[:3, 3] + radius * _octahedron()).astype(np.float32)
-    cross = np.cross(positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0])
-    length = np.linalg.norm(cross, axis=1, keepdims=True)
-    visible_area = (
-        float(length.sum()) / 8
-    )  # half of a cross product is an area; a quarter of all area is visible
-    rows = default_rows(len(positions))
-    rows[:, ROUGHNESS] = 1
-    rows[:, EMISSION] = np.clip(_read_light(light) / visible_area, 0, 1e9)
-    if not rows[:, EMISSION].any() or not np.isfinite(positions).all():
+    positions = (placed.to_world[:3, 3] + radius * octahedron()).astype(np.float32)
+    visible_area = sum_area(positions) / 4
+    radiance = np.clip(_read_light(light) / visible_area, 0, 1e9).astype(np.float32)
+    if not radiance.any() or not np.isfinite(positions).all():
         lost.append("lights without emission")
         return None
-    return TexturedTriangles(
-        positions=positions,
-        normals=np.repeat((cross / length)[:, None], 3, axis=1).astype(np.float32),
-        rows=rows,
-        uv=np.zeros((len(positions), 3, 2), np.float32),
-        texture_set_index=np.zeros(len(positions), np.int64),
-        texture_sets=(NO_TEXTURES,),
-    )
+    return build_lamp(positions, radiance)
 
 
 def _read_light(light: dict[str, Any]) -> NDArray[np.float64]:
@@ -141,13 +128,3 @@ def even_sky() -> Environment:
     return Environment(
         radiance_rgb=np.ones((1, 2, 3), np.float32), source=MapSource(name="even light")
     )
-
-
-def _octahedron() -> NDArray[np.float64]:
-    """Return the triangles [8, 3, 3] of an octahedron of radius 1, counter-clockwise."""
-    axes = np.eye(3)
-    triangles = []
-    for x, y, z in np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T:
-        corners = axes * np.array([x, y, z])
-        triangles.append(corners if x * y * z > 0 else corners[::-1])
-    return np.stack(triangles)

@@ -3,7 +3,6 @@
 Only child processes with limits import this (pipeline.isolation), since the file is untrusted.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,32 +18,22 @@ from pipeline.exchange.gltf.cameras_and_lights import (
     light_triangles,
     read_camera,
 )
-from pipeline.exchange.gltf.materials import apply_material
-from pipeline.exchange.gltf.meshes import WorldTriangles
-from pipeline.exchange.pictures import MAX_PIXELS
-from pipeline.exchange.textured_triangles import (
-    TexturedPiece,
-    TexturedTriangles,
-    build_piece,
-    build_textured_scene,
-    join_arrays,
-    split_by_kind,
-)
-from pipeline.exchange.usd.foreign_cameras import fit_camera
+from pipeline.exchange.part_materials import PartConverter
+from pipeline.exchange.pictures import decode_values
+from pipeline.exchange.textured_triangles import SceneParts, TexturedTriangles
 from pipeline.foreign.gltf.document import GltfDocument, refuse_malformed
 from pipeline.foreign.gltf.materials import DEFAULT, GltfMaterials
 from pipeline.foreign.gltf.nodes import PlacedNode, entry, extension, placed_nodes
 from pipeline.foreign.gltf.primitives import PlacedPrimitive, placed_primitives
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material import SourceMaterial
-from pipeline.foreign.picture import decode_image
+from pipeline.foreign.part import Part, drop_empty, unit_normals
 from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected, TrilightError
-from storage.records.scene import ObjectKind, Scene, SceneObject
+from storage.records.scene import Scene, SceneObject
 from storage.records.texture import MapSource
 
 SUFFIXES = (".glb", ".gltf")
-MAX_OBJECTS = 1 << 16
 _LIMITS = ReadLimits(max_bytes=1 << 30, with_materials=True)
 
 
@@ -79,73 +68,61 @@ def read_gltf(path: Path, licence: str) -> GltfScene:
 
 @dataclass(kw_only=True, eq=False)
 class _GltfReader:
-    """State of reading one file: the document, names in use and losses."""
+    """State of reading one file: the document and losses."""
 
     document: GltfDocument
     name: str
     licence: str
     lost: list[str] = field(default_factory=list)
-    names: dict[str, int] = field(default_factory=dict)
 
     def scene(self) -> GltfScene:
         """Build the scene of the file."""
         tree = self.document.tree
         nodes = list(placed_nodes(tree))
         visible = [placed for placed in nodes if placed.is_visible]
-        pieces = [piece for placed in visible for piece in self._pieces(placed)]
-        if not pieces:
-            raise TrilightError(f"{self.name}: no triangle with an area is placed.")
-        points = np.concatenate([each.piece.mesh.positions for each in pieces])
-        reach = float(np.linalg.norm(np.ptp(points, axis=0)))
-        pieces += [piece for placed in visible for piece in self._lights(placed, reach)]
-        arrays = join_arrays(pieces)
+        parts = SceneParts(self.name)
+        for placed in visible:
+            self._add_mesh(placed, parts)
+        reach = float(np.linalg.norm(np.ptp(parts.surface_points(), axis=0)))
+        suns = []
+        for placed in visible:
+            light = self._light(placed)
+            if light is None:
+                continue
+            if light.get("type") == DIRECTIONAL:
+                suns.append((light, placed.to_world))
+            elif (lamp := light_triangles(light, placed, reach, self.lost)) is not None:
+                parts.add(self._entry(placed.node.get("name") or "light"), lamp, is_lamp=True)
         cameras = [
             read_camera(tree, placed, self.lost) for placed in nodes if "camera" in placed.node
         ]
-        poses = [each for each in cameras if each is not None]
-        if poses:
-            c2w = np.stack([pose for pose, _ in poses]).astype(np.float32)
-            fov_deg = np.array([angle for _, angle in poses], np.float32)
-        else:
-            self.lost.append("no camera: one was added that sees everything")
-            c2w, fov_deg = fit_camera(points)
-        sky = build_sun_sky([each for placed in visible for each in self._suns(placed)], self.lost)
-        if sky is None and not any(each.piece.entry.kind == "emitter" for each in pieces):
+        sky = build_sun_sky(suns, self.lost)
+        if sky is None and not parts.has_emitters:
             self.lost.append("no light: an even sky of radiance 1 lights it")
             sky = even_sky()
-        scene = build_textured_scene(
-            arrays,
-            pieces,
-            c2w=c2w,
-            fov_deg=fov_deg,
-            provenance={"template": "gltf", "file": self.name},
-            environment=sky,
-        )
+        usable = [camera for camera in cameras if camera is not None]
+        scene = parts.build(usable, sky, {"template": "gltf", "file": self.name}, self.lost)
         lost = dict.fromkeys([*self.document.unread, *self.lost])
         return GltfScene(scene=scene, lost=tuple(lost))
 
-    def _pieces(self, placed: PlacedNode) -> Iterator[TexturedPiece]:
+    def _add_mesh(self, placed: PlacedNode, parts: SceneParts) -> None:
         if "mesh" not in placed.node:
             return
         mesh = entry(self.document.tree, "meshes", placed.node["mesh"])
-        name = str(placed.node.get("name") or mesh.get("name") or "object")
+        name = placed.node.get("name") or mesh.get("name") or "object"
         for primitive in placed_primitives(self.document, placed):
-            for kind, triangles in split_by_kind(self._triangles(primitive)):
-                yield build_piece(self._entry(name, kind), triangles)
+            parts.add(self._entry(name), self._triangles(primitive))
 
     @cached_property
     def _materials(self) -> GltfMaterials:
-        return GltfMaterials(self.document, self._decode, emission=True, notes=self.lost)
+        def decode(data: bytes, name: str) -> NDArray:
+            return decode_values(data, name, self.lost)
 
-    def _decode(self, data: bytes, name: str) -> NDArray:
-        try:
-            return decode_image(data, name, MAX_PIXELS, self.lost)
-        except Rejected as why:
-            if why.reason != "texture_too_large":
-                raise
-            raise TrilightError(
-                f"{self.name}: {name}: expected at most {MAX_PIXELS} pixels."
-            ) from why
+        return GltfMaterials(self.document, decode, emission=True, notes=self.lost)
+
+    @cached_property
+    def _converter(self) -> PartConverter:
+        return PartConverter(self.lost)
 
     def _material(self, number: int | None) -> SourceMaterial:
         material = DEFAULT if number is None else self._materials.material(number)
@@ -153,17 +130,35 @@ class _GltfReader:
         return material
 
     def _triangles(self, primitive: PlacedPrimitive) -> TexturedTriangles:
-        triangles = WorldTriangles(primitive)
-        if triangles.num_without_area:
+        corners = primitive.positions[primitive.faces]
+        if not np.isfinite(corners).all():
+            raise Rejected("nonfinite_vertices", "positions are not finite")
+        positions, flat, has_area = drop_empty(corners)
+        if not has_area.all():
             self.lost.append("triangles without an area")
+
+        def select(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+            return None if values is None else values[has_area]
+
+        def coordinates(number: int) -> NDArray[np.float64] | None:
+            uv = select(primitive.coordinates(number))
+            if uv is not None and not np.isfinite(uv).all():
+                raise Rejected("texture_coordinates_not_finite", f"TEXCOORD_{number} is not finite")
+            return uv
+
         number = primitive.primitive.material
         row = {} if number is None else entry(self.document.tree, "materials", number)
-        source = MapSource(
-            name=str(row.get("name", ""))[:200],
-            licence=self.licence,
-            attribution=self._attribution(),
+        part = Part(
+            where="",
+            material=self._material(number),
+            positions=positions,
+            normals=unit_normals(select(primitive.normals), flat),
+            coordinates=coordinates,
+            colors=select(primitive.colors),
         )
-        return apply_material(self._material(number), triangles, source, self.lost)
+        name = str(row.get("name", ""))[:200]
+        source = MapSource(name=name, licence=self.licence, attribution=self._attribution())
+        return self._converter.convert(part, source)
 
     def _light(self, placed: PlacedNode) -> dict[str, Any] | None:
         """Return the JSON of a node's light; None where it has none."""
@@ -174,33 +169,13 @@ class _GltfReader:
             extension(self.document.tree, "KHR_lights_punctual"), "lights", reference["light"]
         )
 
-    def _lights(self, placed: PlacedNode, reach: float) -> Iterator[TexturedPiece]:
-        light = self._light(placed)
-        if light is not None and light.get("type") != DIRECTIONAL:
-            triangles = light_triangles(light, placed, reach, self.lost)
-            name = str(placed.node.get("name") or "light")
-            if triangles is not None:
-                yield build_piece(self._entry(name, "emitter"), triangles)
-
-    def _suns(self, placed: PlacedNode) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
-        light = self._light(placed)
-        if light is not None and light.get("type") == DIRECTIONAL:
-            yield light, placed.to_world
-
     def _attribution(self) -> str:
         return str(self.document.tree.get("asset", {}).get("copyright", ""))[:1000]
 
-    def _entry(self, base: str, kind: ObjectKind) -> SceneObject:
-        if len(self.names) >= MAX_OBJECTS:
-            raise TrilightError(f"{self.name}: more than {MAX_OBJECTS} objects.")
-        base = base[:200].replace("\0", "_")
-        count = self.names.get(base, 0) + 1
-        name = base if count == 1 else f"{base}.{count}"
-        while count > 1 and name in self.names:
-            count += 1
-            name = f"{base}.{count}"
-        self.names[base] = count
-        self.names.setdefault(name, 1)
+    def _entry(self, stated: Any) -> SceneObject:
         return SceneObject(
-            name=name, kind=kind, licence=self.licence, attribution=self._attribution()
+            name=str(stated)[:200].replace("\0", "_"),
+            kind="object",
+            licence=self.licence,
+            attribution=self._attribution(),
         )

@@ -1,18 +1,22 @@
-"""Writes a scene as GLB, a single file for modeling programs, browsers and game engines.
+"""Writes a scene or a mesh as GLB, one file for modeling programs, browsers and game engines.
 
-Materials become glTF dielectrics that reading (pipeline.exchange.gltf.materials) converts back. The
+Materials become glTF dielectrics that reading (pipeline.foreign.material) converts back. The
 specular albedo F is the mean of Schlick's term, F0 + (F90 - F0)/21. The strength of
 KHR_materials_specular is F90. It is set to the strongest channel of F, which then reflects the same
 at every angle, as in Trilight; the tint gives the other channels. The base color is
 diffuse / (1 - F). Lamps are surfaces that emit (KHR_materials_emissive_strength).
 """
 
+import io
+import json
+import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from pipeline.exchange.linear_maps import (
     Map,
@@ -21,12 +25,11 @@ from pipeline.exchange.linear_maps import (
     linear_map,
     resample_to_largest,
 )
-from pipeline.objects.glb import FLOAT, MOST_SPECULAR, UNSIGNED, GlbFile
 from storage.atomic import write_atomically
 from storage.conventions import srgb8
 from storage.records.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, ROUGHNESS, SPECULAR
 from storage.records.scene import ARRAY_FIELDS, Scene
-from storage.records.texture import TEXTURED
+from storage.records.texture import TEXTURED, Texture
 
 CARRIED = frozenset(
     {*ARRAY_FIELDS, "objects.name", "objects.kind", "textures"} - {"materials"}
@@ -36,6 +39,14 @@ CARRIED = frozenset(
 
 _TO_Y_UP = (-(0.5**0.5), 0.0, 0.0, 0.5**0.5)
 """Quaternion of the root node, which rotates +Z up to the +Y up of glTF."""
+
+MOST_SPECULAR = 25.0
+"""Specular factor of a mirror: 25 times the F0 = 0.04 of an ordinary dielectric."""
+_JSON = 0x4E4F534A
+_BIN = 0x004E4942
+FLOAT = 5126
+UNSIGNED = 5125
+"""Component types of glTF accessors: float32, and unsigned 32-bit integers."""
 
 _USED = ["KHR_materials_specular", "KHR_materials_emissive_strength"]
 
@@ -81,8 +92,42 @@ def encode_scene_glb(scene: Scene) -> bytes:
         "nodes": nodes,
         "meshes": meshes,
         "cameras": cameras,
-        "materials": [_material(file, scene, row) for row in range(len(scene.materials))],
+        "materials": [
+            {
+                **_material(file, _maps(scene, row), scene.materials[row, EMISSION]),
+                "name": f"material{row}",
+            }
+            for row in range(len(scene.materials))
+        ],
         "extensionsUsed": _USED,
+    }
+    return file.encode()
+
+
+def encode_mesh_glb(
+    positions: NDArray[np.floating],
+    faces: NDArray[np.integer],
+    uv: NDArray[np.floating],
+    textures: tuple[Texture, Texture, Texture],
+) -> bytes:
+    """Return a textured mesh as the bytes of a GLB file.
+
+    Args:
+        positions: [V, 3], +Z up.
+        faces: [F, 3] rows of `positions`.
+        uv: [F, 3, 2] texture coordinates of the corners, v up.
+        textures: diffuse, specular and roughness.
+    """
+    file = GlbFile()
+    maps = {name: linear_map(texture) for name, texture in zip(TEXTURED, textures, strict=True)}
+    attributes = _attributes(file, positions[faces].reshape(-1, 3), None, uv.reshape(-1, 2))
+    indices = file.accessor(np.arange(faces.size, dtype="<u4"), "SCALAR", UNSIGNED)
+    primitive = {"attributes": attributes, "indices": indices, "material": 0}
+    file.tree |= {
+        "nodes": [{"mesh": 0, "rotation": list(_TO_Y_UP)}],
+        "meshes": [{"primitives": [primitive]}],
+        "materials": [_material(file, maps, np.zeros(3))],
+        "extensionsUsed": _USED[:1],
     }
     return file.encode()
 
@@ -97,7 +142,7 @@ def _group_triangles(scene: Scene) -> Iterator[tuple[int, int, NDArray[np.int64]
 
 
 def _primitive(
-    file: GlbFile, scene: Scene, material: int, triangles: NDArray[np.int64]
+    file: "GlbFile", scene: Scene, material: int, triangles: NDArray[np.int64]
 ) -> dict[str, Any]:
     corners = scene.faces[triangles].reshape(-1)
     if scene.uv is None:
@@ -105,17 +150,10 @@ def _primitive(
     else:
         vertices = corners
         indices = np.arange(len(corners))
-    points = scene.vertex_positions[vertices].astype("<f4")
-    bounds = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
-    normals = scene.vertex_normals[vertices].astype("<f4")
-    attributes = {
-        "POSITION": file.accessor(points, "VEC3", FLOAT, bounds),
-        "NORMAL": file.accessor(normals, "VEC3", FLOAT),
-    }
-    if scene.uv is not None:
-        uv = scene.uv.reshape(-1, 3, 2)[triangles].reshape(-1, 2)
-        from_top = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype("<f4")
-        attributes["TEXCOORD_0"] = file.accessor(from_top, "VEC2", FLOAT)
+    uv = None if scene.uv is None else scene.uv.reshape(-1, 3, 2)[triangles].reshape(-1, 2)
+    attributes = _attributes(
+        file, scene.vertex_positions[vertices], scene.vertex_normals[vertices], uv
+    )
     return {
         "attributes": attributes,
         "indices": file.accessor(indices.astype("<u4"), "SCALAR", UNSIGNED),
@@ -123,9 +161,28 @@ def _primitive(
     }
 
 
-def _material(file: GlbFile, scene: Scene, row: int) -> dict[str, Any]:
-    values = scene.materials[row]
-    maps = _maps(scene, row)
+def _attributes(
+    file: "GlbFile",
+    points: NDArray[np.floating],
+    normals: NDArray[np.floating] | None,
+    uv: NDArray[np.floating] | None,
+) -> dict[str, int]:
+    """Add positions and normals [V, 3] and coordinates [V, 2], v up; return their accessors."""
+    points = points.astype("<f4")
+    bounds = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
+    attributes = {"POSITION": file.accessor(points, "VEC3", FLOAT, bounds)}
+    if normals is not None:
+        attributes["NORMAL"] = file.accessor(normals.astype("<f4"), "VEC3", FLOAT)
+    if uv is not None:
+        from_top = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype("<f4")
+        attributes["TEXCOORD_0"] = file.accessor(from_top, "VEC2", FLOAT)
+    return attributes
+
+
+def _material(
+    file: "GlbFile", maps: Mapping[str, Map], emission: NDArray[np.floating]
+) -> dict[str, Any]:
+    """Return the JSON of a material of the maps of its columns and its radiance [3]."""
     diffuse, specular = resample_to_largest(maps["diffuse"], maps["specular"])
     strength = float(specular.max())
     base: Map = np.clip(diffuse / np.maximum(1 - specular, 1e-6), 0, 1).astype(np.float32)
@@ -148,11 +205,11 @@ def _material(file: GlbFile, scene: Scene, row: int) -> dict[str, Any]:
         blank = np.zeros_like(rough)
         packed = np.concatenate([blank, rough, blank], axis=2)
         surface["metallicRoughnessTexture"] = {"index": file.picture(packed)}
-    made = {"pbrMetallicRoughness": surface, "doubleSided": True, "name": f"material{row}"}
+    made: dict[str, Any] = {"pbrMetallicRoughness": surface, "doubleSided": True}
     extensions: dict[str, Any] = {"KHR_materials_specular": lobe}
-    brightest = float(values[EMISSION].max())
+    brightest = float(emission.max())
     if brightest > 0:
-        made["emissiveFactor"] = (values[EMISSION].astype(float) / brightest).tolist()
+        made["emissiveFactor"] = (emission.astype(float) / brightest).tolist()
         extensions["KHR_materials_emissive_strength"] = {"emissiveStrength": brightest}
     return {**made, "extensions": extensions}
 
@@ -166,3 +223,52 @@ def _maps(scene: Scene, row: int) -> Mapping[str, Map]:
             if texture >= 0:
                 maps[name] = linear_map(scene.textures[texture])
     return maps
+
+
+class GlbFile:
+    """A GLB file under construction: one buffer, and a JSON tree that the caller completes."""
+
+    def __init__(self) -> None:
+        self.tree: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": "trilight"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0}],
+            "accessors": [],
+            "bufferViews": [],
+        }
+        self._data = bytearray()
+
+    def accessor(
+        self, values: NDArray, kind: str, component: int, more: Mapping[str, Any] | None = None
+    ) -> int:
+        """Add an array of numbers; return the index of its accessor."""
+        entry = {"bufferView": self._view(values.tobytes()), "componentType": component}
+        self.tree["accessors"].append({**entry, "count": len(values), "type": kind, **(more or {})})
+        return len(self.tree["accessors"]) - 1
+
+    def picture(self, values: NDArray[np.uint8]) -> int:
+        """Add a picture [H, W, 3], bottom row first; return the index of its texture."""
+        stream = io.BytesIO()
+        Image.fromarray(values[::-1]).save(stream, "PNG")
+        images, textures = (self.tree.setdefault(name, []) for name in ("images", "textures"))
+        images.append({"bufferView": self._view(stream.getvalue()), "mimeType": "image/png"})
+        textures.append({"source": len(images) - 1})
+        return len(textures) - 1
+
+    def encode(self) -> bytes:
+        """Return the bytes of the file."""
+        self.tree["buffers"] = [{"byteLength": len(self._data)}]
+        text = json.dumps(self.tree, sort_keys=True).encode()
+        text += b" " * (-len(text) % 4)
+        data = bytes(self._data) + bytes(-len(self._data) % 4)
+        chunks = struct.pack("<II", len(text), _JSON) + text
+        chunks += struct.pack("<II", len(data), _BIN) + data
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+    def _view(self, data: bytes) -> int:
+        self._data += bytes(-len(self._data) % 4)
+        view = {"buffer": 0, "byteOffset": len(self._data), "byteLength": len(data)}
+        self._data += data
+        self.tree["bufferViews"].append(view)
+        return len(self.tree["bufferViews"]) - 1

@@ -67,17 +67,6 @@ def add_link(prim: Any, name: str, kind: str, source: str | None = None) -> None
         link.connectionPathList.explicitItems = [_target(source)]
 
 
-def has_attributes(prim: Any, attributes: Attributes) -> bool:
-    """Return whether a prim has these attributes with these values and no time samples."""
-    for name, (kind, value) in attributes.items():
-        attribute = prim.attributes.get(name)
-        if attribute is None or attribute.HasInfo("timeSamples"):
-            return False
-        if attribute.typeName != _value_type(kind) or attribute.default != usd_value(kind, value):
-            return False
-    return True
-
-
 def _target(path: str) -> Any:
     """Return the path of a prim as other prims name it, without variant selections."""
     from pxr import Sdf

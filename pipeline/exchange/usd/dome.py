@@ -41,18 +41,24 @@ _SAME_ROTATION = 1e-5
 """Tolerance for a rotation that Trilight wrote: other programs keep angles in float32."""
 
 
-def add_dome(layer: Any, path: str, sky: Environment) -> dict[str, bytes]:
-    """Write the prim of an environment; return its map file by name.
+def add_dome(layer: Any, path: str, sky: Environment) -> None:
+    """Write the prim of an environment."""
+    add_attributes(add_prim(layer, path, "DomeLight"), dome_attributes(sky))
+
+
+def map_files(sky: Environment | None) -> dict[str, bytes]:
+    """Return the map file of an environment by name.
 
     Raises:
         TrilightError: the map is larger than the OpenEXR reader accepts.
     """
+    if sky is None:
+        return {}
     if max(sky.radiance_rgb.shape) > MAX_RESOLUTION:
         raise TrilightError(
             f"environment: {sky.radiance_rgb.shape[1]} texels wide; expected at most "
             f"{MAX_RESOLUTION} in USD. Write it as .safetensors, or make it smaller."
         )
-    add_attributes(add_prim(layer, path, "DomeLight"), dome_attributes(sky))
     return {map_file(sky): encode_channels({"RGB": sky.radiance_rgb})}
 
 

@@ -52,7 +52,7 @@ def light_triangles(placed: PlacedPrim, time: Any, lost: list[str]) -> NDArray[n
     }
     world = np.einsum("ij,tcj->tci", placed.to_world[:3, :3], shapes[kind]())
     world = world + placed.to_world[:3, 3]
-    area = _area(world)
+    area = sum_area(world)
     if not area > 0 or not np.isfinite(area):
         lost.append(f"{prim.GetPath()}: a light without an area")
         return None
@@ -74,7 +74,7 @@ def compute_radiance(
     """
     emitted = read_light_color(placed.prim, time, lost)
     if placed.prim.GetAttribute("inputs:normalize").Get(time):
-        area = _area(triangles.astype(np.float64)) / placed.meters_per_unit**2
+        area = sum_area(triangles) / placed.meters_per_unit**2
         emitted = emitted / max(area, 1e-30)
     if (emitted < 0).any():
         lost.append(f"{placed.prim.GetPath()}: negative radiance; the light emits nothing")
@@ -132,8 +132,9 @@ def _note_losses(prim: Any, time: Any, lost: list[str]) -> None:
     ]
 
 
-def _area(triangles: NDArray[np.float64]) -> float:
-    edges = np.diff(triangles, axis=1)
+def sum_area(triangles: NDArray[np.floating]) -> float:
+    """Return the area of triangles [T, 3, 3]."""
+    edges = np.diff(triangles.astype(np.float64), axis=1)
     return float(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum() / 2)
 
 
@@ -148,7 +149,7 @@ def _disk() -> NDArray[np.float64]:
     angle = -2 * math.pi * np.arange(_DISK_CORNERS) / _DISK_CORNERS
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
     fan = np.stack([np.zeros_like(rim), rim, np.roll(rim, -1, axis=0)], axis=1)
-    return fan * math.sqrt(math.pi / _area(fan))
+    return fan * math.sqrt(math.pi / sum_area(fan))
 
 
 def _build_tube() -> NDArray[np.float64]:
@@ -163,18 +164,23 @@ def _build_tube() -> NDArray[np.float64]:
     return np.concatenate([np.stack(side, axis=1) for side in sides])
 
 
-def _sphere() -> NDArray[np.float64]:
-    """Return 128 triangles with the total area of the unit sphere, facing out."""
-    octahedron = np.array(
+def octahedron() -> NDArray[np.float64]:
+    """Return the triangles [8, 3, 3] of an octahedron of radius 1, facing out."""
+    faces = np.array(
         [[[x, 0, 0], [0, y, 0], [0, 0, z]] for x in (1, -1) for y in (1, -1) for z in (1, -1)],
         float,
     )
-    faces_inward = np.prod(octahedron.sum(axis=1), axis=1) < 0
-    octahedron[faces_inward] = octahedron[faces_inward][:, ::-1]
-    faces = octahedron
+    faces_inward = np.prod(faces.sum(axis=1), axis=1) < 0
+    faces[faces_inward] = faces[faces_inward][:, ::-1]
+    return faces
+
+
+def _sphere() -> NDArray[np.float64]:
+    """Return 128 triangles with the total area of the unit sphere, facing out."""
+    faces = octahedron()
     for _ in range(2):
         middle = (faces + np.roll(faces, -1, axis=1)) / 2
         middle /= np.linalg.norm(middle, axis=2, keepdims=True)
         corner = [np.stack([faces[:, i], middle[:, i], middle[:, i - 1]], axis=1) for i in range(3)]
         faces = np.concatenate([*corner, middle])
-    return faces * math.sqrt(4 * math.pi / _area(faces))
+    return faces * math.sqrt(4 * math.pi / sum_area(faces))

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.textured_triangles import have_areas
+from pipeline.foreign.part import drop_empty, unit_normals
 from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.polygons import (
     CutMesh,
@@ -16,7 +16,6 @@ from pipeline.foreign.usd.polygons import (
     mesh_polygons,
     place_points,
 )
-from pipeline.foreign.usd.texture_nodes import UvChart, chart_corners
 from pipeline.scenes.shading import smooth_shaded
 
 SMOOTH_ANGLE_DEG = 30.0
@@ -31,20 +30,6 @@ class TriangleSoup:
     normals: NDArray[np.float32]  # [T, 3, 3] unit
     cut: CutMesh  # corners of the mesh, for values at them
 
-    @property
-    def prim(self) -> Any:
-        """The prim of the mesh."""
-        return self.cut.prim
-
-    def read_coordinates(self, chart: UvChart, time: Any) -> NDArray[np.float64] | None:
-        """Return texture coordinates [T, 3, 2]; None where a corner lacks them."""
-        uv = chart_corners(chart, self.cut, time)
-        if uv is None or not np.isfinite(uv).all():
-            return None
-        for move in chart.transforms:
-            uv = np.einsum("ij,tcj->tci", move.matrix, uv) + move.translation
-        return uv
-
 
 def read_mesh(placed: PlacedPrim, time: Any, lost: list[str]) -> TriangleSoup:
     """Return the triangles of a mesh that have an area.
@@ -55,14 +40,12 @@ def read_mesh(placed: PlacedPrim, time: Any, lost: list[str]) -> TriangleSoup:
     polygons = mesh_polygons(placed, time)
     cut = cut_mesh(polygons)
     rows = cut.indices[cut.corners]
-    positions = place_points(polygons.points, placed.to_world)[rows].astype(np.float32)
-    cross = _cross(positions)
-    solid = have_areas(positions, cross)
-    if not solid.all():
-        lost.append(f"{cut.prim.GetPath()}: {int((~solid).sum())} triangles without an area")
-    cut = cut.select(solid)
-    positions = positions[solid]
-    normals = _normals(polygons, cut, time, positions, lost)
+    corners = place_points(polygons.points, placed.to_world)[rows]
+    positions, flat, has_area = drop_empty(corners)
+    if not has_area.all():
+        lost.append(f"{cut.prim.GetPath()}: {int((~has_area).sum())} triangles without an area")
+    cut = cut.select(has_area)
+    normals = _normals(polygons, cut, time, positions, flat, lost)
     return TriangleSoup(positions=positions, normals=normals, cut=cut)
 
 
@@ -71,16 +54,15 @@ def _normals(
     cut: CutMesh,
     time: Any,
     positions: NDArray[np.float32],
+    flat: NDArray[np.float64],
     lost: list[str],
 ) -> NDArray[np.float32]:
     placed = polygons.placed
     where = cut.prim.GetPath()
-    cross = _cross(positions)
-    flat = cross / np.linalg.norm(cross, axis=1, keepdims=True)
     stated = None if placed.skin is not None else _stated_normals(cut.prim, time)
     if stated is None:
         if not (polygons.is_smooth or placed.skin is not None) or not len(positions):
-            return np.repeat(flat[:, None], 3, axis=1).astype(np.float32)
+            return unit_normals(None, flat)
         if placed.skin is not None:
             lost.append(f"{where}: posed by bones; its normals are those of its faces")
         elif cut.prim.GetTypeName() == "Mesh":
@@ -89,13 +71,9 @@ def _normals(
     normals = cut.per_corner(*stated)
     if normals is None:
         lost.append(f"{where}: the number of normals does not match")
-        return np.repeat(flat[:, None], 3, axis=1).astype(np.float32)
+        return unit_normals(None, flat)
     normal_matrix = np.linalg.inv(placed.to_world[:3, :3]).T
-    world_normals = np.einsum("ij,tcj->tci", normal_matrix, normals)
-    length = np.linalg.norm(world_normals, axis=2, keepdims=True)
-    usable = np.isfinite(length) & (length > 0)
-    unit = np.where(usable, world_normals / np.where(usable, length, 1), flat[:, None])
-    return np.asarray(unit, np.float32)
+    return unit_normals(np.einsum("ij,tcj->tci", normal_matrix, normals), flat)
 
 
 def _smooth(positions: NDArray[np.float32], cut: CutMesh) -> NDArray[np.float32]:
@@ -122,8 +100,3 @@ def _stated_normals(prim: Any, time: Any) -> tuple[NDArray[np.float64], str] | N
     if values is None or len(values) == 0:
         return None
     return as_array(values, np.float64, (-1, 3)), interpolation
-
-
-def _cross(positions: NDArray[np.float32]) -> NDArray[np.float64]:
-    wide = positions.astype(np.float64)
-    return np.cross(wide[:, 1] - wide[:, 0], wide[:, 2] - wide[:, 0])

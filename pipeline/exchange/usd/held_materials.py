@@ -7,35 +7,62 @@ with a note. Blender writes no specular albedo, so that the exact one stays.
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.linear_maps import constant_map, may_exceed_one
-from pipeline.exchange.usd.foreign_inputs import ShaderInputs, build_textures, lower_diffuse
-from pipeline.exchange.usd.foreign_textures import ForeignTexture, read_texture
+from pipeline.exchange.linear_maps import (
+    color_textures,
+    constant_map,
+    linear_map,
+    may_exceed_one,
+)
+from pipeline.exchange.pictures import MAX_BYTES, MAX_PIXELS
+from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles
 from pipeline.exchange.usd.names import (
     ADDED_COLUMNS,
     MATERIAL_ATTRIBUTES,
     column_attribute,
     texture_attribute,
 )
+from pipeline.exchange.usd.texture_files import decode_texture
 from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS
-from pipeline.foreign.usd.shaders import surface_shader
+from pipeline.foreign.picture import decode_image
+from pipeline.foreign.usd.shaders import (
+    DEFAULTS,
+    IOR_OF_CONSTANT_ALBEDOS,
+    StatedMaterial,
+    surface_shader,
+)
 from pipeline.foreign.usd.stage import OpenedStage
-from pipeline.foreign.usd.texture_nodes import find_sources, is_output, read_texture_node
-from storage.records.material import EMISSION, declared_column, default_rows, laid_out
+from pipeline.foreign.usd.texture_nodes import (
+    TextureNode,
+    UvChart,
+    asset_bytes,
+    find_sources,
+    is_output,
+    read_texture_node,
+)
+from storage.errors import Rejected
+from storage.records.exr import MAGIC
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, declared_column
 from storage.records.texture import TEXTURED, MapSource, Texture
 
-_STATED = {
-    "diffuse": ("diffuseColor", 3),
-    "specular": ("specularColor", 3),
-    "roughness": ("roughness", 1),
+_INPUTS = {
+    "diffuse": "diffuseColor",
+    "specular": "specularColor",
+    "roughness": "roughness",
+    "emission": "emissiveColor",
 }
-"""Preview input and its channel count, by column that may be textured."""
+"""Input of the preview for each published column."""
+
+_EXCESS = 1e-6
+"""Tolerance for the rounding of two float32 albedos that add up to 1."""
+
+ROUGHNESS_PART = slice(ROUGHNESS, ROUGHNESS + 1)
 
 _SAME_VALUE = 1e-5
 """Relative tolerance for a value that Trilight wrote: programs compute in float32."""
@@ -51,15 +78,6 @@ class HeldMaterial:
     """Value of each published column by name."""
     maps: Mapping[str, tuple[str, MapSource]]
     """Digest and source of the texture of each textured column."""
-
-    @property
-    def row(self) -> NDArray[np.float32]:
-        """Row [10 or more] of `Scene.materials` with the exact values."""
-        row = default_rows(1)[0]
-        for column, part in laid_out():
-            if column.name in self.columns:
-                row[part] = self.columns[column.name]
-        return row
 
 
 def read_held_material(material: Any, time: Any) -> HeldMaterial | None:
@@ -94,108 +112,143 @@ def parse_map_text(text: Any) -> tuple[str, MapSource] | None:
     return (sha256, source) if all(isinstance(each, str) for each in texts) else None
 
 
-def read_held_textures(
-    held: HeldMaterial | None, material: Any, time: Any, opened: OpenedStage
-) -> dict[str, ForeignTexture]:
-    """Read the specular texture where only the coat roughness still refers to it."""
+def restore_stated(
+    held: HeldMaterial, stated: StatedMaterial, material: Any, time: Any, opened: OpenedStage
+) -> StatedMaterial:
+    """Return the inputs of a shader in the workflow that Trilight writes.
+
+    Blender writes no specular albedo: the exact one is taken, or the texture that the roughness of
+    the absent coat still refers to.
+    """
     from pxr import UsdShade
 
-    if held is None or "specular" not in held.maps:
-        return {}
+    textures = dict(stated.textures)
+    constants = {**stated.constants, **_WORKFLOW}
     sources = find_sources(surface_shader(material), COAT_ROUGHNESS.removeprefix("inputs:"))
-    if not sources or not is_output(sources[0]):
-        return {}
-    node = UsdShade.Shader(sources[0].GetPrim())
-    if node.GetShaderId() != "UsdUVTexture":
-        return {}
-    texture = read_texture(read_texture_node(node, "rgb", time, opened), opened)
-    return {} if texture is None else {"specularColor": texture}
-
-
-def choose_textures(
-    held: HeldMaterial | None,
-    inputs: ShaderInputs,
-    textures: Mapping[str, Texture],
-    source: MapSource,
-    where: str,
-    lost: list[str],
-) -> tuple[Texture, Texture, Texture]:
-    """Return diffuse, specular and roughness of a material, exact where they are unchanged.
-
-    Args:
-        held: exact values that Trilight wrote, if any.
-        inputs: inputs of the shader.
-        textures: textures by input.
-        source: name and rights of other textures.
-        where: path of the mesh, for notes.
-        lost: receives a sentence for each change.
-    """
-    if held is None:
-        return build_textures(inputs, textures, source, where, lost)
-    is_specular = inputs.stated.is_specular
-    if not is_specular and ("metallic" in textures or inputs.constant("metallic").any()):
-        lost.append(
-            f"{held.where}: became a metal since Trilight wrote it; read as any other material"
-        )
-        return build_textures(inputs, textures, source, where, lost)
-    chosen = dict[str, Texture]()
-    is_changed = False
-    for column, (name, channels) in _STATED.items():
-        stated = textures.get(name)
-        if stated is None and (column != "specular" or is_specular):
-            stated = inputs.build_constant(name, channels, source)
-        exact = _find_exact(held, column, stated)
-        if exact is None and stated is None:
-            lost.append(
-                f"{held.where}: the texture of {column} is not in the file; its mean is used"
+    if "specular" in held.maps and sources and is_output(sources[0]):
+        node = UsdShade.Shader(sources[0].GetPrim())
+        if "specularColor" not in textures and node.GetShaderId() == "UsdUVTexture":
+            textures["specularColor"] = read_texture_node(node, "rgb", time, opened)
+    if not stated.is_specular:
+        constants["specularColor"] = held.columns["specular"]
+        if "specular" in held.maps and "specularColor" not in textures:
+            opened.lost.append(
+                f"{held.where}: the texture of specular is not in the file; its mean is used"
             )
-            stated = Texture(texels=constant_map(held.columns[column]), source=source)
-        elif exact is None:
-            lost.append(
-                f"{held.where}: {column} was changed since Trilight wrote it; the new value is used"
-            )
-            is_changed = True
-        texture = stated if exact is None else exact
-        assert texture is not None
-        chosen[column] = texture
-    diffuse = chosen["diffuse"]
-    specular = chosen["specular"]
-    is_textured = any(texture.constant is None for texture in (diffuse, specular))
-    if is_changed and is_textured and may_exceed_one(diffuse, specular):
-        diffuse, specular = lower_diffuse(diffuse, specular, source, where, lost)
-    return diffuse, specular, chosen["roughness"]
+    return dataclasses.replace(stated, constants=constants, textures=textures)
 
 
-def choose_emission(
-    held: HeldMaterial | None, stated: NDArray[np.float32], lost: list[str]
-) -> NDArray[np.float32]:
-    """Return the radiance [T, 3] of triangles; the exact value where the shader agrees."""
-    if held is None:
-        return stated
-    exact = held.row[EMISSION]
-    if _agree(stated, exact):
-        return np.broadcast_to(exact, stated.shape).astype(np.float32)
-    lost.append(
-        f"{held.where}: emission was changed since Trilight wrote it; the new value is used"
+def as_stated(held: HeldMaterial) -> StatedMaterial:
+    """Return a material of the values that Trilight wrote, for one that has lost its shader."""
+    values = {name: _fill(held.columns[column]) for column, name in _INPUTS.items()}
+    return StatedMaterial(
+        name=held.where.rpartition("/")[2],
+        where=held.where,
+        constants={
+            **{name: _fill(value) for name, value in DEFAULTS.items()},
+            **values,
+            **_WORKFLOW,
+        },
+        textures={},
+        primvars={},
+        has_strength=False,
+        lost=(),
+        has_networks=False,
     )
-    return stated
 
 
-def _find_exact(held: HeldMaterial, column: str, stated: Texture | None) -> Texture | None:
-    """Return the exact texture or constant of a column; None where the shader differs."""
-    if column in held.maps:
-        sha256, source = held.maps[column]
-        is_same = stated is not None and stated.sha256 == sha256
-        return dataclasses.replace(stated, source=source) if stated and is_same else None
-    if stated is not None and not (
-        stated.constant is not None and _agree(stated.constant, held.columns[column])
-    ):
+def find_exact(held: HeldMaterial, stated: StatedMaterial, lost: list[str]) -> dict[str, Texture]:
+    """Return the columns that the shader still shows as Trilight wrote them; note the others.
+
+    A constant, such as emission, is a texture of one texel.
+    """
+    exact = {}
+    for column, name in _INPUTS.items():
+        node = stated.textures.get(name)
+        value = held.columns[column]
+        texture = None
+        if name in stated.primvars:
+            pass
+        elif node is not None:
+            texture = _read_exact_texture(held, column, node, stated.textures.values())
+        elif np.allclose(stated.constants[name], value, rtol=_SAME_VALUE, atol=0):
+            texture = Texture(texels=constant_map(value))
+        if texture is not None:
+            exact[column] = texture
+            continue
+        lost.append(
+            f"{held.where}: {column} was changed since Trilight wrote it; the new value is used"
+        )
+    return exact
+
+
+def _read_exact_texture(
+    held: HeldMaterial, column: str, node: TextureNode, nodes: Iterable[TextureNode]
+) -> Texture | None:
+    """Return the texture of a column; None where its file or its use differs."""
+    is_used_alike = all(
+        each.wrap == ("repeat", "repeat")
+        and each.chart == UvChart(primvar=node.chart.primvar, transforms=())
+        and (each.scale == 1).all()
+        and not each.bias.any()
+        for each in nodes
+    )
+    data = None if node.resolved is None else asset_bytes(node.resolved, MAX_BYTES)
+    if column not in held.maps or not is_used_alike or data is None:
         return None
-    return Texture(texels=constant_map(held.columns[column]))
+    sha256, source = held.maps[column]
+    is_srgb = node.color_space == "sRGB"
+    try:
+        if data.startswith(MAGIC):
+            texture = decode_texture(data, is_exr=True, is_srgb=False, source=source)
+        else:
+            values = decode_image(data, node.named, MAX_PIXELS, [])
+            chosen = values[..., :3] if column != "roughness" else values[..., :1]
+            texels = np.ascontiguousarray(chosen)
+            texture = Texture(texels=texels, is_srgb=is_srgb, source=source)
+    except (LookupError, Rejected):
+        return None
+    return texture if texture.sha256 == sha256 else None
 
 
-def _agree(stated: NDArray[np.float32], exact: NDArray[np.float32]) -> bool:
-    return bool(np.allclose(stated, exact, rtol=_SAME_VALUE, atol=0))
+def keep_exact(
+    triangles: TexturedTriangles, exact: Mapping[str, Texture], where: str, lost: list[str]
+) -> TexturedTriangles:
+    """Return triangles whose unchanged columns are exact, and diffuse + specular at most 1."""
+    rows = triangles.rows.copy()
+    if "emission" in exact:
+        rows[:, EMISSION] = exact["emission"].mean
+    note = f"{where}: diffuse lowered where diffuse + specular is over 1"
+    if triangles.texture_sets[0] == NO_TEXTURES:
+        for column, part in zip(TEXTURED, (DIFFUSE, SPECULAR, ROUGHNESS_PART), strict=True):
+            if column in exact:
+                rows[:, part] = exact[column].mean
+        excess = (rows[:, DIFFUSE] + rows[:, SPECULAR]).max(axis=1, initial=0) > 1 + _EXCESS
+        if excess.any():
+            lost.append(note)
+            rows[excess, DIFFUSE] = np.minimum(rows[excess, DIFFUSE], 1 - rows[excess, SPECULAR])
+        return dataclasses.replace(triangles, rows=rows)
+    texture_sets = []
+    for texture_set in triangles.texture_sets:
+        diffuse, specular, roughness = (
+            exact.get(column, texture)
+            for column, texture in zip(TEXTURED, texture_set, strict=True)
+        )
+        assert diffuse is not None and specular is not None
+        if not {"diffuse", "specular"} <= exact.keys() and may_exceed_one(diffuse, specular):
+            lost.append(note)
+            source = diffuse.source
+            diffuse, specular = color_textures(linear_map(diffuse), linear_map(specular), source)
+        texture_sets.append((diffuse, specular, roughness))
+    return dataclasses.replace(triangles, rows=rows, texture_sets=texture_sets)
+
+
+def _fill(value: Any) -> NDArray[np.float32]:
+    return np.broadcast_to(np.asarray(value, np.float32), 3)
+
+
+_WORKFLOW = {"useSpecularWorkflow": _fill(1), "ior": _fill(IOR_OF_CONSTANT_ALBEDOS)}
+"""Inputs that Trilight writes to every material."""
 
 
 def name_lost_columns(material: Any) -> list[str]:

@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.exchange.usd.foreign_scene import build_stage_scene
 from pipeline.exchange.usd.read_exact_scene import is_marked, read_exact, scene_keys
 from pipeline.foreign.usd.stage import OpenedStage, read_quietly
-from storage.errors import TrilightError
+from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
 
 MAX_FRAMES = 10_000
@@ -75,8 +75,9 @@ def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> Usd
         opened.lost.append(f"time codes other than {chosen} of {len(frames)}")
     try:
         scene = build_stage_scene(stage, _time(chosen), opened, licence)
-    except TrilightError as error:
-        text = str(error).removeprefix(f"{path.name}: ")
+    except (TrilightError, Rejected) as error:
+        message = error.message if isinstance(error, Rejected) else str(error)
+        text = message.removeprefix(f"{path.name}: ")
         raise TrilightError(f"{path.name}: {text}") from error
     return UsdScene(key=chosen, scene=scene, lost=opened.notes, exact=False)
 

@@ -1,52 +1,48 @@
 """Reads a scene that Trilight wrote from its layer, bit for bit, without composing a stage.
 
 After an edit (a mesh moved, a color changed, a light added) the exact attributes of a file are
-stale. So this reader compares the file with everything that export writes, and the geometry with
-its digest. Where anything differs, it returns None and the file is read as a foreign one
+stale. So this reader compares the scene with its digest, and the file with what export writes of
+it. Where anything differs, it returns None and the file is read as a foreign one
 (pipeline.exchange.usd.foreign_scene).
 """
 
 import json
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.pictures import MAX_BYTES
+from pipeline.exchange.textured_triangles import MAX_ROWS
 from pipeline.exchange.usd import names
-from pipeline.exchange.usd.authoring import has_attributes
-from pipeline.exchange.usd.dome import dome_attributes, read_exact_dome, sky_attributes
+from pipeline.exchange.usd.dome import read_exact_dome
 from pipeline.exchange.usd.exact_layer import (
     Changed,
-    children_by_row,
-    drop_absent,
+    list_by_row,
     read_integers,
     read_vectors,
     require,
-    require_children,
-    require_plain,
+    require_same,
 )
-from pipeline.exchange.usd.read_exact_materials import read_exact_materials
-from pipeline.exchange.usd.write import ENVIRONMENT, camera_attributes
-from pipeline.exchange.usd.write_meshes import (
-    CENTER,
-    MESH,
-    SUBSET,
-    center_points,
-    object_attributes,
-    position_attributes,
-    sum_positions,
-)
-from pipeline.exchange.usd.write_textures import ST
+from pipeline.exchange.usd.texture_files import decode_texture
+from pipeline.exchange.usd.write import ENVIRONMENT, author_scene, new_layer
+from pipeline.exchange.usd.write_meshes import CENTER, sum_positions
+from pipeline.exchange.usd.write_textures import SHADERS, ST
 from pipeline.foreign.usd.stage import OpenedStage
+from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.conventions import require_readable
 from storage.errors import TrilightError
-from storage.records.environment import Environment
-from storage.records.material import UndeclaredColumn
+from storage.records.material import (
+    PUBLISHED_COLUMNS,
+    UndeclaredColumn,
+    declared_column,
+    default_rows,
+    laid_out,
+)
 from storage.records.scene import OBJECT_KINDS, Scene, SceneObject
 from storage.records.scene_file import scene_digest, scene_provenance
-
-_PLACE = {CENTER, "xformOpOrder", names.EXACT_ROWS, names.EXACT_POSITIONS}
-_ARRAYS = {"points", "normals", "extent", "faceVertexCounts", "faceVertexIndices"}
+from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
 
 
 def scene_keys(layer: Any) -> list[str] | None:
@@ -97,6 +93,11 @@ def read_exact(
         scene.check()
     except TrilightError as error:
         raise TrilightError(f"{name}: {error}") from error
+    expected = new_layer(".usdc", names.ROOT)
+    try:
+        require_same(root, author_scene(expected, names.ROOT, scene))
+    except (Changed, LookupError, TypeError, ValueError, AttributeError):
+        return None
     return scene
 
 
@@ -110,20 +111,20 @@ def _find_root(layer: Any, key: str | None) -> Any:
 
 
 def _read_scene(root: Any, opened: OpenedStage | None) -> Scene:
-    sky = _read_environment(root, opened)
-    names_of = {"Materials", "Objects", "Cameras"}
-    folders = require_children(root, names_of if sky is None else {*names_of, ENVIRONMENT})
-    for folder in folders:
-        if folder.name != ENVIRONMENT:
-            require_plain(folder, set())
-    materials = read_exact_materials(folders["Materials"], opened)
+    folders = root.nameChildren
+    sky = None
+    if ENVIRONMENT in folders:
+        require(opened is not None)
+        assert opened is not None
+        sky = read_exact_dome(folders[ENVIRONMENT], root.layer, opened)
+    materials = _read_materials(folders["Materials"], opened)
     prims = sorted(folders["Objects"].nameChildren, key=lambda p: p.attributes[names.INDEX].default)
     objects = tuple(_read_object(prim) for prim in prims)
     meshes = [prim for prim in prims if prim.typeName == "Mesh"]
-    vertices, normals = _read_vertices(root, meshes, sky)
-    faces, material_index, object_index = _read_faces(meshes, len(materials.rows))
+    vertices, normals = _read_vertices(root, meshes)
+    faces, material_index, object_index = _read_faces(meshes)
     c2w, fov_deg = _read_cameras(folders["Cameras"])
-    scene = Scene(
+    return Scene(
         vertex_positions=vertices,
         vertex_normals=normals,
         faces=faces,
@@ -139,28 +140,6 @@ def _read_scene(root: Any, opened: OpenedStage | None) -> Scene:
         material_textures=materials.material_textures,
         environment=sky,
     )
-    for row, prim in enumerate(prims):
-        require(has_attributes(prim, object_attributes(scene, row)))
-        expected = {*object_attributes(scene, row)}
-        if prim.typeName == "Mesh":
-            expected |= {*MESH, *_ARRAYS, names.VERTEX_ROWS, names.FACE_ROWS, "material:binding"}
-            expected |= {ST} if scene.textures else set()
-            expected |= _PLACE if CENTER in prim.attributes else set()
-            require(has_attributes(prim, MESH))
-        require_plain(prim, expected)
-    return scene
-
-
-def _read_environment(root: Any, opened: OpenedStage | None) -> Environment | None:
-    prim = root.nameChildren.get(ENVIRONMENT)
-    if prim is None:
-        return None
-    require(opened is not None and prim.typeName == "DomeLight")
-    assert opened is not None
-    sky = read_exact_dome(prim, root.layer, opened)
-    require(has_attributes(prim, dome_attributes(sky)))
-    require_plain(prim, set(dome_attributes(sky)))
-    return sky
 
 
 def _read_object(prim: Any) -> SceneObject:
@@ -169,15 +148,8 @@ def _read_object(prim: Any) -> SceneObject:
     return SceneObject(**texts)
 
 
-def _read_vertices(
-    root: Any, meshes: list[Any], sky: Environment | None
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _read_vertices(root: Any, meshes: list[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return positions and normals [V, 3], placed by the vertex rows of meshes and root."""
-    expected = {names.VERSION, names.DIGEST, names.PROVENANCE}
-    expected |= {names.UNUSED_ROWS, names.UNUSED_POSITIONS, names.UNUSED_NORMALS}
-    attributes = drop_absent(root, sky_attributes(sky), {names.SKY_SOURCE})
-    require_plain(root, expected | set(attributes))
-    require(has_attributes(root, attributes))
     kinds = [(root, names.UNUSED_ROWS, names.UNUSED_NORMALS)]
     kinds += [(mesh, names.VERTEX_ROWS, "normals") for mesh in meshes]
     rows = np.concatenate([read_integers(prim, name) for prim, name, _ in kinds])
@@ -200,15 +172,11 @@ def _read_positions(mesh: Any) -> NDArray[np.float32]:
     center = np.array(mesh.attributes[CENTER].default, np.float64)
     positions = sum_positions(center, points)
     positions[read_integers(mesh, names.EXACT_ROWS)] = read_vectors(mesh, names.EXACT_POSITIONS)
-    expected_center, expected_points = center_points(positions)
-    require(np.array_equal(center, expected_center))
-    require(np.array_equal(points.view(np.uint32), expected_points.view(np.uint32)))
-    require(has_attributes(mesh, position_attributes(center, points, positions)))
     return positions
 
 
 def _read_faces(
-    meshes: list[Any], num_materials: int
+    meshes: list[Any],
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint16], NDArray[np.uint16]]:
     rows = np.concatenate([read_integers(mesh, names.FACE_ROWS) for mesh in meshes])
     count = len(rows)
@@ -219,17 +187,12 @@ def _read_faces(
     for mesh in meshes:
         face_rows = read_integers(mesh, names.FACE_ROWS)
         vertex_rows = read_integers(mesh, names.VERTEX_ROWS)
-        require(np.array_equal(read_integers(mesh, "faceVertexCounts"), np.full(len(face_rows), 3)))
         faces[face_rows] = vertex_rows[read_integers(mesh, "faceVertexIndices").reshape(-1, 3)]
         object_index[face_rows] = mesh.attributes[names.INDEX].default
         index = np.full(len(face_rows), -1)
         for subset in mesh.nameChildren:
-            require(has_attributes(subset, SUBSET))
-            require_plain(subset, {*SUBSET, "indices", "material:binding"})
-            material = _bound_material_row(subset)
-            require(material < num_materials)
-            index[read_integers(subset, "indices")] = material
-        require(len(index) > 0 and index.min() >= 0 and _bound_material_row(mesh) == index.min())
+            index[read_integers(subset, "indices")] = int(subset.name.rpartition("_")[2])
+        require(len(index) > 0 and index.min() >= 0 and index.max() < MAX_ROWS)
         material_index[face_rows] = index
     return faces, material_index, object_index
 
@@ -238,31 +201,89 @@ def _read_coordinates(meshes: list[Any], count: int) -> NDArray[np.float32]:
     """Return the texture coordinates [3T, 2] of all corners."""
     uv = np.zeros((count, 3, 2), np.float32)
     for mesh in meshes:
-        attribute = mesh.attributes[ST]
-        require(attribute.GetInfo("interpolation") == "faceVarying")
-        require(attribute.typeName == "texCoord2f[]" and not attribute.HasInfo("timeSamples"))
-        corner_uv = np.array(attribute.default, np.float32)
+        corner_uv = np.array(mesh.attributes[ST].default, np.float32)
         uv[read_integers(mesh, names.FACE_ROWS)] = corner_uv.reshape(-1, 3, 2)
     return uv.reshape(-1, 2)
 
 
-def _bound_material_row(prim: Any) -> int:
-    """Return the row of the material that is bound to a prim; require the same scene."""
-    (target,) = prim.relationships["material:binding"].targetPathList.explicitItems
-    scene_path = str(prim.path.StripAllVariantSelections()).partition("/Objects/")[0]
-    row = int(target.name.rpartition("_")[2])
-    require(str(target) == f"{scene_path}/Materials/{names.material_name(row)}")
-    return row
-
-
 def _read_cameras(folder: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    prims = children_by_row(folder, names.camera_name)
+    prims = list_by_row(folder, names.camera_name)
     c2w = np.zeros((len(prims), 4, 4), np.float32)
     fov_deg = np.zeros(len(prims), np.float32)
     for row, prim in enumerate(prims):
         c2w[row] = np.array(prim.attributes["xformOp:transform"].default).T
         fov_deg[row] = prim.attributes[names.FOV_DEG].default
-        expected = camera_attributes(c2w[row], float(fov_deg[row]))
-        require(has_attributes(prim, expected))
-        require_plain(prim, set(expected))
     return c2w, fov_deg
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Materials:
+    """Material arrays of a scene, as the prims of all materials hold them."""
+
+    rows: NDArray[np.float32]
+    """[M, 10 or more] rows of `Scene.materials`."""
+    textures: tuple[Texture, ...]
+    """Distinct textures, the value of `Scene.textures`."""
+    material_textures: NDArray[np.int32] | None
+    """[M, 3] the value of `Scene.material_textures`; None without textures."""
+
+
+def _read_materials(folder: Any, opened: OpenedStage | None) -> _Materials:
+    """Read the materials below a prim; raises UndeclaredColumn."""
+    prims = list_by_row(folder, names.material_name)
+    rows = default_rows(len(prims))
+    columns = _list_columns(prims[0])
+    index = np.full((len(prims), len(TEXTURED)), CONSTANT, np.int32)
+    textures: dict[int, Texture] = {}
+    for row, prim in enumerate(prims):
+        for column, part in laid_out():
+            if column.name in columns:
+                rows[row, part] = prim.attributes[names.column_attribute(column.name)].default
+        used = _read_textures(prim, textures, opened)
+        for name, texture in used.items():
+            index[row, TEXTURED.index(name)] = texture
+    return _Materials(
+        rows=rows,
+        textures=tuple(textures[row] for row in range(len(textures))),
+        material_textures=index if textures else None,
+    )
+
+
+def _read_textures(
+    prim: Any, textures: dict[int, Texture], opened: OpenedStage | None
+) -> dict[str, int]:
+    """Return the texture rows of a material's columns, and add new ones to `textures`."""
+    used = {}
+    for name, shader in SHADERS.items():
+        if shader not in prim.nameChildren:
+            continue
+        require(opened is not None)
+        assert opened is not None
+        attributes = prim.nameChildren[shader].attributes
+        row = attributes[names.TEXTURE_ROW].default
+        if row not in textures:
+            textures[row] = _read_texture(attributes, prim.layer, opened)
+        used[name] = row
+    return used
+
+
+def _read_texture(attributes: Any, layer: Any, opened: OpenedStage) -> Texture:
+    named = attributes["inputs:file"].default.path
+    resolved = opened.resolve(layer, named)
+    data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
+    if data is None:
+        raise LookupError(named)
+    texts = {field: attributes[name].default for field, name in names.MAP_TEXTS.items()}
+    return decode_texture(
+        data,
+        is_exr=named.endswith(".exr"),
+        is_srgb=attributes["inputs:sourceColorSpace"].default == "sRGB",
+        source=MapSource(**texts),
+    )
+
+
+def _list_columns(prim: Any) -> tuple[str, ...]:
+    """Return the column names of a material; raises UndeclaredColumn."""
+    added_or_none = (names.added_column(attribute.name) for attribute in prim.attributes)
+    added = [name for name in added_or_none if name is not None]
+    return (*PUBLISHED_COLUMNS, *(declared_column(name).name for name in added))

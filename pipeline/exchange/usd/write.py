@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
-from pipeline.exchange.usd.dome import add_dome, sky_attributes
+from pipeline.exchange.usd.dome import add_dome, map_files, sky_attributes
 from pipeline.exchange.usd.names import (
     DIGEST,
     FOV_DEG,
@@ -110,8 +110,6 @@ def root_attributes(scene: Scene) -> Attributes:
 
 def _add_scene(layer: Any, path: str, scene: Scene) -> dict[str, bytes]:
     """Write a scene into a layer; return its texture and map files by name."""
-    from pxr import Sdf
-
     scene.check()
     scene = without_constant_textures(scene)
     for entry in scene.objects:
@@ -119,15 +117,23 @@ def _add_scene(layer: Any, path: str, scene: Scene) -> dict[str, bytes]:
     for texture in scene.textures:
         source = texture.source
         _require_text(source.name, source.licence, source.attribution, source.source_url)
+    author_scene(layer, path, scene)
+    return texture_files(scene) | map_files(scene.environment)
+
+
+def author_scene(layer: Any, path: str, scene: Scene) -> Any:
+    """Write the prims of a scene into a layer; return its root prim."""
+    from pxr import Sdf
+
     with Sdf.ChangeBlock():
-        add_attributes(add_prim(layer, path, "Xform"), root_attributes(scene))
+        root = add_prim(layer, path, "Xform")
+        add_attributes(root, root_attributes(scene))
         add_materials(layer, f"{path}/Materials", scene)
         add_objects(layer, f"{path}/Objects", scene, f"{path}/Materials")
         add_cameras(layer, f"{path}/Cameras", scene)
-        files = texture_files(scene)
-        if scene.environment is None:
-            return files
-        return files | add_dome(layer, f"{path}/{ENVIRONMENT}", scene.environment)
+        if scene.environment is not None:
+            add_dome(layer, f"{path}/{ENVIRONMENT}", scene.environment)
+    return root
 
 
 def _require_text(*texts: str) -> None:
@@ -137,11 +143,16 @@ def _require_text(*texts: str) -> None:
 
 
 def _new_layer(path: Path, root: str) -> Any:
-    from pxr import Sdf
-
     if path.suffix.lower() not in SUFFIXES:
         raise TrilightError(f"{path.name}: expected a name that ends in {', '.join(SUFFIXES)}.")
-    layer = Sdf.Layer.CreateAnonymous(".usda" if path.suffix.lower() == ".usda" else ".usdc")
+    return new_layer(".usda" if path.suffix.lower() == ".usda" else ".usdc", root)
+
+
+def new_layer(suffix: str, root: str) -> Any:
+    """Return an empty layer in meters with +Z up, whose default prim is `root`."""
+    from pxr import Sdf
+
+    layer = Sdf.Layer.CreateAnonymous(suffix)
     layer.defaultPrim = root.removeprefix("/")
     layer.pseudoRoot.SetInfo("upAxis", "Z")
     layer.pseudoRoot.SetInfo("metersPerUnit", 1.0)

@@ -40,6 +40,7 @@ from pipeline.exchange.usd.write_textures import (
     texture_tables,
     used_textures,
 )
+from pipeline.foreign.usd.shaders import IOR_OF_CONSTANT_ALBEDOS
 from storage.records.material import (
     DIFFUSE,
     EMISSION,
@@ -51,9 +52,6 @@ from storage.records.material import (
 from storage.records.scene import Scene
 
 Color = tuple[float, float, float]
-
-INDEX_OF_REFRACTION = 1000.0
-"""Index of refraction of the preview; 1000 is Blender's maximum and reflects 0.996 head-on."""
 
 _MOST_REFLECTING = 0.98
 """Maximum head-on reflectance that sets the index of refraction: 0.98 needs 199."""
@@ -106,7 +104,7 @@ def material_tables(
             "inputs:specularColor": ("color3f", specular),
             "inputs:roughness": ("float", roughness),
             "inputs:emissiveColor": ("color3f", emission),
-            "inputs:ior": ("float", INDEX_OF_REFRACTION),
+            "inputs:ior": ("float", IOR_OF_CONSTANT_ALBEDOS),
         },
     }
     if used:

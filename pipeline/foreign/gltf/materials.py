@@ -5,7 +5,7 @@ slots are linear.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from pipeline.foreign.gltf.document import GltfDocument
 from pipeline.foreign.gltf.nodes import entry, extension
 from pipeline.foreign.material import MOST_UV_SETS, RGB, Slot, SourceMaterial
 from pipeline.foreign.numbers import Malformed, read_count, read_number, read_numbers
-from pipeline.foreign.picture import Picture, Wrap
+from pipeline.foreign.picture import Decode, Picture, Wrap
 from storage.errors import Rejected
 
 DEFAULT = SourceMaterial(metallic=1.0)
@@ -24,9 +24,6 @@ DEFAULT = SourceMaterial(metallic=1.0)
 _WRAPS: Mapping[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728
 _MOST_EMISSION = 1e9
-
-Decode = Callable[[bytes, str], NDArray]
-"""Function that returns the values of a picture's bytes; the name is for messages."""
 
 
 class GltfMaterials:

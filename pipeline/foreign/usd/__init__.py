@@ -6,5 +6,7 @@ bytes, so only processes with limits import this (pipeline.isolation).
 - `stage`, `composition`: a file and the files that it names, bounded before it is composed.
 - `placed`, `schemas`: the visible prims with their transforms; names of unread contents.
 - `polygons`, `solids`, `skins`: a mesh as triangles, posed by its skeleton.
-- `shaders`, `texture_nodes`, `colors`: the inputs of a material, before a caller interprets them.
+- `shaders`, `texture_nodes`, `colors`: the inputs of a material.
+- `stage_materials`, `materials`: all materials of a stage, and those of a mesh's triangles.
+- `object_stage`, `object_source`: a stage as an object.
 """

@@ -85,6 +85,13 @@ class CutMesh:
             self.lost.append(f"{self.prim.GetPath()}.{primvar.GetName()}: its number does not fit")
         return fitting
 
+    def read_coordinates(self, primvar: str, time: Any) -> NDArray[np.float64] | None:
+        """Return texture coordinates [T, 3, 2], perhaps not finite; None where one is missing."""
+        values = self.read_primvar(primvar, time)
+        if values is None or values.ndim != 3 or values.shape[2] < 2:
+            return None
+        return np.asarray(values[..., :2], np.float64)
+
 
 def mesh_polygons(placed: PlacedPrim, time: Any) -> MeshPolygons:
     """Return the polygons of a mesh or solid at a time, posed by its skeleton if it has one.

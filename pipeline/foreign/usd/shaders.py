@@ -71,6 +71,10 @@ _DEFAULTS: Mapping[str, Mapping[str, Any]] = {
 }
 """Defaults of each shader for inputs that are not stated."""
 
+IOR_OF_CONSTANT_ALBEDOS = 1000.0
+"""Index of refraction that Trilight writes in the specular workflow: at 1000, which is Blender's
+maximum, a specular albedo is the same at every angle."""
+
 TEXTURED = ("diffuseColor", "specularColor", "emissiveColor", "metallic", "roughness", "ior")
 """Inputs that may be textures or primvars."""
 

@@ -1,7 +1,7 @@
 """The materials of a USD stage, by mesh and polygon, with the bytes of their pictures."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.material_files import MaterialFiles
 from pipeline.foreign.usd.object_stage import UsdStage
-from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.shaders import StatedMaterial, read_bindings, read_material
 from pipeline.foreign.usd.stage import OutsideFile
 from pipeline.foreign.usd.texture_nodes import TextureNode, asset_bytes
@@ -28,6 +27,8 @@ _LOST = {
 """Words for unsupported inputs, by the beginnings of their names."""
 
 
+ReadMaterial = Callable[[Any], StatedMaterial | None]
+
 Binding = tuple[int, NDArray[np.int64] | None]
 """Index of a material, or -1 for none, and the polygons of a mesh that have it; None for all."""
 
@@ -44,61 +45,64 @@ class StageMaterials:
     """Contents of pictures by resolved path."""
 
 
-def read_stage_materials(stage: UsdStage, max_bytes: int) -> StageMaterials:
+def read_stage_materials(
+    stage: UsdStage, max_bytes: int, read: ReadMaterial | None = None
+) -> StageMaterials:
     """Return the materials of the visible meshes of a stage.
 
     Args:
         stage: the open stage.
         max_bytes: maximum bytes of all pictures together.
+        read: function that reads a UsdShade.Material, None leaving it out; by default one that
+            refuses a material without a shader that is understood.
 
     Raises:
         Rejected: texture_outside, materials_unreadable.
     """
-    reader = _Reader(stage)
+    rows: dict[str, int] = {}
+    materials: list[StatedMaterial] = []
+
+    def find_row(material: Any) -> int:
+        if not material:
+            return -1
+        name = str(material.GetPath())
+        if name not in rows:
+            stated = _read_strictly(stage, material) if read is None else read(material)
+            rows[name] = -1 if stated is None else len(materials)
+            materials.extend([] if stated is None else [_drop_ior_texture(stage, stated)])
+        return rows[name]
+
     try:
-        bindings = tuple(tuple(reader.bindings(each)) for each in stage.meshes)
+        bindings = tuple(
+            tuple(
+                (find_row(material), polygons)
+                for material, polygons in read_bindings(placed.prim, stage.time)
+            )
+            for placed in stage.meshes
+        )
     except OutsideFile as error:
         raise Rejected("texture_outside", f"{error!s:.200}") from error
     except TrilightError as error:
         raise Rejected("materials_unreadable", f"{error!s:.200}") from error
-    materials = tuple(reader.materials)
     nodes = [node for material in materials for node in material.textures.values()]
     return StageMaterials(
-        materials=materials, bindings=bindings, pictures=_read_pictures(nodes, max_bytes)
+        materials=tuple(materials), bindings=bindings, pictures=_read_pictures(nodes, max_bytes)
     )
 
 
-class _Reader:
-    """Reads each material once."""
-
-    def __init__(self, stage: UsdStage) -> None:
-        self._stage = stage
-        self._rows: dict[str, int] = {}
-        self.materials: list[StatedMaterial] = []
-
-    def bindings(self, placed: PlacedPrim) -> Iterator[Binding]:
-        for material, polygons in read_bindings(placed.prim, self._stage.time):
-            yield self._row(material), polygons
-
-    def _row(self, material: Any) -> int:
-        if not material:
-            return -1
+def _read_strictly(stage: UsdStage, material: Any) -> StatedMaterial:
+    stated = read_material(material, stage.time, stage.opened)
+    if stated is None:
         name = str(material.GetPath())
-        if name not in self._rows:
-            self._rows[name] = len(self.materials)
-            self.materials.append(self._read(material))
-        return self._rows[name]
+        raise TrilightError(f"{name!r:.100} has no shader that is understood")
+    return stated
 
-    def _read(self, material: Any) -> StatedMaterial:
-        lost = self._stage.opened.lost
-        stated = read_material(material, self._stage.time, self._stage.opened)
-        if stated is None:
-            name = str(material.GetPath())
-            raise TrilightError(f"{name!r:.100} has no shader that is understood")
-        textures = dict(stated.textures)
-        if textures.pop("ior", None):
-            lost.append(f"{stated.where}.ior: its texture is not read; 1.5 taken")
-        return dataclasses.replace(stated, textures=textures)
+
+def _drop_ior_texture(stage: UsdStage, stated: StatedMaterial) -> StatedMaterial:
+    textures = dict(stated.textures)
+    if textures.pop("ior", None):
+        stage.opened.lost.append(f"{stated.where}.ior: its texture is not read; 1.5 taken")
+    return dataclasses.replace(stated, textures=textures)
 
 
 def name_unsupported(stated: StatedMaterial) -> tuple[str, ...]:

@@ -3,21 +3,20 @@
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.numbers import read_number, read_numbers
-from pipeline.foreign.usd.polygons import CutMesh
+from pipeline.foreign.picture import Wrap
 from pipeline.foreign.usd.stage import OpenedStage, file_and_member
 from storage.errors import TrilightError
 
 _MOST_NODES = 8
 """Maximum number of transforms in a row."""
 
-NodeWrap = Literal["repeat", "mirror", "clamp", "black"]
-_WRAPS = ("repeat", "mirror", "clamp", "black")
+_WRAPS = get_args(Wrap)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +55,7 @@ class TextureNode:
     """Resolved path below the folder of the stage; None for a missing file."""
     color_space: str
     """`sRGB`, `raw`, or anything else for `auto`."""
-    wrap: tuple[NodeWrap, NodeWrap]
+    wrap: tuple[Wrap, Wrap]
     """Wrap modes along s and t; `useMetadata` and unknown ones are `repeat`."""
     scale: NDArray[np.float32]
     """[4] factors of the picture's RGBA values."""
@@ -139,17 +138,6 @@ def read_chart(shader: Any, time: Any, lost: list[str]) -> UvChart:
     return UvChart(primvar=primvar, transforms=tuple(reversed(moves)))
 
 
-def chart_corners(chart: UvChart, cut: CutMesh, time: Any) -> NDArray[np.float64] | None:
-    """Return the coordinates [T, 3, 2] of a chart before its transforms; some may not be finite.
-
-    None where the mesh has none, or not for every corner.
-    """
-    values = cut.read_primvar(chart.primvar, time)
-    if values is None or values.ndim != 3 or values.shape[2] < 2:
-        return None
-    return np.asarray(values[..., :2], np.float64)
-
-
 def asset_bytes(resolved: str, max_bytes: int) -> bytes | None:
     """Return the bytes of a plain file, or of a member of an archive; None for a missing one.
 
@@ -197,9 +185,9 @@ def read_input(shader: Any, name: str, time: Any, default: Any) -> Any:
     return default if value is None else value
 
 
-def _wrap(shader: Any, name: str, time: Any) -> NodeWrap:
+def _wrap(shader: Any, name: str, time: Any) -> Wrap:
     mode = str(read_input(shader, name, time, "repeat"))
-    return cast(NodeWrap, mode) if mode in _WRAPS else "repeat"
+    return cast(Wrap, mode) if mode in _WRAPS else "repeat"
 
 
 def _vector(shader: Any, name: str, time: Any, default: tuple[float, ...]) -> tuple[float, ...]:

@@ -172,7 +172,7 @@ def test_each_shard_is_reported(tmp_path: Path) -> None:
 def test_bad_samples_and_failures_are_one_clear_line(tmp_path: Path) -> None:
     plain, scene = sample(7, furnished([])), furnished(["a"])
     bad = [
-        sample(7, furnished([]).with_provenance({})),
+        sample(7, furnished([]).with_provenance({"template": 3})),
         sample(7, furnished([]), noise_floor_db="quiet"),
         sample(7, dataclasses.replace(scene, faces=scene.faces + np.uint32(50))),
         dataclasses.replace(plain, views=plain.views[:1], radiance_rgb=plain.radiance_rgb[:1]),

@@ -133,19 +133,6 @@ def test_transforms_of_nodes_and_of_textures(tmp_path: Path) -> None:
         assert row_at(scene, x, y)[:3] == pytest.approx(diffuse_of(colour), abs=CODED), colour
 
 
-@pytest.mark.parametrize(
-    ("wrap", "colour"),
-    [(10497, RED), (33071, GREEN), (33648, GREEN)],
-    ids=["repeat", "clamp", "mirror"],
-)
-def test_coordinates_beyond_the_picture(tmp_path: Path, wrap: int, colour: Any) -> None:
-    """u from 0 to 2: at a right quarter of the floor, u is 1.25 (above the middle row)."""
-    wide = UV * np.array([2, 1], np.float32)
-    scene = read(tmp_path, uv=wide, sampler={"wrapS": wrap, "wrapT": wrap}).scene
-    assert row_at(scene, 0.25, 0.5)[:3] == pytest.approx(diffuse_of(colour), abs=CODED)
-    assert row_at(scene, -0.75, 0.5)[:3] == pytest.approx(diffuse_of(RED), abs=CODED)
-
-
 def test_metal_is_blue_and_roughness_green(tmp_path: Path) -> None:
     mixed = np.array([[[9, 255, 0], [9, 51, 255]]], np.uint8)
     surface = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}}
@@ -158,14 +145,6 @@ def test_metal_is_blue_and_roughness_green(tmp_path: Path) -> None:
     assert plain[:3] == pytest.approx(diffuse_of(RED), abs=CODED) and plain[6] == 1
     assert metal[:3] == pytest.approx([0, 0, 0], abs=CODED) and metal[6] == pytest.approx(0.2)
     assert metal[3:6] == pytest.approx(np.array(GREEN) / 255 * 20 / 21 + 1 / 21, abs=CODED)
-
-
-def test_the_specular_extension_scales_what_is_reflected_head_on(tmp_path: Path) -> None:
-    gloss = {"specularFactor": 0.5, "specularColorFactor": [1, 0.5, 0]}
-    material = {"extensions": {"KHR_materials_specular": gloss}}
-    found = row_at(read(tmp_path, material=material).scene, 0.5, 0.5)[3:6]
-    head_on = 0.5 * 0.04 * np.array([1, 0.5, 0])
-    assert found == pytest.approx(head_on + (0.5 - head_on) / 21, abs=1e-6)
 
 
 def test_cameras_lights_and_emission(tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ def spoil(layer: Any) -> None:
     "edit, albedos, said",
     [
         (drop_shader, (0.5, 0.4, 0.3, 0.2, 0.2, 0.2), "the values that Trilight wrote are used"),
-        (to_metal, (0, 0, 0, 0.5, 0.4, 0.3), "became a metal"),
+        (to_metal, (0, 0, 0, 11 / 21, 9 / 21, 7 / 21), "became a metal"),
         (spoil, (0.5, 0.4, 0.3, 0.2, 0.2, 0.2), "changed since Trilight wrote it"),
     ],
 )

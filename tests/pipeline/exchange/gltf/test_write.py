@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.objects.glb import encode_glb
+from pipeline.exchange.gltf.write import encode_mesh_glb
 from storage.records.asset import Level
 from tests.pipeline.assets.meshes_by_hand import geometry, prepare, write_glb
 from tests.pipeline.assets.source_materials.textured_kit import (
@@ -23,7 +23,9 @@ STEPS = 0.03
 
 def _written(path: Path, level: Level) -> Path:
     assert level.skin is not None
-    path.write_bytes(encode_glb(level.positions, level.faces, level.skin.uv, level.skin.textures))
+    path.write_bytes(
+        encode_mesh_glb(level.positions, level.faces, level.skin.uv, level.skin.textures)
+    )
     return path
 
 

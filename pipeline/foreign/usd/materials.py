@@ -5,30 +5,34 @@ defines, and metadata of the picture are ignored.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.material import MOST_UV_SETS, RGB, WHITE, Slot, SourceMaterial
 from pipeline.foreign.material_files import MaterialFiles
-from pipeline.foreign.picture import Picture, has_colors
+from pipeline.foreign.picture import Decode, Picture, has_colors
 from pipeline.foreign.textured_mesh import TexturedMesh
-from pipeline.foreign.usd.object_meshes import PlacedMesh
 from pipeline.foreign.usd.object_source import UsdSource
-from pipeline.foreign.usd.shaders import StatedMaterial, read_colors, reflect_head_on
-from pipeline.foreign.usd.stage_materials import Binding, name_unsupported
+from pipeline.foreign.usd.polygons import CutMesh
+from pipeline.foreign.usd.shaders import (
+    IOR_OF_CONSTANT_ALBEDOS,
+    StatedMaterial,
+    parse_color,
+    read_colors,
+    reflect_head_on,
+)
+from pipeline.foreign.usd.stage_materials import StageMaterials, name_unsupported
 from pipeline.foreign.usd.texture_nodes import TextureNode, UvChart
 from storage.errors import Rejected
 
 _CHANNELS = {"rgb": 0, "r": 0, "g": 1, "b": 2, "a": 3}
 _STRIP = 256
-_MOST_VARIED = 256
+_MOST_VARIED = 4096
 """Maximum number of materials made of the primvars of one; more values become their mean."""
 _UNBOUND = 0.18
 """Gray of a mesh without material and display color, as USD shows it."""
-
-Decode = Callable[[bytes, str], NDArray]
 
 
 def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = False) -> TexturedMesh:
@@ -38,121 +42,130 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
         Rejected: no_materials, materials_unreadable, no_texture_coordinates, or as reading a
             picture.
     """
-    stage_materials = source.materials()
     time = source.stage.time
-    nodes = [node for stated in stage_materials.materials for node in stated.textures.values()]
-    primvars = list(dict.fromkeys(node.chart.primvar for node in nodes))
-    if len(primvars) > MOST_UV_SETS:
-        raise Rejected("no_texture_coordinates", f"textures lie on {len(primvars)} sets of them")
-    reader = _Reader(stage_materials.pictures, primvars, decode, emission=emission)
-    materials = [reader.material(stated) for stated in stage_materials.materials]
-    plain = len(materials)
-    materials.append(SourceMaterial(roughness=0.5))
-    primvar_materials = _PrimvarMaterials(
-        stage_materials.materials, materials, time, emission=emission
-    )
-    rows = []
-    tints = []
-    coordinates = []
-    for placed in source.meshes:
-        mesh_rows = _material_rows(stage_materials.bindings[placed.number], placed, plain)
-        tints.append(_corner_tints(placed, mesh_rows == plain, time))
-        primvar_materials.apply(placed, mesh_rows, tints[-1])
-        rows.append(mesh_rows)
-        coordinates.append(placed.coordinates(primvars or ["st"], time))
-    material = np.concatenate(rows)
-    tint = np.concatenate(tints)
-    if (material == plain).all() and (tint == _UNBOUND).all():
+    looks = MeshMaterials(source.materials(), decode, time, emission=emission)
+    if len(looks.primvars) > MOST_UV_SETS:
+        count = len(looks.primvars)
+        raise Rejected("no_texture_coordinates", f"textures lie on {count} sets of them")
+    looks_of_meshes = [looks.assign(placed.number, placed.cut) for placed in source.meshes]
+    material = np.concatenate([rows for rows, _ in looks_of_meshes])
+    tint = np.concatenate([tints for _, tints in looks_of_meshes])
+    if (material == looks.plain).all() and (tint == _UNBOUND).all():
         raise Rejected("no_materials", "the stage has no materials and no display colours")
+    sets = looks.primvars or ["st"]
     return TexturedMesh(
         mesh=source.mesh,
         material=material,
-        materials=tuple(materials),
-        uv=np.concatenate(coordinates),
+        materials=tuple(looks.materials),
+        uv=np.concatenate([placed.coordinates(sets, time) for placed in source.meshes]),
         color=None if (tint == 1).all() else tint,
     )
 
 
-def _material_rows(
-    bindings: Sequence[Binding], placed: PlacedMesh, plain: int
-) -> NDArray[np.int64]:
-    rows = np.full(len(placed.cut.corners), plain)
-    for row, polygons in bindings:
-        chosen = slice(None) if polygons is None else np.isin(placed.cut.polygons, polygons)
-        rows[chosen] = plain if row < 0 else row
-    return rows
-
-
-def _corner_tints(
-    placed: PlacedMesh, is_plain: NDArray[np.bool_], time: object
-) -> NDArray[np.float64]:
-    """Return the tints [T, 3, 3] of corners: display colors where there is no material, else 1."""
-    tints = np.ones((len(is_plain), 3, 3))
-    if is_plain.any():
-        display_colors = read_colors(placed.cut, "displayColor", time)
-        tints[is_plain] = (
-            _UNBOUND if display_colors is None else np.clip(display_colors[is_plain], 0, 1)
-        )
-    return tints
-
-
-class _PrimvarMaterials:
-    """Materials with primvar inputs: colors tint corners, and numbers become further materials."""
+class MeshMaterials:
+    """The materials of a stage's meshes; primvars tint corners, or make further materials."""
 
     def __init__(
         self,
-        stated: Sequence[StatedMaterial],
-        materials: list[SourceMaterial],
+        stage_materials: StageMaterials,
+        decode: Decode,
         time: object,
         *,
-        emission: bool,
+        emission: bool = False,
+        notes: list[str] | None = None,
     ) -> None:
-        self._stated = stated
-        self._materials = materials
+        """Convert all materials, decoding each picture once.
+
+        Args:
+            stage_materials: the materials as the stage states them.
+            decode: returns the values of a picture's bytes.
+            time: time of the values.
+            emission: whether emission is read, too.
+            notes: receives sentences on pictures that are left out; None refuses the file.
+
+        Raises:
+            Rejected: materials_unreadable, or as reading a picture.
+        """
+        self._stated = stage_materials.materials
+        self._bindings = stage_materials.bindings
         self._time = time
         self._emission = emission
         self._known: dict[tuple[int, bytes], int] = {}
+        nodes = [node for stated in self._stated for node in stated.textures.values()]
+        self.primvars = list(dict.fromkeys(node.chart.primvar for node in nodes))
+        """Names of the sets of texture coordinates, by the numbers in slots."""
+        reader = _Reader(
+            stage_materials.pictures, self.primvars, decode, emission=emission, notes=notes
+        )
+        self.materials = [reader.material(stated) for stated in self._stated]
+        """Materials by row; those of primvars are added when they are met."""
+        self.plain = len(self.materials)
+        """Row of triangles without a material."""
+        self.materials.append(SourceMaterial(roughness=0.5))
+        self.origins = list(range(self.plain + 1))
+        """Row of the stated material of each material."""
 
-    def apply(
-        self, placed: PlacedMesh, rows: NDArray[np.int64], tints: NDArray[np.float64]
-    ) -> None:
-        """Replace the rows [T] and tints [T, 3, 3] of triangles that have such materials."""
+    def assign(self, number: int, cut: CutMesh) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the material rows [T] and corner tints [T, 3, 3] of a mesh's triangles.
+
+        Args:
+            number: index of the mesh within the stage.
+            cut: its triangles.
+        """
+        rows = np.full(len(cut.corners), self.plain)
+        for row, polygons in self._bindings[number]:
+            chosen = slice(None) if polygons is None else np.isin(cut.polygons, polygons)
+            rows[chosen] = self.plain if row < 0 else row
+        tints = np.ones((len(rows), 3, 3))
+        is_plain = rows == self.plain
+        if is_plain.any():
+            display_colors = read_colors(cut, "displayColor", self._time)
+            tints[is_plain] = (
+                _UNBOUND if display_colors is None else np.clip(display_colors[is_plain], 0, 1)
+            )
         for row in np.unique(rows):
-            if row >= len(self._stated) or not self._stated[row].primvars:
-                continue
-            stated = self._stated[row]
-            mask = rows == row
-            base = stated.read_values("diffuseColor", placed.cut, self._time)
-            if base is not None:
-                tints[mask] = np.clip(base, 0, 1)[mask]
-            elif "diffuseColor" in stated.primvars:
-                tints[mask] = np.maximum(stated.constants["diffuseColor"], 0)
-            values = {
-                name: stated.read_values(name, placed.cut, self._time) for name in stated.primvars
-            }
-            values["diffuseColor"] = None
-            glow = values.get("emissiveColor")
-            if glow is not None:
-                values["emissiveColor"] = glow * _read_strength(stated) if self._emission else None
-            means = {name: each.mean(axis=1) for name, each in values.items() if each is not None}
-            if means:
-                rows[mask] = self._add_materials(int(row), {k: v[mask] for k, v in means.items()})
+            if row < self.plain and self._stated[row].primvars:
+                self._apply_primvars(int(row), cut, rows, tints)
+        return rows, tints
+
+    def _apply_primvars(
+        self, row: int, cut: CutMesh, rows: NDArray[np.int64], tints: NDArray[np.float64]
+    ) -> None:
+        """Replace the rows [T] and tints [T, 3, 3] of triangles of a material with primvars."""
+        stated = self._stated[row]
+        mask = rows == row
+        values = {name: stated.read_values(name, cut, self._time) for name in stated.primvars}
+        base = values.pop("diffuseColor", None)
+        if base is not None:
+            tints[mask] = np.clip(base, 0, 1)[mask]
+        elif "diffuseColor" in stated.primvars:
+            tints[mask] = np.maximum(stated.constants["diffuseColor"], 0)
+        glow = values.pop("emissiveColor", None)
+        if glow is not None and self._emission:
+            values["emissiveColor"] = glow * _read_strength(stated)
+        means = {name: each.mean(axis=1)[mask] for name, each in values.items() if each is not None}
+        if means and mask.any():
+            rows[mask] = self._add_materials(row, means, cut)
 
     def _add_materials(
-        self, row: int, means: Mapping[str, NDArray[np.float64]]
+        self, row: int, means: Mapping[str, NDArray[np.float64]], cut: CutMesh
     ) -> NDArray[np.int64]:
         """Return rows [T] of materials with mean inputs [T, 3] of triangles, adding new ones."""
         table = np.concatenate(list(means.values()), axis=1)
-        if len(np.unique(table, axis=0)) > _MOST_VARIED:
-            table = np.broadcast_to(table.mean(axis=0), table.shape)
         distinct, index = np.unique(table, axis=0, return_inverse=True)
+        if len(distinct) > _MOST_VARIED:
+            names = ", ".join(means)
+            cut.lost.append(f"{cut.prim.GetPath()}: many values of {names}: their mean is taken")
+            distinct = table.mean(axis=0, keepdims=True)
+            index = np.zeros(len(table), np.int64)
         rows = []
         for values in distinct:
             key = (row, values.tobytes())
             if key not in self._known:
-                self._known[key] = len(self._materials)
+                self._known[key] = len(self.materials)
                 inputs = dict(zip(means, np.split(values, len(means)), strict=True))
-                self._materials.append(_replace_values(self._materials[row], inputs))
+                self.materials.append(_replace_values(self.materials[row], inputs))
+                self.origins.append(row)
             rows.append(self._known[key])
         return np.array(rows, np.int64)[index.reshape(-1)]
 
@@ -182,18 +195,25 @@ class _Reader:
     """Converts the materials of one stage, decoding each picture once."""
 
     def __init__(
-        self, files: MaterialFiles, primvars: Sequence[str], decode: Decode, *, emission: bool
+        self,
+        files: MaterialFiles,
+        primvars: Sequence[str],
+        decode: Decode,
+        *,
+        emission: bool,
+        notes: list[str] | None,
     ) -> None:
         self._files = files
         self._primvars = primvars
         self._decode = decode
         self._emission = emission
+        self._notes = notes
         self._values: dict[str, NDArray] = {}
 
     def material(self, stated: StatedMaterial) -> SourceMaterial:
         base = self._color_slot(stated, "diffuseColor")
         is_tint = base is not None or "diffuseColor" in stated.primvars
-        roughness = self._number_slot(stated, "roughness")
+        roughness = self._slot(stated, "roughness")
         lost = name_unsupported(stated)
         glows = any(_glow(stated)) or "emissiveColor" in stated.primvars
         material = SourceMaterial(
@@ -205,10 +225,11 @@ class _Reader:
         )
         if self._emission and any(_glow(stated)):
             picture = self._color_slot(stated, "emissiveColor")
-            material = dataclasses.replace(material, emission_rgb=_glow(stated), emission=picture)
+            glow = _glow(stated) if picture is not None else _scale_glow(stated)
+            material = dataclasses.replace(material, emission_rgb=glow, emission=picture)
         if stated.is_specular:
             return self._specular(stated, material)
-        metallic = self._number_slot(stated, "metallic")
+        metallic = self._slot(stated, "metallic")
         return dataclasses.replace(
             material,
             metallic=1.0 if metallic is not None else _first_channel(stated, "metallic"),
@@ -223,18 +244,27 @@ class _Reader:
             f0=1.0,
             specular_rgb=WHITE if color is not None else _rgb(stated, "specularColor"),
             specular_colour=color,
+            has_fresnel=stated.constants["ior"][0] != IOR_OF_CONSTANT_ALBEDOS,
         )
 
     def _color_slot(self, stated: StatedMaterial, name: str) -> Slot | None:
         """Return the slot of a color input; a single channel is copied to all three."""
         node = stated.textures.get(name)
-        return None if node is None else self._slot(node, is_grey=node.output != "rgb")
+        return self._slot(stated, name, is_grey=node is not None and node.output != "rgb")
 
-    def _number_slot(self, stated: StatedMaterial, name: str) -> Slot | None:
+    def _slot(self, stated: StatedMaterial, name: str, *, is_grey: bool = False) -> Slot | None:
         node = stated.textures.get(name)
-        return None if node is None else self._slot(node, is_grey=False)
+        if node is None:
+            return None
+        try:
+            return self._read_slot(node, f"{stated.where}.{name}", is_grey=is_grey)
+        except Rejected as why:
+            if self._notes is None or why.reason in ("texture_outside", "texture_too_large"):
+                raise
+            self._notes.append(f"{stated.where}.{name}: a texture is left out: {why.message}")
+            return None
 
-    def _slot(self, node: TextureNode, *, is_grey: bool) -> Slot:
+    def _read_slot(self, node: TextureNode, where: str, *, is_grey: bool) -> Slot:
         values = self._picture(node)
         is_srgb = self._is_srgb(node)
         channel = _CHANNELS[node.output]
@@ -249,6 +279,8 @@ class _Reader:
                 scale = scale[[channel] * 3 + [3]]
                 bias = bias[[channel] * 3 + [3]]
             picture = _scale_picture(picture, scale, bias)
+            if self._notes is not None and picture.values[..., :3].max() > 1:
+                self._notes.append(f"{where}: texels above 1 are clamped, but for emission")
         uv_matrix, uv_offset = _chart_transform(node.chart)
         return Slot(
             picture=picture,
@@ -293,7 +325,14 @@ def _chart_transform(chart: UvChart) -> tuple[NDArray[np.float64], NDArray[np.fl
 
 
 def _rgb(stated: StatedMaterial, name: str) -> RGB:
-    return _drop_negative(stated.constants[name])
+    return _drop_negative(_read_constant(stated, name))
+
+
+def _read_constant(stated: StatedMaterial, name: str) -> NDArray[np.float32]:
+    """Return the constant of an input, which is the fallback of a texture that is left out."""
+    node = stated.textures.get(name)
+    fallback = None if node is None or node.fallback is None else parse_color(node.fallback[:3])
+    return stated.constants[name] if fallback is None else fallback
 
 
 def _drop_negative(values: NDArray) -> RGB:
@@ -306,6 +345,11 @@ def _glow(stated: StatedMaterial) -> RGB:
     strength = _read_strength(stated)
     if "emissiveColor" in stated.textures:
         return (strength, strength, strength)
+    return _scale_glow(stated)
+
+
+def _scale_glow(stated: StatedMaterial) -> RGB:
+    strength = _read_strength(stated)
     red, green, blue = (strength * value for value in _rgb(stated, "emissiveColor"))
     return red, green, blue
 
@@ -315,4 +359,4 @@ def _read_strength(stated: StatedMaterial) -> float:
 
 
 def _first_channel(stated: StatedMaterial, name: str) -> float:
-    return float(stated.constants[name][0])
+    return float(_read_constant(stated, name)[0])

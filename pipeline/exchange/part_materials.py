@@ -1,0 +1,219 @@
+"""Converts parts of any format to textures and material rows, as for objects.
+
+Other formats reflect more at grazing angles, by Schlick's curve; a scene's material reflects the
+mean of that curve at all angles (pipeline.foreign.material).
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.linear_maps import (
+    Map,
+    color_textures,
+    constant_map,
+    number_texture,
+    resample_to_largest,
+)
+from pipeline.exchange.part_maps import SLOTS, PlacedSlots, place_slots
+from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles, TextureSet
+from pipeline.foreign.material import MaterialSamples, SourceMaterial, source_columns
+from pipeline.foreign.part import Part
+from pipeline.foreign.picture import spread_points
+from storage.conventions import srgb8
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
+from storage.records.texture import MapSource
+
+_STRIP = 256
+"""Number of texel rows whose material columns are computed at a time."""
+
+_TRIANGLES = 4096
+"""Number of triangles whose emission is sampled at a time."""
+
+_MOST_TINTS = 256
+"""Maximum number of vertex colors that become separate materials; more become a texture."""
+
+_MOST_TINTED = 1 << 25
+"""Maximum texels of all textures of a mesh that differ in vertex color alone."""
+
+_ROUGH = ("roughness", "glossiness")
+
+
+class PartConverter:
+    """Converts parts to triangles with textures, which parts of one material share."""
+
+    def __init__(self, lost: list[str]) -> None:
+        """Keep `lost`, which receives a sentence for each loss."""
+        self._lost = lost
+        self._textures: dict[tuple[object, ...], TextureSet] = {}
+        self._means: dict[int, Mapping[str, Map]] = {}
+
+    def convert(self, part: Part, source: MapSource) -> TexturedTriangles:
+        """Return the triangles of a part with the textures and rows of its material.
+
+        Args:
+            part: the triangles; its material is the same object as of others that share textures.
+            source: name and rights of the textures.
+        """
+        count = len(part.positions)
+        placed = place_slots(part, self._lost)
+        uv = placed.uv
+        most = _MOST_TINTED
+        if uv is not None:
+            most = min(max(_MOST_TINTED // placed.texels, 1), _MOST_TINTS)
+        tints, tint_index = _tints(part, most, self._lost)
+        rows = default_rows(count)
+        rows[:, EMISSION] = _emission(part, self._lost)
+        texture_sets: Sequence[TextureSet] = (NO_TEXTURES,)
+        if uv is not None:
+            texture_sets = self._build_textures(part.material, placed, tints, source)
+        else:
+            if id(part.material) not in self._means:
+                self._means[id(part.material)] = placed.build_maps()
+            means = self._means[id(part.material)]
+            if len(tints) > _MOST_TINTS:
+                means, uv = _build_palette(means, tints, tint_index)
+                white = np.ones(3)
+                texture_sets = [_textures(part.material, means, white, source)]
+            else:
+                values = _columns(part.material, means, np.asarray(tints)[None])[0, tint_index]
+                rows[:, DIFFUSE] = values[:, :3]
+                rows[:, SPECULAR] = values[:, 3:6]
+                rows[:, ROUGHNESS] = values[:, 6]
+        return TexturedTriangles(
+            positions=part.positions,
+            normals=part.normals,
+            rows=rows,
+            uv=np.zeros((count, 3, 2), np.float32) if uv is None else uv,
+            texture_set_index=tint_index % len(texture_sets),
+            texture_sets=texture_sets,
+        )
+
+    def _build_textures(
+        self,
+        material: SourceMaterial,
+        placed: PlacedSlots,
+        tints: NDArray[np.float64],
+        source: MapSource,
+    ) -> list[TextureSet]:
+        """Return the textures of a material for each tint [K, 3]."""
+        keys = [(id(material), placed.tiles, source, tint.tobytes()) for tint in tints]
+        if not self._textures.keys() >= set(keys):
+            maps = placed.build_maps()
+            for key, tint in zip(keys, tints, strict=True):
+                self._textures[key] = _textures(material, maps, tint, source)
+        return [self._textures[key] for key in keys]
+
+
+def _textures(
+    material: SourceMaterial, maps: Mapping[str, Map], tint: NDArray[np.float64], source: MapSource
+) -> TextureSet:
+    """Return the textures of a material whose base color is multiplied by a tint [3]."""
+    colored = {name: values for name, values in maps.items() if name not in _ROUGH}
+    rough = {name: values for name, values in maps.items() if name in _ROUGH}
+    values = _columns(material, colored, tint[None, None])
+    roughness = _columns(material, rough, np.ones((1, 1, 3)))[..., 6:]
+    diffuse, specular = color_textures(
+        _collapse_constant(values[..., :3]), _collapse_constant(values[..., 3:6]), source
+    )
+    return diffuse, specular, number_texture(_collapse_constant(roughness), source)
+
+
+def _columns(
+    material: SourceMaterial, maps: Mapping[str, Map], tint: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Return the columns [H, W, 7] of a material whose base is multiplied by a tint [., ., 3]."""
+    names = list(maps)
+    resampled = dict(zip(names, resample_to_largest(*maps.values()), strict=True)) if names else {}
+    height, width = np.broadcast_shapes(
+        tint.shape[:2], *(map_.shape[:2] for map_ in resampled.values())
+    )
+    values = np.zeros((height, width, 7), np.float32)
+    for first in range(0, height, _STRIP):
+        size = min(_STRIP, height - first)
+        texel_values = {
+            name: _flatten_on_grid(
+                map_[first : first + size] if len(map_) > 1 else map_, size, width
+            )
+            for name, map_ in resampled.items()
+        }
+        colors = _flatten_on_grid(tint, size, width)
+        texel_values["base"] = (
+            texel_values["base"][:, :3] * colors if "base" in texel_values else colors
+        )
+        known = MaterialSamples(**{name: texel_values.get(name) for name in SLOTS})
+        rows = source_columns(material, known, size * width, least_roughness=0)
+        values[first : first + size] = rows.reshape(size, width, 7)
+    return values
+
+
+def _flatten_on_grid(values: NDArray, height: int, width: int) -> NDArray:
+    """Return the values [N, C] of a map at each texel of a grid."""
+    return np.broadcast_to(values, (height, width, values.shape[2])).reshape(-1, values.shape[2])
+
+
+def _collapse_constant(values: NDArray[np.float32]) -> Map:
+    """Return a map of one texel where all texels are equal."""
+    return values[:1, :1] if (values == values[0, 0]).all() else values
+
+
+def _tints(part: Part, most: int, lost: list[str]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return at most `most` colors [K, 3], and the index [T] of the color of each triangle."""
+    colors = part.colors
+    if colors is None or not len(colors):
+        return np.ones((1, 3)), np.zeros(len(part.positions), np.int64)
+    if np.ptp(colors, axis=1).max() > 1 / 255:
+        lost.append(f"{part.where}colors of vertices: replaced by the mean of each triangle")
+    plain = np.clip(np.nan_to_num(colors.mean(axis=1)), 0, 1)
+    tints, tint_index = _group_colors(plain, np.round(plain * 1e6).astype(np.int64))
+    coded = srgb8(plain).astype(np.int64)
+    shift = 0
+    while len(tints) > most:
+        tints, tint_index = _group_colors(plain, coded >> shift)
+        shift += 1
+    if shift:
+        lost.append(f"{part.where}colors of vertices over textures: rounded to a few")
+    return tints, tint_index
+
+
+def _group_colors(
+    colors: NDArray[np.float64], codes: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Group colors by equal codes [T, 3]; return group means [K, 3] and indices [T]."""
+    keys = codes @ np.array([1 << 42, 1 << 21, 1])
+    _, group_index, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    sums = [np.bincount(group_index, colors[:, channel]) for channel in range(3)]
+    return np.stack(sums, axis=1) / counts[:, None], group_index.astype(np.int64)
+
+
+def _build_palette(
+    means: Mapping[str, Map], tints: NDArray[np.float64], tint_index: NDArray[np.int64]
+) -> tuple[dict[str, Map], NDArray[np.float32]]:
+    """Return maps with one texel for each of many colors, and coordinates [T, 3, 2] of these."""
+    side = int(np.ceil(np.sqrt(len(tints))))
+    texels = np.ones((side * side, 4), np.float32)
+    texels[: len(tints), :3] = tints
+    base = means.get("base", constant_map([1, 1, 1, 1])) * texels.reshape(side, side, 4)
+    centers = (np.stack([tint_index % side, tint_index // side], axis=1) + 0.5) / side
+    return {**means, "base": base}, np.repeat(centers[:, None], 3, axis=1).astype(np.float32)
+
+
+def _emission(part: Part, lost: list[str]) -> NDArray[np.float64]:
+    """Return the radiance [T, 3] of triangles; a texture counts by its mean over each."""
+    radiance = np.tile(part.material.emission_rgb, (len(part.positions), 1))
+    slot = part.material.emission
+    if slot is None or not part.material.emits:
+        return radiance
+    lost.append(f"{part.where}textures of emission: one value for each triangle")
+    picture = slot.picture
+    uv = part.coordinates(slot.uv_set)
+    if uv is None:
+        return radiance * picture.linear(picture.values).mean(axis=(0, 1))[:3]
+    for first in range(0, len(uv), _TRIANGLES):
+        corners = uv[first : first + _TRIANGLES] @ slot.uv_matrix.T + slot.uv_offset
+        points = np.einsum("pk,tkc->tpc", spread_points(), corners)
+        flat = points.reshape(-1, 2)
+        values = picture.sample(flat, np.zeros(len(flat), np.int64)).reshape(*points.shape[:2], 4)
+        radiance[first : first + _TRIANGLES] *= values.mean(axis=1)[:, :3]
+    return radiance
