@@ -40,7 +40,7 @@ class Table(NamedTuple):
     rows: Sequence[Sequence[object]]
 
 
-class Part(NamedTuple):
+class ReportPart(NamedTuple):
     """Figure with tables and notes beside it."""
 
     figure: str
@@ -50,7 +50,7 @@ class Part(NamedTuple):
     notes: Sequence[str] = ()
 
 
-def report_sections(distributions: Distributions) -> dict[str, list[Part]]:
+def report_sections(distributions: Distributions) -> dict[str, list[ReportPart]]:
     """Return the parts below each title; none without scenes, and without maps none on maps."""
     if not distributions.scenes:
         return {}
@@ -83,7 +83,7 @@ def _histograms(
     more: Sequence[Panel] = (),
     tables: Sequence[Table] = (),
     notes: Sequence[str] = (),
-) -> Part:
+) -> ReportPart:
     """Return histograms of quantities, and of whole numbers in `more`, with their statistics."""
     panels = [*(_panel(distributions, name) for name in names), *more]
     digits = [*(QUANTITIES[name].digits for name in names), *(0 for _ in more)]
@@ -93,7 +93,7 @@ def _histograms(
     ]
     alt = ", ".join(panel.label for panel in panels)
     figure = data_uri(draw_panels(panels))
-    return Part(figure, alt, [Table([""], STATISTICS, rows), *tables], notes)
+    return ReportPart(figure, alt, [Table([""], STATISTICS, rows), *tables], notes)
 
 
 def _panel(distributions: Distributions, name: str) -> Panel:
@@ -125,7 +125,7 @@ def _bars(names: Sequence[str], parts: Mapping[str, Sequence[int]], label: str) 
     return data_uri(draw_bars(names[:_MOST_BARS], first, label=label))
 
 
-def _scenes(distributions: Distributions) -> Part:
+def _scenes(distributions: Distributions) -> ReportPart:
     names = distributions.templates
     counts = {
         split: [distributions.scenes.get((name, split), 0) for name in names]
@@ -138,17 +138,17 @@ def _scenes(distributions: Distributions) -> Part:
         for row, name in enumerate([*names, "all"])
     ]
     table = Table(["template"], [*columns], rows)
-    return Part(_bars(names, counts, "scenes"), "scenes by template and split", [table])
+    return ReportPart(_bars(names, counts, "scenes"), "scenes by template and split", [table])
 
 
-def _objects(distributions: Distributions) -> Part:
+def _objects(distributions: Distributions) -> ReportPart:
     uses = np.array(distributions.uses_per_object())
     places = Panel(values=uses, label="places of an object in scenes", unit="objects")
     note = f"{int((uses > 0).sum())} of {len(uses)} objects stand in a scene."
     return _histograms(distributions, ["objects_per_scene"], more=[places], notes=[note])
 
 
-def _materials(distributions: Distributions) -> Part:
+def _materials(distributions: Distributions) -> ReportPart:
     rows = []
     for kind, name in _KINDS.items():
         count, *those = (distributions.surfaces.get((kind, key), 0) for key in SURFACE_COUNTS)
@@ -163,7 +163,7 @@ def _materials(distributions: Distributions) -> Part:
     return _histograms(distributions, names, tables=[shares], notes=[note])
 
 
-def _maps(distributions: Distributions) -> Part:
+def _maps(distributions: Distributions) -> ReportPart:
     """Return the families of textures and skies, and the shares of scenes with some."""
     ordered = sorted(
         distributions.maps.items(), key=lambda entry: (entry[0][0], -entry[1], entry[0])
@@ -188,10 +188,10 @@ def _maps(distributions: Distributions) -> Part:
         Table([""], ["count", "share"], shares),
         Table(["map", "family or name"], ["scenes"], families),
     ]
-    return Part(figure, "scenes by family of texture and of sky", tables)
+    return ReportPart(figure, "scenes by family of texture and of sky", tables)
 
 
-def _map_sizes(distributions: Distributions) -> Part:
+def _map_sizes(distributions: Distributions) -> ReportPart:
     textured, sky_lit = (len(distributions.all(name)) for name in ("texture_width", "sky_radiance"))
     names = (
         *(("textures_per_scene", "texture_width") if textured else ()),
@@ -220,10 +220,10 @@ def _floors_by_split(distributions: Distributions) -> Table:
     return Table(["split"], head, rows)
 
 
-def _rejections(distributions: Distributions) -> Part:
+def _rejections(distributions: Distributions) -> ReportPart:
     rejections = distributions.rejections
     if not rejections:
-        return Part("", "", [], ["Nothing was rejected."])
+        return ReportPart("", "", [], ["Nothing was rejected."])
     parts = {
         label: [
             sum(number for attempt, number in counts.items() if low <= attempt <= high)
@@ -237,14 +237,14 @@ def _rejections(distributions: Distributions) -> Part:
         for row, ((stage, reason), counts) in enumerate(rejections.items())
     ]
     table = Table(["stage", "reason"], ["all", *parts], rows)
-    return Part(figure, "rejections by stage and reason", [table])
+    return ReportPart(figure, "rejections by stage and reason", [table])
 
 
-def _licences(distributions: Distributions) -> Part:
+def _licences(distributions: Distributions) -> ReportPart:
     rows = [(name, *counts) for name, counts in distributions.licences.items()]
     head = ["objects", "of them in scenes", "places in scenes"]
     note = "attribution.csv names the author of each object."
-    return Part("", "", [Table(["licence"], head, rows)], [note])
+    return ReportPart("", "", [Table(["licence"], head, rows)], [note])
 
 
 def _share(count: int, total: int) -> str:
