@@ -12,7 +12,7 @@ from infra.rendering.options import RenderOptions
 
 if TYPE_CHECKING:
     from infra.rendering.ways import Choice
-    from pipeline.renders.results import Sampling
+    from storage.renderer import Sampling
 
 
 @command("source")

@@ -24,7 +24,7 @@ from storage.records.scene import Scene
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
     from pipeline.generation.path_tracer import PathTracer
-    from pipeline.renders.results import Sampling
+    from storage.renderer import Sampling
 
 Fact = str | int | float
 Facts = Mapping[str, Fact]

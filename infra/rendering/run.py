@@ -32,7 +32,7 @@ from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
 
 if TYPE_CHECKING:
-    from pipeline.renders.results import Sampling
+    from storage.renderer import Sampling
 
 
 @dataclass(frozen=True, kw_only=True)

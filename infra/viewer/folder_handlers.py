@@ -22,10 +22,11 @@ from pipeline.exchange.formats import LoadedScene
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
 from pipeline.generation.progressive_tracer import ProgressiveTracer
-from pipeline.renders.results import GrowingPicture, Sampling
+from pipeline.renders.results import GrowingPicture
 from pipeline.renders.settings import one_picture
 from storage.conventions import preview_gain
 from storage.records.lights import num_lights
+from storage.renderer import Sampling
 
 THUMBNAIL_PX = 128
 THUMBNAIL_SPP = 4

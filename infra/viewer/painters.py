@@ -15,13 +15,14 @@ from infra.viewer.picture_options import PictureOptions
 from pipeline.documents.scene_passes import PASS_VIEWS, PassView
 from pipeline.generation.progressive_tracer import ProgressiveTracer
 from pipeline.renders.preview import usual_filter
-from pipeline.renders.results import GrowingPicture, Sampling
+from pipeline.renders.results import GrowingPicture
 from pipeline.renders.settings import FIRST_SPP, NoiseTargets, RenderSettings, one_picture
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.records.passes.declared import pass_names
 from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
+from storage.renderer import Sampling
 
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer, PreparedScene

@@ -15,10 +15,10 @@ from typing import Any, Literal
 from infra.viewer.edits import apply_edits
 from infra.viewer.painters import Painter, RenderedImage
 from infra.viewer.picture_options import PictureOptions
-from pipeline.renders.results import Sampling
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.scene import Scene
+from storage.renderer import Sampling
 
 MOST_KEPT = 32
 """Maximum number of pictures that are kept; one of 1024 pixels takes 13 MB."""

@@ -14,11 +14,12 @@ from pipeline.generation.environment import environment
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
 from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings
 from pipeline.renders.renderer import SceneRenderer, set_threads
-from pipeline.renders.results import RenderedView, Sampling, with_result
+from pipeline.renders.results import RenderedView, with_result
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, activate
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
+from storage.renderer import Sampling
 from storage.settings.described import settings_record
 
 _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child=1 << 30)

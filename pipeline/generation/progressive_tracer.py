@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, with_retries
 from pipeline.renders.progressive import ProgressiveRenderer
 from pipeline.renders.renderer import set_threads
-from pipeline.renders.results import GrowingPicture, Sampling, with_result
+from pipeline.renders.results import GrowingPicture, with_result
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, activate
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
+from storage.renderer import Sampling
 
 _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=600, calls_per_child=1 << 30)
 

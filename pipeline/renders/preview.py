@@ -15,12 +15,12 @@ from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import representable, require_surfaces
-from pipeline.renders.results import Sampling
 from pipeline.renders.settings import PASS_SPP, Depth, Filtered, RenderSettings, Resolution
 from pipeline.renders.tracer import Tracer
 from pipeline.renders.view_pictures import require_bounded
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
+from storage.renderer import Sampling
 from storage.seeds import seed_for
 from storage.settings.described import checked
 from storage.settings.ranges import Within

@@ -15,11 +15,12 @@ from pipeline.renders.camera import Camera
 from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.preview import denoise_preview, samples_sum, usual_filter
 from pipeline.renders.renderer import SceneRenderer, representable, run_to_end
-from pipeline.renders.results import GrowingPicture, RenderedView, Sampling
+from pipeline.renders.results import GrowingPicture, RenderedView
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.view_pictures import require_bounded
 from storage.errors import Rejected
 from storage.records.scene import Scene
+from storage.renderer import Sampling
 
 FIRST_LOOKS_SPP = (1, 4, 16)
 """Samples of the previews; each is a picture of its own, and together they cost less than a third

@@ -24,7 +24,7 @@ from pipeline.renders.denoiser import set_denoiser_threads
 from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans, HostPictures
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import MeasuredFloor
-from pipeline.renders.results import GrowingPicture, RenderedView, Sampling, UsedTime
+from pipeline.renders.results import GrowingPicture, RenderedView, UsedTime
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.stopping import Floors, Goal, expected_spp, gaps_db, next_spp
@@ -36,6 +36,7 @@ from storage.errors import Rejected, TrilightError
 from storage.records.lights import light_rows, rounded_to_half, sum_of_lights
 from storage.records.parts import MAX_PICTURES
 from storage.records.scene import Scene
+from storage.renderer import Sampling
 
 Result = TypeVar("Result")
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.noise_floor import MeasuredFloor
 from storage.records.parts import Parts
+from storage.renderer import Sampling
 
 Step = TypeVar("Step")
 Result = TypeVar("Result")
@@ -43,18 +44,6 @@ class RenderedView:
     `lights_rgb`, in every bit."""
     part_floors: Mapping[str, MeasuredFloor] | None = None
     """Measured error of each part, of all lights together."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sampling:
-    """Progress of the samples of a view."""
-
-    spp: int
-    """Samples per pixel so far."""
-    expected_spp: int
-    """Samples at which all targets should be reached, or the cap; a guess that improves."""
-    missing_db: float | None
-    """The widest gap to a target when the floors were measured last; None before that."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -25,11 +25,11 @@ from infra.viewer.picture_options import PictureOptions, parse_picture_options
 from infra.viewer.render_queue import RenderJob, RenderQueue, agreement_db
 from infra.viewer.scene_bytes import scene_bytes, sky_bytes, texture_png
 from infra.viewer.scene_handlers import SceneHandlers
-from pipeline.renders.results import Sampling
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
 from storage.records.scene import Scene
+from storage.renderer import Sampling
 from tests.for_each import case
 from tests.infra.viewer.served_kit import served
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene

@@ -15,13 +15,14 @@ from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings, 
 from pipeline.renders.preview_parts import all_parts, preview_parts, seconds_of, timed_parts
 from pipeline.renders.progressive import FIRST_LOOKS_SPP, ProgressiveRenderer
 from pipeline.renders.renderer import SceneRenderer, run_to_end
-from pipeline.renders.results import GrowingPicture, Sampling
+from pipeline.renders.results import GrowingPicture
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tracer import Features
 from pipeline.renders.variant import choose_variant
 from storage.errors import Rejected, TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.scene import Scene
+from storage.renderer import Sampling
 from tests.pipeline.renders.sampling import SIGMAS
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 from tests.scenes_by_hand import tiny_scene
