@@ -8,7 +8,7 @@ from typing import Any
 from infra.bench.experiment import Experiment
 from infra.bench.rows import Row, rows_of
 from infra.bench.store import Run
-from infra.cost_charts import (
+from train.evaluation.cost_charts import (
     SeriesPoint,
     colors_of,
     draw_legend,

@@ -7,10 +7,10 @@ import numpy as np
 
 from infra.release.pictures import NETWORK, SceneComparison
 from pipeline.documents.html import Markup, element, enlargeable, join_markup, page, table
-from pipeline.documents.markdown import front_matter
 from pipeline.documents.png import encode_png
 from storage.atomic import write_atomically
 from storage.conventions import preview_srgb8
+from storage.markdown import front_matter
 from train.evaluation.sheet import ERROR_WHITE, error_picture
 
 _TITLE = "Trilight: traced, learned and filtered"

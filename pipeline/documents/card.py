@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from pipeline.documents.distributions import MEASURED, Distributions
-from pipeline.documents.markdown import code, front_matter, table, text
+from storage.markdown import code, front_matter, table, text
 from pipeline.documents.report_maps import maps_in_words
 from pipeline.documents.rights import Rights, hub_licence, rights_markdown
 from storage.dataset.derived import Derivation, derivation_of

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from pipeline.documents.markdown import code, table
+from storage.markdown import code, table
 from storage.licences import DUTIES, duties_of, licence_url, union_of_duties
 from storage.records.objects import LockedObject
 

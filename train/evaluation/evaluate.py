@@ -17,11 +17,11 @@ from model.scene_tensors import SceneTensors
 from model.weights import MAX_LIGHTS
 from storage.conventions import radiance_from_log10
 from storage.dataset.shard_set import ShardSet
-from storage.errors import TrilightError
+from storage.errors import TrilightError, Unrenderable
 from storage.metrics import psnr_log_db
 from storage.records.sample import Sample
 from storage.records.scene import Scene
-from storage.seeds import rng_for
+from storage.renderer import Camera, Renderer
 from storage.settings.described import checked
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.scenes import TrainingScene, training_scene
@@ -30,7 +30,7 @@ from train.evaluation.judge import ValidationScene, predict, validation_scene
 from train.evaluation.judged_view import GROUPED, NETWORK, JudgedView, scene_facts
 from train.evaluation.metrics import noise_floors, picture_scores
 from train.evaluation.options import SceneCount, Width
-from train.evaluation.same_time import CAPTION, TRACER, TracedBeside
+from train.evaluation.same_time import CAPTION, TRACER, TracedViews
 from train.evaluation.sheet import SheetView
 from train.loss.lpips import Lpips
 
@@ -57,8 +57,24 @@ class EvalConfig:
     """The LPIPS network; None without its weights: LPIPS is then n/a."""
     most_scenes: SceneCount
     """Maximum number of scenes, from the start of the split."""
-    traced: SkipValidation[TracedBeside | None] = None
+    tracer: SkipValidation[Renderer | None] = None
     """Path tracer at equal time; None leaves it out."""
+    tracer_views: int = 0
+    """Maximum number of views for the path tracer."""
+
+    @property
+    def num_scenes(self) -> int:
+        """Number of scenes to evaluate; opens only shards that are evaluated anyway."""
+        count = 0
+        for number in range(len(self.shards.names)):
+            if count < self.most_scenes:
+                count += self.shards.num_samples(number)
+        return min(count, self.most_scenes)
+
+    @property
+    def traced_views(self) -> TracedViews:
+        """Views that the path tracer is judged on."""
+        return TracedViews(most_views=self.tracer_views, num_scenes=self.num_scenes)
 
     def samples(self) -> Iterator[Sample]:
         """Yield the samples; a damaged one raises, since the scores would be of another set."""
@@ -85,7 +101,8 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
     """
     rows: list[JudgedView] = []
     before: SceneTensors | None = None
-    for sample in config.samples():
+    to_trace = config.traced_views
+    for number, sample in enumerate(config.samples()):
         scene = validation_scene(sample, config.resolution)
         if config.network.config.view_stage == "hits":
             scene = with_traced_views(scene, config.network, config.resolution)
@@ -94,10 +111,18 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
         grouped_VRR3 = grouped_pictures(config.network, sample.scene, config.resolution)
         if grouped_VRR3 is not None:
             contestants[GROUPED] = grouped_VRR3
-        scene_rows = [
-            _judge_view(config, sample, scene, view, contestants)
-            for view in range(len(scene.target_VRR3))
-        ]
+        views = range(len(scene.target_VRR3))
+        traced = _traced_pictures(
+            config, sample, [view for view in views if to_trace.has(number, view)]
+        )
+        scene_rows = []
+        for view in views:
+            pictures = {name: pictures_VRR3[view] for name, pictures_VRR3 in contestants.items()}
+            if config.baselines is not None:
+                pictures |= config.baselines.pictures(scene.target_VRR3[view])
+            if view in traced:
+                pictures[TRACER] = traced[view]
+            scene_rows.append(_judge_view(config, sample, scene, view, pictures))
         if before is not None and config.network.config.scene_tokens:
             scene_rows = _add_swapped_scores(scene_rows, config.network, scene, before)
         rows += scene_rows
@@ -113,31 +138,33 @@ def _judge_view(
     sample: Sample,
     judged: ValidationScene,
     view: int,
-    contestants: Mapping[str, NDArray[np.float64]],
+    pictures: Mapping[str, NDArray],
 ) -> JudgedView:
     target = judged.target_VRR3[view]
     hits = judged.hits_VRR[view]
-    pictures = {name: pictures_VRR3[view] for name, pictures_VRR3 in contestants.items()}
-    if config.baselines is not None:
-        pictures |= config.baselines.pictures(target)
-    if config.traced is not None:
-        traced = config.traced.judged(sample, view)
-        pictures |= {} if traced is None else {TRACER: traced}
     return JudgedView(
         **scene_facts(sample),
         view=view,
-        floors=noise_floors(
-            sample.views[view],
-            target,
-            hits,
-            config.lpips,
-            rng_for(0, f"noise of {sample.key}", view),
-        ),
+        floors=noise_floors(sample, view, target, hits, config.lpips),
         scores={
             name: picture_scores(picture, target, hits, config.lpips)
             for name, picture in pictures.items()
         },
     )
+
+
+def _traced_pictures(
+    config: EvalConfig, sample: Sample, views: Sequence[int]
+) -> dict[int, NDArray[np.float32]]:
+    """Return the path tracer's pictures of some views; none if it cannot trace the scene."""
+    if config.tracer is None or not views:
+        return {}
+    scene = sample.scene
+    try:
+        loaded = config.tracer.load(scene, sample.key)
+        return {view: loaded.render(Camera.of_scene(scene, view)).radiance_rgb for view in views}
+    except Unrenderable:
+        return {}
 
 
 def _add_swapped_scores(
@@ -160,13 +187,13 @@ def sheet_views(config: EvalConfig, chosen: Sequence[JudgedView]) -> list[SheetV
         if rows := rows_of.get(sample.key):
             scene = training_scene(sample, config.resolution)
             pictures = predict(config.network, scene)
+            traced = _traced_pictures(config, sample, [row.view for row in rows])
             for row in rows:
                 sheet_view = _sheet_view(row, scene, pictures[row.view])
-                if config.traced is not None:
-                    traced = config.traced.shown(sample, row.view)
+                if config.tracer is not None:
                     black = np.zeros_like(sheet_view.target_rgb)
-                    extra_pictures = {CAPTION: black if traced is None else traced}
-                    sheet_view = dataclasses.replace(sheet_view, extra_rgb=extra_pictures)
+                    extra_rgb = {CAPTION: traced.get(row.view, black)}
+                    sheet_view = dataclasses.replace(sheet_view, extra_rgb=extra_rgb)
                 sheet_of_view[row.key, row.view] = sheet_view
     return [sheet_of_view[row.key, row.view] for row in chosen]
 

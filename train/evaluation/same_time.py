@@ -1,24 +1,44 @@
-"""Report on the path tracer at equal time, within an evaluation.
+"""Equal-time baseline: the path tracer with as many CPU seconds as a network.
 
-No picture is traced here: infra.tracer_rival provides the pictures and the times.
+A network is timed on a few scenes of its evaluation, and so are previews of 1, 2, 4, ... samples
+per pixel with either filter. The baseline is the preview of the most samples whose further view
+takes no longer than the network's; if even one sample takes longer, it is that one.
 """
 
 import dataclasses
+import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
-from numpy.typing import NDArray
-
+from storage.errors import TrilightError, Unrenderable
 from storage.records.sample import Sample
+from storage.renderer import Renderer
 from train.evaluation.judged_view import NETWORK, JudgedView, summarize_views
-from train.evaluation.pairs import paired_lead
+from train.evaluation.pairs import interval_text, paired_lead
+from train.evaluation.timing import Price, median_price, time_scene
 
 TRACER = "path tracer, same time"
 """Name of the path tracer among the evaluated methods."""
 
 CAPTION = "path tracer"
 """Short name of the path tracer on sheets."""
+
+TIMED_SCENES = 4
+"""Number of scenes on which both are timed."""
+
+TIMED_S = 60.0
+"""CPU seconds of the network after which no further scene is timed."""
+
+Level = tuple[int, str]
+"""Samples per pixel, and the denoiser's filter: fast or high."""
+
+LEAST: Level = (1, "fast")
+"""Cheapest level."""
+
+DEARER = Price(first_s=math.inf, further_s=math.inf)
+"""Price of a level that was not tried, since fewer samples took too long."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,17 +73,130 @@ class SameTimeResult:
     """Reason why nothing is traced; empty otherwise."""
 
 
-class TracedBeside(Protocol):
-    """Source of traced pictures of stored scenes for an evaluation."""
+@dataclass(frozen=True, kw_only=True)
+class TracedViews:
+    """Views that the path tracer is judged on, spread over the split."""
 
-    def judged(self, sample: Sample, view: int) -> NDArray | None:
-        """Return linear radiance [R, R, 3], or None for a view that is not scored."""
+    most_views: int
+    """Maximum number of views; 0 for none."""
+    num_scenes: int
+    """Number of evaluated scenes."""
 
-    def shown(self, sample: Sample, view: int) -> NDArray | None:
-        """Return linear radiance [R, R, 3] of any view, or None if it cannot be traced."""
+    @property
+    def every(self) -> int:
+        """One scene in so many is traced."""
+        return max(1, -(-self.num_scenes // max(self.most_views, 1)))
 
-    def close(self) -> None:
-        """Release all resources; a later picture allocates them again."""
+    @property
+    def first(self) -> int:
+        """Number of views of such a scene, from the first one."""
+        return max(1, self.most_views // max(self.num_scenes, 1))
+
+    def has(self, number: int, view: int) -> bool:
+        """Return whether a view of the scene of a number, from 0, is traced."""
+        return number % self.every == 0 and view < self.first
+
+    def text(self, num_views: int) -> str:
+        """Return a description of the views, of scenes with up to `num_views` views."""
+        views = f"the first {self.first} views" if self.first > 1 else "the first view"
+        if num_views <= self.first:
+            views = "all views"
+        return f"{views} of {'each scene' if self.every == 1 else f'one scene in {self.every}'}"
+
+
+def time_both(
+    network: Renderer,
+    previews: Mapping[Level, Renderer],
+    samples: Sequence[Sample],
+    *,
+    missing: str = "",
+    note: str = "",
+) -> SameTimeResult:
+    """Time both on some scenes, and choose the samples that fit.
+
+    The network is timed first, then the path tracer, then the network once more.
+
+    Args:
+        network: the network on one thread of the processor.
+        previews: path tracers on one thread by level, samples ascending; empty to trace nothing.
+        samples: scenes, at least one.
+        missing: reason why there are no previews.
+        note: remark about the machine's path tracer.
+
+    Raises:
+        TrilightError: the network cannot render such pictures.
+    """
+    timed: list[Sample] = []
+    ours: list[Price] = []
+    began = time.process_time()
+    for sample in samples:
+        if not timed or time.process_time() - began < TIMED_S:
+            timed.append(sample)
+            ours.append(time_scene(network, sample.scene, sample.key)[1])
+    theirs: list[Mapping[Level, Price]] = []
+    if previews:
+        theirs, missing = _preview_prices(previews, timed, median_price(ours).further_s)
+    ours += [time_scene(network, sample.scene, sample.key)[1] for sample in timed]
+    middle = median_price(ours)
+    preview = None
+    if theirs:
+        level = chosen_level(theirs, middle.further_s)
+        price = median_price([each.get(level, DEARER) for each in theirs])
+        preview = TracerTimes(
+            samples=level[0], denoiser=level[1], note=note, **dataclasses.asdict(price)
+        )
+    return SameTimeResult(
+        network_first_s=middle.first_s,
+        network_further_s=middle.further_s,
+        scenes=len(timed),
+        preview=preview,
+        missing=missing,
+    )
+
+
+def _preview_prices(
+    previews: Mapping[Level, Renderer], samples: Sequence[Sample], most_s: float
+) -> tuple[list[Mapping[Level, Price]], str]:
+    """Return the prices of each scene that can be traced, or an empty list and the reason."""
+    by_scene: list[Mapping[Level, Price]] = []
+    for sample in samples:
+        try:
+            by_scene.append(_ladder_prices(previews, sample, most_s))
+        except Unrenderable:
+            continue
+        except TrilightError as error:
+            return [], str(error).rstrip(".")
+    return by_scene, "" if by_scene else "the scenes that were timed cannot be traced"
+
+
+def _ladder_prices(
+    previews: Mapping[Level, Renderer], sample: Sample, most_s: float
+) -> Mapping[Level, Price]:
+    """Return the prices up to the first samples whose fast filter takes more than `most_s`."""
+    prices: dict[Level, Price] = {}
+    for (spp, denoiser), preview in previews.items():
+        fewer = prices.get((spp // 2, "fast"))
+        if fewer is not None and fewer.further_s > most_s:
+            break
+        prices[spp, denoiser] = time_scene(preview, sample.scene, sample.key)[1]
+    return prices
+
+
+def chosen_level(prices: Sequence[Mapping[Level, Price]], most_s: float) -> Level:
+    """Return the most samples whose median further view fits, and of equals the better filter.
+
+    If none fits, return LEAST.
+
+    Args:
+        prices: prices of each scene by level; a missing level takes longer than `most_s`.
+        most_s: maximum CPU seconds of a further view.
+    """
+    fits = [
+        level
+        for level in set().union(*prices)
+        if median_price([each.get(level, DEARER) for each in prices]).further_s <= most_s
+    ]
+    return max(fits, key=lambda level: (level[0], level[1] == "high"), default=LEAST)
 
 
 def same_time(views: Sequence[JudgedView], times: SameTimeResult, which: str) -> dict[str, Any]:
@@ -103,6 +236,8 @@ def sentences(figures: Mapping[str, Any]) -> list[str]:
         ]
     preview = figures["preview"]
     lead = figures["lead_db"]
+    interval = interval_text(lead["low"], lead["high"])
+    interval = f"{interval}, 95 % by scene" if interval else "no interval, of one scene"
     longer = preview["further_s"] > figures["network_further_s"]
     lines = [
         network_sentence,
@@ -113,14 +248,8 @@ def sentences(figures: Mapping[str, Any]) -> list[str]:
         f"Over {figures['views']} views ({figures['which']}) the network has "
         f"{figures['network']['psnr_log_db']['median']:.2f} dB and the path tracer "
         f"{figures['tracer']['psnr_log_db']['median']:.2f} dB, medians of psnr_log_db; view by "
-        f"view the network less the path tracer is {lead['mean']:+.2f} dB ({_interval(lead)}), "
+        f"view the network less the path tracer is {lead['mean']:+.2f} dB ({interval}), "
         f"and the network is better in {figures['share_better']:.0%}.",
         "The targets went through the same denoiser, which favours the path tracer a little.",
     ]
     return [*lines, *([f"{preview['note']}."] if preview["note"] else [])]
-
-
-def _interval(lead: Mapping[str, float | None]) -> str:
-    if lead["low"] is None:
-        return "no interval, of one scene"
-    return f"{lead['low']:+.2f} to {lead['high']:+.2f}, 95 % by scene"

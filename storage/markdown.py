@@ -1,4 +1,4 @@
-"""Markdown and YAML in which untrusted text never becomes markup."""
+"""Markdown, YAML and cells of CSV in which untrusted text never becomes markup or a formula."""
 
 import json
 import re
@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 _SPECIAL = re.compile(r"[\\`*_\[\]|#~!$]")
+_FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 _ENTITIES = {"&": "&amp;", "<": "&lt;", ">": "&gt;"}
 
 
@@ -24,6 +25,11 @@ def code(value: object) -> str:
     """Return a value as a code span; a backtick becomes an apostrophe."""
     inner = plain(value).replace("`", "'").replace("|", "\\|")
     return f"`{inner}`" if inner else ""
+
+
+def inert(cell: str) -> str:
+    """Return untrusted text, escaped so that a spreadsheet reads no formula in it."""
+    return f"'{cell}" if cell.startswith(_FORMULA_STARTS) else cell
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, numbers: int = 0) -> str:

@@ -1,6 +1,6 @@
 """Store of a leaderboard's scores in rows.jsonl, so that no view is evaluated twice.
 
-The key of a line is width, scene, view, the contestant's name, and the digest of everything that
+The key of a line is width, scene, view, the method's name, and the digest of everything that
 decides the picture and its evaluation. The first line names the dataset of the others.
 """
 
@@ -14,12 +14,10 @@ from typing import Any
 from storage.atomic import write_error
 from storage.errors import TrilightError
 from storage.records.safe_read import read_plain
+from train.evaluation.timing import Price
 
 UNKNOWN_MACHINE = "a machine that is not named"
 """Machine of old rows, which do not name theirs."""
-
-Scores = Mapping[str, float | None]
-"""Value by metric; None is n/a."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,27 +31,28 @@ class RowKey:
     view: int
     """Row of the camera in the scene."""
     name: str
-    """Name of the contestant, as in the table."""
+    """Name of the method, as in the table."""
     digest: str
     """SHA-256 of everything that decides the picture and its evaluation."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoardRow:
+class Row:
     """Scores and times of one picture."""
 
-    scores: Scores
+    scores: Mapping[str, float | None]
+    """Value by metric; None is n/a."""
     first_s: float | None = None
     """CPU seconds of the scene's first view, loading included; None if it is not timed."""
     further_s: float | None = None
     """CPU seconds of a further view; None if it is not timed."""
     machine: str | None = None
-    """Processor of the times, named by infra.processor; None without times."""
+    """Processor of the times; None without times."""
     facts: Mapping[str, Any] | None = None
     """Facts of the scene, in rows of the targets' noise only."""
 
 
-class BoardRows:
+class Rows:
     """Rows in rows.jsonl of a folder."""
 
     def __init__(self, path: Path, set_digest: str) -> None:
@@ -63,8 +62,8 @@ class BoardRows:
             TrilightError: the file holds rows of another dataset, or no rows.
         """
         self.path = path
-        self._rows: dict[RowKey, BoardRow] = {}
-        self._priced: dict[tuple[RowKey, str], BoardRow] = {}
+        self._rows: dict[RowKey, Row] = {}
+        self._prices: dict[tuple[RowKey, str], Price] = {}
         lines = self._whole_lines()
         if not lines:
             self._append({"set": set_digest})
@@ -72,7 +71,9 @@ class BoardRows:
         try:
             stored_digest = str(json.loads(lines[0])["set"])
             for line in lines[1:]:
-                self._keep(*_row(json.loads(line)))
+                record = json.loads(line)
+                key = RowKey(**{name: record.pop(name) for name in RowKey.__dataclass_fields__})
+                self._keep(key, Row(**record))
         except (ValueError, KeyError, TypeError) as error:
             raise TrilightError(
                 f"{path}: not the rows of a leaderboard ({error}). Choose another --out, or delete "
@@ -84,31 +85,29 @@ class BoardRows:
                 f"{set_digest[:12]}; expected the same set. Choose another --out."
             )
 
-    def get(self, key: RowKey) -> BoardRow | None:
+    def get(self, key: RowKey) -> Row | None:
         """Return the row of a key, or None."""
         return self._rows.get(key)
 
-    def price(self, key: RowKey, machine: str) -> tuple[float, float] | None:
+    def price(self, key: RowKey, machine: str) -> Price | None:
         """Return the CPU seconds of first and further view on a machine, or None."""
-        row = self._priced.get((key, machine))
-        if row is None or row.first_s is None or row.further_s is None:
-            return None
-        return row.first_s, row.further_s
+        return self._prices.get((key, machine))
 
     def machines(self) -> set[str]:
         """Return the names of all machines with times."""
-        return {machine for _, machine in self._priced}
+        return {machine for _, machine in self._prices}
 
-    def add(self, key: RowKey, row: BoardRow) -> None:
+    def add(self, key: RowKey, row: Row) -> None:
         """Append a row to the file; of two rows with one key the later one counts."""
         plain = {name: value for name, value in asdict(row).items() if value is not None}
         self._append({**asdict(key), **plain})
         self._keep(key, row)
 
-    def _keep(self, key: RowKey, row: BoardRow) -> None:
+    def _keep(self, key: RowKey, row: Row) -> None:
         self._rows[key] = row
-        if row.first_s is not None:
-            self._priced[key, row.machine or UNKNOWN_MACHINE] = row
+        if row.first_s is not None and row.further_s is not None:
+            price = Price(first_s=row.first_s, further_s=row.further_s)
+            self._prices[key, row.machine or UNKNOWN_MACHINE] = price
 
     def _whole_lines(self) -> list[bytes]:
         """Return the whole lines, and truncate an incomplete one of a killed run."""
@@ -128,9 +127,3 @@ class BoardRows:
                 os.fsync(stream.fileno())
         except OSError as error:
             raise write_error(self.path, error) from error
-
-
-def _row(record: dict[str, Any]) -> tuple[RowKey, BoardRow]:
-    names = RowKey.__dataclass_fields__
-    key = RowKey(**{name: record.pop(name) for name in names})
-    return key, BoardRow(**record)

@@ -1,18 +1,18 @@
-"""Folder of OpenEXR pictures from elsewhere as a contestant; all are checked at the start."""
+"""Folder of OpenEXR pictures from elsewhere, judged beside renderers; all are checked first."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.leaderboard.contestants import ELSEWHERE, ShownViews
 from pipeline.exchange.exports.scenes import picture_name
 from pipeline.exchange.pictures import MAX_BYTES, decode_pixels
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.safe_read import read_plain
 from storage.records.sample import Sample
+from train.evaluation.stored_pictures import StoredPictures
 
 _LEAST = -1e-2
 """Least radiance that still counts as a network's rounding of 0."""
@@ -21,14 +21,11 @@ Views = Sequence[tuple[str, int]]
 """Scene key and camera of every evaluated view."""
 
 
-class FolderContestant:
+class PictureFolder(StoredPictures):
     """Pictures from elsewhere, all of one width.
 
     Values slightly below 0, which networks of logarithms return, count as 0; alpha is ignored.
     """
-
-    kind = ELSEWHERE
-    is_timed = False
 
     def __init__(self, folder: Path, views: Views, widths: Sequence[int]) -> None:
         """Check the picture of every view.
@@ -53,22 +50,15 @@ class FolderContestant:
                 f"--pictures {folder}: its pictures have several widths ({listed}); expected one. "
                 "Put those of each width into a folder of their own."
             )
-        (self._width,) = by_width
-        self.notes: Sequence[str] = (
-            f"{self.name} were made elsewhere: what they cost is not known, and they are judged at "
-            f"{self._width} pixels alone",
-        )
-
-    def why_not(self, width: int) -> str:
-        return "" if width == self._width else f"its pictures have {self._width} pixels"
+        (self.resolution,) = by_width
 
     def digest(self, key: str, view: int) -> str:
         return self._sha256[key, view]
 
-    def shown(self, sample: Sample, width: int, *, timed: bool) -> ShownViews:
+    def pictures(self, sample: Sample) -> NDArray[np.float32]:
         paths = [self._path(sample.key, view) for view in range(sample.scene.num_views)]
-        pictures = [_picture(_bytes_of(path), path, [width]) for path in paths]
-        return ShownViews(radiance_VRR3=np.maximum(np.stack(pictures), 0))
+        pictures = [_picture(_bytes_of(path), path, [self.resolution]) for path in paths]
+        return np.maximum(np.stack(pictures), 0)
 
     def _path(self, key: str, view: int) -> Path:
         return self._folder / picture_name(key, view)
@@ -125,16 +115,16 @@ def _refuse(radiance_rgb: NDArray[np.float32], legal: NDArray[np.bool_], name: s
     )
 
 
-def folder_contestants(
+def picture_folders(
     folders: Sequence[Path], views: Views, widths: Sequence[int]
-) -> Mapping[str, FolderContestant]:
-    """Return the folders as contestants by name; raises TrilightError for equal names."""
-    by_name: dict[str, FolderContestant] = {}
+) -> list[PictureFolder]:
+    """Return the checked folders; raises TrilightError for equal names."""
+    found: list[PictureFolder] = []
     for folder in folders:
-        one = FolderContestant(folder, views, widths)
-        if one.name in by_name:
+        one = PictureFolder(folder, views, widths)
+        if one.name in [other.name for other in found]:
             raise TrilightError(
                 f"--pictures {folder}: another folder has the same name; expected different ones."
             )
-        by_name[one.name] = one
-    return by_name
+        found.append(one)
+    return found

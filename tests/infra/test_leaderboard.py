@@ -12,33 +12,35 @@ import numpy as np
 import pytest
 import torch
 
-from infra.leaderboard import contest as contest_module
-from infra.leaderboard import run as run_module
-from infra.leaderboard.chart import plot_leaderboard
-from infra.leaderboard.contest import NOISE
-from infra.leaderboard.options import LeaderboardOptions
-from infra.leaderboard.picture_folder import FolderContestant, folder_contestants
-from infra.leaderboard.rows import UNKNOWN_MACHINE, BoardRow, BoardRows, RowKey
-from infra.leaderboard.run import (
+from infra import leaderboard as run_module
+from infra.leaderboard import (
     NEAREST_OTHER,
     NEAREST_TRAINED,
     Leaderboard,
     make_leaderboard,
     widths_of,
 )
-from infra.leaderboard.standings import Standing, WidthStandings
+from infra.picture_folder import PictureFolder, picture_folders
 from infra.rendering.methods import DIRECT_LIGHT, TRACED_LIGHT
 from model.open import save_published
 from pipeline.exchange.exports.export import export_dataset
 from pipeline.exchange.exports.scenes import picture_name
-from storage.errors import Rejected, TrilightError
+from storage.errors import TrilightError, Unrenderable
 from storage.records.exr import encode_channels
 from tests.command_line import trilight
 from tests.for_each import case
 from tests.model.kit import awake
 from tests.model.published.test_convert import publishable
 from tests.train.toy import VIEWS, toy_sample, write_toy_dataset
+from train.evaluation import board as board_module
+from train.evaluation.board import NOISE
+from train.evaluation.chart import plot_leaderboard
+from train.evaluation.options import LeaderboardOptions
 from train.evaluation.pairs import METRIC
+from train.evaluation.rows import UNKNOWN_MACHINE, Row, RowKey, Rows
+from train.evaluation.standings import Standing, WidthStandings
+from train.evaluation.stored_pictures import NearestView
+from train.evaluation.timing import Price
 
 PX = 16
 SHIPPED = {"network builtin:", "network builtin:tokens"}
@@ -70,7 +72,7 @@ def order(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Leader
 def short(order: LeaderboardOptions, monkeypatch: pytest.MonkeyPatch) -> LeaderboardOptions:
     """Return an order of one network beside the nearest picture, without a chart."""
     monkeypatch.setattr(run_module, "BUILTIN_NETWORKS", ("builtin:tokens",))
-    monkeypatch.setattr(run_module, "_builtin_entries", lambda stack: [])
+    monkeypatch.setattr(run_module, "_add_traced", lambda lineup, widths: None)
     monkeypatch.setattr(run_module, "plot_leaderboard", lambda *words: None)
     return order
 
@@ -123,8 +125,8 @@ def test_nothing_is_judged_twice_and_what_changed_is_judged_again(
     before = board_of(asked)
     lines = (asked.out / "rows.jsonl").read_text().splitlines()
     judged: list[Any] = []
-    real = contest_module.picture_scores
-    monkeypatch.setattr(contest_module, "picture_scores", counted(real, judged))
+    real = board_module.picture_scores
+    monkeypatch.setattr(board_module, "picture_scores", counted(real, judged))
     assert board_of(asked).widths == before.widths and judged == []
     assert (asked.out / "rows.jsonl").read_text().splitlines() == lines
     name = sorted(path.name for path in mine.glob("*.exr"))[-1]  # the scene before is not judged
@@ -163,17 +165,17 @@ def test_a_set_without_training_split_looks_up_its_other_scenes(
 def test_a_scene_that_somebody_cannot_show_is_left_out_for_all(
     short: LeaderboardOptions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(self: Any, sample: Any, width: int, *, timed: bool) -> Any:
+    def refused(self: Any, sample: Any) -> Any:
         if sample.key.endswith("4"):
-            raise Rejected("no_light", "nothing shines")
-        return real(self, sample, width, timed=timed)
+            raise Unrenderable("nothing shines")
+        return real(self, sample)
 
-    real = run_module.NearestContestant.shown
-    monkeypatch.setattr(run_module.NearestContestant, "shown", refused)
+    real = NearestView.pictures
+    monkeypatch.setattr(NearestView, "pictures", refused)
     board = board_of(short)
     assert board.widths[0].num_scenes == 1
     assert any("scene 000000004 is left out at 16 pixels" in text for text in board.notes)
-    monkeypatch.setattr(run_module.NearestContestant, "shown", real)
+    monkeypatch.setattr(NearestView, "pictures", real)
     assert board_of(short).widths[0].num_scenes == 2, "and asked again"
 
 
@@ -205,19 +207,18 @@ def test_prices_of_two_machines_do_not_mix(
     short: LeaderboardOptions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def prices(machine: str, measured_s: float) -> tuple[dict[str, str], Leaderboard]:
-        def shown(self: Any, sample: Any, width: int, *, timed: bool) -> Any:
-            made = real(self, sample, width, timed=False)
-            first_s, further_s = (measured_s, measured_s / 2) if timed else (None, None)
-            return dataclasses.replace(made, first_s=first_s, further_s=further_s)
+        def timed(renderer: Any, scene: Any, name: str) -> Any:
+            loaded, _ = real(renderer, scene, name)
+            return loaded, Price(first_s=measured_s, further_s=measured_s / 2)
 
         monkeypatch.setattr(run_module, "processor", lambda: machine)
-        monkeypatch.setattr(run_module.NetworkContestant, "shown", shown)
+        monkeypatch.setattr(board_module, "time_scene", timed)
         board = board_of(short)
         rows = tables(short.out, "leaderboard.csv")
         (row,) = [row for row in rows if row["name"] == "network builtin:tokens"]
         return row, board
 
-    real = run_module.NetworkContestant.shown
+    real = board_module.time_scene
     first, _ = prices("Slow 1", 8.0)
     assert (first["first_core_s"], first["processor"]) == ("8.0", "Slow 1")
     second, board = prices("Quick 2", 2.0)
@@ -271,7 +272,7 @@ def write(path: Path, rgb: np.ndarray) -> None:
 
 def refusal(folder: Path) -> str:
     with pytest.raises(TrilightError) as refused:
-        FolderContestant(folder, SHOWN, WIDTHS)
+        PictureFolder(folder, SHOWN, WIDTHS)
     assert "\n" not in str(refused.value)
     return str(refused.value)
 
@@ -282,16 +283,14 @@ def test_pictures_are_shown_as_they_are_at_their_one_width(folder: Path) -> None
     alpha = np.full((16, 16), 0.5, np.float32)
     channels = dict(zip("RGB", np.moveaxis(rgb, -1, 0).copy(), strict=True)) | {"A": alpha}
     (folder / picture_name(*SHOWN[2])).write_bytes(encode_channels(channels))
-    one = FolderContestant(folder, SHOWN, WIDTHS)
-    assert one.name == "pictures of mine" and one.why_not(16) == ""
-    assert one.why_not(8) == "its pictures have 16 pixels"
-    shown = one.shown(toy_sample(1), 16, timed=True)
-    assert shown.first_s is None
-    np.testing.assert_array_equal(shown.radiance_VRR3[0], np.maximum(rgb, 0))
-    np.testing.assert_array_equal(shown.radiance_VRR3[1], picture(3))
+    one = PictureFolder(folder, SHOWN, WIDTHS)
+    assert one.name == "pictures of mine" and one.resolution == 16
+    shown = one.pictures(toy_sample(1))
+    np.testing.assert_array_equal(shown[0], np.maximum(rgb, 0))
+    np.testing.assert_array_equal(shown[1], picture(3))
     before = one.digest(*SHOWN[0])
     write(folder / picture_name(*SHOWN[0]), picture(9))
-    after = FolderContestant(folder, SHOWN, WIDTHS)
+    after = PictureFolder(folder, SHOWN, WIDTHS)
     assert after.digest(*SHOWN[0]) != before and after.digest(*SHOWN[1]) == one.digest(*SHOWN[1])
 
 
@@ -331,21 +330,21 @@ def test_values_that_are_no_radiance_are_said_with_their_place(folder: Path) -> 
 
 
 def test_two_folders_of_one_name_are_refused(folder: Path) -> None:
-    assert list(folder_contestants([folder], SHOWN, WIDTHS)) == ["pictures of mine"]
+    assert [one.name for one in picture_folders([folder], SHOWN, WIDTHS)] == ["pictures of mine"]
     with pytest.raises(TrilightError, match="another folder has the same name"):
-        folder_contestants([folder, folder], SHOWN, WIDTHS)
+        picture_folders([folder, folder], SHOWN, WIDTHS)
 
 
 KEY = RowKey(width=64, scene="000000001", view=0, name="somebody", digest="d")
-ROW = BoardRow(scores={"psnr_log_db": 30.0, "lpips": None}, first_s=0.5, further_s=0.25)
+ROW = Row(scores={"psnr_log_db": 30.0, "lpips": None}, first_s=0.5, further_s=0.25)
 
 
 def test_rows_come_back_and_the_later_of_two_counts(tmp_path: Path) -> None:
     path = tmp_path / "board/rows.jsonl"
-    rows = BoardRows(path, "set a")
-    rows.add(KEY, BoardRow(scores={"psnr_log_db": 29.0}))
+    rows = Rows(path, "set a")
+    rows.add(KEY, Row(scores={"psnr_log_db": 29.0}))
     rows.add(KEY, ROW)
-    again = BoardRows(path, "set a")
+    again = Rows(path, "set a")
     assert again.get(KEY) == rows.get(KEY) == ROW
     assert (
         again.get(RowKey(width=64, scene="000000001", view=0, name="somebody", digest="e")) is None
@@ -357,13 +356,13 @@ def test_rows_come_back_and_the_later_of_two_counts(tmp_path: Path) -> None:
 
 def test_a_line_that_a_kill_cut_short_is_judged_again(tmp_path: Path) -> None:
     path = tmp_path / "rows.jsonl"
-    BoardRows(path, "set a").add(KEY, ROW)
+    Rows(path, "set a").add(KEY, ROW)
     whole = path.read_bytes()
     path.write_bytes(whole + b'{"width": 64, "sce')
-    rows = BoardRows(path, "set a")
+    rows = Rows(path, "set a")
     assert rows.get(KEY) == ROW and path.read_bytes() == whole
     path.write_bytes(whole[: whole.index(b"\n") + 20])
-    assert BoardRows(path, "set a").get(KEY) is None
+    assert Rows(path, "set a").get(KEY) is None
     assert path.read_bytes() == whole[: whole.index(b"\n") + 1]
 
 
@@ -379,7 +378,7 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
         with case(text):
             (tmp_path / "rows.jsonl").write_text(text)
             with pytest.raises(TrilightError, match=said):
-                BoardRows(tmp_path / "rows.jsonl", "set a")
+                Rows(tmp_path / "rows.jsonl", "set a")
 
 
 FORMULA = r"runs of $\nothing$"

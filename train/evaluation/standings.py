@@ -1,24 +1,23 @@
 """Table of each width from the rows: medians, tails, costs, and paired differences."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from infra.cost_tables import on_front
-from infra.leaderboard.contest import NOISE, JudgedWidth
+from train.evaluation.board import NOISE, JudgedWidth
+from train.evaluation.cost_tables import on_front
 from train.evaluation.judged_view import summarize_views
 from train.evaluation.pairs import METRIC, PairedLead, paired_lead
+from train.evaluation.timing import median_price
 
 
 @dataclass(frozen=True, kw_only=True)
 class Standing:
-    """Figures of one contestant at one width."""
+    """Figures of one method at one width."""
 
     name: str
-    """Name of the contestant, or NOISE."""
+    """Name of the method, or NOISE."""
     kind: str
     """Kind of method; empty for NOISE."""
     first_s: float | None
@@ -47,7 +46,7 @@ class WidthStandings:
     width: int
     """Width of the pictures in pixels."""
     num_scenes: int
-    """Number of scenes that all contestants rendered."""
+    """Number of scenes that all methods rendered."""
     num_views: int
     """Number of views of these scenes."""
     standings: tuple[Standing, ...]
@@ -61,44 +60,35 @@ def standings_of(judged: JudgedWidth, kinds: Mapping[str, str], rival: str) -> W
 
     Args:
         judged: scores and times, with one view at least.
-        kinds: kind of each contestant by name.
+        kinds: kind of each method by name.
         rival: name of the row that all others are compared with.
     """
     names = [name for name in judged.views[0].scores if name != NOISE]
     pairs = {two: paired_lead(judged.views, *two) for two in itertools.permutations(names, 2)}
-    front = _front(judged, names)
+    scores = {name: summarize_views(judged.views, name) for name in [NOISE, *names]}
+    costs = {name: median_price(prices) for name, prices in judged.prices.items()}
+    figures = [
+        (-float(scores[name][METRIC]["median"]), (cost.first_s, cost.further_s))
+        for name, cost in costs.items()
+    ]
+    front = dict(zip(costs, on_front(figures), strict=True))
     standings = [
         Standing(
             name=name,
             kind=kinds.get(name, ""),
-            first_s=_median(judged.first_s.get(name)),
-            further_s=_median(judged.further_s.get(name)),
-            timed_scenes=len(judged.first_s.get(name, ())),
-            scores=summarize_views(judged.views, name),
+            first_s=costs[name].first_s if name in costs else None,
+            further_s=costs[name].further_s if name in costs else None,
+            timed_scenes=len(judged.prices.get(name, ())),
+            scores=scores[name],
             lead=pairs.get((name, rival)),
             on_front=front.get(name),
         )
-        for name in [NOISE, *names]
+        for name in scores
     ]
-    order = sorted(standings, key=lambda one: (one.name != NOISE, -one.median_db))
     return WidthStandings(
         width=judged.width,
         num_scenes=len({view.key for view in judged.views}),
         num_views=len(judged.views),
-        standings=tuple(order),
+        standings=tuple(sorted(standings, key=lambda one: (one.name != NOISE, -one.median_db))),
         pairs=pairs,
     )
-
-
-def _front(judged: JudgedWidth, names: Sequence[str]) -> dict[str, bool]:
-    priced = [name for name in names if judged.first_s.get(name)]
-    figures = []
-    for name in priced:
-        median_db = float(summarize_views(judged.views, name)[METRIC]["median"])
-        costs = [float(np.median(each[name])) for each in (judged.first_s, judged.further_s)]
-        figures.append((-median_db, costs))
-    return dict(zip(priced, on_front(figures), strict=True))
-
-
-def _median(seconds: Sequence[float] | None) -> float | None:
-    return float(np.median(seconds)) if seconds else None

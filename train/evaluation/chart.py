@@ -1,19 +1,22 @@
-"""Chart of a leaderboard: a panel for each width, CPU seconds against the median error."""
+"""Charts of a leaderboard, CPU seconds against the median error, and of unusual scenes."""
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from infra.cost_charts import (
+import numpy as np
+
+from train.evaluation.board import NOISE
+from train.evaluation.cost_charts import (
     SeriesPoint,
     colors_of,
     draw_legend,
     draw_points,
     name_points,
 )
-from infra.leaderboard.contest import NOISE
-from infra.leaderboard.standings import Standing, WidthStandings
+from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.pairs import METRIC
+from train.evaluation.standings import Standing, WidthStandings
 
 _PANEL = (7.4, 6.2)
 _DPI = 110
@@ -86,3 +89,49 @@ def _line_across(axes: Any, standing: Standing) -> None:
         color="0.3",
         horizontalalignment="right",
     )
+
+
+_COLUMNS = 3
+"""Number of plots of axes in a row."""
+
+
+def plot_excursions(path: Path, views: Sequence[JudgedView]) -> int:
+    """Plot psnr_log_db beyond the usual range of scenes; return the number of axes.
+
+    Each axis has a plot: a dot is a view, the line the median at each value, the dashed line the
+    median of the noise floors. Nothing is written if no view leaves the usual range.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")  # before pyplot: no display is needed
+    import matplotlib.pyplot as plt
+
+    axes: dict[str, list[JudgedView]] = {}
+    for view in views:
+        if view.excursion is not None:
+            axes.setdefault(view.excursion[0], []).append(view)
+    if not axes:
+        return 0
+    rows = -(-len(axes) // _COLUMNS)
+    figure, grid = plt.subplots(
+        rows, _COLUMNS, figsize=(4.2 * _COLUMNS, 3.2 * rows), squeeze=False, layout="constrained"
+    )
+    for place, (axis, members) in zip(grid.flat, sorted(axes.items()), strict=False):
+        at = np.array([view.excursion[1] for view in members if view.excursion is not None])
+        scores = np.array([view.scores[NETWORK]["psnr_log_db"] for view in members], float)
+        floors = np.array([view.floors["psnr_log_db"] for view in members])
+        values = np.unique(at)
+        place.plot(at, scores, ".", color="tab:blue", alpha=0.4)
+        medians = [np.median(scores[at == value]) for value in values]
+        place.plot(values, medians, "-o", color="tab:blue", label="network")
+        noise = [np.median(floors[at == value]) for value in values]
+        place.plot(values, noise, "--", color="grey", label="noise floor")
+        place.set(title=axis.replace("_", " "), xlabel="value", ylabel="psnr_log_db")
+        if values[0] > 0 and values[-1] / values[0] > 8:
+            place.set_xscale("log")
+    grid.flat[0].legend()
+    for place in grid.flat[len(axes) :]:
+        place.axis("off")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return len(axes)
