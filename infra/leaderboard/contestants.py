@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.rendering.methods import (
+from infra.render.methods import (
     KINDS,
     Method,
     kind_of,
@@ -37,7 +37,7 @@ TRACED_LIGHT = KINDS[1]
 TRACER = KINDS[2]
 BASELINE = "picture of another scene"
 ELSEWHERE = "pictures made elsewhere"
-"""Kinds of contestants, in addition to those of infra.rendering.methods."""
+"""Kinds of contestants, in addition to those of infra.render.methods."""
 
 _REPEATS = 1
 """Measured repetitions after the warm-up; one, because the result is the median over scenes."""

@@ -29,7 +29,7 @@ from infra.leaderboard.picture_folder import folder_contestants
 from infra.leaderboard.rows import BoardRows
 from infra.leaderboard.standings import WidthStandings, standings_of
 from infra.processor import processor
-from infra.rendering.methods import (
+from infra.render.methods import (
     BUILTIN_NETWORKS,
     DIRECT_LIGHT,
     SAMPLES,

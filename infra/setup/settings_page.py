@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any, get_args
 
 from infra.leaderboard.options import LeaderboardOptions
-from infra.rendering.options import RenderOptions
+from infra.render.options import RenderOptions
 from infra.serving.train_model import TrainOptions
 from pipeline.builds.settings import BuildSettings
 from pipeline.documents.markdown import table

@@ -17,7 +17,7 @@ import pytest
 from numpy.typing import NDArray
 
 from infra.leaderboard.options import LeaderboardOptions
-from infra.rendering.options import RenderOptions
+from infra.render.options import RenderOptions
 from infra.serving.train_model import TrainOptions
 from infra.setup.settings_page import ROOTS, reachable
 from model.base_widths import BaseWidths

@@ -27,7 +27,7 @@ from infra.leaderboard.run import (
     widths_of,
 )
 from infra.leaderboard.standings import Standing, WidthStandings
-from infra.rendering.methods import DIRECT_LIGHT, TRACED_LIGHT
+from infra.render.methods import DIRECT_LIGHT, TRACED_LIGHT
 from model.open import save_published
 from pipeline.exchange.exports.export import export_dataset
 from pipeline.exchange.exports.scenes import picture_name
