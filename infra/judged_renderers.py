@@ -8,7 +8,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from infra.rendering.methods import SAMPLE_SEED, Method, network_method
+from infra.render.methods import SAMPLE_SEED, Method, network_method
 from model.neural_renderer import NeuralRenderer
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, with_retries
 from pipeline.renders.preview import MOST_SPP, PreviewRenderer, PreviewSettings
@@ -138,7 +138,11 @@ def previews_on_one_thread(resolution: int) -> tuple[Mapping[Level, Renderer], s
         previews: dict[Level, Renderer] = {
             level: PreviewOnOneThread(
                 "",
-                PreviewSettings(resolution=resolution, spp=level[0], denoiser=level[1]),
+                PreviewSettings(
+                    resolution=resolution,
+                    spp=level[0],
+                    denoiser="high" if level[1] == "high" else "fast",
+                ),
                 0,
                 variant,
                 children,

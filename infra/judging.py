@@ -4,7 +4,7 @@ import contextlib
 import copy
 import dataclasses
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from model.weights import network_digest
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
+from storage.renderer import Renderer
 from storage.typed_json import read_json
 from train.evaluation.chart import plot_excursions
 from train.evaluation.evaluate import (
@@ -30,7 +31,7 @@ from train.evaluation.evaluate import (
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.pages import evaluation_page
 from train.evaluation.report import record
-from train.evaluation.same_time import TIMED_SCENES, SameTimeResult, same_time, time_both
+from train.evaluation.same_time import TIMED_SCENES, Level, SameTimeResult, same_time, time_both
 from train.evaluation.sheet import draw_sheet, write_picture
 from train.loop.distributed import choose_device
 from train.loss.lpips import load_lpips
@@ -118,7 +119,8 @@ def _time_tracer(
     """Time the network and the path tracer, and add the latter if it can trace the scenes."""
     samples = list(itertools.islice(contest.samples(), TIMED_SCENES))
     network = NeuralRenderer(copy.deepcopy(contest.network).cpu())
-    previews, missing, note = {}, "no views of it were requested", ""
+    previews: Mapping[Level, Renderer] = {}
+    missing, note = "no views of it were requested", ""
     if contest.tracer_views:
         previews, missing, note = previews_on_one_thread(contest.resolution)
     for preview in previews.values():

@@ -9,7 +9,7 @@ from pathlib import Path
 from infra.judged_renderers import MethodRenderer, network_renderer, samples_renderers
 from infra.picture_folder import picture_folders
 from infra.processor import processor
-from infra.rendering.methods import (
+from infra.render.methods import (
     BUILTIN_NETWORKS,
     DIRECT_LIGHT,
     TRACED_LIGHT,
@@ -54,7 +54,7 @@ NEAREST_OTHER = "nearest other scene"
 
 BASELINE = "picture of another scene"
 ELSEWHERE = "pictures made elsewhere"
-"""Kinds of stored pictures, in addition to those of infra.rendering.methods."""
+"""Kinds of stored pictures, in addition to those of infra.render.methods."""
 
 ALONE = "no picture is looked up: the set has no scene beside the one that is judged"
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.rendering.cameras import own_camera
+from infra.render.cameras import own_camera
 from infra.torch_library import require_torch
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import NoiseTargets, one_picture

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from infra.bench.experiment import BenchScale
 from infra.bench.workloads.named_scenes import first_sample, given_scenes, sampled_scene
 from infra.bench_options import BenchOptions
-from infra.rendering.held_out_scenes import composing_child
+from infra.render.held_out_scenes import composing_child
 from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
 from pipeline.generation.prepare_isolated import preload_mesh_libraries

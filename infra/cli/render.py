@@ -8,17 +8,17 @@ from rich.text import Text
 
 from infra.cli.console import progress_bars
 from infra.cli.options import OutputOptions, command
-from infra.rendering.options import RenderOptions
+from infra.render.options import RenderOptions
 
 if TYPE_CHECKING:
-    from infra.rendering.ways import Choice
+    from infra.render.ways import Choice
     from storage.renderer import Sampling
 
 
 @command("source")
 def render(options: RenderOptions, output: OutputOptions) -> None:
     from infra.cli.rendered import print_outcome
-    from infra.rendering.run import render_from_options
+    from infra.render.run import render_from_options
 
     started = time.monotonic()
     with progress_bars() as bars:

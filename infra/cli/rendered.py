@@ -9,11 +9,11 @@ import numpy as np
 from rich.text import Text
 
 from infra.cli.console import console, print_json, print_rows
-from infra.rendering.comparison import Flicker
-from infra.rendering.engines import EnginePlan, Facts, MitsubaPlan, NeuralPlan
-from infra.rendering.look import enlargement
-from infra.rendering.plan import RenderPlan
-from infra.rendering.run import FinishedShot, RenderResult
+from infra.render.comparison import Flicker
+from infra.render.engines import EnginePlan, Facts, MitsubaPlan, NeuralPlan
+from infra.render.look import enlargement
+from infra.render.plan import RenderPlan
+from infra.render.run import FinishedShot, RenderResult
 from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.settings import RenderSettings
 

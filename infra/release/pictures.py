@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.rendering.cameras import own_camera
-from infra.rendering.engines import Engine, MitsubaPlan, NeuralPlan
+from infra.render.cameras import own_camera
+from infra.render.engines import Engine, MitsubaPlan, NeuralPlan
 from model.weights import MAX_LIGHTS
 from pipeline.documents.scene_choice import ChosenScene, choose_scenes, read_chosen
 from pipeline.renders.preview import PreviewSettings

@@ -1,4 +1,4 @@
-"""Measures infra/rendering/previews.json, the table of `trilight render --seconds` and `--error`.
+"""Measures infra/render/previews.json, the table of `trilight render --seconds` and `--error`.
 
     python -m infra.setup.preview_table
 
@@ -18,16 +18,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from infra.processor import processor
-from infra.rendering.held_out_scenes import composing_child, held_out_build, held_out_scene
-from infra.rendering.machine_costs import PROBES
-from infra.rendering.methods import sampled_method
-from infra.rendering.raw_references import (
+from infra.render.held_out_scenes import composing_child, held_out_build, held_out_scene
+from infra.render.machine_costs import PROBES
+from infra.render.methods import sampled_method
+from infra.render.raw_references import (
     RawReference,
     first_camera,
     raw_reference,
     true_error_db,
 )
-from infra.rendering.way_table import (
+from infra.render.way_table import (
     NETWORK_SCENE,
     NETWORK_VIEW,
     SHIPPED,

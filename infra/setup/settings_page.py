@@ -7,7 +7,7 @@ import typing
 from collections.abc import Iterator
 from typing import Any, get_args
 
-from infra.rendering.options import RenderOptions
+from infra.render.options import RenderOptions
 from infra.serving.train_model import TrainOptions
 from pipeline.builds.settings import BuildSettings
 from pipeline.flows.orders import DatasetInRuns

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from infra.rendering.cameras import ShotCamera
+from infra.render.cameras import ShotCamera
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError, expected_one_of
 from storage.records.scene import MAX_POSITION_M

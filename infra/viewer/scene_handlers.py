@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.rendering.look import Look, ToneMap, tone_mapped
+from infra.render.look import Look, ToneMap, tone_mapped
 from infra.viewer.painters import Painter, render_words
 from infra.viewer.picture_options import parse_edits, parse_picture_options
 from infra.viewer.render_queue import RenderJob, RenderQueue, agreement_db

@@ -7,12 +7,12 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from pipeline.documents.distributions import MEASURED, Distributions
-from storage.markdown import code, front_matter, table, text
 from pipeline.documents.report_maps import maps_in_words
 from pipeline.documents.rights import Rights, hub_licence, rights_markdown
 from storage.dataset.derived import Derivation, derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest
+from storage.markdown import code, front_matter, table, text
 from storage.records.objects import SKY, TEXTURE
 from storage.records.profiles import PLAIN
 from storage.records.quantities import summary

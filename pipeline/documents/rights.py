@@ -5,8 +5,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from storage.markdown import code, table
 from storage.licences import DUTIES, duties_of, licence_url, union_of_duties
+from storage.markdown import code, table
 from storage.records.objects import LockedObject
 
 _HUB_LICENCES = frozenset(

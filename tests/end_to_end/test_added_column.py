@@ -13,7 +13,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from infra.rendering.engines import MitsubaEngine
+from infra.render.engines import MitsubaEngine
 from model.neural_renderer import NeuralRenderer
 from model.open import open_network, save_published
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors

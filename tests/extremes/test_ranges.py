@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from infra.rendering.options import RenderOptions
+from infra.render.options import RenderOptions
 from infra.serving.train_model import TrainOptions
 from infra.setup.settings_page import ROOTS, reachable
 from model.base_widths import BaseWidths

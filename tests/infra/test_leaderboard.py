@@ -21,7 +21,7 @@ from infra.leaderboard import (
     widths_of,
 )
 from infra.picture_folder import PictureFolder, picture_folders
-from infra.rendering.methods import DIRECT_LIGHT, TRACED_LIGHT
+from infra.render.methods import DIRECT_LIGHT, TRACED_LIGHT
 from model.open import save_published
 from pipeline.exchange.exports.export import export_dataset
 from pipeline.exchange.exports.scenes import picture_name

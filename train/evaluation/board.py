@@ -73,12 +73,21 @@ class Board:
         digest = sha256_hex(f"{made_by} {self.judged_by}".encode())
         return RowKey(width=width, scene=key, view=view, name=name, digest=digest)
 
+    @functools.cached_property
+    def _renderer_digests(self) -> dict[int, str]:
+        """Digest of each renderer by its `id`."""
+        return {
+            id(method): method_digest(method.identity)
+            for method in self.methods
+            if not isinstance(method, StoredPictures)
+        }
+
     def key_of(self, method: Method, key: str, view: int) -> RowKey:
         """Return the key of a method's row."""
         if isinstance(method, StoredPictures):
             made_by = method.digest(key, view)
         else:
-            made_by = method_digest(dict(method.identity))
+            made_by = self._renderer_digests[id(method)]
         return self.row_key(method.resolution, method.name, made_by, key, view)
 
     def present(self, width: int) -> list[Method]:

@@ -1,6 +1,6 @@
-"""Stored pictures that are judged beside renderers: looked up, not rendered, and without a price."""
+"""Stored pictures that are judged beside renderers: looked up, not rendered, without a price."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import metadata
 
 import numpy as np
@@ -76,6 +76,6 @@ class NearestView(StoredPictures):
         return np.stack([self._baselines.nearest(target, not_of=itself) for target in targets])
 
 
-def method_digest(identity: dict[str, object]) -> str:
+def method_digest(identity: Mapping[str, object]) -> str:
     """Return the digest of what decides a method's pictures, this version of Trilight included."""
     return sha256_hex(canonical_json({**identity, "trilight": metadata.version("trilight")}))

@@ -16,7 +16,7 @@ from infra.bench.workloads.mapped_scenes import SKIES, mapped_scene
 from infra.bench.workloads.named_scenes import given_scenes
 from infra.bench.workloads.shots import shots
 from infra.bench_options import BenchOptions
-from infra.rendering.raw_references import RawReference, first_camera, raw_reference, true_error_db
+from infra.render.raw_references import RawReference, first_camera, raw_reference, true_error_db
 from pipeline.exchange.usd.write import write_usd
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.results import RenderedView

@@ -26,7 +26,7 @@ from infra.bench.workloads.named_scenes import given_scenes, sampled_trials
 from infra.bench.workloads.plain_mitsuba import PlainPicture, render_levels
 from infra.bench.workloads.shots import SEED, shots
 from infra.bench_options import BenchOptions
-from infra.rendering.raw_references import RawReference, first_camera, true_error_db
+from infra.render.raw_references import RawReference, first_camera, true_error_db
 from pipeline.builds.training import pretrain_256
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.settings import USUAL_FLOOR_DB, RenderSettings

@@ -9,8 +9,8 @@ from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
 from infra.bench.workloads.cached_references import kept_reference
 from infra.bench_options import BenchOptions
-from infra.rendering.held_out_scenes import TRIANGLES, held_out_build, held_out_scene
-from infra.rendering.methods import (
+from infra.render.held_out_scenes import TRIANGLES, held_out_build, held_out_scene
+from infra.render.methods import (
     BUILTIN_NETWORKS,
     DIRECT_LIGHT,
     SAMPLES,
@@ -26,7 +26,7 @@ from infra.rendering.methods import (
     traced_network,
     warm_up_denoiser,
 )
-from infra.rendering.raw_references import RawReference, first_camera, true_error_db
+from infra.render.raw_references import RawReference, first_camera, true_error_db
 from infra.timed_views import TimedViews, timed_views
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK

@@ -7,7 +7,7 @@ not depend on whether its reference was cached.
 import numpy as np
 from safetensors.numpy import load, save
 
-from infra.rendering.raw_references import RawReference, raw_reference
+from infra.render.raw_references import RawReference, raw_reference
 from pipeline.isolation import IsolatedChild
 from pipeline.renders.camera import Camera
 from storage.atomic import write_atomically

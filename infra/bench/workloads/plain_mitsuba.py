@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.rendering.methods import warm_up_denoiser
-from infra.rendering.raw_references import first_camera
+from infra.render.methods import warm_up_denoiser
+from infra.render.raw_references import first_camera
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.load_tracer import load_tracer

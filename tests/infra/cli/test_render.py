@@ -13,7 +13,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from infra.rendering.options import RenderOptions
+from infra.render.options import RenderOptions
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.generation import path_tracer
 from storage.conventions import preview_srgb8
@@ -30,7 +30,7 @@ from tests.command_line import trilight
 from tests.crash import CrashingRenderer
 from tests.for_each import case
 from tests.infra.child_here import use_processes
-from tests.infra.rendering.render_kit import SMALL, mistake, render
+from tests.infra.render.render_kit import SMALL, mistake, render
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 pytestmark = pytest.mark.usefixtures("children_here")

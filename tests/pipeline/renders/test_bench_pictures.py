@@ -8,7 +8,7 @@ from infra.bench.workloads.judged_pictures import shrunk
 from infra.bench.workloads.mesh_pictures import picture_db
 from infra.bench.workloads.plain_mitsuba import render_levels
 from infra.bench.workloads.shots import fixed_samples, shots
-from infra.rendering.raw_references import raw_reference
+from infra.render.raw_references import raw_reference
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.renders.load_tracer import load_tracer
 from storage.metrics import psnr_log_db

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from infra.rendering.way_table import (
+from infra.render.way_table import (
     NETWORK_SCENE,
     NETWORK_VIEW,
     KnownCosts,

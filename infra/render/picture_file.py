@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.rendering.cameras import ShotCamera
-from infra.rendering.engines import Fact, Facts, Rendered
+from infra.render.cameras import ShotCamera
+from infra.render.engines import Fact, Facts, Rendered
 from storage.atomic import write_atomically
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError

@@ -6,14 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, pair_cameras
-from infra.rendering.engines import EnginePlan, MitsubaPlan, NeuralPlan
-from infra.rendering.look import Look
-from infra.rendering.options import EngineChoice, RenderOptions
-from infra.rendering.output_paths import OutputPaths, output_paths
-from infra.rendering.sources import scene_sources
-from infra.rendering.way_table import known_costs, shipped_table
-from infra.rendering.ways import Choice, Way, chosen_way, priced_ways
+from infra.render.cameras import ShotCamera, camera_path, orbit, own_camera, pair_cameras
+from infra.render.engines import EnginePlan, MitsubaPlan, NeuralPlan
+from infra.render.look import Look
+from infra.render.options import EngineChoice, RenderOptions
+from infra.render.output_paths import OutputPaths, output_paths
+from infra.render.sources import scene_sources
+from infra.render.way_table import known_costs, shipped_table
+from infra.render.ways import Choice, Way, chosen_way, priced_ways
 from infra.torch_library import require_torch
 from pipeline.exchange.open_scene import SceneSource, scene_source
 from pipeline.exchange.reader import SceneReader

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from infra.bench.workloads.judged_pictures import difference_db
-from infra.rendering.comparison import Frame, flicker
-from infra.rendering.methods import (
+from infra.render.comparison import Frame, flicker
+from infra.render.methods import (
     direct_light_method,
     network_method,
     traced_network,
     untrained_network,
 )
-from infra.rendering.raw_references import RawReference, true_error_db
+from infra.render.raw_references import RawReference, true_error_db
 from infra.timed_views import Show, timed_views
 from infra.tracer_rival import LADDER, Level, Price, TracerRival, chosen_level
 from model.config import hits_smoke

@@ -4,7 +4,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from infra.rendering.video import SUFFIXES, require_encoder
+from infra.render.video import SUFFIXES, require_encoder
 from storage.atomic import write_error
 from storage.errors import TrilightError
 

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from infra.rendering.held_out_scenes import composing_child, held_out_build, held_out_scene
-from infra.rendering.way_table import (
+from infra.render.held_out_scenes import composing_child, held_out_build, held_out_scene
+from infra.render.way_table import (
     NETWORK_SCENE,
     NETWORK_VIEW,
     PartCost,

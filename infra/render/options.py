@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from infra.rendering.look import ToneMap
+from infra.render.look import ToneMap
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.renders.preview import MOST_SPP
 from pipeline.renders.settings import Filtered, NoiseFloor, NoiseTargets, Resolution, Samples

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from infra.rendering import plan
-from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, pair_cameras
-from infra.rendering.engines import MitsubaPlan, NeuralPlan
-from infra.rendering.options import RenderOptions
-from infra.rendering.plan import plan_render
-from infra.rendering.sources import scene_sources
+from infra.render import plan
+from infra.render.cameras import ShotCamera, camera_path, orbit, own_camera, pair_cameras
+from infra.render.engines import MitsubaPlan, NeuralPlan
+from infra.render.options import RenderOptions
+from infra.render.plan import plan_render
+from infra.render.sources import scene_sources
 from pipeline.exchange.open_scene import SceneSource
 from pipeline.exchange.reader import SceneReader
 from pipeline.isolation import Result
@@ -24,7 +24,7 @@ from storage.errors import TrilightError
 from storage.records.sample import encode_sample
 from storage.records.scene_file import encode_scene
 from tests.conftest import ROOT
-from tests.infra.rendering.render_kit import write_network
+from tests.infra.render.render_kit import write_network
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 
@@ -185,8 +185,8 @@ def test_only_the_plan_reads_what_was_asked() -> None:
     """No other file reads an option of the command, so that a picture depends on the plan alone."""
     readers = {
         path.name
-        for path in (ROOT / "infra/rendering").glob("*.py")
-        if re.search(r"\boptions\.\w", path.read_text().replace("rendering.options", ""))
+        for path in (ROOT / "infra/render").glob("*.py")
+        if re.search(r"\boptions\.\w", path.read_text().replace("render.options", ""))
     }
     assert readers == {"plan.py", "run.py"}, "run.py opens the reader of scenes"
     assert "options." not in (ROOT / "infra/cli/rendered.py").read_text()

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infra.rendering.machine_costs import PROBED_PX, PROBES, PartSeconds, costs_of
-from infra.rendering.way_table import (
+from infra.render.machine_costs import PROBED_PX, PROBES, PartSeconds, costs_of
+from infra.render.way_table import (
     MEASURE,
     NETWORK_SCENE,
     NETWORK_VIEW,
@@ -28,7 +28,7 @@ from infra.rendering.way_table import (
     machine_name,
     shipped_table,
 )
-from infra.rendering.ways import (
+from infra.render.ways import (
     Priced,
     Way,
     chosen_way,

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from infra.rendering import look as look_module
-from infra.rendering.cameras import ShotCamera, orbit, own_camera, pair_cameras
-from infra.rendering.comparison import comparison_sheet
-from infra.rendering.engines import Facts, OpenedScene, Rendered
-from infra.rendering.look import Look, enlarge, enlargement, tone_mapped
-from infra.rendering.output_paths import OutputPaths, output_paths
-from infra.rendering.plan import RenderPlan, shots
-from infra.rendering.run import FinishedShot, run_plan
-from infra.rendering.video import write_video
-from infra.rendering.ways import Choice
+from infra.render import look as look_module
+from infra.render.cameras import ShotCamera, orbit, own_camera, pair_cameras
+from infra.render.comparison import comparison_sheet
+from infra.render.engines import Facts, OpenedScene, Rendered
+from infra.render.look import Look, enlarge, enlargement, tone_mapped
+from infra.render.output_paths import OutputPaths, output_paths
+from infra.render.plan import RenderPlan, shots
+from infra.render.run import FinishedShot, run_plan
+from infra.render.video import write_video
+from infra.render.ways import Choice
 from pipeline.exchange.open_scene import SceneSource
 from storage.conventions import preview_srgb8
 from storage.errors import TrilightError
@@ -25,7 +25,7 @@ from storage.records.exr import decode_exr
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
 from tests.for_each import case
-from tests.infra.rendering.test_plan import HereReader
+from tests.infra.render.test_plan import HereReader
 from tests.scenes_by_hand import tiny_scene
 
 

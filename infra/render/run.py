@@ -8,21 +8,21 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from infra.rendering.cameras import own_camera
-from infra.rendering.comparison import Flicker, Frame, comparison_sheet, flicker, log_error
-from infra.rendering.engines import Engine, OpenedScene
-from infra.rendering.look import Look, display_pixels
-from infra.rendering.options import RenderOptions
-from infra.rendering.picture_file import (
+from infra.render.cameras import own_camera
+from infra.render.comparison import Flicker, Frame, comparison_sheet, flicker, log_error
+from infra.render.engines import Engine, OpenedScene
+from infra.render.look import Look, display_pixels
+from infra.render.options import RenderOptions
+from infra.render.picture_file import (
     PictureFile,
     PictureKey,
     Radiance,
     load_matching_picture,
     write_picture,
 )
-from infra.rendering.plan import RenderPlan, Shot, plan_render
-from infra.rendering.video import write_video
-from infra.rendering.ways import Choice
+from infra.render.plan import RenderPlan, Shot, plan_render
+from infra.render.video import write_video
+from infra.render.ways import Choice
 from pipeline.documents.png import encode_png
 from pipeline.exchange.reader import SceneReader
 from storage.atomic import write_atomically

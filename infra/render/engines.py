@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.rendering.cameras import ShotCamera
+from infra.render.cameras import ShotCamera
 from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.settings import FIRST_SPP, RenderSettings
 from pipeline.renders.variant import Variant

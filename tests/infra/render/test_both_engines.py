@@ -20,7 +20,7 @@ from storage.records.exr import decode_exr
 from storage.records.sample import encode_sample
 from storage.records.scene_file import encode_scene, scene_digest
 from tests.command_line import trilight
-from tests.infra.rendering.render_kit import SMALL, mistake, render, write_network
+from tests.infra.render.render_kit import SMALL, mistake, render, write_network
 from tests.model.test_neural_renderer import many_lights
 from tests.pipeline.exchange.strangers_stage import write_stage
 from tests.scenes_by_hand import tiny_sample, tiny_scene
