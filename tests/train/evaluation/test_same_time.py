@@ -1,0 +1,137 @@
+"""The path tracer in a network's own time: which samples are chosen, and which views are traced."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from storage.errors import TrilightError, Unrenderable
+from storage.records.scene import Scene
+from storage.renderer import Camera, Image, OnProgress, ignore_progress
+from tests.for_each import case
+from tests.train.toy import toy_sample
+from train.evaluation.same_time import Level, TracedViews, chosen_level, time_both
+from train.evaluation.timing import Price, time_scene
+
+LADDER = tuple(1 << step for step in range(13))
+
+
+def prices(*, sample_s: float, fast_s: float, high_s: float, most: int) -> Mapping[Level, Price]:
+    found: dict[Level, Price] = {}
+    for spp in LADDER[:most]:
+        found[spp, "fast"] = Price(first_s=1.0, further_s=spp * sample_s + fast_s)
+        found[spp, "high"] = Price(first_s=1.0, further_s=spp * sample_s + high_s)
+    return found
+
+
+@given(st.floats(0, 100))
+def test_the_most_samples_that_fit_and_then_the_better_filter(most_s: float) -> None:
+    one = prices(sample_s=1.0, fast_s=0.5, high_s=3.0, most=6)
+    spp, denoiser = chosen_level([one], most_s)
+    chosen_s = one[spp, denoiser].further_s
+    if most_s < 1.5:  # not even one sample with the fast filter fits
+        assert (spp, denoiser) == (1, "fast")
+        return
+    assert chosen_s <= most_s
+    for (other_spp, other), price in one.items():
+        if price.further_s <= most_s:
+            assert (other_spp, other == "high") <= (spp, denoiser == "high")
+
+
+def test_scenes_vote_by_their_median_and_what_was_not_tried_takes_longer() -> None:
+    cheap = prices(sample_s=1.0, fast_s=0.0, high_s=0.5, most=5)
+    dear = prices(sample_s=10.0, fast_s=0.0, high_s=0.5, most=3)
+    assert chosen_level([cheap, cheap, dear], 8.2) == (8, "fast"), "one is outvoted"
+    assert chosen_level([cheap, dear, dear], 12.0) == (1, "high")
+    assert chosen_level([cheap, dear], 16.0) == (2, "high"), "of two, both have to be asked"
+    assert chosen_level([dear], 1.0) == (1, "fast")
+
+
+JUDGED = [(64, 10, 10 * 2), (10, 10, 10), (4, 10, 4), (1, 10, 1)]
+
+
+def test_it_is_judged_on_no_more_views_than_asked_from_all_over_the_split() -> None:
+    for most, scenes, judged in JUDGED:
+        with case(most):
+            chosen = TracedViews(most_views=most, num_scenes=scenes)
+            numbers = [
+                number for number in range(scenes) for view in range(2) if chosen.has(number, view)
+            ]
+            assert len(numbers) == judged <= most
+            assert max(numbers) >= scenes // 2 or most == 1
+            views = "all views" if most == 64 else "the first view"
+            assert chosen.text(2).startswith(f"{views} of ")
+            assert ("each scene" in chosen.text(2)) == (most >= scenes)
+
+
+class Clocked:
+    """Renderer that says what it takes: the first round is slow, and every price is by samples."""
+
+    name = "clocked"
+    resolution = 16
+    identity: Mapping[str, str] = {}
+    notes: Sequence[str] = ()
+    seconds = 0.0
+
+    def __init__(self, further_s: float, *, dark: str = "", lacking: str = "") -> None:
+        self.further_s = further_s
+        self.cpu_seconds: float | None = 100.0
+        self.loads = 0
+        self._dark = dark
+        self._lacking = lacking
+
+    def load(self, scene: Scene, name: str) -> "Clocked":
+        if self._lacking:
+            raise TrilightError(self._lacking)
+        if name == self._dark:
+            raise Unrenderable(f"{name}: nothing shines")
+        self.loads += 1
+        self.cpu_seconds = 100.0 if self.loads == 1 else 3.0
+        return self
+
+    def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Image:
+        return Image(radiance_rgb=np.zeros((16, 16, 3), np.float32), cpu_seconds=self.further_s)
+
+    def close(self) -> None:
+        pass
+
+
+def test_the_first_view_pays_for_loading_and_the_round_that_warms_up_counts_not() -> None:
+    renderer = Clocked(1.0)
+    _, price = time_scene(renderer, toy_sample(0).scene, "scene")
+    assert (renderer.loads, price) == (2, Price(first_s=4.0, further_s=1.0))
+
+
+def test_samples_double_until_they_take_longer_than_the_network() -> None:
+    previews = {
+        (spp, denoiser): Clocked(spp * (1.0 if denoiser == "fast" else 1.4), dark="000000001")
+        for spp in LADDER
+        for denoiser in ("fast", "high")
+    }
+    samples = [toy_sample(0), dataclasses.replace(toy_sample(1), key="000000001")]
+    times = time_both(Clocked(6.0), previews, samples, note="slow")
+    assert times.preview is not None and times.scenes == 2 and times.missing == ""
+    assert (times.preview.samples, times.preview.denoiser) == (4, "high")
+    assert (times.preview.further_s, times.preview.note) == (5.6, "slow")
+    tried = [level for level, preview in previews.items() if preview.loads]
+    assert tried == [(s, d) for s in (1, 2, 4, 8) for d in ("fast", "high")]
+
+
+def test_without_a_path_tracer_it_says_so_and_the_network_is_timed_all_the_same() -> None:
+    network, sample = Clocked(6.0), toy_sample(0)
+    broken = {(1, "fast"): Clocked(1.0, lacking="no tracer here.")}
+    dark = {(1, "fast"): Clocked(1.0, dark=sample.key)}
+    for previews, missing, said in (
+        (broken, "", "no tracer here"),
+        (dark, "", "the scenes that were timed cannot be traced"),
+        ({}, "no views of it were requested", "no views of it were requested"),
+    ):
+        with case(said):
+            times = time_both(network, previews, [sample], missing=missing)
+            assert times.preview is None and times.missing == said
+            assert times.network_further_s == 6.0 and times.scenes == 1
+    with pytest.raises(TrilightError, match="resolution is 20"):
+        time_both(Clocked(1.0, lacking="resolution is 20"), {}, [sample])
