@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from storage.records.scene import Scene
+from storage.renderer import Camera, Renderer
+
 REPEATS = 3
 """Number of measured repetitions after the warm-up; the result is their median."""
 
@@ -36,6 +39,32 @@ def timed_views(load: Callable[[], Show], repeats: int = REPEATS) -> TimedViews:
         radiance_rgb=repetitions[-1].radiance_rgb,
         first_s=_median([one.first_s for one in repetitions]),
         further_s=_median([one.further_s for one in repetitions]),
+    )
+
+
+def time_views(renderer: Renderer, scene: Scene, repeats: int = REPEATS) -> TimedViews:
+    """Load a scene and render its first camera twice, once to warm up and then `repeats` times.
+
+    CPU seconds are those that the renderer reports, of whatever process it renders in.
+    """
+    repetitions = [_render_twice(renderer, scene) for _ in range(1 + repeats)][1:]
+    return TimedViews(
+        radiance_rgb=repetitions[-1].radiance_rgb,
+        first_s=_median([one.first_s for one in repetitions]),
+        further_s=_median([one.further_s for one in repetitions]),
+    )
+
+
+def _render_twice(renderer: Renderer, scene: Scene) -> TimedViews:
+    camera = Camera.of_scene(scene, 0)
+    loaded = renderer.load(scene, "scene")
+    first = loaded.render(camera)
+    further = loaded.render(camera)
+    first_s = (loaded.cpu_seconds or 0.0) + (first.cpu_seconds or 0.0)
+    return TimedViews(
+        radiance_rgb=further.radiance_rgb,
+        first_s=first_s,
+        further_s=further.cpu_seconds or 0.0,
     )
 
 

@@ -83,12 +83,17 @@ def ignore_progress(_: Sampling | Image) -> None:
 class LoadedScene(Protocol):
     """Scene in a renderer, ready for any number of cameras."""
 
-    notes: Sequence[str]
-    """What the renderer cannot show of the scene, one sentence each."""
-    seconds: float
-    """Wall-clock seconds of loading, without the start of a process."""
-    cpu_seconds: float | None
-    """CPU seconds of loading, where they were spent; None where they are unknown."""
+    @property
+    def notes(self) -> Sequence[str]:
+        """What the renderer cannot show of the scene, one sentence each."""
+
+    @property
+    def seconds(self) -> float:
+        """Wall-clock seconds of loading, without the start of a process."""
+
+    @property
+    def cpu_seconds(self) -> float | None:
+        """CPU seconds of loading, where they were spent; None where they are unknown."""
 
     def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Image:
         """Return the picture of a camera.
@@ -102,10 +107,17 @@ class LoadedScene(Protocol):
 class Renderer(Protocol):
     """What makes pictures of one width; it starts processes and reads weights when first needed."""
 
-    name: str
-    """Name in rows, files and messages."""
-    resolution: int
-    """Width and height of its pictures in pixels."""
+    @property
+    def name(self) -> str:
+        """Name in rows, files and messages."""
+
+    @property
+    def resolution(self) -> int:
+        """Width and height of its pictures in pixels."""
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """What all of its pictures lack, one sentence each."""
 
     @property
     def identity(self) -> Mapping[str, Any]:

@@ -49,7 +49,7 @@ def doctor(options: DoctorOptions, output: OutputOptions) -> None:
 def _measure_previews(*, silent: bool) -> "Finding":
     from infra.doctor import Finding
     from infra.render.machine_costs import measure_costs
-    from infra.render.way_table import keep_machine_costs, shipped_table
+    from infra.render.preview_table import keep_machine_costs, shipped_table
 
     with console.status("measuring previews"):
         path = keep_machine_costs(measure_costs(shipped_table()))

@@ -9,10 +9,10 @@ from rich.text import Text
 from infra.cli.console import progress_bars
 from infra.cli.options import OutputOptions, command
 from infra.render.options import RenderOptions
+from storage.renderer import Image, Sampling
 
 if TYPE_CHECKING:
-    from infra.render.ways import Choice
-    from storage.renderer import Sampling
+    from infra.render.budget import Choice
 
 
 @command("source")
@@ -42,7 +42,9 @@ class _Bars:
     def on_picture(self, done: int, total: int) -> None:
         self._bars.update(self._pictures, completed=done, total=total, visible=self._visible)
 
-    def on_samples(self, now: "Sampling") -> None:
+    def on_samples(self, now: Sampling | Image) -> None:
+        if isinstance(now, Image):
+            return
         note = "" if now.missing_db is None else f"{now.missing_db:.1f} dB to go"
         self._bars.update(
             self._samples,

@@ -1,7 +1,6 @@
 """Cameras of pictures: one of the scene's cameras, an orbit around the scene, or a camera path."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,21 +9,12 @@ from pipeline.exchange.open_scene import SceneSource, scene_source
 from pipeline.exchange.reader import SceneReader
 from storage.errors import TrilightError
 from storage.records.scene import Scene
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ShotCamera:
-    """Pose and field of view of one picture."""
-
-    c2w: NDArray[np.float32]
-    """[4, 4] camera to world."""
-    fov_deg: float
-    """Full field of view in degrees."""
+from storage.renderer import Camera
 
 
 def pair_cameras(
-    sources: Sequence[SceneSource], cameras: Sequence[ShotCamera | int]
-) -> list[tuple[SceneSource, ShotCamera | int]]:
+    sources: Sequence[SceneSource], cameras: Sequence[Camera | int]
+) -> list[tuple[SceneSource, Camera | int]]:
     """Return scene and camera of each picture, in order.
 
     One scene is combined with all cameras, and one camera with all scenes; equally many scenes and
@@ -42,17 +32,17 @@ def pair_cameras(
     return [(sources[at % len(sources)], cameras[at % len(cameras)]) for at in range(count)]
 
 
-def own_camera(scene: Scene, view: int, named: str = "--view") -> ShotCamera:
+def own_camera(scene: Scene, view: int, named: str = "--view") -> Camera:
     """Return a camera of a scene; raises TrilightError, with `named`, if there is no such view."""
     if not 0 <= view < scene.num_views:
         raise TrilightError(
             f"{named} is {view}; expected 0 to {scene.num_views - 1}: the scene has "
             f"{scene.num_views} cameras."
         )
-    return ShotCamera(c2w=scene.c2w[view], fov_deg=float(scene.fov_deg[view]))
+    return Camera.of_scene(scene, view)
 
 
-def orbit(scene: Scene, start: ShotCamera, count: int, arc_deg: float) -> list[ShotCamera]:
+def orbit(scene: Scene, start: Camera, count: int, arc_deg: float) -> list[Camera]:
     """Return `count` cameras on a horizontal circle around the point that `start` looks at.
 
     The circle's center is the point of the camera's axis nearest to the center of all surfaces that
@@ -73,7 +63,7 @@ def orbit(scene: Scene, start: ShotCamera, count: int, arc_deg: float) -> list[S
     return [_orbit_camera(start, target, float(np.radians(angle_deg))) for angle_deg in angles_deg]
 
 
-def camera_path(text: str, reader: SceneReader, view: int) -> list[ShotCamera]:
+def camera_path(text: str, reader: SceneReader, view: int) -> list[Camera]:
     """Return the cameras of a file: all of one scene, or one of each frame of an animated stage.
 
     Args:
@@ -90,11 +80,11 @@ def camera_path(text: str, reader: SceneReader, view: int) -> list[ShotCamera]:
         return [own_camera(reader.load(frame).scene, view) for frame in frames]
     c2w, fov_deg = reader.cameras(frames[0])
     return [
-        ShotCamera(c2w=pose, fov_deg=float(angle)) for pose, angle in zip(c2w, fov_deg, strict=True)
+        Camera(c2w=pose, fov_deg=float(angle)) for pose, angle in zip(c2w, fov_deg, strict=True)
     ]
 
 
-def _orbit_camera(start: ShotCamera, target: NDArray[np.float64], angle_rad: float) -> ShotCamera:
+def _orbit_camera(start: Camera, target: NDArray[np.float64], angle_rad: float) -> Camera:
     """Return a camera rotated about the vertical axis through `target`, by radians."""
     cos = np.cos(angle_rad)
     sin = np.sin(angle_rad)
@@ -102,4 +92,4 @@ def _orbit_camera(start: ShotCamera, target: NDArray[np.float64], angle_rad: flo
     pose = start.c2w.astype(np.float64)
     pose[:3, :3] = np.einsum("ij,jk->ik", rotation, pose[:3, :3])
     pose[:3, 3] = np.einsum("ij,j->i", rotation, pose[:3, 3] - target) + target
-    return ShotCamera(c2w=pose.astype(np.float32), fov_deg=start.fov_deg)
+    return Camera(c2w=pose.astype(np.float32), fov_deg=start.fov_deg)

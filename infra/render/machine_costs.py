@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from infra.render.held_out_scenes import composing_child, held_out_build, held_out_scene
-from infra.render.way_table import (
+from infra.render.preview_table import (
     NETWORK_SCENE,
     NETWORK_VIEW,
     PartCost,
     PictureCosts,
-    WayTable,
+    PreviewTable,
     machine_name,
 )
 from pipeline.objects.generated import BENCHMARK
@@ -41,7 +41,7 @@ PartSeconds = dict[tuple[int, int], Mapping[str, float]]
 """Seconds of each part by (width, threads)."""
 
 
-def measure_costs(table: WayTable) -> PictureCosts:
+def measure_costs(table: PreviewTable) -> PictureCosts:
     """Return the costs of the parts here; takes less than a minute on an idle machine."""
     cores = os.cpu_count() or 1
     variant = choose_variant("auto")
@@ -57,7 +57,7 @@ def measure_costs(table: WayTable) -> PictureCosts:
     return costs_of(table, mean, cores, machine_name(variant))
 
 
-def costs_of(table: WayTable, timed: PartSeconds, cores: int, machine: str) -> PictureCosts:
+def costs_of(table: PreviewTable, timed: PartSeconds, cores: int, machine: str) -> PictureCosts:
     """Return the shipped costs times the ratio of this machine's time to the table's.
 
     Args:

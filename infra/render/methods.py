@@ -1,24 +1,24 @@
-"""Methods that render a picture: networks, traced light without a network, the path tracer.
+"""Renderers that are compared: networks, traced light without a network, the path tracer."""
 
-A method loads a scene and then renders any camera. The benchmark and the leaderboard compare them.
-"""
-
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from infra.render.networks import DirectLight, NetworkRenderer, traced_network
+from infra.render.path_tracer import PathTracer, RenderChild
+from infra.render.quality import FixedSamples
 from pipeline.renders.denoiser import Quality, denoise
 from pipeline.renders.preview import PreviewRenderer, PreviewSettings
 from pipeline.renders.renderer import run_to_end
 from pipeline.renders.settings import Filtered
 from pipeline.renders.tracer import Features
 from storage.records.scene import Scene
+from storage.renderer import Camera, Renderer
 
 if TYPE_CHECKING:
-    from model.config import ModelConfig
     from model.neural_renderer import NeuralRenderer
 
 View = Callable[[NDArray[np.float32], float], NDArray[np.float32]]
@@ -27,7 +27,7 @@ View = Callable[[NDArray[np.float32], float], NDArray[np.float32]]
 Method = Callable[[Scene], View]
 """Function that loads a scene and returns its `View`; all pictures have one width."""
 
-DIRECT_LIGHT = "direct light, no network"
+DIRECT_LIGHT = DirectLight.name
 TRACED_LIGHT = "all traced light, no network"
 BUILTIN_NETWORKS = ("builtin:", "builtin:tokens")
 """Networks of every comparison: the hybrid one (more accurate), and the pure one."""
@@ -108,67 +108,45 @@ def network_method(renderer: "NeuralRenderer", resolution: int) -> Method:
 
 
 def direct_light_method(resolution: int) -> Method:
-    """Return the method that renders the direct light of lamps, as the view stage `hits` does.
-
-    Nothing is gathered or mirrored and no network runs. Light is sampled by points on the lamps
-    only, so that sharp reflections of lamps in smooth surfaces are noisy.
-    """
-    from model.config import hits_smoke
-    from model.hits.lit_scene import LitScene
-    from model.hits.radiosity import SceneLight
-    from model.hits.view_inputs import Channel, view_inputs
-    from storage.records.material import PUBLISHED_COLUMNS, chosen_columns
+    """Return the method that renders the direct light of lamps."""
 
     def load(scene: Scene) -> View:
-        rows = chosen_columns(scene.materials, PUBLISHED_COLUMNS)[scene.material_index]
-        corners, normals = (
-            part[scene.faces] for part in (scene.vertex_positions, scene.vertex_normals)
-        )
-        lit = LitScene(corners, normals, rows)
-        dark = np.zeros((2, lit.num_triangles, 3), np.float32)
-        light = SceneLight(direct_2T3=dark, indirect_2T3=dark, mean_3=np.ones(3, np.float32))
-
-        def view(c2w: NDArray[np.float32], fov_deg: float) -> NDArray[np.float32]:
-            inputs = view_inputs(
-                lit, light, c2w, fov_deg, resolution,
-                rays_a_side=hits_smoke().hit_rays, anchors_a_side=1, gather_rays=0,
-            )  # fmt: skip
-            of_lamps = inputs.pixels[..., Channel.SHOWN_DIFFUSE]
-            return of_lamps + inputs.pixels[..., Channel.DIRECT_SPECULAR]
-
-        return view
+        loaded = DirectLight(resolution=resolution).load(scene, "scene")
+        return lambda c2w, fov_deg: loaded.view(Camera(c2w=c2w, fov_deg=fov_deg))
 
     return load
 
 
-def traced_network() -> "NeuralRenderer":
-    """Return an untrained network that renders the traced light of the view stage `hits`.
+def compared_renderers(
+    resolution: int,
+    networks: "Mapping[str, NeuralRenderer]",
+    child: RenderChild,
+    levels: Sequence[tuple[int, Filtered]] = SAMPLES,
+) -> list[Renderer]:
+    """Return the renderers of a comparison at a width, named as their rows.
 
-    Every gain is 1, nothing is added or filtered, and gathered light is weighted by the distance of
-    anchors. Layers have the least possible size, so that only the tracing takes time.
+    Networks and traced light run on one thread of this process. Samples have the same seed in every
+    view, as those of `trilight render --orbit`.
+
+    Args:
+        resolution: width in pixels.
+        networks: networks by the names of their rows.
+        child: render child, which the previews share.
+        levels: samples per pixel and filters of the previews.
     """
-    import dataclasses
-
-    from model.config import VERTEX_COORDINATES, hits_smoke
-
-    smallest = dataclasses.replace(
-        hits_smoke(), width=2 * VERTEX_COORDINATES, num_heads=1, rope_num_freqs=1,
-        encoder_layers=1, decoder_layers=1, hidden_width=1, num_registers=0, pixel_width=1,
-        filter_width=0, scene_tokens=False,
-    )  # fmt: skip
-    return untrained_network(smallest)
-
-
-def untrained_network(config: "ModelConfig") -> "NeuralRenderer":
-    """Return a hybrid network of any size that renders only the traced light."""
-    import torch
-
-    from model.neural_renderer import NeuralRenderer
-    from model.renderformer import RenderFormer
-
-    model = RenderFormer(config)
-    model.initialize(torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        model.decoder.head.query.weight.zero_()
-        model.decoder.head.last.bias[-6:] = -30.0  # softplus of this is 0: nothing is added
-    return NeuralRenderer(model)
+    compared: list[Renderer] = [DirectLight(resolution=resolution)]
+    for name, network in {**networks, TRACED_LIGHT: traced_network()}.items():
+        compared.append(
+            NetworkRenderer(
+                name=name,
+                checkpoint=name,
+                resolution=resolution,
+                threads=1,
+                opened=network,
+            )
+        )
+    for level in levels:
+        quality = FixedSamples(spp=level[0], denoiser=level[1])
+        name = samples_name(level)
+        compared.append(PathTracer(child, quality, resolution, seed=SAMPLE_SEED, name=name))
+    return compared

@@ -4,8 +4,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from infra.render.look import ToneMap
+from infra.render.quality import MOST_SPP as MOST_TRACED_SPP
+from infra.render.quality import ErrorBudget, FixedSamples, Quality, TimeBudget, ToStatedError
 from pipeline.exchange.from_description import AlbedoOverOne
-from pipeline.renders.preview import MOST_SPP
+from pipeline.renders.preview import MOST_SPP, usual_filter
 from pipeline.renders.settings import Filtered, NoiseFloor, NoiseTargets, Resolution, Samples
 from storage.errors import TrilightError
 from storage.metrics import MAX_DB
@@ -40,7 +42,7 @@ class RenderOptions:
     noise_floor_objects_db: NoiseFloor | None = None
     """mitsuba: stop at this noise floor as object_psnr_log_db (without background); by default
     none."""
-    max_spp: Samples = 4096
+    max_spp: Samples = MOST_TRACED_SPP
     """mitsuba: maximum number of samples per pixel."""
     spp: Annotated[int | None, Within(1, MOST_SPP, unit="samples")] = None
     """mitsuba: samples per pixel of a preview with one denoise; by default sampling goes on to the
@@ -97,12 +99,23 @@ class RenderOptions:
             )
 
     @property
-    def noise_targets(self) -> NoiseTargets:
-        """The target errors."""
-        return NoiseTargets(
-            log_db=self.noise_floor_db,
-            linear_db=self.noise_floor_linear_db,
-            objects_db=self.noise_floor_objects_db,
+    def quality(self) -> Quality:
+        """Quality of traced pictures, or the budget that chooses it."""
+        if self.seconds is not None:
+            return TimeBudget(seconds=self.seconds)
+        if self.error_db is not None:
+            return ErrorBudget(error_db=self.error_db)
+        if self.spp is not None:
+            return FixedSamples(spp=self.spp, denoiser=self.denoiser or usual_filter(self.spp))
+        return ToStatedError(
+            targets=NoiseTargets(
+                log_db=self.noise_floor_db,
+                linear_db=self.noise_floor_linear_db,
+                objects_db=self.noise_floor_objects_db,
+            ),
+            max_spp=self.max_spp,
+            split=self.split,
+            split_lobes=self.split_lobes,
         )
 
     def _require_one_kind(self) -> None:

@@ -1,50 +1,36 @@
 """One call of `trilight render`: renders every picture of a plan, or keeps an equal one."""
 
-import dataclasses
 import itertools
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
+from infra.render.budget import Choice
 from infra.render.cameras import own_camera
 from infra.render.comparison import Flicker, Frame, comparison_sheet, flicker, log_error
-from infra.render.engines import Engine, OpenedScene
 from infra.render.look import Look, display_pixels
 from infra.render.options import RenderOptions
 from infra.render.picture_file import (
     PictureFile,
-    PictureKey,
     Radiance,
+    header_of,
     load_matching_picture,
     write_picture,
 )
 from infra.render.plan import RenderPlan, Shot, plan_render
 from infra.render.video import write_video
-from infra.render.ways import Choice
 from pipeline.documents.png import encode_png
+from pipeline.exchange.formats import SceneSource
 from pipeline.exchange.reader import SceneReader
+from pipeline.renders.settings import FIRST_SPP
 from storage.atomic import write_atomically
 from storage.metrics import psnr_log_db
 from storage.records.lights import num_lights
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
-
-if TYPE_CHECKING:
-    from storage.renderer import Sampling
-
-
-@dataclass(frozen=True, kw_only=True)
-class SceneIdentity:
-    """Digest and size of a scene."""
-
-    digest: str
-    """SHA-256 of the scene by storage.records.scene_file.scene_digest."""
-    num_triangles: int
-    """Number of triangles, emitting ones included."""
-    num_lights: int
-    """Number of emitter objects, not of their triangles."""
+from storage.renderer import Facts, Image, LoadedScene, OnProgress, Renderer, Sampling
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,13 +38,18 @@ class FinishedShot:
     """Result of one shot."""
 
     shot: Shot
-    scene: SceneIdentity
+    scene_sha256: str
+    """SHA-256 of the scene by storage.records.scene_file.scene_digest."""
+    num_triangles: int
+    """Number of triangles of the scene, emitting ones included."""
+    num_lights: int
+    """Number of emitter objects of the scene, not of their triangles."""
     pictures: Mapping[str, PictureFile]
-    """Files by the name of their engine."""
+    """Files by the name of their renderer."""
     psnr_log_db: float | None
     """PSNR of the network's picture against the traced one; None without both."""
     flicker: Flicker | None
-    """Flicker since the preceding picture of the scene or stage; None without both engines."""
+    """Flicker since the preceding picture of the scene or stage; None without both renderers."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,12 +67,12 @@ class RenderProgress(Protocol):
     """Callbacks on the progress of a render."""
 
     def on_choice(self, choice: Choice) -> None:
-        """Report the quality preset that --seconds or --error chose."""
+        """Report what --seconds or --error chose."""
 
     def on_picture(self, done: int, total: int) -> None:
         """Report the number of finished pictures and of all."""
 
-    def on_samples(self, now: "Sampling") -> None:
+    def on_samples(self, now: Sampling | Image) -> None:
         """Report a finished pass of the path tracer."""
 
 
@@ -100,97 +91,73 @@ def run_plan(plan: RenderPlan, reader: SceneReader, watcher: RenderProgress) -> 
     """
     finished = list[FinishedShot]()
     notes = dict[str, None]()
-    choice = plan.choice
-    if choice is not None:
-        watcher.on_choice(choice)
+    if plan.choice is not None:
+        watcher.on_choice(plan.choice)
     before: Frame | None = None
     with ExitStack() as stack:
-        engines = {
-            each.name: stack.enter_context(closing(each.start(watcher.on_samples)))
-            for each in plan.engines
-        }
+        for renderer in plan.renderers:
+            stack.enter_context(closing(renderer))
         watcher.on_picture(0, len(plan.shots))
-        for scene, shot in _with_scenes(plan.shots, reader):
-            made = {
-                name: _picture(shot, name, engine, scene, choice)
-                for name, engine in engines.items()
-            }
-            done, before = _finish(shot, scene.identity, made, plan.look, before)
-            finished.append(done)
-            notes |= dict.fromkeys(scene.notes)
-            watcher.on_picture(len(finished), len(plan.shots))
+        for source, shots in itertools.groupby(plan.shots, key=lambda shot: shot.source):
+            found = reader.load(source)
+            scene = _SceneAtHand(source, found.scene, plan.choice, watcher.on_samples)
+            for shot in shots:
+                made = {each.name: scene.picture(shot, each) for each in plan.renderers}
+                done, before = _finish(shot, scene, made, plan.look, before)
+                finished.append(done)
+                watcher.on_picture(len(finished), len(plan.shots))
+            notes |= dict.fromkeys([*found.notes, *scene.notes])
     if plan.output.video is not None:
         write_video(plan.output.video, [done.shot.png for done in finished], plan.fps)
-    return RenderResult(plan=plan, shots=finished, notes=[*notes, *_caveats(plan, finished)])
+    for renderer in plan.renderers:
+        notes |= dict.fromkeys(_caveats(renderer, finished))
+    return RenderResult(plan=plan, shots=finished, notes=list(notes))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _SceneAtHand:
-    """Scene of the current shots."""
+    """Scene of consecutive shots; a renderer loads it for the first picture that is not kept."""
 
-    scene: Scene
-    identity: SceneIdentity
-    notes: list[str]
-    """Warnings about its file, and then those of each engine that opened it."""
-    opened: dict[str, OpenedScene]
-    """Opened scene by the name of its engine, from the first picture on that is not kept."""
+    def __init__(
+        self, source: SceneSource, scene: Scene, choice: Choice | None, on_progress: OnProgress
+    ) -> None:
+        self.scene = scene
+        self.sha256 = scene_digest(scene)
+        self.notes: list[str] = []
+        self._source = source
+        self._facts: Facts = {} if choice is None else choice.facts
+        self._on_progress = on_progress
+        self._loaded: dict[str, LoadedScene] = {}
 
-
-def _with_scenes(shots: Sequence[Shot], reader: SceneReader) -> Iterator[tuple[_SceneAtHand, Shot]]:
-    """Yield shots with their scenes; a scene is read once for consecutive shots."""
-    for source, same_scene in itertools.groupby(shots, key=lambda shot: shot.source):
-        loaded = reader.load(source)
-        identity = SceneIdentity(
-            digest=scene_digest(loaded.scene),
-            num_triangles=loaded.scene.num_triangles,
-            num_lights=num_lights(loaded.scene),
-        )
-        at_hand = _SceneAtHand(
-            scene=loaded.scene, identity=identity, notes=list(loaded.notes), opened={}
-        )
-        for shot in same_scene:
-            yield at_hand, shot
-
-
-def _picture(
-    shot: Shot, name: str, engine: Engine, at_hand: _SceneAtHand, choice: Choice | None
-) -> tuple[PictureFile, Radiance]:
-    """Return the picture of one engine, from an equal file or rendered."""
-    view = shot.camera if isinstance(shot.camera, int) else None
-    camera = own_camera(at_hand.scene, shot.camera) if isinstance(shot.camera, int) else shot.camera
-    key = PictureKey(
-        engine=name,
-        identity=engine.identity,
-        source=shot.source.name,
-        scene_sha256=at_hand.identity.digest,
-        camera=camera,
-        view=view,
-    )
-    existing = load_matching_picture(shot.exrs[name], key) if shot.keep else None
-    if existing is not None:
-        return existing
-    seconds = 0.0
-    if name not in at_hand.opened:
-        at_hand.opened[name] = engine.open(at_hand.scene, shot.source.name)
-        at_hand.notes.extend(at_hand.opened[name].notes)
-        seconds = at_hand.opened[name].seconds
-    began = time.perf_counter()
-    rendered = at_hand.opened[name].render(camera, shot.name)
-    seconds += time.perf_counter() - began
-    if choice is not None:
-        rendered = dataclasses.replace(rendered, facts={**rendered.facts, **choice.facts})
-    written, radiance_rgb = write_picture(shot.exrs[name], key, rendered)
-    return dataclasses.replace(written, seconds=seconds), radiance_rgb
+    def picture(self, shot: Shot, renderer: Renderer) -> tuple[PictureFile, Radiance]:
+        """Return the picture of one renderer, from an equal file or rendered."""
+        camera = shot.camera
+        if isinstance(camera, int):
+            camera = own_camera(self.scene, camera)
+        path = shot.exrs[renderer.name]
+        header = header_of(renderer, self._source.name, self.sha256, camera)
+        existing = load_matching_picture(path, header) if shot.keep else None
+        if existing is not None:
+            return existing
+        seconds = 0.0
+        loaded = self._loaded.get(renderer.name)
+        if loaded is None:
+            loaded = self._loaded[renderer.name] = renderer.load(self.scene, self._source.name)
+            self.notes += [f"{self._source.name}: {note}" for note in loaded.notes]
+            seconds = loaded.seconds
+        began = time.perf_counter()
+        image = loaded.render(camera, self._on_progress)
+        seconds += time.perf_counter() - began
+        return write_picture(path, header, image, {**image.facts, **self._facts}, seconds)
 
 
 def _finish(
     shot: Shot,
-    scene: SceneIdentity,
+    scene: _SceneAtHand,
     made: Mapping[str, tuple[PictureFile, Radiance]],
     look: Look,
     before: Frame | None,
 ) -> tuple[FinishedShot, Frame | None]:
-    """Write the PNG; return the finished shot, and the frame if there are both engines."""
+    """Write the PNG; return the finished shot, and the frame if there are both renderers."""
     files = {name: file for name, (file, _) in made.items()}
     radiances = {name: radiance_rgb for name, (_, radiance_rgb) in made.items()}
     now = None
@@ -211,7 +178,9 @@ def _finish(
     write_atomically(shot.png, encode_png(pixels))
     finished = FinishedShot(
         shot=shot,
-        scene=scene,
+        scene_sha256=scene.sha256,
+        num_triangles=scene.scene.num_triangles,
+        num_lights=num_lights(scene.scene),
         pictures=files,
         psnr_log_db=agreement,
         flicker=flicker(before, now) if now else None,
@@ -219,17 +188,23 @@ def _finish(
     return finished, now
 
 
-def _caveats(plan: RenderPlan, finished: Sequence[FinishedShot]) -> list[str]:
-    """Return warnings about all pictures together."""
+def _caveats(renderer: Renderer, finished: Sequence[FinishedShot]) -> list[str]:
+    """Return warnings about all pictures of a renderer together."""
+    pictures = [shot.pictures[renderer.name] for shot in finished]
+    every = [picture.facts for picture in pictures]
     notes = []
-    for engine in plan.engines:
-        pictures = [shot.pictures[engine.name] for shot in finished]
-        black = sum(picture.is_black for picture in pictures)
-        if black:
-            which = "the picture is" if len(pictures) == 1 else f"{black} pictures are"
-            notes.append(f"{engine.name}: {which} black: the camera sees nothing that is lit")
-        if any(int(picture.facts.get("clipped_pixels", 0)) for picture in pictures):
-            notes.append(f"{engine.name}: pixels beyond what half floats hold were clipped")
-    for engine in plan.engines:
-        notes += engine.caveats([shot.pictures[engine.name].facts for shot in finished])
-    return notes
+    black = sum(picture.is_black for picture in pictures)
+    if black:
+        which = "the picture is" if len(pictures) == 1 else f"{black} pictures are"
+        notes.append(f"{renderer.name}: {which} black: the camera sees nothing that is lit")
+    if any(int(facts.get("clipped_pixels", 0)) for facts in every):
+        notes.append(f"{renderer.name}: pixels beyond what half floats hold were clipped")
+    sampled = [facts for facts in every if "spp" in facts]
+    if any("noise_floor_db" not in facts for facts in sampled):
+        notes.append(
+            "the error of a preview is not measured, so that its noise floor is unknown: "
+            "--noise-floor 40 measures it and samples on to it"
+        )
+    elif any(int(facts["spp"]) < FIRST_SPP for facts in sampled):
+        notes.append(f"below {FIRST_SPP} samples the measured noise floor may flatter")
+    return [*notes, *renderer.notes]

@@ -92,11 +92,6 @@ class SceneRenderer:
         """What traces all light of the scene."""
         return self._tracer
 
-    @property
-    def used_core_s(self) -> float:
-        """Core-seconds of this process since the view at hand began, without its looks."""
-        return self._used.core_s()
-
     def render_view(self, c2w: ArrayLike, fov_deg: float, seed: int) -> RenderedView:
         """Return the picture of one camera; equal arguments give equal bits.
 
@@ -144,6 +139,7 @@ class SceneRenderer:
             noise_floor_linear_db=floor.linear_db,
             object_noise_floor_db=floor.object_log_db,
             at_cap=bool(gaps_db(settings.targets_db, _by_metric(floor))),
+            core_s=self._used.core_s(),
             hits=pictures.hits,
             part_floors=look.part_floors or None,
             **stored,

@@ -33,6 +33,8 @@ class RenderedView:
     """Measured error as object_psnr_log_db over `hits`, in dB; more is better."""
     at_cap: bool
     """True if sampling ended at max_spp with a floor below its target."""
+    core_s: float
+    """Core-seconds that the picture took, without its looks and without loading the scene."""
     hits: NDArray[np.bool_]
     """[R, R] true where the ray through a pixel's center hits geometry other than emitters."""
     lights_rgb: NDArray[np.float32] | None = None

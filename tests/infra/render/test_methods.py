@@ -10,19 +10,21 @@ from numpy.typing import NDArray
 
 from infra.bench.workloads.judged_pictures import difference_db
 from infra.render.comparison import Frame, flicker
-from infra.render.methods import (
-    direct_light_method,
-    network_method,
+from infra.render.networks import (
+    DirectLight,
+    NetworkRenderer,
     traced_network,
     untrained_network,
 )
 from infra.render.raw_references import RawReference, true_error_db
 from infra.timed_views import Show, timed_views
 from model.config import hits_smoke
+from model.neural_renderer import NeuralRenderer
 from pipeline.exchange.open_scene import SceneSource
 from pipeline.renders.noise_floor import clamped_radiance
 from storage.conventions import log10_radiance
 from storage.metrics import psnr_linear_db, psnr_log_db
+from storage.renderer import Camera, Renderer
 from tests.for_each import case
 from tests.train.toy import toy_scene
 
@@ -30,26 +32,30 @@ SCENE = toy_scene(2)
 PX = 16
 
 
-def shown(method: object) -> np.ndarray:
-    return method(SCENE)(SCENE.c2w[0], float(SCENE.fov_deg[0]))  # type: ignore[operator]
+def shown(renderer: Renderer) -> np.ndarray:
+    return renderer.load(SCENE, "toy").render(Camera.of_scene(SCENE, 0)).radiance_rgb
+
+
+def network(opened: NeuralRenderer) -> NetworkRenderer:
+    return NetworkRenderer(checkpoint="toy", resolution=PX, opened=opened)
 
 
 def test_light_of_lamps_is_what_is_left_when_nothing_is_gathered() -> None:
-    of_lamps = shown(direct_light_method(PX))
+    of_lamps = shown(DirectLight(resolution=PX))
     config = dataclasses.replace(hits_smoke(), gather_rays=0)
     # the network's picture went through log10(1 + radiance) in float32
     np.testing.assert_allclose(
-        of_lamps, shown(network_method(untrained_network(config), PX)), rtol=1e-4, atol=1e-5
+        of_lamps, shown(network(untrained_network(config))), rtol=1e-4, atol=1e-5
     )
     assert of_lamps.max() > 0.01
-    everything = shown(network_method(traced_network(), PX))
+    everything = shown(network(traced_network()))
     assert everything.mean() > of_lamps.mean(), "other surfaces send light too"
 
 
 def test_the_smallest_layers_show_what_large_ones_show() -> None:
-    small = shown(network_method(traced_network(), PX))
+    small = shown(network(traced_network()))
     unfiltered = dataclasses.replace(hits_smoke(), filter_width=0)
-    large = shown(network_method(untrained_network(unfiltered), PX))
+    large = shown(network(untrained_network(unfiltered)))
     np.testing.assert_allclose(small, large, rtol=1e-3, atol=1e-4)  # sums in another order
 
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from infra.render import plan
-from infra.render.cameras import ShotCamera, camera_path, orbit, own_camera, pair_cameras
-from infra.render.engines import MitsubaPlan, NeuralPlan
+from infra.render.cameras import camera_path, orbit, own_camera, pair_cameras
+from infra.render.networks import NetworkRenderer
 from infra.render.options import RenderOptions
+from infra.render.path_tracer import PathTracer
 from infra.render.plan import plan_render
 from infra.render.sources import scene_sources
 from pipeline.exchange.open_scene import SceneSource
@@ -23,6 +24,7 @@ from storage.dataset.shard import write_shard
 from storage.errors import TrilightError
 from storage.records.sample import encode_sample
 from storage.records.scene_file import encode_scene
+from storage.renderer import Camera
 from tests.conftest import ROOT
 from tests.infra.render.render_kit import write_network
 from tests.scenes_by_hand import tiny_sample, tiny_scene
@@ -39,8 +41,8 @@ def sources(count: int) -> list[SceneSource]:
     return [SceneSource(path=Path(f"{at}.h5"), key=None) for at in range(count)]
 
 
-def cameras(count: int) -> list[ShotCamera]:
-    return [ShotCamera(c2w=np.eye(4, dtype=np.float32), fov_deg=40.0 + at) for at in range(count)]
+def cameras(count: int) -> list[Camera]:
+    return [Camera(c2w=np.eye(4, dtype=np.float32), fov_deg=40.0 + at) for at in range(count)]
 
 
 def test_a_turn_begins_at_the_camera_and_looks_at_one_point() -> None:
@@ -68,7 +70,7 @@ def test_a_turn_begins_at_the_camera_and_looks_at_one_point() -> None:
 def test_a_camera_that_looks_away_turns_about_itself() -> None:
     scene = tiny_scene()
     away = look_at_c2w(eye=[2, 0, 1], target=[4, 0, 1], up=[0, 0, 1]).astype(np.float32)
-    turn = orbit(scene, ShotCamera(c2w=away, fov_deg=40.0), 4, 360)
+    turn = orbit(scene, Camera(c2w=away, fov_deg=40.0), 4, 360)
     for camera in turn:
         np.testing.assert_allclose(camera.c2w[:3, 3], [2, 0, 1], atol=1e-6)
 
@@ -131,10 +133,10 @@ def test_a_shard_without_a_key_is_all_of_its_scenes(tmp_path: Path) -> None:
 def test_one_picture_is_of_the_scenes_own_camera(source: Path, tmp_path: Path) -> None:
     asked = RenderOptions(source=str(source), out=tmp_path / "new/x.exr", view=1, threads=3)
     plan = plan_render(asked, HereReader())
-    (shot,), (engine,) = plan.shots, plan.engines
-    assert isinstance(engine, MitsubaPlan)
-    assert (engine.threads, engine.settings.resolution, plan.resolution) == (3, 512, 512)
-    assert (shot.camera, shot.name) == (1, "tiny.safetensors, view 1")
+    (shot,), (tracer,) = plan.shots, plan.renderers
+    assert isinstance(tracer, PathTracer)
+    assert (tracer.child.threads, tracer.settings.resolution, plan.resolution) == (3, 512, 512)
+    assert shot.camera == 1
     assert shot.exrs == {"mitsuba": tmp_path / "new/x.exr"}
     assert shot.png == tmp_path / "new/x.png"
 
@@ -152,15 +154,16 @@ def test_both_engines_share_the_width_and_have_files_of_their_own(
         orbit=3,
     )
     plan = plan_render(asked, HereReader())
-    mitsuba, neural = plan.engines
-    assert isinstance(mitsuba, MitsubaPlan) and isinstance(neural, NeuralPlan)
+    mitsuba, neural = plan.renderers
+    assert isinstance(mitsuba, PathTracer) and isinstance(neural, NetworkRenderer)
     assert mitsuba.settings.resolution == neural.resolution == plan.resolution == 16
     assert neural.checkpoint == network
     assert plan.output.video == tmp_path / "turn.webp"
     assert len(plan.shots) == 3
-    assert all(isinstance(shot.camera, ShotCamera) for shot in plan.shots)
+    assert all(isinstance(shot.camera, Camera) for shot in plan.shots)
     last, folder = plan.shots[2], tmp_path / "turn"
-    assert last.name == "tiny.safetensors, picture 000002"
+    assert isinstance(last.camera, Camera)
+    assert (last.camera.name, last.camera.view) == ("picture 000002", None)
     assert last.exrs == {name: folder / f"000002.{name}.exr" for name in ("mitsuba", "neural")}
     assert last.png == folder / "000002.png"
 
@@ -170,11 +173,11 @@ def test_the_pictures_of_a_turn_share_the_loading_of_its_scene(
 ) -> None:
     told: list[float] = []
 
-    def priced_ways(*_: object, per_scene: float, **__: object) -> None:
+    def price_all(*_: object, per_scene: float, **__: object) -> None:
         told.append(per_scene)
         raise TrilightError("no way to it")
 
-    monkeypatch.setattr(plan, "priced_ways", priced_ways)
+    monkeypatch.setattr(plan, "price_all", price_all)
     for more in ({"out": tmp_path / "x.exr"}, {"out": tmp_path / "turn", "orbit": 3}):
         with pytest.raises(TrilightError, match="no way"):
             plan_render(RenderOptions(source=str(source), seconds=1.0, **more), HereReader())

@@ -6,31 +6,33 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image as Picture
 
 from infra.render import look as look_module
-from infra.render.cameras import ShotCamera, orbit, own_camera, pair_cameras
+from infra.render.budget import Choice
+from infra.render.cameras import orbit, own_camera, pair_cameras
 from infra.render.comparison import comparison_sheet
-from infra.render.engines import Facts, OpenedScene, Rendered
 from infra.render.look import Look, enlarge, enlargement, tone_mapped
 from infra.render.output_paths import OutputPaths, output_paths
 from infra.render.plan import RenderPlan, shots
 from infra.render.run import FinishedShot, run_plan
 from infra.render.video import write_video
-from infra.render.ways import Choice
 from pipeline.exchange.open_scene import SceneSource
 from storage.conventions import preview_srgb8
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
+from storage.renderer import Camera, Image, LoadedScene
 from tests.for_each import case
 from tests.infra.render.test_plan import HereReader
 from tests.scenes_by_hand import tiny_scene
 
 
-class FlatEngine:
+class FlatRenderer:
     """Every picture is as bright as the camera stands far to the right; counts its work."""
+
+    resolution, notes = 16, ()
 
     def __init__(self, name: str = "neural", setting: int = 0) -> None:
         self.name = name
@@ -38,23 +40,27 @@ class FlatEngine:
         self.opened = 0
         self.rendered = 0
 
-    def start(self, sampled: object) -> "FlatEngine":
-        return self
-
-    def caveats(self, pictures: Sequence[Facts]) -> list[str]:
-        return []
-
-    def open(self, scene: Scene, name: str) -> OpenedScene:
+    def load(self, scene: Scene, name: str) -> LoadedScene:
         self.opened += 1
-        return OpenedScene(notes=(f"{name} was opened",), render=self._render, seconds=0.0)
-
-    def _render(self, camera: ShotCamera, name: str) -> Rendered:
-        self.rendered += 1
-        picture = np.full((16, 16, 3), 3 + camera.c2w[0, 3], np.float32)
-        return Rendered(radiance_rgb=picture, facts={"number": self.rendered, "half": 0.5})
+        return LoadedFlat(self)
 
     def close(self) -> None:
         pass
+
+
+class LoadedFlat:
+    """A scene in it."""
+
+    notes, seconds, cpu_seconds = ("it was opened",), 0.0, 0.0
+
+    def __init__(self, renderer: FlatRenderer) -> None:
+        self.renderer = renderer
+
+    def render(self, camera: Camera, on_progress: object = None) -> Image:
+        self.renderer.rendered += 1
+        picture = np.full((16, 16, 3), 3 + camera.c2w[0, 3], np.float32)
+        facts = {"number": self.renderer.rendered, "half": 0.5}
+        return Image(radiance_rgb=picture, cpu_seconds=0.0, facts=facts)
 
 
 class SilentProgress:
@@ -70,7 +76,7 @@ class SilentProgress:
         pass
 
 
-Pairs = list[tuple[SceneSource, ShotCamera | int]]
+Pairs = list[tuple[SceneSource, Camera | int]]
 
 
 @pytest.fixture
@@ -82,7 +88,7 @@ def turn(tmp_path: Path) -> Pairs:
 
 
 def run(
-    engines: list[FlatEngine],
+    renderers: list[FlatRenderer],
     out: Path,
     pairs: Pairs,
     look: Look = Look(),  # noqa: B008
@@ -92,11 +98,11 @@ def run(
         source="tiny",
         view=0,
         engine="neural",
-        engines=engines,
+        renderers=renderers,
         resolution=16,
         look=look,
         output=where,
-        shots=list(shots(pairs, where, [engine.name for engine in engines])),
+        shots=list(shots(pairs, where, [each.name for each in renderers])),
         fps=24,
     )
     outcome = run_plan(plan, HereReader(), SilentProgress())
@@ -104,10 +110,10 @@ def run(
 
 
 def test_pictures_are_numbered_and_the_scene_is_opened_once(turn: Pairs, tmp_path: Path) -> None:
-    engine = FlatEngine()
+    engine = FlatRenderer()
     finished, notes = run([engine], tmp_path / "turn", turn)
     assert (engine.opened, engine.rendered) == (1, 4)
-    assert notes == ["tiny.safetensors was opened"]
+    assert notes == ["tiny.safetensors: it was opened"]
     names = sorted(path.name for path in (tmp_path / "turn").iterdir())
     assert names == [f"{at:06d}.{suffix}" for at in range(4) for suffix in ("exr", "png")]
     expected = [5, 3, 1, 3]
@@ -116,8 +122,8 @@ def test_pictures_are_numbered_and_the_scene_is_opened_once(turn: Pairs, tmp_pat
 
 
 def test_what_is_there_is_kept_and_only_the_rest_is_made(turn: Pairs, tmp_path: Path) -> None:
-    out, again = tmp_path / "turn", FlatEngine()
-    first, _ = run([FlatEngine()], out, turn)
+    out, again = tmp_path / "turn", FlatRenderer()
+    first, _ = run([FlatRenderer()], out, turn)
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     (out / "000002.exr").unlink()
     (out / "000003.exr").write_bytes(before["000003.exr"][:200])
@@ -128,7 +134,7 @@ def test_what_is_there_is_kept_and_only_the_rest_is_made(turn: Pairs, tmp_path: 
     assert kept[1].facts == first[1].pictures["neural"].facts == {"number": 2, "half": 0.5}
     for shown in ("000000.png", "000003.png"):
         assert (out / shown).read_bytes() == before[shown]
-    nothing = FlatEngine()
+    nothing = FlatRenderer()
     run([nothing], out, turn)
     assert (nothing.opened, nothing.rendered) == (0, 0)
 
@@ -137,20 +143,20 @@ def test_pictures_of_other_settings_scenes_or_cameras_are_made_anew(
     turn: Pairs, tmp_path: Path
 ) -> None:
     out = tmp_path / "turn"
-    run([FlatEngine()], out, turn)
-    other_setting, other_name = FlatEngine(setting=1), FlatEngine(name="mitsuba", setting=1)
+    run([FlatRenderer()], out, turn)
+    other_setting, other_name = FlatRenderer(setting=1), FlatRenderer(name="mitsuba", setting=1)
     run([other_setting], out, turn)
     run([other_name], out, turn)
     assert (other_setting.rendered, other_name.rendered) == (4, 4)
-    moved = FlatEngine(name="mitsuba", setting=1)
+    moved = FlatRenderer(name="mitsuba", setting=1)
     run([moved], out, turn[1:])
     assert moved.rendered == 3
-    changed = FlatEngine(name="mitsuba", setting=1)
+    changed = FlatRenderer(name="mitsuba", setting=1)
     materials = tiny_scene().materials * np.float32(0.5)
     turn[0][0].path.write_bytes(encode_scene(tiny_scene(materials=materials)))
     run([changed], out, turn)
     assert changed.rendered == 4
-    one = FlatEngine()
+    one = FlatRenderer()
     for _ in range(2):
         run([one], tmp_path / "one.exr", [(turn[0][0], 0)])
     assert one.rendered == 2, "a single picture is always made anew"
@@ -158,18 +164,18 @@ def test_pictures_of_other_settings_scenes_or_cameras_are_made_anew(
 
 def test_another_look_needs_no_other_picture(turn: Pairs, tmp_path: Path) -> None:
     """Stops multiply the light by powers of two; the EXR that is measured knows nothing of it."""
-    out, again = tmp_path / "turn", FlatEngine()
-    run([FlatEngine()], out, turn)
+    out, again = tmp_path / "turn", FlatRenderer()
+    run([FlatRenderer()], out, turn)
     measured = (out / "000000.exr").read_bytes()
     run([again], out, turn, Look(exposure_ev=-3.0))
     assert (out / "000000.exr").read_bytes() == measured
-    darker = np.asarray(Image.open(out / "000000.png"))
+    darker = np.asarray(Picture.open(out / "000000.png"))
     np.testing.assert_array_equal(darker[::16, ::16], preview_srgb8(decode_exr(measured) / 8))
     assert 0 < darker.min() < 255
     pytest.importorskip("PyOpenColorIO", reason="the film-like curve is OpenColorIO's")
     run([again], out, turn, Look(tone_map="filmic"))
     assert again.rendered == 0
-    assert (np.asarray(Image.open(out / "000000.png")) != darker).any()
+    assert (np.asarray(Picture.open(out / "000000.png")) != darker).any()
 
 
 def test_small_pictures_are_enlarged_by_whole_numbers() -> None:
@@ -216,21 +222,21 @@ def _frames(folder: Path) -> list[Path]:
         pixels = np.zeros((32, 48, 3), np.uint8)
         pixels[:, 8 * at : 8 * at + 8] = [200, 120, 40]
         paths.append(folder / f"{at}.png")
-        Image.fromarray(pixels).save(paths[-1])
+        Picture.fromarray(pixels).save(paths[-1])
     return paths
 
 
 def test_a_webp_shows_the_pictures_in_a_row(tmp_path: Path) -> None:
     frames = _frames(tmp_path)
     write_video(tmp_path / "x.webp", frames, 20)
-    with Image.open(tmp_path / "x.webp") as video:
+    with Picture.open(tmp_path / "x.webp") as video:
         assert (getattr(video, "n_frames", 1), video.size) == (6, (48, 32))
         for at, path in enumerate(frames):
             video.seek(at)
             shown = np.asarray(video.convert("RGB")).astype(int)
             assert video.info["duration"] == 50
             # lossy: colour has half the resolution, so edges are off, and flat parts by some steps
-            assert abs(shown - np.asarray(Image.open(path))).mean() < 8
+            assert abs(shown - np.asarray(Picture.open(path))).mean() < 8
 
 
 def test_an_mp4_shows_the_pictures_in_a_row(tmp_path: Path) -> None:
@@ -244,7 +250,7 @@ def test_an_mp4_shows_the_pictures_in_a_row(tmp_path: Path) -> None:
             for frame in video.decode(video=0)
         ]
     for pixels, path in zip(shown, frames, strict=True):
-        assert abs(pixels.astype(int) - np.asarray(Image.open(path))).mean() < 8  # as above
+        assert abs(pixels.astype(int) - np.asarray(Picture.open(path))).mean() < 8  # as above
 
 
 def test_out_says_what_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -72,6 +72,7 @@ class _Renderer:
             noise_floor_linear_db=20.0,
             object_noise_floor_db=20.0,
             at_cap=False,
+            core_s=0.0,
             hits=np.ones((16, 16), np.bool_),
         )
 

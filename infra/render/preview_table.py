@@ -1,4 +1,4 @@
-"""Tables of cost and error of quality presets, for `trilight render --seconds` and `--error`.
+"""Tables of cost and error of previews, for `trilight render --seconds` and `--error`.
 
 Errors are shipped: they do not depend on the machine. Costs are shipped as well, as CPU seconds of
 the machine on which they were measured; `trilight doctor --measure` times the same parts on this
@@ -34,9 +34,6 @@ NETWORK_VIEW = "network view"
 MEASURE = "trilight doctor --measure"
 """Command that writes the costs of this machine."""
 
-Rung = Literal["traced", "network"]
-"""Method: few samples and a filter, or the network builtin:tokens, cheapest for further views."""
-
 Seconds = Annotated[float, Within(0, 1e6, unit="seconds")]
 Decibels = Annotated[float, Within(-MAX_DB, MAX_DB, unit="dB")]
 
@@ -65,12 +62,12 @@ class PictureCosts:
     """Costs of each part at each width."""
 
 
-@checked("errors of a way")
-class WayError:
-    """Error of the pictures of one quality preset at a width."""
+@checked("the error of a preview")
+class PreviewError:
+    """Error of pictures of a number of samples, or of the network, at a width."""
 
-    rung: Rung
-    """Method: traced, or by the network."""
+    rung: Literal["traced", "network"]
+    """Few samples and a filter, or the network builtin:tokens, cheapest for further views."""
     spp: Annotated[int, Within(0, MOST_SPP, unit="samples")]
     """Samples per pixel; 0 for the network."""
     denoiser: Filtered
@@ -84,13 +81,13 @@ class WayError:
 
 
 @checked("the table of previews")
-class WayTable:
-    """Shipped errors and costs of all quality presets."""
+class PreviewTable:
+    """Shipped errors and costs of all previews."""
 
     scenes: Annotated[int, Within(1, 1_000_000, unit="scenes")]
     """Number of scenes, one view each."""
-    errors: tuple[WayError, ...]
-    """Errors of each preset at each measured width."""
+    errors: tuple[PreviewError, ...]
+    """Errors of each preview at each measured width."""
     costs: PictureCosts
     """Median CPU seconds of the parts on one thread."""
     probe: PictureCosts
@@ -107,9 +104,9 @@ class KnownCosts:
 
 
 @functools.cache
-def shipped_table() -> WayTable:
+def shipped_table() -> PreviewTable:
     """Return the shipped table."""
-    return from_record(WayTable, json.loads(SHIPPED.read_bytes()))
+    return from_record(PreviewTable, json.loads(SHIPPED.read_bytes()))
 
 
 def machine_name(variant: Variant) -> str:

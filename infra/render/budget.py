@@ -5,65 +5,36 @@ measured error needs more samples (`--noise-floor`).
 """
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from infra.render.way_table import (
+from infra.render.preview_table import (
     NETWORK_SCENE,
     NETWORK_VIEW,
     KnownCosts,
     PictureCosts,
-    Rung,
-    WayError,
-    WayTable,
+    PreviewError,
+    PreviewTable,
 )
+from infra.render.quality import Budget, FixedSamples, TimeBudget
 from pipeline.renders.preview_parts import SCENE, preview_parts, seconds_of
-from pipeline.renders.settings import Filtered
 from storage.errors import TrilightError
+
+NETWORK = "the network builtin:tokens"
 
 _LEAST_S = 1e-9
 """Lower bound of seconds, so that logarithms can be taken."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Way:
-    """Quality preset: samples per pixel and denoiser, or the network."""
-
-    rung: Rung
-    """Method: traced, or by the network."""
-    spp: int
-    """Samples per pixel; 0 for the network."""
-    denoiser: Filtered
-    """Filter of Open Image Denoise; off for the network."""
-
-    def __str__(self) -> str:
-        """Return the preset as text."""
-        if self.rung == "network":
-            return "the network builtin:tokens"
-        return f"{self.spp} sample{'s' if self.spp > 1 else ''} a pixel, filter {self.denoiser}"
-
-    @property
-    def scene_part(self) -> str:
-        """Name of the part that a scene costs once, before its first picture."""
-        return NETWORK_SCENE if self.rung == "network" else SCENE
-
-    @property
-    def view_parts(self) -> Counter[str]:
-        """Number of occurrences of each part in a picture."""
-        if self.rung == "network":
-            return Counter([NETWORK_VIEW])
-        return preview_parts(self.spp, self.denoiser)
-
-
-@dataclass(frozen=True, kw_only=True)
 class Priced:
-    """Quality preset with its expected cost and error at one width."""
+    """Samples or the network, with expected cost and error at one width."""
 
-    way: Way
+    samples: FixedSamples | None
+    """Samples and filter; None for the network builtin:tokens."""
     seconds: float
     """Wall-clock seconds of a picture, without start-up."""
     db: float
@@ -77,13 +48,12 @@ class Priced:
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """Chosen quality preset, and its expected cost and error."""
+    """Chosen samples or network, and the expected cost and error."""
 
-    option: str
-    """Option that chose the preset, with its value."""
+    budget: Budget
     priced: Priced
     fits: bool
-    """True where the preset keeps to the budget."""
+    """True where the choice keeps to the budget."""
     scenes: int
     """Number of scenes behind the expected error."""
     costs: str
@@ -91,8 +61,8 @@ class Choice:
 
     @property
     def engine(self) -> Literal["mitsuba", "neural"]:
-        """Engine that renders the preset."""
-        return "neural" if self.priced.way.rung == "network" else "mitsuba"
+        """Engine that renders it."""
+        return "neural" if self.priced.samples is None else "mitsuba"
 
     @property
     def sentence(self) -> str:
@@ -100,23 +70,23 @@ class Choice:
         one = self.priced
         lead = "chosen" if self.fits else "nothing is as quick; the quickest is chosen"
         return (
-            f"{self.option}: {lead}: {one.way}; expected {one.db:.1f} dB in the median of "
-            f"{self.scenes} scenes at {one.judged_px} pixels ({one.least_db:.1f} in the worst), in "
-            f"{_seconds_text(one.seconds)} s after start-up; {self.costs}"
+            f"{self.budget}: {lead}: {one.samples or NETWORK}; expected {one.db:.1f} dB in the "
+            f"median of {self.scenes} scenes at {one.judged_px} pixels ({one.least_db:.1f} in the "
+            f"worst), in {_seconds_text(one.seconds)} s after start-up; {self.costs}"
         )
 
     @property
     def facts(self) -> Mapping[str, str | float]:
         """Facts for the header of a picture."""
         return {
-            "chosen_for": self.option,
+            "chosen_for": str(self.budget),
             "expected_db": round(self.priced.db, 2),
             "expected_seconds": float(f"{self.priced.seconds:.4g}"),
         }
 
 
-def priced_ways(
-    table: WayTable,
+def price_all(
+    table: PreviewTable,
     costs: PictureCosts,
     *,
     width: int,
@@ -124,10 +94,10 @@ def priced_ways(
     per_scene: float,
     network: bool,
 ) -> list[Priced]:
-    """Return every quality preset with its expected cost and error.
+    """Return every row of the table with its expected cost and error.
 
     Args:
-        table: presets and their errors.
+        table: numbers of samples and the network, with their errors.
         costs: costs of the parts of pictures.
         width: width of a picture in pixels.
         threads: number of threads; no more than there are cores.
@@ -136,30 +106,39 @@ def priced_ways(
             was measured.
     """
     part_s = _part_seconds(costs, width, threads)
-    rows: dict[Way, list[WayError]] = {}
+    rows: dict[FixedSamples | None, list[PreviewError]] = {}
     for row in table.errors:
-        way = Way(rung=row.rung, spp=row.spp, denoiser=row.denoiser)
+        traced = FixedSamples(spp=row.spp, denoiser=row.denoiser)
         if network or row.rung != "network":
-            rows.setdefault(way, []).append(row)
-            rows[way].sort(key=lambda each: each.width)
-    return [
-        Priced(
-            way=way,
-            seconds=part_s[way.scene_part] / per_scene + seconds_of(way.view_parts, part_s),
-            db=_at_width(width, {row.width: row.median_db for row in of_way}),
-            least_db=_at_width(width, {row.width: row.least_db for row in of_way}),
-            judged_px=min(max(width, of_way[0].width), of_way[-1].width),
-        )
-        for way, of_way in rows.items()
+            rows.setdefault(traced if row.rung == "traced" else None, []).append(row)
+    priced = []
+    for samples, unsorted in rows.items():
+        errors = sorted(unsorted, key=lambda each: each.width)
+        least, most = errors[0].width, errors[-1].width
         # more pixels do not harm samples; a network fails beyond the widths of its training
-        if way.rung == "traced" or of_way[0].width <= width <= of_way[-1].width
-    ]
+        if samples is None and not least <= width <= most:
+            continue
+        if samples is None:
+            seconds = part_s[NETWORK_SCENE] / per_scene + part_s[NETWORK_VIEW]
+        else:
+            parts = preview_parts(samples.spp, samples.denoiser)
+            seconds = part_s[SCENE] / per_scene + seconds_of(parts, part_s)
+        priced.append(
+            Priced(
+                samples=samples,
+                seconds=seconds,
+                db=_at_width(width, {row.width: row.median_db for row in errors}),
+                least_db=_at_width(width, {row.width: row.least_db for row in errors}),
+                judged_px=min(max(width, least), most),
+            )
+        )
+    return priced
 
 
-def within_seconds(candidates: Sequence[Priced], seconds: float) -> tuple[Priced, bool]:
-    """Return the preset of least error within the seconds, the cheaper of equals, and True.
+def choose_within(candidates: Sequence[Priced], seconds: float) -> tuple[Priced, bool]:
+    """Return the candidate of least error within the seconds, the cheaper of equals, and True.
 
-    Where none fits, return the fastest preset and False.
+    Where none fits, return the fastest candidate and False.
     """
     fitting = [one for one in candidates if one.seconds <= seconds]
     if not fitting:
@@ -167,11 +146,11 @@ def within_seconds(candidates: Sequence[Priced], seconds: float) -> tuple[Priced
     return max(fitting, key=lambda one: (one.db, -one.seconds)), True
 
 
-def reaching(candidates: Sequence[Priced], db: float, width: int) -> Priced:
-    """Return the fastest preset whose median error reaches `db`, the better of equals.
+def choose_reaching(candidates: Sequence[Priced], db: float, width: int) -> Priced:
+    """Return the fastest candidate whose median error reaches `db`, the better of equals.
 
     Raises:
-        TrilightError: no preset reaches it.
+        TrilightError: none reaches it.
     """
     good = [one for one in candidates if one.db >= db]
     if not good:
@@ -184,25 +163,16 @@ def reaching(candidates: Sequence[Priced], db: float, width: int) -> Priced:
     return min(good, key=lambda one: (one.seconds, -one.db))
 
 
-def chosen_way(
-    candidates: Sequence[Priced],
-    table: WayTable,
-    known: KnownCosts,
-    *,
-    seconds: float | None,
-    error_db: float | None,
-    width: int,
+def choose(
+    budget: Budget, candidates: Sequence[Priced], table: PreviewTable, known: KnownCosts, width: int
 ) -> Choice:
-    """Return the preset for seconds or for an error; raises TrilightError as `reaching`."""
-    if seconds is not None:
-        option = f"--seconds {seconds:g}"
-        priced, fits = within_seconds(candidates, seconds)
+    """Return the choice for a budget; raises TrilightError as `choose_reaching`."""
+    if isinstance(budget, TimeBudget):
+        priced, fits = choose_within(candidates, budget.seconds)
     else:
-        assert error_db is not None
-        option = f"--error {error_db:g}"
-        priced = reaching(candidates, error_db, width)
+        priced = choose_reaching(candidates, budget.error_db, width)
         fits = True
-    return Choice(option=option, priced=priced, fits=fits, scenes=table.scenes, costs=known.source)
+    return Choice(budget=budget, priced=priced, fits=fits, scenes=table.scenes, costs=known.source)
 
 
 def _part_seconds(costs: PictureCosts, width: int, threads: int) -> dict[str, float]:

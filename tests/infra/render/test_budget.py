@@ -12,30 +12,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from infra.render.budget import Priced, choose, choose_reaching, choose_within, price_all
 from infra.render.machine_costs import PROBED_PX, PROBES, PartSeconds, costs_of
-from infra.render.way_table import (
+from infra.render.preview_table import (
     MEASURE,
     NETWORK_SCENE,
     NETWORK_VIEW,
     KnownCosts,
     PartCost,
     PictureCosts,
-    WayError,
-    WayTable,
+    PreviewError,
+    PreviewTable,
     keep_machine_costs,
     known_costs,
     machine_costs_path,
     machine_name,
     shipped_table,
 )
-from infra.render.ways import (
-    Priced,
-    Way,
-    chosen_way,
-    priced_ways,
-    reaching,
-    within_seconds,
-)
+from infra.render.quality import FixedSamples, TimeBudget
 from infra.setup.preview_table import NETWORK, WIDTHS, ladder, part_names, table_of
 from pipeline.renders.preview_parts import all_parts
 from pipeline.renders.settings import Filtered
@@ -48,8 +42,8 @@ FILTERS: tuple[Filtered, ...] = ("fast", "high")
 
 
 def priced(seconds: float, db: float, spp: int = 1) -> Priced:
-    way = Way(rung="traced", spp=spp, denoiser="fast")
-    return Priced(way=way, seconds=seconds, db=db, least_db=db - 5, judged_px=64)
+    samples = FixedSamples(spp=spp, denoiser="fast")
+    return Priced(samples=samples, seconds=seconds, db=db, least_db=db - 5, judged_px=64)
 
 
 def part(name: str, width: int, serial_s: float, parallel_s: float = 0.0) -> PartCost:
@@ -68,7 +62,7 @@ some_ways = st.lists(
 def test_no_way_within_the_seconds_is_better_or_as_good_and_cheaper(
     ways: list[Priced], seconds: float
 ) -> None:
-    found, fits = within_seconds(ways, seconds)
+    found, fits = choose_within(ways, seconds)
     assert fits == any(one.seconds <= seconds for one in ways)
     for other in ways:
         if fits and other.seconds <= seconds:
@@ -81,9 +75,9 @@ def test_no_way_within_the_seconds_is_better_or_as_good_and_cheaper(
 def test_no_way_that_reaches_the_error_is_quicker(ways: list[Priced], db: float) -> None:
     if all(one.db < db for one in ways):
         with pytest.raises(TrilightError, match="--noise-floor"):
-            reaching(ways, db, 64)
+            choose_reaching(ways, db, 64)
         return
-    found = reaching(ways, db, 64)
+    found = choose_reaching(ways, db, 64)
     assert found.db >= db
     for other in ways:
         if other.db >= db:
@@ -94,29 +88,27 @@ def test_more_seconds_are_never_worse_and_more_decibels_never_quicker() -> None:
     for width in [8, 64, 96, 128, 512, 2048]:
         with case(width):
             table = shipped_table()
-            ways = priced_ways(
-                table, table.costs, width=width, threads=1, per_scene=1, network=True
-            )
+            ways = price_all(table, table.costs, width=width, threads=1, per_scene=1, network=True)
             asked_s = [1e-9, *(10 ** (k / 4) for k in range(-12, 13)), 1e9]
-            found = [within_seconds(ways, seconds)[0].db for seconds in asked_s if
+            found = [choose_within(ways, seconds)[0].db for seconds in asked_s if
                      any(one.seconds <= seconds for one in ways)]  # fmt: skip
             assert found == sorted(found) and found[-1] == max(one.db for one in ways)
             most = max(one.db for one in ways)
-            times = [reaching(ways, most * share / 20, width).seconds for share in range(21)]
+            times = [choose_reaching(ways, most * share / 20, width).seconds for share in range(21)]
             assert times == sorted(times)
             assert times[0] == min(one.seconds for one in ways)
             with pytest.raises(
                 TrilightError, match=f"most that previews reach; --noise-floor {most + 1:g}"
             ):
-                reaching(ways, most + 1, width)
+                choose_reaching(ways, most + 1, width)
 
 
 def test_what_is_said_to_be_reached_can_be_asked_for() -> None:
     """The figure of the complaint is rounded down, so that nobody is sent round in a circle."""
     ways = [priced(1.0, 38.49)]
     with pytest.raises(TrilightError, match=r"expected at most 38\.4 dB"):
-        reaching(ways, 38.5, 64)
-    assert reaching(ways, 38.4, 64) is ways[0]
+        choose_reaching(ways, 38.5, 64)
+    assert choose_reaching(ways, 38.4, 64) is ways[0]
 
 
 def test_prices_are_sums_of_parts_between_widths_in_logarithms() -> None:
@@ -127,11 +119,11 @@ def test_prices_are_sums_of_parts_between_widths_in_logarithms() -> None:
         for width in (64, 256)
     ]
     error: dict[str, Any] = {"spp": 20, "denoiser": "fast", "rung": "traced"}
-    table = WayTable(
+    table = PreviewTable(
         scenes=3,
         errors=(
-            WayError(**error, width=64, median_db=20.0, least_db=10.0),
-            WayError(**error, width=256, median_db=30.0, least_db=14.0),
+            PreviewError(**error, width=64, median_db=20.0, least_db=10.0),
+            PreviewError(**error, width=256, median_db=30.0, least_db=14.0),
         ),
         costs=PictureCosts(machine="x", rows=tuple(rows)),
         probe=PictureCosts(machine="x", rows=()),
@@ -141,14 +133,14 @@ def test_prices_are_sums_of_parts_between_widths_in_logarithms() -> None:
     # 20 samples: a pass of 16 and one of 4, guides of 16 rays, the fast filter
     units = of["pass of 16"] + of["pass of 4"] + of["guides of 16"] + of["fast"]
     for threads, per_scene in itertools.product((1, 4), (1, 10)):
-        (one,) = priced_ways(
+        (one,) = price_all(
             table, table.costs, width=128, threads=threads, per_scene=per_scene, network=False
         )
         expected = (units + of["scene"] / per_scene) * 128**1.5 / threads
         assert one.seconds == pytest.approx(expected, rel=1e-9)  # rounding of floats
         assert (one.db, one.least_db) == pytest.approx((25.0, 12.0))
     for width, db, growth in ((8, 20.0, 64**1.5), (2048, 30.0, 256**1.5 * 64)):
-        (one,) = priced_ways(table, table.costs, width=width, threads=1, per_scene=1, network=False)
+        (one,) = price_all(table, table.costs, width=width, threads=1, per_scene=1, network=False)
         assert one.db == db and one.judged_px == (64 if width < 64 else 256)
         assert one.seconds == pytest.approx((units + of["scene"]) * growth, rel=1e-9)
 
@@ -161,19 +153,19 @@ def test_the_network_is_chosen_by_its_figures_alone() -> None:
         for row in table.costs.rows
     ]
     quick = PictureCosts(machine="x", rows=tuple(rows))
-    for network, rung in ((True, "network"), (False, "traced")):
-        ways = priced_ways(table, quick, width=64, threads=1, per_scene=1, network=network)
-        assert reaching(ways, 0, 64).way.rung == rung
-        assert within_seconds(ways, 1e-9)[0].way.rung == rung
-        assert within_seconds(ways, 1e9)[0].way.rung == "traced"
+    for network in (True, False):
+        ways = price_all(table, quick, width=64, threads=1, per_scene=1, network=network)
+        assert (choose_reaching(ways, 0, 64).samples is None) == network
+        assert (choose_within(ways, 1e-9)[0].samples is None) == network
+        assert choose_within(ways, 1e9)[0].samples is not None
 
 
 def test_the_network_is_no_way_at_widths_at_which_it_was_not_judged() -> None:
     table = shipped_table()
     judged = [row.width for row in table.errors if row.rung == "network"]
     for width in (8, 64, 128, 256, 512, 1024):
-        ways = priced_ways(table, table.costs, width=width, threads=1, per_scene=1, network=True)
-        offered = any(one.way.rung == "network" for one in ways)
+        ways = price_all(table, table.costs, width=width, threads=1, per_scene=1, network=True)
+        offered = any(one.samples is None for one in ways)
         assert offered == (min(judged) <= width <= max(judged))
 
 
@@ -182,7 +174,7 @@ def test_a_choice_says_what_it_is_and_whether_it_fits() -> None:
     known = KnownCosts(costs=table.costs, source="costs as shipped")
     ways = [priced(0.25, 30.0, spp=4)]
     for seconds, lead in ((1.0, "chosen"), (1e-9, "nothing is as quick; the quickest is chosen")):
-        choice = chosen_way(ways, table, known, seconds=seconds, error_db=None, width=64)
+        choice = choose(TimeBudget(seconds=seconds), ways, table, known, 64)
         assert choice.sentence == (
             f"--seconds {seconds:g}: {lead}: 4 samples a pixel, filter fast; expected 30.0 dB in "
             f"the median of {table.scenes} scenes at 64 pixels (25.0 in the worst), in 0.25 s "
