@@ -4,15 +4,22 @@ import contextlib
 import copy
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from infra.judged_renderers import network_renderer, previews_on_one_thread
+import torch
+
+from infra.render.networks import NetworkRenderer
+from infra.render.path_tracer import PathTracer, RenderChild
+from infra.render.quality import FixedSamples
 from model.neural_renderer import NeuralRenderer
 from model.open import find_network
 from model.weights import network_digest
+from pipeline.renders.preview import MOST_SPP
+from pipeline.renders.variant import choose_variant
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
@@ -31,11 +38,23 @@ from train.evaluation.evaluate import (
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.pages import evaluation_page
 from train.evaluation.report import record
-from train.evaluation.same_time import TIMED_SCENES, Level, SameTimeResult, same_time, time_both
+from train.evaluation.same_time import (
+    TIMED_SCENES,
+    Filter,
+    Level,
+    SameTimeResult,
+    same_time,
+    time_both,
+)
 from train.evaluation.sheet import draw_sheet, write_picture
 from train.loop.distributed import choose_device
 from train.loss.lpips import load_lpips
 from train.result import pretty_json
+
+FILTERS: tuple[Filter, ...] = ("fast", "high")
+
+LADDER = [(1 << step, each) for step in range(MOST_SPP.bit_length()) for each in FILTERS]
+"""Samples per pixel and filters that the path tracer tries in the network's time."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,9 +70,9 @@ class Judgement:
 
 
 def judge_network(
-    checkpoint: str,
-    data: Sequence[str],
+    checkpoint: str | os.PathLike[str],
     *,
+    data: str | os.PathLike[str] | Sequence[str],
     split: str = "test",
     train_data: Sequence[str] | None = None,
     resolution: int | None = None,
@@ -79,11 +98,11 @@ def judge_network(
         done: called with (finished, all) scenes.
 
     Raises:
-        TrilightError: the network or the data does not exist, or the split is empty.
+        TrilightError: PyTorch, the network or the data does not exist, or the split is empty.
     """
-    opened = open_training_data(data)
+    opened = open_training_data([os.fspath(data)] if isinstance(data, str | os.PathLike) else data)
     rivals = opened if train_data is None else open_training_data(train_data)
-    network_file = find_network(checkpoint)
+    network_file = find_network(os.fspath(checkpoint))
     shards = opened.split(split)
     if resolution is None:
         stored = stored_resolution(shards)
@@ -105,37 +124,55 @@ def judge_network(
     done(0, total)
     numbers = itertools.count(1)
     with contextlib.ExitStack() as stack:
-        contest, times = _time_tracer(contest, stack)
-        views = judge_views(contest, lambda: done(next(numbers), total))
+        times, tracer = _time_tracer(contest, stack)
+        judged = dataclasses.replace(contest, tracer=tracer)
+        views = judge_views(judged, lambda: done(next(numbers), total))
     which = contest.traced_views.text(max(view.view for view in views) + 1)
-    about = _about(checkpoint, opened, contest, split, views)
+    about = _about(Path(checkpoint).name, opened, contest, split, views)
     told = record(views, about, same_time(views, times, which))
     return Judgement(record=told, views=tuple(views), contest=contest)
 
 
 def _time_tracer(
     contest: EvalConfig, stack: contextlib.ExitStack
-) -> tuple[EvalConfig, SameTimeResult]:
-    """Time the network and the path tracer, and add the latter if it can trace the scenes."""
-    samples = list(itertools.islice(contest.samples(), TIMED_SCENES))
-    network = NeuralRenderer(copy.deepcopy(contest.network).cpu())
-    previews: Mapping[Level, Renderer] = {}
+) -> tuple[SameTimeResult, Renderer | None]:
+    """Time the network and the path tracer; return the latter, too, if it can trace the scenes."""
+    network = NetworkRenderer(
+        name=NETWORK,
+        checkpoint=NETWORK,
+        resolution=contest.resolution,
+        threads=1,  # core-seconds of waiting threads are not the network's
+        opened=NeuralRenderer(copy.deepcopy(contest.network).cpu()),
+    )
+    previews: dict[Level, Renderer] = {}
     missing, note = "no views of it were requested", ""
     if contest.tracer_views:
-        previews, missing, note = previews_on_one_thread(contest.resolution)
-    for preview in previews.values():
-        stack.callback(preview.close)
-    times = time_both(
-        network_renderer(NETWORK, network, contest.resolution),
-        previews,
-        samples,
-        missing=missing,
-        note=note,
-    )
-    if times.preview is not None:
-        tracer = previews[times.preview.samples, times.preview.denoiser]
-        contest = dataclasses.replace(contest, tracer=tracer)
-    return contest, times
+        try:
+            note = choose_variant().note
+            tracers = _previews(LADDER, contest.resolution, stack)
+            previews = dict(zip(LADDER, tracers, strict=True))
+        except TrilightError as error:
+            missing = str(error).rstrip(".")
+    samples = list(itertools.islice(contest.samples(), TIMED_SCENES))
+    threads = torch.get_num_threads()
+    try:
+        times = time_both(network, previews, samples, missing=missing, note=note)
+    finally:
+        torch.set_num_threads(threads)
+    chosen = times.preview
+    return times, previews[chosen.samples, chosen.denoiser] if chosen else None
+
+
+def _previews(
+    levels: Sequence[Level], resolution: int, stack: contextlib.ExitStack
+) -> list[Renderer]:
+    """Return path tracers of one thread by samples and filter, until `stack` ends their child."""
+    child = RenderChild(choose_variant(), threads=1)
+    stack.callback(child.close)
+    return [
+        PathTracer(child, FixedSamples(spp=spp, denoiser=denoiser), resolution)
+        for spp, denoiser in levels
+    ]
 
 
 def write_judgement(judgement: Judgement, out: str | Path) -> Path:
@@ -159,7 +196,11 @@ def write_judgement(judgement: Judgement, out: str | Path) -> Path:
     if excursions := worst_of_each_excursion(views):
         chosen["worst of each axis"] = excursions
         plot_excursions(folder / "excursions.png", views)
-    with contextlib.closing(contest.tracer) if contest.tracer else contextlib.nullcontext():
+    with contextlib.ExitStack() as stack:
+        if preview := evaluation["path tracer"]["preview"]:
+            level = (preview["samples"], preview["denoiser"])
+            (tracer,) = _previews([level], contest.resolution, stack)
+            contest = dataclasses.replace(contest, tracer=tracer)
         pictures = sheet_views(contest, [row for rows in chosen.values() for row in rows])
     remaining = iter(pictures)
     for name, rows in chosen.items():
@@ -182,7 +223,7 @@ def _network_of(folder: Path) -> str | None:
 
 
 def _about(
-    checkpoint: str,
+    network: str,
     opened: TrainingData,
     contest: EvalConfig,
     split: str,
@@ -190,7 +231,7 @@ def _about(
 ) -> dict[str, str | int]:
     """Return the report's facts about itself, without paths of this machine."""
     return {
-        "network": Path(checkpoint).name,
+        "network": network,
         "network sha256": network_digest(contest.network),
         "data": opened.display_name.rstrip("/").rsplit("/", 1)[-1],
         "build": opened.build or "unknown",

@@ -3,44 +3,31 @@
 import contextlib
 import functools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
-from infra.judged_renderers import MethodRenderer, network_renderer, samples_renderers
 from infra.picture_folder import picture_folders
 from infra.processor import processor
 from infra.render.methods import (
     BUILTIN_NETWORKS,
-    DIRECT_LIGHT,
-    TRACED_LIGHT,
-    direct_light_method,
+    compared_renderers,
     kind_of,
     network_labels,
-    network_method,
     network_name,
-    samples_name,
-    traced_network,
 )
+from infra.render.path_tracer import RenderChild
 from model.neural_renderer import NeuralRenderer
+from pipeline.renders.variant import choose_variant
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
-from train.evaluation.board import (
-    Board,
-    JudgedWidth,
-    Method,
-    OnProgress,
-    first_keys,
-    judge_all,
-    judged_width,
-)
+from train.evaluation.board import Board, OnProgress, first_keys, judge_all
 from train.evaluation.chart import plot_leaderboard
 from train.evaluation.evaluate import BASELINE_SCENES, make_baselines, stored_resolution
 from train.evaluation.options import LeaderboardOptions
 from train.evaluation.pages import leaderboard_page, pairs_csv, standings_csv
-from train.evaluation.rows import Rows
 from train.evaluation.standings import WidthStandings, standings_of
-from train.evaluation.stored_pictures import NearestView, StoredPictures
+from train.evaluation.stored_pictures import NearestView
 from train.loss.lpips import load_lpips
 
 USUAL_WIDTHS = (64, 256, 512)
@@ -76,25 +63,6 @@ class Leaderboard:
     """Folder of the leaderboard's files."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Lineup:
-    """Methods of a leaderboard, and what its reader should know of them."""
-
-    methods: list[Method] = field(default_factory=list)
-    """Methods, each of one width, in the order of evaluation."""
-    kinds: dict[str, str] = field(default_factory=dict)
-    """Kind of each method by name, which decides the chart's color."""
-    notes: list[str] = field(default_factory=list)
-    """Notes for the reader."""
-    most_triangles: dict[str, int] = field(default_factory=dict)
-    """Triangles of the largest scene that a network was trained on, by name."""
-
-    def add(self, method: Method, kind: str) -> None:
-        """Add a method of one width."""
-        self.methods.append(method)
-        self.kinds[method.name] = kind
-
-
 def make_leaderboard(order: LeaderboardOptions, on_progress: OnProgress) -> Leaderboard:
     """Evaluate the missing views; write leaderboard.md, leaderboard.csv, pairs.csv and a chart.
 
@@ -109,31 +77,23 @@ def make_leaderboard(order: LeaderboardOptions, on_progress: OnProgress) -> Lead
             f"SOURCE is {opened.display_name}, a list of shards; expected a dataset with its "
             "manifest."
         )
-    widths = widths_of(order.width, stored_resolution(shards))
-    keys = first_keys(shards, order.scenes)
-    views = [(key, view) for key in keys for view in range(opened.num_views)]
-    lineup = Lineup()
-    _add_folders(lineup, order, views, widths)
-    _add_nearest(lineup, order, opened, keys, widths)
-    _add_traced(lineup, widths)
-    _add_networks(lineup, order, widths)
     board = Board(
         shards=shards,
-        keys=keys,
+        set_digest=opened.digest,
+        keys=first_keys(shards, order.scenes),
         num_views=opened.num_views,
         timed_scenes=order.timed_scenes,
         machine=processor() or "an unnamed processor",
-        widths=widths,
-        methods=lineup.methods,
+        widths=widths_of(order.width, stored_resolution(shards)),
         lpips=load_lpips(order.lpips),
-        rows=Rows(order.out / "rows.jsonl", opened.digest),
+        folder=order.out,
     )
-    with contextlib.ExitStack() as stack:
-        for method in lineup.methods:
-            if not isinstance(method, StoredPictures):
-                stack.callback(method.close)
+    _add_folders(board, order.pictures)
+    _add_nearest(board, order, opened)
+    with contextlib.closing(RenderChild(choose_variant(), threads=1)) as child:
+        most_triangles = _add_renderers(board, order.checkpoint, child)
         judge_all(board, on_progress)
-    return _write_leaderboard(order, opened, board, lineup)
+    return _write_leaderboard(order, opened, board, most_triangles)
 
 
 def widths_of(requested: Sequence[int], stored: int) -> list[int]:
@@ -147,27 +107,17 @@ def widths_of(requested: Sequence[int], stored: int) -> list[int]:
     return sorted(set(requested or usual or [stored]))
 
 
-def _add_folders(
-    lineup: Lineup,
-    order: LeaderboardOptions,
-    views: Sequence[tuple[str, int]],
-    widths: Sequence[int],
-) -> None:
-    for folder in picture_folders(order.pictures, views, widths):
-        lineup.add(folder, ELSEWHERE)
-        lineup.notes.append(
+def _add_folders(board: Board, folders: Sequence[Path]) -> None:
+    views = [(key, view) for key in board.keys for view in range(board.num_views)]
+    for folder in picture_folders(folders, views, board.widths):
+        board.add(folder, ELSEWHERE)
+        board.notes.append(
             f"{folder.name} were made elsewhere: what they cost is not known, and they are judged "
             f"at {folder.resolution} pixels alone"
         )
 
 
-def _add_nearest(
-    lineup: Lineup,
-    order: LeaderboardOptions,
-    opened: TrainingData,
-    keys: Sequence[str],
-    widths: Sequence[int],
-) -> None:
+def _add_nearest(board: Board, order: LeaderboardOptions, opened: TrainingData) -> None:
     """Add the lookup among pictures of the training split, or of the other scenes.
 
     There is none if the only scene to look up is the only evaluated one.
@@ -178,75 +128,63 @@ def _add_nearest(
     if order.train_data and not trained:
         raise TrilightError(
             f"--train-data {pool.display_name}: it has no training split; expected one. Leave it "
-            "out to "
-            "look up the other scenes of the set."
+            "out to look up the other scenes of the set."
         )
-    if pool.digest == opened.digest and first_keys(pool.split(split), 2) == keys[:2] == keys[:1]:
-        lineup.notes.append(ALONE)
+    is_own = pool.digest == opened.digest
+    if is_own and first_keys(pool.split(split), 2) == board.keys[:2] == board.keys[:1]:
+        board.notes.append(ALONE)
         return
     name = NEAREST_TRAINED if trained else NEAREST_OTHER
-    for width in widths:
-        nearest = NearestView(
-            name,
-            width,
-            functools.partial(make_baselines, pool.split(split), width),
-            pool=f"{pool.digest} {split}",
-            not_itself=pool.digest == opened.digest,
-        )
-        lineup.add(nearest, BASELINE)
+    for width in board.widths:
+        read = functools.partial(make_baselines, pool.split(split), width)
+        pool_name = f"{pool.digest} {split}"
+        nearest = NearestView(name, width, read, pool=pool_name, not_itself=is_own)
+        board.add(nearest, BASELINE)
     note = (
         f"{name} is found by the target itself, among the first {BASELINE_SCENES} scenes of the "
         f"{split} split: no way to look one of them up can do better"
     )
     if not trained:
         note += ". The set has no training split, so that its other scenes are looked up"
-    lineup.notes.append(note)
+    board.notes.append(note)
 
 
-def _add_traced(lineup: Lineup, widths: Sequence[int]) -> None:
-    """Add the traced methods, which every leaderboard has."""
-    traced = traced_network()
-    for width in widths:
-        direct = direct_light_method(width)
-        lineup.add(
-            MethodRenderer(DIRECT_LIGHT, direct, width, {"name": DIRECT_LIGHT, "weights": ""}),
-            kind_of(TRACED_LIGHT),
-        )
-        method = network_method(traced, width)
-        lineup.add(
-            MethodRenderer(TRACED_LIGHT, method, width, {"name": TRACED_LIGHT, "weights": ""}),
-            kind_of(TRACED_LIGHT),
-        )
-        names = {spp: samples_name((spp, "fast")) for spp in SAMPLES}
-        for renderer in samples_renderers(names, width):
-            lineup.add(renderer, kind_of(renderer.name))
+def _add_renderers(board: Board, checkpoints: Sequence[str], child: RenderChild) -> dict[str, int]:
+    """Add the built-in networks, those of the options, traced light and the path tracer.
 
-
-def _add_networks(lineup: Lineup, order: LeaderboardOptions, widths: Sequence[int]) -> None:
-    """Add the built-in networks and those of the options, at the widths that each supports."""
-    more = [place for place in order.checkpoint if place not in BUILTIN_NETWORKS]
-    places = [*BUILTIN_NETWORKS, *more]
+    Returns:
+        Triangles of the largest scene that a network was trained on, by its name.
+    """
+    places = [*BUILTIN_NETWORKS, *(each for each in checkpoints if each not in BUILTIN_NETWORKS)]
     names = _names(places)
     if twice := [name for name in names if names.count(name) > 1]:
         raise TrilightError(
             f"--checkpoint: {twice[0]} is there twice; expected each network once, in folders of "
             "different names."
         )
+    networks: dict[str, NeuralRenderer] = {}
+    most_triangles: dict[str, int] = {}
     for name, place in zip(names, places, strict=True):
-        network = NeuralRenderer.load(place, device="cpu")
+        network = networks[name] = NeuralRenderer.load(place, device="cpu")
         trained = network.trained
         width = "an unknown width" if trained.resolution is None else f"{trained.resolution} pixels"
         most = ""
         if trained.max_triangles is not None:
-            lineup.most_triangles[name] = trained.max_triangles
+            most_triangles[name] = trained.max_triangles
             most = f", at most {trained.max_triangles} triangles"
-        lineup.notes.append(f"{name} is {network.digest[:8]}, trained at {width}{most}")
-        for px in widths:
+        board.notes.append(f"{name} is {network.digest[:8]}, trained at {width}{most}")
+    for px in board.widths:
+        fitting = {}
+        for name, network in networks.items():
             try:
-                lineup.add(network_renderer(name, network, px), kind_of(name))
+                network.require_resolution(px)
+                fitting[name] = network
             except TrilightError as error:
                 why = str(error).rstrip(".")
-                lineup.notes.append(f"{name} is not judged at {px} pixels: {why}")
+                board.notes.append(f"{name} is not judged at {px} pixels: {why}")
+        for one in compared_renderers(px, fitting, child, [(spp, "fast") for spp in SAMPLES]):
+            board.add(one, kind_of(one.name))
+    return most_triangles
 
 
 def _names(places: Sequence[str]) -> list[str]:
@@ -255,11 +193,14 @@ def _names(places: Sequence[str]) -> list[str]:
 
 
 def _write_leaderboard(
-    order: LeaderboardOptions, opened: TrainingData, board: Board, lineup: Lineup
+    order: LeaderboardOptions,
+    opened: TrainingData,
+    board: Board,
+    most_triangles: dict[str, int],
 ) -> Leaderboard:
     rival = _names(order.checkpoint or BUILTIN_NETWORKS[:1])[0]
-    judged = [judged_width(board, width) for width in board.widths]
-    tables = tuple(standings_of(one, lineup.kinds, rival) for one in judged if one.views)
+    standings = [standings_of(board, width, rival) for width in board.widths]
+    tables = tuple(one for one in standings if one is not None)
     if not tables:
         why = next(iter(board.left_out.values()), "the split is empty")
         raise TrilightError(f"leaderboard: no scene could be rendered by all entries ({why}).")
@@ -269,7 +210,7 @@ def _write_leaderboard(
         "scenes": str(len(board.keys)),
         "processor": board.machine,
     }
-    told = [*lineup.notes, *_notes(board, tables), *_beyond(lineup, judged)]
+    told = [*board.notes, *_notes(board, tables), *_beyond(most_triangles, tables)]
     notes = tuple(dict.fromkeys(told))
     page = leaderboard_page(about, tables, notes, rival)
     write_atomically(order.out / "leaderboard.md", page.encode())
@@ -302,10 +243,10 @@ def _notes(board: Board, tables: Sequence[WidthStandings]) -> Iterator[str]:
     )
 
 
-def _beyond(lineup: Lineup, judged: Sequence[JudgedWidth]) -> Iterator[str]:
+def _beyond(most_triangles: dict[str, int], tables: Sequence[WidthStandings]) -> Iterator[str]:
     """Yield a note for each network that rendered larger scenes than it was trained on."""
-    sizes = {view.key: view.num_triangles for one in judged for view in one.views}
-    for name, most in lineup.most_triangles.items():
+    sizes = {key: size for one in tables for key, size in one.triangles.items()}
+    for name, most in most_triangles.items():
         larger = sum(size > most for size in sizes.values())
         if larger:
             yield (

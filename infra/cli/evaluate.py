@@ -38,7 +38,7 @@ def _judge_network(
         task = bars.add_task("scenes", total=None, note="", visible=not silent)
         judgement = judge_network(
             checkpoint,
-            order.data,
+            data=order.data,
             split=order.split,
             train_data=order.train_data or None,
             resolution=order.resolution,

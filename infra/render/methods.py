@@ -1,31 +1,21 @@
 """Renderers that are compared: networks, traced light without a network, the path tracer."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from infra.render.networks import DirectLight, NetworkRenderer, traced_network
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import FixedSamples
 from pipeline.renders.denoiser import Quality, denoise
-from pipeline.renders.preview import PreviewRenderer, PreviewSettings
-from pipeline.renders.renderer import run_to_end
 from pipeline.renders.settings import Filtered
 from pipeline.renders.tracer import Features
-from storage.records.scene import Scene
-from storage.renderer import Camera, Renderer
+from storage.renderer import Renderer
 
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
-
-View = Callable[[NDArray[np.float32], float], NDArray[np.float32]]
-"""Function that renders [R, R, 3] from camera to world [4, 4] and full field of view in degrees."""
-
-Method = Callable[[Scene], View]
-"""Function that loads a scene and returns its `View`; all pictures have one width."""
 
 DIRECT_LIGHT = DirectLight.name
 TRACED_LIGHT = "all traced light, no network"
@@ -78,43 +68,6 @@ def warm_up_denoiser(resolution: int, quality: Quality = "high") -> None:
     """Create this process's denoiser for pictures of a size."""
     black = np.zeros((resolution, resolution, 3), np.float32)
     denoise(black, Features(albedo=black, normal=black), quality)
-
-
-def sampled_method(resolution: int, spp: int, denoiser: Filtered) -> Method:
-    """Return the path tracer with a number of samples per pixel and one denoise.
-
-    It runs only in a render child. Samples have the same seed in every view, as those of `trilight
-    render --orbit`.
-    """
-    settings = PreviewSettings(resolution=resolution, spp=spp, denoiser=denoiser)
-
-    def load(scene: Scene) -> View:
-        renderer = PreviewRenderer(scene, settings)
-        return lambda c2w, fov_deg: (
-            run_to_end(renderer.view_steps(c2w, fov_deg, SAMPLE_SEED)).radiance_rgb
-        )
-
-    return load
-
-
-def network_method(renderer: "NeuralRenderer", resolution: int) -> Method:
-    """Return the method that renders with a network."""
-
-    def load(scene: Scene) -> View:
-        prepared = renderer.prepare(scene)
-        return lambda c2w, fov_deg: renderer.view(prepared, c2w, fov_deg, resolution)
-
-    return load
-
-
-def direct_light_method(resolution: int) -> Method:
-    """Return the method that renders the direct light of lamps."""
-
-    def load(scene: Scene) -> View:
-        loaded = DirectLight(resolution=resolution).load(scene, "scene")
-        return lambda c2w, fov_deg: loaded.view(Camera(c2w=c2w, fov_deg=fov_deg))
-
-    return load
 
 
 def compared_renderers(

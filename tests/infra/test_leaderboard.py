@@ -22,11 +22,13 @@ from infra.leaderboard import (
 )
 from infra.picture_folder import PictureFolder, picture_folders
 from infra.render.methods import DIRECT_LIGHT, TRACED_LIGHT
+from infra.render.networks import NetworkRenderer
 from model.open import save_published
 from pipeline.exchange.exports.export import export_dataset
 from pipeline.exchange.exports.scenes import picture_name
 from storage.errors import TrilightError, Unrenderable
 from storage.records.exr import encode_channels
+from storage.renderer import Renderer
 from tests.command_line import trilight
 from tests.for_each import case
 from tests.model.kit import awake
@@ -72,9 +74,18 @@ def order(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Leader
 def short(order: LeaderboardOptions, monkeypatch: pytest.MonkeyPatch) -> LeaderboardOptions:
     """Return an order of one network beside the nearest picture, without a chart."""
     monkeypatch.setattr(run_module, "BUILTIN_NETWORKS", ("builtin:tokens",))
-    monkeypatch.setattr(run_module, "_add_traced", lambda lineup, widths: None)
+    monkeypatch.setattr(run_module, "compared_renderers", networks_alone)
     monkeypatch.setattr(run_module, "plot_leaderboard", lambda *words: None)
     return order
+
+
+def networks_alone(resolution: int, networks: Any, *more: Any) -> list[Renderer]:
+    return [
+        NetworkRenderer(
+            name=name, checkpoint=name, resolution=resolution, threads=1, opened=network
+        )
+        for name, network in networks.items()
+    ]
 
 
 def board_of(order: LeaderboardOptions) -> Leaderboard:
@@ -208,8 +219,8 @@ def test_prices_of_two_machines_do_not_mix(
 ) -> None:
     def prices(machine: str, measured_s: float) -> tuple[dict[str, str], Leaderboard]:
         def timed(renderer: Any, scene: Any, name: str) -> Any:
-            loaded, _ = real(renderer, scene, name)
-            return loaded, Price(first_s=measured_s, further_s=measured_s / 2)
+            price = Price(first_s=measured_s, further_s=measured_s / 2)
+            return dataclasses.replace(real(renderer, scene, name), price=price)
 
         monkeypatch.setattr(run_module, "processor", lambda: machine)
         monkeypatch.setattr(board_module, "time_scene", timed)
@@ -335,7 +346,7 @@ def test_two_folders_of_one_name_are_refused(folder: Path) -> None:
         picture_folders([folder, folder], SHOWN, WIDTHS)
 
 
-KEY = RowKey(width=64, scene="000000001", view=0, name="somebody", digest="d")
+KEY = RowKey(64, "000000001", 0, "somebody", "d")
 ROW = Row(scores={"psnr_log_db": 30.0, "lpips": None}, first_s=0.5, further_s=0.25)
 
 
@@ -346,9 +357,7 @@ def test_rows_come_back_and_the_later_of_two_counts(tmp_path: Path) -> None:
     rows.add(KEY, ROW)
     again = Rows(path, "set a")
     assert again.get(KEY) == rows.get(KEY) == ROW
-    assert (
-        again.get(RowKey(width=64, scene="000000001", view=0, name="somebody", digest="e")) is None
-    )
+    assert again.get(KEY._replace(digest="e")) is None
     assert len(path.read_text().splitlines()) == 3
     # written before rows named their machine: a price of nowhere
     assert rows.price(KEY, "somewhere") is None and again.machines() == {UNKNOWN_MACHINE}
@@ -394,7 +403,7 @@ def test_dollar_signs_in_names_are_no_formula(tmp_path: Path) -> None:
         for seconds in (0.5, None)
     )  # fmt: skip
     one = WidthStandings(
-        width=64, num_scenes=1, num_views=1, standings=(priced, unpriced), pairs={}
+        width=64, num_views=1, triangles={"a": 1}, standings=(priced, unpriced), pairs={}
     )
     plot_leaderboard([one], FORMULA, tmp_path / "board.png")
     assert (tmp_path / "board.png").read_bytes().startswith(b"\x89PNG")

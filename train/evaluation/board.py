@@ -9,7 +9,7 @@ import functools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,10 +39,12 @@ OnProgress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Board:
-    """Scenes, widths and methods of a leaderboard."""
+    """Scenes, widths and methods of a leaderboard, and what its reader should know of them."""
 
     shards: ShardSet
     """Dataset shards of the evaluated split."""
+    set_digest: str
+    """Digest of the dataset."""
     keys: Sequence[str]
     """Keys of the evaluated scenes, the first ones of the split."""
     num_views: int
@@ -53,25 +55,34 @@ class Board:
     """Name of this processor; times of different processors are not comparable."""
     widths: Sequence[int]
     """Widths of pictures in pixels, ascending."""
-    methods: Sequence[Method]
-    """Methods, each of one width, in the order of evaluation."""
     lpips: Lpips | None
     """LPIPS metric; None without its weights."""
-    rows: Rows
-    """Stored rows, to which new ones are added."""
+    folder: Path
+    """Folder of the rows."""
+    methods: list[Method] = field(default_factory=list)
+    """Methods, each of one width, in the order of evaluation."""
+    kinds: dict[str, str] = field(default_factory=dict)
+    """Kind of each method by name, which decides the chart's color."""
+    notes: list[str] = field(default_factory=list)
+    """Notes for the reader."""
     left_out: dict[tuple[int, str], str] = field(default_factory=dict)
     """Reason by (width, key) of scenes that a method cannot render."""
 
+    def add(self, method: Method, kind: str) -> None:
+        """Add a method of one width."""
+        self.methods.append(method)
+        self.kinds[method.name] = kind
+
     @functools.cached_property
-    def judged_by(self) -> str:
+    def rows(self) -> Rows:
+        """Stored rows; raises TrilightError if those of the folder are of another dataset."""
+        return Rows(self.folder / "rows.jsonl", self.set_digest)
+
+    @functools.cached_property
+    def _judged_by(self) -> str:
         """Digest of the metrics' definitions."""
         meanings = {metric: METRICS[metric].meaning for metric in METRICS}
         return sha256_hex(canonical_json([meanings, self.lpips is not None]))
-
-    def row_key(self, width: int, name: str, made_by: str, key: str, view: int) -> RowKey:
-        """Return the key of a row; `made_by` is the digest of the method of the picture."""
-        digest = sha256_hex(f"{made_by} {self.judged_by}".encode())
-        return RowKey(width=width, scene=key, view=view, name=name, digest=digest)
 
     @functools.cached_property
     def _renderer_digests(self) -> dict[int, str]:
@@ -88,11 +99,46 @@ class Board:
             made_by = method.digest(key, view)
         else:
             made_by = self._renderer_digests[id(method)]
-        return self.row_key(method.resolution, method.name, made_by, key, view)
+        return self._row_key(method.resolution, method.name, made_by, key, view)
+
+    def noise_key(self, width: int, key: str, view: int) -> RowKey:
+        """Return the key of the row of a target's own noise."""
+        return self._row_key(width, NOISE, "", key, view)
+
+    def _row_key(self, width: int, name: str, made_by: str, key: str, view: int) -> RowKey:
+        return RowKey(width, key, view, name, sha256_hex(f"{made_by} {self._judged_by}".encode()))
 
     def present(self, width: int) -> list[Method]:
         """Return the methods of a width."""
         return [method for method in self.methods if method.resolution == width]
+
+    def views(self, width: int) -> Iterator[JudgedView]:
+        """Yield the views that every method of a width has, with NOISE as a further method."""
+        present = self.present(width)
+        known = {one.name for one in dataclasses.fields(JudgedView)}
+        for key in self.keys:
+            for view in range(self.num_views):
+                noise = self.rows.get(self.noise_key(width, key, view))
+                rows = {one.name: self.rows.get(self.key_of(one, key, view)) for one in present}
+                if noise is None or noise.facts is None or None in rows.values():
+                    continue
+                floors = {name: value for name, value in noise.scores.items() if value is not None}
+                scores = {name: dict(row.scores) for name, row in rows.items() if row is not None}
+                scores[NOISE] = {metric: noise.scores.get(metric) for metric in METRICS}
+                facts = {name: value for name, value in noise.facts.items() if name in known}
+                if facts["excursion"] is not None:  # JSON has no pairs
+                    facts["excursion"] = tuple(facts["excursion"])
+                yield JudgedView(view=view, floors=floors, scores=scores, **facts)
+
+    def prices(self, width: int) -> dict[str, list[Price]]:
+        """Return the prices of this machine by method, one for each timed scene."""
+        found: dict[str, list[Price]] = {}
+        for method in self.present(width):
+            for key in self.keys[: self.timed_scenes]:
+                price = self.rows.price(self.key_of(method, key, 0), self.machine)
+                if price is not None and (width, key) not in self.left_out:
+                    found.setdefault(method.name, []).append(price)
+        return found
 
 
 def first_keys(shards: ShardSet, limit: int) -> list[str]:
@@ -139,6 +185,12 @@ class _SceneAtWidth:
     def _judged(self) -> ValidationScene:
         return validation_scene(self._sample, self._width)
 
+    def _views(self) -> Sequence[int]:
+        return range(self._sample.scene.num_views)
+
+    def _is_timed(self, method: Method) -> bool:
+        return self._timed and not isinstance(method, StoredPictures)
+
     def missing(self) -> list[Method]:
         """Return the methods that lack rows or times of the scene."""
         return [one for one in self._board.present(self._width) if not self._has_all(one)]
@@ -149,40 +201,31 @@ class _SceneAtWidth:
         is_priced = not self._is_timed(method) or rows.price(keys[0], self._board.machine)
         return bool(is_priced) and all(rows.get(key) is not None for key in keys)
 
-    def _is_timed(self, method: Method) -> bool:
-        return self._timed and not isinstance(method, StoredPictures)
-
-    def _views(self) -> Sequence[int]:
-        return range(self._sample.scene.num_views)
-
     def judge(self, method: Method) -> None:
         """Add a method's rows, or record why the scene is left out."""
+        board, sample, judged = self._board, self._sample, self._judged
         try:
-            pictures, price = _show(method, self._sample, timed=self._is_timed(method))
+            pictures, price = _show(method, sample, timed=self._is_timed(method))
         except Unrenderable as error:
-            reason = f"{method.name}: {error}"
-            self._board.left_out[self._width, self._sample.key] = reason
+            board.left_out[self._width, sample.key] = f"{method.name}: {error}"
             return
-        judged = self._judged
         for view, picture in enumerate(pictures):
             scores = picture_scores(
-                picture, judged.target_VRR3[view], judged.hits_VRR[view], self._board.lpips
+                picture, judged.target_VRR3[view], judged.hits_VRR[view], board.lpips
             )
             row = Row(scores=scores)
             if price is not None and view == 0:
-                row = Row(scores=scores, **dataclasses.asdict(price), machine=self._board.machine)
-            self._board.rows.add(self._board.key_of(method, self._sample.key, view), row)
+                row = Row(scores=scores, **dataclasses.asdict(price), machine=board.machine)
+            board.rows.add(board.key_of(method, sample.key, view), row)
 
     def judge_noise(self) -> None:
         """Add the scores of the targets' own noise, with facts of the scene."""
         board, sample = self._board, self._sample
         for view in self._views():
-            key = board.row_key(self._width, NOISE, "", sample.key, view)
+            key = board.noise_key(self._width, sample.key, view)
             if board.rows.get(key) is None:
-                judged = self._judged
-                floors = noise_floors(
-                    sample, view, judged.target_VRR3[view], judged.hits_VRR[view], board.lpips
-                )
+                target, hits = self._judged.target_VRR3[view], self._judged.hits_VRR[view]
+                floors = noise_floors(sample, view, target, hits, board.lpips)
                 board.rows.add(key, Row(scores=floors, facts=scene_facts(sample)))
 
 
@@ -192,56 +235,9 @@ def _show(
     """Return the pictures [R, R, 3] of all views, and the price if it is measured."""
     if isinstance(method, StoredPictures):
         return list(method.pictures(sample)), None
-    scene, price = sample.scene, None
-    if timed:
-        loaded, price = time_scene(method, scene, sample.key)
-    else:
-        loaded = method.load(scene, sample.key)
+    scene = sample.scene
+    measured = time_scene(method, scene, sample.key) if timed else None
+    loaded = measured.loaded if measured else method.load(scene, sample.key)
     cameras = [Camera.of_scene(scene, view) for view in range(scene.num_views)]
-    return [loaded.render(camera).radiance_rgb for camera in cameras], price
-
-
-@dataclass(frozen=True, kw_only=True)
-class JudgedWidth:
-    """Scores and times of all methods at one width."""
-
-    width: int
-    """Width of the pictures in pixels."""
-    views: tuple[JudgedView, ...]
-    """Views that every method of the width has, with NOISE as a further method."""
-    prices: dict[str, list[Price]]
-    """Prices by method, one for each timed scene."""
-
-
-def judged_width(board: Board, width: int) -> JudgedWidth:
-    """Return the rows of a width, grouped by view."""
-    judged = JudgedWidth(width=width, views=tuple(_views(board, width)), prices={})
-    scene_keys = {view.key for view in judged.views}
-    for method in board.present(width):
-        for key in board.keys[: board.timed_scenes]:
-            price = board.rows.price(board.key_of(method, key, 0), board.machine)
-            if key in scene_keys and price is not None:
-                judged.prices.setdefault(method.name, []).append(price)
-    return judged
-
-
-def _views(board: Board, width: int) -> Iterator[JudgedView]:
-    present = board.present(width)
-    for key in board.keys:
-        for view in range(board.num_views):
-            noise = board.rows.get(board.row_key(width, NOISE, "", key, view))
-            rows = {one.name: board.rows.get(board.key_of(one, key, view)) for one in present}
-            if noise is None or noise.facts is None or None in rows.values():
-                continue
-            floors = {name: value for name, value in noise.scores.items() if value is not None}
-            scores = {name: dict(row.scores) for name, row in rows.items() if row is not None}
-            scores[NOISE] = {metric: noise.scores.get(metric) for metric in METRICS}
-            yield JudgedView(view=view, floors=floors, scores=scores, **_facts(noise.facts))
-
-
-def _facts(facts: Any) -> dict[str, Any]:
-    """Return facts of a view from JSON, with the pair that JSON turned into a list."""
-    excursion = facts["excursion"]
-    known = {one.name for one in dataclasses.fields(JudgedView)}
-    values = {**facts, "excursion": None if excursion is None else tuple(excursion)}
-    return {name: value for name, value in values.items() if name in known}
+    pictures = [loaded.render(camera).radiance_rgb for camera in cameras]
+    return pictures, measured.price if measured else None

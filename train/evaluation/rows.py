@@ -1,7 +1,6 @@
 """Store of a leaderboard's scores in rows.jsonl, so that no view is evaluated twice.
 
-The key of a line is width, scene, view, the method's name, and the digest of everything that
-decides the picture and its evaluation. The first line names the dataset of the others.
+The first line of the file names the dataset; each other one is a `Row`.
 """
 
 import json
@@ -9,7 +8,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from storage.atomic import write_error
 from storage.errors import TrilightError
@@ -20,8 +19,7 @@ UNKNOWN_MACHINE = "a machine that is not named"
 """Machine of old rows, which do not name theirs."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RowKey:
+class RowKey(NamedTuple):
     """Key of a row."""
 
     width: int
@@ -72,7 +70,7 @@ class Rows:
             stored_digest = str(json.loads(lines[0])["set"])
             for line in lines[1:]:
                 record = json.loads(line)
-                key = RowKey(**{name: record.pop(name) for name in RowKey.__dataclass_fields__})
+                key = RowKey(*(record.pop(name) for name in RowKey._fields))
                 self._keep(key, Row(**record))
         except (ValueError, KeyError, TypeError) as error:
             raise TrilightError(
@@ -100,7 +98,7 @@ class Rows:
     def add(self, key: RowKey, row: Row) -> None:
         """Append a row to the file; of two rows with one key the later one counts."""
         plain = {name: value for name, value in asdict(row).items() if value is not None}
-        self._append({**asdict(key), **plain})
+        self._append({**key._asdict(), **plain})
         self._keep(key, row)
 
     def _keep(self, key: RowKey, row: Row) -> None:

@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from storage.errors import TrilightError, Unrenderable
 from storage.records.sample import Sample
@@ -31,8 +31,11 @@ TIMED_SCENES = 4
 TIMED_S = 60.0
 """CPU seconds of the network after which no further scene is timed."""
 
-Level = tuple[int, str]
-"""Samples per pixel, and the denoiser's filter: fast or high."""
+Filter = Literal["fast", "high"]
+"""Filter of the denoiser."""
+
+Level = tuple[int, Filter]
+"""Samples per pixel, and the filter."""
 
 LEAST: Level = (1, "fast")
 """Cheapest level."""
@@ -47,7 +50,7 @@ class TracerTimes:
 
     samples: int
     """Number of samples per pixel."""
-    denoiser: str
+    denoiser: Filter
     """Name of the denoiser's filter."""
     first_s: float
     """CPU seconds of the first view of a scene."""
@@ -132,11 +135,11 @@ def time_both(
     for sample in samples:
         if not timed or time.process_time() - began < TIMED_S:
             timed.append(sample)
-            ours.append(time_scene(network, sample.scene, sample.key)[1])
+            ours.append(time_scene(network, sample.scene, sample.key).price)
     theirs: list[Mapping[Level, Price]] = []
     if previews:
         theirs, missing = _preview_prices(previews, timed, median_price(ours).further_s)
-    ours += [time_scene(network, sample.scene, sample.key)[1] for sample in timed]
+    ours += [time_scene(network, sample.scene, sample.key).price for sample in timed]
     middle = median_price(ours)
     preview = None
     if theirs:
@@ -178,7 +181,7 @@ def _ladder_prices(
         fewer = prices.get((spp // 2, "fast"))
         if fewer is not None and fewer.further_s > most_s:
             break
-        prices[spp, denoiser] = time_scene(preview, sample.scene, sample.key)[1]
+        prices[spp, denoiser] = time_scene(preview, sample.scene, sample.key).price
     return prices
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from train.evaluation.board import NOISE, JudgedWidth
+from train.evaluation.board import NOISE, Board
 from train.evaluation.cost_tables import on_front
 from train.evaluation.judged_view import summarize_views
 from train.evaluation.pairs import METRIC, PairedLead, paired_lead
@@ -45,28 +45,31 @@ class WidthStandings:
 
     width: int
     """Width of the pictures in pixels."""
-    num_scenes: int
-    """Number of scenes that all methods rendered."""
     num_views: int
-    """Number of views of these scenes."""
+    """Number of views that all methods rendered."""
+    triangles: Mapping[str, int]
+    """Number of triangles of each scene by its key."""
     standings: tuple[Standing, ...]
     """Rows, NOISE first, then sorted from the best to the worst."""
     pairs: Mapping[tuple[str, str], PairedLead]
     """Paired difference of the first from the second, for every pair of names."""
 
+    @property
+    def num_scenes(self) -> int:
+        """Number of scenes of these views."""
+        return len(self.triangles)
 
-def standings_of(judged: JudgedWidth, kinds: Mapping[str, str], rival: str) -> WidthStandings:
-    """Return the table of a width.
 
-    Args:
-        judged: scores and times, with one view at least.
-        kinds: kind of each method by name.
-        rival: name of the row that all others are compared with.
-    """
-    names = [name for name in judged.views[0].scores if name != NOISE]
-    pairs = {two: paired_lead(judged.views, *two) for two in itertools.permutations(names, 2)}
-    scores = {name: summarize_views(judged.views, name) for name in [NOISE, *names]}
-    costs = {name: median_price(prices) for name, prices in judged.prices.items()}
+def standings_of(board: Board, width: int, rival: str) -> WidthStandings | None:
+    """Return the table of a width, compared with `rival`; None without a judged view."""
+    views = list(board.views(width))
+    if not views:
+        return None
+    names = [name for name in views[0].scores if name != NOISE]
+    pairs = {two: paired_lead(views, *two) for two in itertools.permutations(names, 2)}
+    scores = {name: summarize_views(views, name) for name in [NOISE, *names]}
+    prices = board.prices(width)
+    costs = {name: median_price(each) for name, each in prices.items()}
     figures = [
         (-float(scores[name][METRIC]["median"]), (cost.first_s, cost.further_s))
         for name, cost in costs.items()
@@ -75,20 +78,20 @@ def standings_of(judged: JudgedWidth, kinds: Mapping[str, str], rival: str) -> W
     standings = [
         Standing(
             name=name,
-            kind=kinds.get(name, ""),
+            kind=board.kinds.get(name, ""),
             first_s=costs[name].first_s if name in costs else None,
             further_s=costs[name].further_s if name in costs else None,
-            timed_scenes=len(judged.prices.get(name, ())),
-            scores=scores[name],
+            timed_scenes=len(prices.get(name, ())),
+            scores=summary,
             lead=pairs.get((name, rival)),
             on_front=front.get(name),
         )
-        for name in scores
+        for name, summary in scores.items()
     ]
     return WidthStandings(
-        width=judged.width,
-        num_scenes=len({view.key for view in judged.views}),
-        num_views=len(judged.views),
+        width=width,
+        num_views=len(views),
+        triangles={view.key: view.num_triangles for view in views},
         standings=tuple(sorted(standings, key=lambda one: (one.name != NOISE, -one.median_db))),
         pairs=pairs,
     )

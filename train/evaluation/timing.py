@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from storage.records.scene import Scene
 from storage.renderer import Camera, LoadedScene, Renderer
@@ -19,22 +20,39 @@ class Price:
     """CPU seconds of a further view."""
 
 
-def time_scene(renderer: Renderer, scene: Scene, name: str) -> tuple[LoadedScene, Price]:
-    """Load a scene and render its first view twice, after a round that warms everything up.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TimedScene:
+    """Scene that a renderer has loaded, with what that and its pictures take."""
+
+    loaded: LoadedScene
+    radiance_rgb: NDArray[np.float32]
+    """[R, R, 3] linear radiance of the first view."""
+    price: Price
+    """Medians over the measured rounds."""
+
+
+def time_scene(renderer: Renderer, scene: Scene, name: str, rounds: int = 1) -> TimedScene:
+    """Load a scene and render its first view twice, in rounds after one that warms everything up.
 
     Args:
         renderer: a renderer that states its CPU seconds.
         scene: the scene.
         name: name of the scene in messages.
+        rounds: measured rounds.
 
     Raises:
         Unrenderable, TrilightError: as `Renderer.load` and `LoadedScene.render`.
     """
-    for _ in range(2):
+    camera = Camera.of_scene(scene, 0)
+    prices = []
+    for _ in range(1 + rounds):
         loaded = renderer.load(scene, name)
-        camera = Camera.of_scene(scene, 0)
-        first_s, further_s = (loaded.render(camera).cpu_seconds or 0.0 for _ in range(2))
-    return loaded, Price(first_s=(loaded.cpu_seconds or 0.0) + first_s, further_s=further_s)
+        first, further = loaded.render(camera), loaded.render(camera)
+        first_s = (loaded.cpu_seconds or 0.0) + (first.cpu_seconds or 0.0)
+        prices.append(Price(first_s=first_s, further_s=further.cpu_seconds or 0.0))
+    return TimedScene(
+        loaded=loaded, radiance_rgb=further.radiance_rgb, price=median_price(prices[1:])
+    )
 
 
 def median_price(prices: Sequence[Price]) -> Price:

@@ -22,7 +22,6 @@ from infra.render.methods import (
 )
 from infra.render.path_tracer import RenderChild
 from infra.render.raw_references import RawReference, first_camera, true_error_db
-from infra.timed_views import TimedViews, time_views
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK
 from pipeline.renders.noise_floor import clamped_radiance
@@ -33,6 +32,9 @@ from storage.records.scene import Scene
 from storage.renderer import Renderer
 
 WIDTHS = (64, 256)
+
+ROUNDS = 3
+"""Measured rounds after the one that warms up; their median counts."""
 
 
 def row_name(px: int, name: str) -> str:
@@ -68,7 +70,7 @@ def _measure(
         camera = first_camera(scene, px)
         reference = kept_reference(child, scene, camera, 2 * context.scale.max_spp)
         for renderer in renderers[px]:
-            figures = judged_figures(time_views(renderer, scene), scene, reference)
+            figures = judged_figures(renderer, scene, reference)
             yield row_name(px, renderer.name), figures
 
 
@@ -91,17 +93,19 @@ def _set_up(context: BenchContext) -> tuple[Mapping[int, Sequence[Renderer]], Is
     return renderers, context.render_child(held_out_build(), BENCHMARK, threads=1)
 
 
-def judged_figures(picture: TimedViews, scene: Scene, reference: RawReference) -> Figures:
+def judged_figures(renderer: Renderer, scene: Scene, reference: RawReference) -> Figures:
     """Return the figures of a picture; its decibels exclude the noise of the reference."""
     from train.evaluation.metrics import picture_scores
+    from train.evaluation.timing import time_scene
 
+    picture = time_scene(renderer, scene, "scene", ROUNDS)
     radiance_rgb = picture.radiance_rgb
     hits = first_hits(scene, resolution=len(radiance_rgb)).met
     everywhere = np.ones_like(hits)
     mean = 0.5 * (reference.a_rgb + reference.b_rgb)
     return {
-        "core_s": picture.first_s,
-        "view_s": picture.further_s,
+        "core_s": picture.price.first_s,
+        "view_s": picture.price.further_s,
         "db": true_error_db(radiance_rgb, reference, log10_radiance, everywhere)[0],
         "object_db": true_error_db(radiance_rgb, reference, log10_radiance, hits)[0],
         "linear_db": true_error_db(radiance_rgb, reference, clamped_radiance, everywhere)[0],

@@ -1,7 +1,6 @@
 """What networks are judged beside: methods without one, the path tracer, raw references."""
 
 import dataclasses
-import time
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from infra.render.networks import (
     untrained_network,
 )
 from infra.render.raw_references import RawReference, true_error_db
-from infra.timed_views import Show, timed_views
 from model.config import hits_smoke
 from model.neural_renderer import NeuralRenderer
 from pipeline.exchange.open_scene import SceneSource
@@ -131,25 +129,3 @@ def test_two_renderers_without_noise() -> None:
     assert difference_db(one, other, log10_radiance) == pytest.approx(exact, abs=0.5)
     same = RawReference(a_rgb=_noisy(rng, 0.05), b_rgb=_noisy(rng, 0.05))
     assert difference_db(one, same, log10_radiance) > exact + 8
-
-
-def test_the_first_view_pays_for_loading_and_the_round_that_warms_up_counts_not(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    now = [0.0]
-    loaded = [100.0, 3.0, 5.0, 4.0]
-    monkeypatch.setattr(time, "process_time", lambda: now[0])
-
-    def load() -> Show:
-        now[0] += loaded.pop(0)
-
-        def show() -> np.ndarray:
-            now[0] += 1.0
-            return np.full((2, 2, 3), now[0], np.float32)
-
-        return show
-
-    found = timed_views(load, repeats=3)
-    assert not loaded
-    assert (found.first_s, found.further_s) == (5.0, 1.0)  # the median of 3, 5 and 4, and a view
-    assert found.radiance_rgb[0, 0, 0] == now[0], "the last picture"

@@ -269,8 +269,8 @@ def test_no_report_takes_the_place_of_another_networks(
         monkeypatch.setattr(judging, name, lambda *more: {})
 
     def written(digest: str) -> str:
-        about, idle = {"network sha256": digest}, SimpleNamespace(tracer=None)
-        told: Any = SimpleNamespace(record={"about": about}, views=(), contest=idle)
+        figures = {"about": {"network sha256": digest}, "path tracer": {"preview": None}}
+        told: Any = SimpleNamespace(record=figures, views=(), contest=SimpleNamespace())
         return judging.write_judgement(told, tmp_path / "evaluation").name
 
     assert [*map(written, "aba")] == ["evaluation", "evaluation-2", "evaluation"]
