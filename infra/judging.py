@@ -44,6 +44,8 @@ from train.evaluation.same_time import (
     Level,
     SameTimeResult,
     same_time,
+    spread_text,
+    spread_views,
     time_both,
 )
 from train.evaluation.sheet import draw_sheet, write_picture
@@ -127,7 +129,7 @@ def judge_network(
         times, tracer = _time_tracer(contest, stack)
         judged = dataclasses.replace(contest, tracer=tracer)
         views = judge_views(judged, lambda: done(next(numbers), total))
-    which = contest.traced_views.text(max(view.view for view in views) + 1)
+    which = spread_text(*spread_views(tracer_views, total), 1 + max(view.view for view in views))
     about = _about(Path(checkpoint).name, opened, contest, split, views)
     told = record(views, about, same_time(views, times, which))
     return Judgement(record=told, views=tuple(views), contest=contest)

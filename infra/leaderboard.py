@@ -27,7 +27,7 @@ from train.evaluation.evaluate import BASELINE_SCENES, make_baselines, stored_re
 from train.evaluation.options import LeaderboardOptions
 from train.evaluation.pages import leaderboard_page, pairs_csv, standings_csv
 from train.evaluation.standings import WidthStandings, standings_of
-from train.evaluation.stored_pictures import NearestView
+from train.evaluation.stored_pictures import nearest_view
 from train.loss.lpips import load_lpips
 
 USUAL_WIDTHS = (64, 256, 512)
@@ -138,7 +138,7 @@ def _add_nearest(board: Board, order: LeaderboardOptions, opened: TrainingData) 
     for width in board.widths:
         read = functools.partial(make_baselines, pool.split(split), width)
         pool_name = f"{pool.digest} {split}"
-        nearest = NearestView(name, width, read, pool=pool_name, not_itself=is_own)
+        nearest = nearest_view(name, width, read, pool=pool_name, not_itself=is_own)
         board.add(nearest, BASELINE)
     note = (
         f"{name} is found by the target itself, among the first {BASELINE_SCENES} scenes of the "

@@ -21,58 +21,55 @@ Views = Sequence[tuple[str, int]]
 """Scene key and camera of every evaluated view."""
 
 
-class PictureFolder(StoredPictures):
-    """Pictures from elsewhere, all of one width.
+def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> StoredPictures:
+    """Return a folder of pictures from elsewhere, all of one width, after checking every view's.
 
     Values slightly below 0, which networks of logarithms return, count as 0; alpha is ignored.
+
+    Raises:
+        TrilightError: a picture is missing, unreadable, of another width than the first one or than
+            the evaluated ones, or has values that are not finite or below 0.
     """
+    _require_all(folder, views)
+    sha256: dict[tuple[str, int], str] = {}
+    by_width: dict[int, Path] = {}
+    for key, view in views:
+        path = folder / picture_name(key, view)
+        data = _bytes_of(path)
+        by_width.setdefault(_picture(data, path, widths).shape[0], path)
+        sha256[key, view] = sha256_hex(data)
+    if len(by_width) > 1:
+        listed = ", ".join(f"{path.name} has {width}" for width, path in by_width.items())
+        raise TrilightError(
+            f"--pictures {folder}: its pictures have several widths ({listed}); expected one. "
+            "Put those of each width into a folder of their own."
+        )
+    (resolution,) = by_width
 
-    def __init__(self, folder: Path, views: Views, widths: Sequence[int]) -> None:
-        """Check the picture of every view.
+    def pictures(sample: Sample) -> NDArray[np.float32]:
+        names = [picture_name(sample.key, view) for view in range(sample.scene.num_views)]
+        paths = [folder / name for name in names]
+        found = [_picture(_bytes_of(path), path, [resolution]) for path in paths]
+        return np.maximum(np.stack(found), 0)
 
-        Raises:
-            TrilightError: a picture is missing, unreadable, of another width than the first one or
-                than the evaluated ones, or has values that are not finite or below 0.
-        """
-        self.name = f"pictures of {folder.name or folder.resolve().name}"
-        self._folder = folder
-        self._require_all(views)
-        self._sha256: dict[tuple[str, int], str] = {}
-        by_width: dict[int, Path] = {}
-        for key, view in views:
-            path = self._path(key, view)
-            data = _bytes_of(path)
-            by_width.setdefault(_picture(data, path, widths).shape[0], path)
-            self._sha256[key, view] = sha256_hex(data)
-        if len(by_width) > 1:
-            listed = ", ".join(f"{path.name} has {width}" for width, path in by_width.items())
-            raise TrilightError(
-                f"--pictures {folder}: its pictures have several widths ({listed}); expected one. "
-                "Put those of each width into a folder of their own."
-            )
-        (self.resolution,) = by_width
+    return StoredPictures(
+        name=f"pictures of {folder.name or folder.resolve().name}",
+        resolution=resolution,
+        digest=lambda key, view: sha256[key, view],
+        pictures=pictures,
+    )
 
-    def digest(self, key: str, view: int) -> str:
-        return self._sha256[key, view]
 
-    def pictures(self, sample: Sample) -> NDArray[np.float32]:
-        paths = [self._path(sample.key, view) for view in range(sample.scene.num_views)]
-        pictures = [_picture(_bytes_of(path), path, [self.resolution]) for path in paths]
-        return np.maximum(np.stack(pictures), 0)
-
-    def _path(self, key: str, view: int) -> Path:
-        return self._folder / picture_name(key, view)
-
-    def _require_all(self, views: Views) -> None:
-        if not self._folder.is_dir():
-            raise TrilightError(f"--pictures {self._folder}: no such folder; expected one.")
-        missing = [name for name in views if not self._path(*name).is_file()]
-        if missing:
-            raise TrilightError(
-                f"--pictures {self._folder}: {len(missing)} of {len(views)} pictures are missing, "
-                f"the first is {picture_name(*missing[0])}; expected one for each view, called as "
-                "`trilight export SET --form exr` calls them. --scenes judges fewer."
-            )
+def _require_all(folder: Path, views: Views) -> None:
+    if not folder.is_dir():
+        raise TrilightError(f"--pictures {folder}: no such folder; expected one.")
+    missing = [name for name in views if not (folder / picture_name(*name)).is_file()]
+    if missing:
+        raise TrilightError(
+            f"--pictures {folder}: {len(missing)} of {len(views)} pictures are missing, the first "
+            f"is {picture_name(*missing[0])}; expected one for each view, called as `trilight "
+            "export SET --form exr` calls them. --scenes judges fewer."
+        )
 
 
 def _bytes_of(path: Path) -> bytes:
@@ -117,11 +114,11 @@ def _refuse(radiance_rgb: NDArray[np.float32], legal: NDArray[np.bool_], name: s
 
 def picture_folders(
     folders: Sequence[Path], views: Views, widths: Sequence[int]
-) -> list[PictureFolder]:
+) -> list[StoredPictures]:
     """Return the checked folders; raises TrilightError for equal names."""
-    found: list[PictureFolder] = []
+    found: list[StoredPictures] = []
     for folder in folders:
-        one = PictureFolder(folder, views, widths)
+        one = picture_folder(folder, views, widths)
         if one.name in [other.name for other in found]:
             raise TrilightError(
                 f"--pictures {folder}: another folder has the same name; expected different ones."

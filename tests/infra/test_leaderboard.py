@@ -20,7 +20,7 @@ from infra.leaderboard import (
     make_leaderboard,
     widths_of,
 )
-from infra.picture_folder import PictureFolder, picture_folders
+from infra.picture_folder import picture_folder, picture_folders
 from infra.render.methods import DIRECT_LIGHT, TRACED_LIGHT
 from infra.render.networks import NetworkRenderer
 from model.open import save_published
@@ -41,7 +41,7 @@ from train.evaluation.options import LeaderboardOptions
 from train.evaluation.pairs import METRIC
 from train.evaluation.rows import UNKNOWN_MACHINE, Row, RowKey, Rows
 from train.evaluation.standings import Standing, WidthStandings
-from train.evaluation.stored_pictures import NearestView
+from train.evaluation.stored_pictures import StoredPictures, nearest_view
 from train.evaluation.timing import Price
 
 PX = 16
@@ -176,17 +176,20 @@ def test_a_set_without_training_split_looks_up_its_other_scenes(
 def test_a_scene_that_somebody_cannot_show_is_left_out_for_all(
     short: LeaderboardOptions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(self: Any, sample: Any) -> Any:
-        if sample.key.endswith("4"):
-            raise Unrenderable("nothing shines")
-        return real(self, sample)
+    def refused(*words: Any, **more: Any) -> StoredPictures:
+        def pictures(sample: Any) -> Any:
+            if sample.key.endswith("4"):
+                raise Unrenderable("nothing shines")
+            return found.pictures(sample)
 
-    real = NearestView.pictures
-    monkeypatch.setattr(NearestView, "pictures", refused)
+        found = nearest_view(*words, **more)
+        return dataclasses.replace(found, pictures=pictures)
+
+    monkeypatch.setattr(run_module, "nearest_view", refused)
     board = board_of(short)
     assert board.widths[0].num_scenes == 1
     assert any("scene 000000004 is left out at 16 pixels" in text for text in board.notes)
-    monkeypatch.setattr(NearestView, "pictures", real)
+    monkeypatch.setattr(run_module, "nearest_view", nearest_view)
     assert board_of(short).widths[0].num_scenes == 2, "and asked again"
 
 
@@ -283,7 +286,7 @@ def write(path: Path, rgb: np.ndarray) -> None:
 
 def refusal(folder: Path) -> str:
     with pytest.raises(TrilightError) as refused:
-        PictureFolder(folder, SHOWN, WIDTHS)
+        picture_folder(folder, SHOWN, WIDTHS)
     assert "\n" not in str(refused.value)
     return str(refused.value)
 
@@ -294,14 +297,14 @@ def test_pictures_are_shown_as_they_are_at_their_one_width(folder: Path) -> None
     alpha = np.full((16, 16), 0.5, np.float32)
     channels = dict(zip("RGB", np.moveaxis(rgb, -1, 0).copy(), strict=True)) | {"A": alpha}
     (folder / picture_name(*SHOWN[2])).write_bytes(encode_channels(channels))
-    one = PictureFolder(folder, SHOWN, WIDTHS)
+    one = picture_folder(folder, SHOWN, WIDTHS)
     assert one.name == "pictures of mine" and one.resolution == 16
     shown = one.pictures(toy_sample(1))
     np.testing.assert_array_equal(shown[0], np.maximum(rgb, 0))
     np.testing.assert_array_equal(shown[1], picture(3))
     before = one.digest(*SHOWN[0])
     write(folder / picture_name(*SHOWN[0]), picture(9))
-    after = PictureFolder(folder, SHOWN, WIDTHS)
+    after = picture_folder(folder, SHOWN, WIDTHS)
     assert after.digest(*SHOWN[0]) != before and after.digest(*SHOWN[1]) == one.digest(*SHOWN[1])
 
 

@@ -30,7 +30,7 @@ from train.evaluation.judge import ValidationScene, predict, validation_scene
 from train.evaluation.judged_view import GROUPED, NETWORK, JudgedView, scene_facts
 from train.evaluation.metrics import noise_floors, picture_scores
 from train.evaluation.options import SceneCount, Width
-from train.evaluation.same_time import CAPTION, TRACER, TracedViews
+from train.evaluation.same_time import CAPTION, TRACER, spread_views
 from train.evaluation.sheet import SheetView
 from train.loss.lpips import Lpips
 
@@ -71,11 +71,6 @@ class EvalConfig:
                 count += self.shards.num_samples(number)
         return min(count, self.most_scenes)
 
-    @property
-    def traced_views(self) -> TracedViews:
-        """Views that the path tracer is judged on."""
-        return TracedViews(most_views=self.tracer_views, num_scenes=self.num_scenes)
-
     def samples(self) -> Iterator[Sample]:
         """Yield the samples; a damaged one raises, since the scores would be of another set."""
         return first_samples(self.shards, self.most_scenes, BadSampleCounter(0))
@@ -101,7 +96,7 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
     """
     rows: list[JudgedView] = []
     before: SceneTensors | None = None
-    to_trace = config.traced_views
+    every, first = spread_views(config.tracer_views, config.num_scenes)
     for number, sample in enumerate(config.samples()):
         scene = validation_scene(sample, config.resolution)
         if config.network.config.view_stage == "hits":
@@ -112,9 +107,7 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
         if grouped_VRR3 is not None:
             contestants[GROUPED] = grouped_VRR3
         views = range(len(scene.target_VRR3))
-        traced = _traced_pictures(
-            config, sample, [view for view in views if to_trace.has(number, view)]
-        )
+        traced = _traced_pictures(config, sample, views[:first] if number % every == 0 else ())
         scene_rows = []
         for view in views:
             pictures = {name: pictures_VRR3[view] for name, pictures_VRR3 in contestants.items()}

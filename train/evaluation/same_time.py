@@ -5,8 +5,8 @@ per pixel with either filter. The baseline is the preview of the most samples wh
 takes no longer than the network's; if even one sample takes longer, it is that one.
 """
 
+import contextlib
 import dataclasses
-import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -36,12 +36,6 @@ Filter = Literal["fast", "high"]
 
 Level = tuple[int, Filter]
 """Samples per pixel, and the filter."""
-
-LEAST: Level = (1, "fast")
-"""Cheapest level."""
-
-DEARER = Price(first_s=math.inf, further_s=math.inf)
-"""Price of a level that was not tried, since fewer samples took too long."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,35 +70,17 @@ class SameTimeResult:
     """Reason why nothing is traced; empty otherwise."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class TracedViews:
-    """Views that the path tracer is judged on, spread over the split."""
+def spread_views(most_views: int, num_scenes: int) -> tuple[int, int]:
+    """Return which views the path tracer is judged on: one scene in so many, its first so many."""
+    return max(1, -(-num_scenes // max(most_views, 1))), max(1, most_views // max(num_scenes, 1))
 
-    most_views: int
-    """Maximum number of views; 0 for none."""
-    num_scenes: int
-    """Number of evaluated scenes."""
 
-    @property
-    def every(self) -> int:
-        """One scene in so many is traced."""
-        return max(1, -(-self.num_scenes // max(self.most_views, 1)))
-
-    @property
-    def first(self) -> int:
-        """Number of views of such a scene, from the first one."""
-        return max(1, self.most_views // max(self.num_scenes, 1))
-
-    def has(self, number: int, view: int) -> bool:
-        """Return whether a view of the scene of a number, from 0, is traced."""
-        return number % self.every == 0 and view < self.first
-
-    def text(self, num_views: int) -> str:
-        """Return a description of the views, of scenes with up to `num_views` views."""
-        views = f"the first {self.first} views" if self.first > 1 else "the first view"
-        if num_views <= self.first:
-            views = "all views"
-        return f"{views} of {'each scene' if self.every == 1 else f'one scene in {self.every}'}"
+def spread_text(every: int, first: int, num_views: int) -> str:
+    """Return `spread_views` as text, of scenes with up to `num_views` views."""
+    views = f"the first {first} views" if first > 1 else "the first view"
+    if num_views <= first:
+        views = "all views"
+    return f"{views} of {'each scene' if every == 1 else f'one scene in {every}'}"
 
 
 def time_both(
@@ -121,7 +97,8 @@ def time_both(
 
     Args:
         network: the network on one thread of the processor.
-        previews: path tracers on one thread by level, samples ascending; empty to trace nothing.
+        previews: path tracers on one thread by level, from the least to the best; empty to trace
+            nothing.
         samples: scenes, at least one.
         missing: reason why there are no previews.
         note: remark about the machine's path tracer.
@@ -136,17 +113,24 @@ def time_both(
         if not timed or time.process_time() - began < TIMED_S:
             timed.append(sample)
             ours.append(time_scene(network, sample.scene, sample.key).price)
-    theirs: list[Mapping[Level, Price]] = []
-    if previews:
-        theirs, missing = _preview_prices(previews, timed, median_price(ours).further_s)
+    theirs: Mapping[Level, Price] = {}
+    try:
+        theirs = _preview_prices(previews, timed, median_price(ours).further_s)
+        if previews and not theirs:
+            missing = "the scenes that were timed cannot be traced"
+    except TrilightError as error:
+        missing = str(error).rstrip(".")
     ours += [time_scene(network, sample.scene, sample.key).price for sample in timed]
     middle = median_price(ours)
     preview = None
     if theirs:
-        level = chosen_level(theirs, middle.further_s)
-        price = median_price([each.get(level, DEARER) for each in theirs])
+        fitting = [level for level in theirs if theirs[level].further_s <= middle.further_s]
+        samples_a_pixel, denoiser = level = [next(iter(theirs)), *fitting][-1]
         preview = TracerTimes(
-            samples=level[0], denoiser=level[1], note=note, **dataclasses.asdict(price)
+            samples=samples_a_pixel,
+            denoiser=denoiser,
+            note=note,
+            **dataclasses.asdict(theirs[level]),
         )
     return SameTimeResult(
         network_first_s=middle.first_s,
@@ -159,47 +143,23 @@ def time_both(
 
 def _preview_prices(
     previews: Mapping[Level, Renderer], samples: Sequence[Sample], most_s: float
-) -> tuple[list[Mapping[Level, Price]], str]:
-    """Return the prices of each scene that can be traced, or an empty list and the reason."""
-    by_scene: list[Mapping[Level, Price]] = []
-    for sample in samples:
-        try:
-            by_scene.append(_ladder_prices(previews, sample, most_s))
-        except Unrenderable:
-            continue
-        except TrilightError as error:
-            return [], str(error).rstrip(".")
-    return by_scene, "" if by_scene else "the scenes that were timed cannot be traced"
-
-
-def _ladder_prices(
-    previews: Mapping[Level, Renderer], sample: Sample, most_s: float
 ) -> Mapping[Level, Price]:
-    """Return the prices up to the first samples whose fast filter takes more than `most_s`."""
-    prices: dict[Level, Price] = {}
-    for (spp, denoiser), preview in previews.items():
-        fewer = prices.get((spp // 2, "fast"))
-        if fewer is not None and fewer.further_s > most_s:
-            break
-        prices[spp, denoiser] = time_scene(preview, sample.scene, sample.key).price
-    return prices
+    """Return median prices over the scenes that can be traced; empty if none can.
 
-
-def chosen_level(prices: Sequence[Mapping[Level, Price]], most_s: float) -> Level:
-    """Return the most samples whose median further view fits, and of equals the better filter.
-
-    If none fits, return LEAST.
-
-    Args:
-        prices: prices of each scene by level; a missing level takes longer than `most_s`.
-        most_s: maximum CPU seconds of a further view.
+    The first samples whose fast filter takes more than `most_s` CPU seconds are the last ones.
     """
-    fits = [
-        level
-        for level in set().union(*prices)
-        if median_price([each.get(level, DEARER) for each in prices]).further_s <= most_s
-    ]
-    return max(fits, key=lambda level: (level[0], level[1] == "high"), default=LEAST)
+    prices: dict[Level, Price] = {}
+    for level, preview in previews.items():
+        measured = []
+        for sample in samples:
+            with contextlib.suppress(Unrenderable):
+                measured.append(time_scene(preview, sample.scene, sample.key).price)
+        if not measured:
+            break
+        prices[level] = median_price(measured)
+        if level[1] == "fast" and prices[level].further_s > most_s:
+            break
+    return prices
 
 
 def same_time(views: Sequence[JudgedView], times: SameTimeResult, which: str) -> dict[str, Any]:

@@ -1,6 +1,8 @@
 """Stored pictures that are judged beside renderers: looked up, not rendered, without a price."""
 
+import functools
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib import metadata
 
 import numpy as np
@@ -12,6 +14,7 @@ from train.data.resolution import block_mean
 from train.evaluation.baselines import Baselines
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class StoredPictures:
     """Pictures of one width, by the scene's key and the camera's row."""
 
@@ -19,61 +22,38 @@ class StoredPictures:
     """Name in rows."""
     resolution: int
     """Width and height of the pictures in pixels."""
-
-    def digest(self, key: str, view: int) -> str:
-        """Return the digest of everything that decides the picture of a view."""
-        raise NotImplementedError
-
-    def pictures(self, sample: Sample) -> NDArray[np.floating]:
-        """Return the pictures [V, R, R, 3] of a sample, linear radiance of at least 0.
-
-        Raises:
-            TrilightError: a picture cannot be read.
-        """
-        raise NotImplementedError
+    digest: Callable[[str, int], str]
+    """Returns the digest of everything that decides the picture of a view."""
+    pictures: Callable[[Sample], NDArray[np.floating]]
+    """Returns the pictures [V, R, R, 3] of a sample, linear radiance of at least 0."""
 
 
-class NearestView(StoredPictures):
-    """Picture of another scene that is nearest to the target: the bound of any lookup.
+def nearest_view(
+    name: str, resolution: int, read: Callable[[], Baselines], *, pool: str, not_itself: bool
+) -> StoredPictures:
+    """Return the lookup of the picture of another scene that is nearest to the target.
 
-    The lookup uses the target itself, so that no method that looks up a picture by the scene can be
-    better.
+    It is the bound of any lookup: it uses the target itself, so that no method that looks up a
+    picture by the scene can be better.
+
+    Args:
+        name: name of the row.
+        resolution: width of the pictures in pixels.
+        read: returns the pictures of the lookup; called when the first one is needed.
+        pool: digest of the dataset of these pictures.
+        not_itself: whether the evaluated scenes are among them.
     """
+    baselines = functools.cache(read)
 
-    def __init__(
-        self,
-        name: str,
-        resolution: int,
-        baselines: Callable[[], Baselines],
-        *,
-        pool: str,
-        not_itself: bool,
-    ) -> None:
-        """Store the pictures of the lookup.
+    def pictures(sample: Sample) -> NDArray[np.floating]:
+        targets = block_mean(sample.radiance_rgb, resolution)
+        itself = sample.key if not_itself else ""
+        return np.stack([baselines().nearest(target, not_of=itself) for target in targets])
 
-        Args:
-            name: name of the row.
-            resolution: width of the pictures in pixels.
-            baselines: returns the pictures of the lookup; called when the first one is needed.
-            pool: digest of the dataset of these pictures.
-            not_itself: whether the evaluated scenes are among them.
-        """
-        self.name = name
-        self.resolution = resolution
-        self._read = baselines
-        self._baselines: Baselines | None = None
-        self._digest = method_digest({"pool": pool})
-        self._not_itself = not_itself
-
-    def digest(self, key: str, view: int) -> str:
-        return self._digest
-
-    def pictures(self, sample: Sample) -> NDArray[np.floating]:
-        if self._baselines is None:
-            self._baselines = self._read()
-        targets = block_mean(sample.radiance_rgb, self.resolution)
-        itself = sample.key if self._not_itself else ""
-        return np.stack([self._baselines.nearest(target, not_of=itself) for target in targets])
+    digest = method_digest({"pool": pool})
+    return StoredPictures(
+        name=name, resolution=resolution, digest=lambda key, view: digest, pictures=pictures
+    )
 
 
 def method_digest(identity: Mapping[str, object]) -> str:

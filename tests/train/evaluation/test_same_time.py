@@ -5,50 +5,17 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from storage.errors import TrilightError, Unrenderable
 from storage.records.scene import Scene
 from storage.renderer import Camera, Image, OnProgress, Renderer, ignore_progress
 from tests.for_each import case
 from tests.train.toy import toy_sample
-from train.evaluation.same_time import Filter, Level, TracedViews, chosen_level, time_both
+from train.evaluation.same_time import Filter, Level, spread_text, spread_views, time_both
 from train.evaluation.timing import Price, time_scene
 
 FILTERS: tuple[Filter, ...] = ("fast", "high")
 LADDER = tuple(1 << step for step in range(13))
-
-
-def prices(*, sample_s: float, fast_s: float, high_s: float, most: int) -> Mapping[Level, Price]:
-    found: dict[Level, Price] = {}
-    for spp in LADDER[:most]:
-        found[spp, "fast"] = Price(first_s=1.0, further_s=spp * sample_s + fast_s)
-        found[spp, "high"] = Price(first_s=1.0, further_s=spp * sample_s + high_s)
-    return found
-
-
-@given(st.floats(0, 100))
-def test_the_most_samples_that_fit_and_then_the_better_filter(most_s: float) -> None:
-    one = prices(sample_s=1.0, fast_s=0.5, high_s=3.0, most=6)
-    spp, denoiser = chosen_level([one], most_s)
-    chosen_s = one[spp, denoiser].further_s
-    if most_s < 1.5:  # not even one sample with the fast filter fits
-        assert (spp, denoiser) == (1, "fast")
-        return
-    assert chosen_s <= most_s
-    for (other_spp, other), price in one.items():
-        if price.further_s <= most_s:
-            assert (other_spp, other == "high") <= (spp, denoiser == "high")
-
-
-def test_scenes_vote_by_their_median_and_what_was_not_tried_takes_longer() -> None:
-    cheap = prices(sample_s=1.0, fast_s=0.0, high_s=0.5, most=5)
-    dear = prices(sample_s=10.0, fast_s=0.0, high_s=0.5, most=3)
-    assert chosen_level([cheap, cheap, dear], 8.2) == (8, "fast"), "one is outvoted"
-    assert chosen_level([cheap, dear, dear], 12.0) == (1, "high")
-    assert chosen_level([cheap, dear], 16.0) == (2, "high"), "of two, both have to be asked"
-    assert chosen_level([dear], 1.0) == (1, "fast")
 
 
 JUDGED = [(64, 10, 10 * 2), (10, 10, 10), (4, 10, 4), (1, 10, 1)]
@@ -57,15 +24,13 @@ JUDGED = [(64, 10, 10 * 2), (10, 10, 10), (4, 10, 4), (1, 10, 1)]
 def test_it_is_judged_on_no_more_views_than_asked_from_all_over_the_split() -> None:
     for most, scenes, judged in JUDGED:
         with case(most):
-            chosen = TracedViews(most_views=most, num_scenes=scenes)
-            numbers = [
-                number for number in range(scenes) for view in range(2) if chosen.has(number, view)
-            ]
+            every, first = spread_views(most, scenes)
+            numbers = [number for number in range(0, scenes, every) for view in range(2)[:first]]
             assert len(numbers) == judged <= most
             assert max(numbers) >= scenes // 2 or most == 1
             views = "all views" if most == 64 else "the first view"
-            assert chosen.text(2).startswith(f"{views} of ")
-            assert ("each scene" in chosen.text(2)) == (most >= scenes)
+            assert spread_text(every, first, 2).startswith(f"{views} of ")
+            assert ("each scene" in spread_text(every, first, 2)) == (most >= scenes)
 
 
 class Clocked:
@@ -119,7 +84,10 @@ def test_samples_double_until_they_take_longer_than_the_network() -> None:
     assert (times.preview.samples, times.preview.denoiser) == (4, "high")
     assert (times.preview.further_s, times.preview.note) == (5.6, "slow")
     tried = [level for level, each in previews.items() if isinstance(each, Clocked) and each.loads]
-    assert tried == [(spp, denoiser) for spp in (1, 2, 4, 8) for denoiser in FILTERS]
+    assert tried == [*((spp, denoiser) for spp in (1, 2, 4) for denoiser in FILTERS), (8, "fast")]
+    least = time_both(Clocked(0.5), previews, samples)
+    assert least.preview is not None, "where nothing fits, the cheapest is shown"
+    assert (least.preview.samples, least.preview.denoiser) == (1, "fast")
 
 
 def test_without_a_path_tracer_it_says_so_and_the_network_is_timed_all_the_same() -> None:
