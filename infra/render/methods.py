@@ -112,7 +112,7 @@ def direct_light_method(resolution: int) -> Method:
 
     def load(scene: Scene) -> View:
         loaded = DirectLight(resolution=resolution).load(scene, "scene")
-        return lambda c2w, fov_deg: loaded.view(Camera(c2w=c2w, fov_deg=fov_deg))
+        return lambda c2w, fov_deg: loaded.render(Camera(c2w=c2w, fov_deg=fov_deg)).radiance_rgb
 
     return load
 
