@@ -3,7 +3,7 @@
 import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,35 +16,32 @@ from storage.renderer import Camera, Facts, Image, OnProgress, ignore_progress
 
 if TYPE_CHECKING:
     from model.config import ModelConfig
-    from model.neural_renderer import NeuralRenderer, PreparedScene
-
-View = Callable[[Camera], NDArray[np.float32]]
-"""Function that returns the linear radiance [R, R, 3] of a camera."""
+    from model.neural_renderer import NeuralRenderer
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneHere:
-    """Scene that this process renders."""
+    """Scene that a function of this process renders."""
 
-    view: View
-    seconds: float
-    cpu_seconds: float | None
+    render_image: Callable[[Camera], Image]
     notes: Sequence[str] = ()
-    facts: Facts = field(default_factory=dict)
-    """Facts of every picture."""
+    seconds: float = 0.0
+    cpu_seconds: float | None = None
 
     def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Image:
-        """Return the picture of a camera, clipped to half floats, which end at 65504."""
-        began_s = time.process_time()
-        picture = self.view(camera)
-        return Image(
-            radiance_rgb=np.minimum(picture, HALF_FLOAT_MAX),
-            cpu_seconds=time.process_time() - began_s,
-            facts={
-                **self.facts,
-                "clipped_pixels": int((picture > HALF_FLOAT_MAX).any(axis=-1).sum()),
-            },
-        )
+        """Return the picture of a camera; raises Unrenderable where there is none."""
+        return self.render_image(camera)
+
+
+def image_here(view: Callable[[], NDArray[np.float32]], facts: Facts) -> Image:
+    """Return the linear radiance [R, R, 3] of a function as a picture, clipped to half floats."""
+    began_s = time.process_time()
+    picture = view()
+    return Image(
+        radiance_rgb=np.minimum(picture, HALF_FLOAT_MAX),
+        cpu_seconds=time.process_time() - began_s,
+        facts={**facts, "clipped_pixels": int((picture > HALF_FLOAT_MAX).any(axis=-1).sum())},
+    )
 
 
 @dataclass(kw_only=True, eq=False)
@@ -104,13 +101,19 @@ class NetworkRenderer:
         network = self.network
         began = time.perf_counter()
         began_s = time.process_time()
-        prepared: PreparedScene = network.prepare(scene, lights_per_pass=self.lights_per_pass)
+        prepared = network.prepare(scene, lights_per_pass=self.lights_per_pass)
+
+        def render_image(camera: Camera) -> Image:
+            return image_here(
+                lambda: network.view(prepared, camera.c2w, camera.fov_deg, self.resolution),
+                {"passes": len(prepared.groups)},
+            )
+
         return SceneHere(
-            view=lambda camera: network.view(prepared, camera.c2w, camera.fov_deg, self.resolution),
+            render_image=render_image,
             seconds=time.perf_counter() - began,
             cpu_seconds=time.process_time() - began_s,
             notes=prepared.notes,
-            facts={"passes": len(prepared.groups)},
         )
 
     def close(self) -> None:
@@ -161,7 +164,7 @@ class DirectLight:
             return of_lamps + inputs.pixels[..., Channel.DIRECT_SPECULAR]
 
         return SceneHere(
-            view=view,
+            render_image=lambda camera: image_here(lambda: view(camera), {}),
             seconds=time.perf_counter() - began,
             cpu_seconds=time.process_time() - began_s,
         )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.render.networks import NetworkRenderer
+from infra.render.networks import NetworkRenderer, SceneHere
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import FixedSamples, ToStatedError
 from infra.viewer.picture_options import PictureOptions
@@ -21,7 +21,7 @@ from storage.errors import Unrenderable
 from storage.records.passes.declared import pass_names
 from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
-from storage.renderer import Camera, Image, OnProgress, Renderer, ignore_progress
+from storage.renderer import Camera, Image, Renderer
 
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
@@ -55,20 +55,6 @@ class PassImage(Image):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LocalScene:
-    """Scene whose pictures are looked up or computed without loading."""
-
-    render_image: Callable[[Camera], Image]
-    notes: Sequence[str] = ()
-    seconds: float = 0.0
-    cpu_seconds: float | None = None
-
-    def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Image:
-        """Return the picture of a camera; raises Unrenderable where there is none."""
-        return self.render_image(camera)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class PassRenderer:
     """Pass of the visible surfaces, such as depth: a function of scene and camera without light."""
 
@@ -82,9 +68,9 @@ class PassRenderer:
         """Word of the pass."""
         return self.shown.word
 
-    def load(self, scene: Scene, name: str) -> LocalScene:
+    def load(self, scene: Scene, name: str) -> SceneHere:
         """Return the scene as it is."""
-        return LocalScene(render_image=functools.partial(self._render, scene))
+        return SceneHere(render_image=functools.partial(self._render, scene))
 
     def close(self) -> None:
         """Do nothing: nothing is held."""
@@ -97,17 +83,14 @@ class PassRenderer:
             scene.with_cameras(camera.c2w[None], angle), [name], view=0, resolution=self.resolution
         )[name]
         core_s = time.process_time() - began_s
-        has_hits = (
-            np.isfinite(values).any() if values.dtype.kind == "f" else bool((values >= 0).any())
-        )
+        has_hits = (np.isfinite(values) if values.dtype.kind == "f" else values >= 0).any()
+        caption = self.shown.caption(values).partition(", in the")[0] if has_hits else ""
         pixels = self.shown.pixels(values)
         return PassImage(
             radiance_rgb=np.zeros((*pixels.shape[:2], 3), np.float32),
             pixels=pixels,
             cpu_seconds=core_s,
-            remark=self.shown.caption(values).partition(", in the")[0]
-            if has_hits
-            else "nothing is met",
+            remark=caption or "nothing is met",
         )
 
 
@@ -129,11 +112,11 @@ class StoredPictures:
         """Width of the pictures in pixels."""
         return int(self.radiance_rgb.shape[1])
 
-    def load(self, scene: Scene, name: str) -> LocalScene:
+    def load(self, scene: Scene, name: str) -> SceneHere:
         """Return the pictures; raises Unrenderable for another scene than theirs."""
         if scene is not self.scene:
             raise Unrenderable("The file's picture shows the scene without your changes.")
-        return LocalScene(render_image=self._stored)
+        return SceneHere(render_image=self._stored)
 
     def close(self) -> None:
         """Do nothing: nothing is held."""
