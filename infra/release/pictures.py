@@ -15,9 +15,11 @@ from pipeline.renders.variant import choose_variant
 from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
-from storage.metrics import psnr_log_db
 from storage.records.sample import Sample
 from storage.renderer import Camera, Renderer
+from train.evaluation.evaluate import judge_view
+from train.evaluation.judge import validation_scene
+from train.evaluation.pairs import METRIC
 
 RIVALS = (1, 4, 16)
 """Samples per pixel of the previews in the comparison, filtered by Open Image Denoise."""
@@ -104,12 +106,12 @@ def _compare_scene(sample: Sample, split: str, renderers: Sequence[Renderer]) ->
         each.name: each.load(sample.scene, sample.key).render(camera).radiance_rgb
         for each in renderers
     }
-    template = sample.scene.provenance.get("template", "")
+    row = judge_view(sample, validation_scene(sample, len(target)), 0, pictures, None)
     return SceneComparison(
-        key=sample.key,
-        caption=f"{split}, {template}, {sample.scene.num_triangles} triangles",
+        key=row.key,
+        caption=f"{split}, {row.template}, {row.num_triangles} triangles",
         target_rgb=target,
-        floor_db=float(sample.views[0].noise_floor_db),
+        floor_db=row.floors[METRIC],
         pictures_rgb=pictures,
-        psnr_db={name: float(psnr_log_db(picture, target)) for name, picture in pictures.items()},
+        psnr_db={name: scores[METRIC] or 0.0 for name, scores in row.scores.items()},
     )

@@ -115,7 +115,7 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
                 pictures |= config.baselines.pictures(scene.target_VRR3[view])
             if view in traced:
                 pictures[TRACER] = traced[view]
-            scene_rows.append(_judge_view(config, sample, scene, view, pictures))
+            scene_rows.append(judge_view(sample, scene, view, pictures, config.lpips))
         if before is not None and config.network.config.scene_tokens:
             scene_rows = _add_swapped_scores(scene_rows, config.network, scene, before)
         rows += scene_rows
@@ -126,22 +126,22 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
     return rows
 
 
-def _judge_view(
-    config: EvalConfig,
+def judge_view(
     sample: Sample,
     judged: ValidationScene,
     view: int,
     pictures: Mapping[str, NDArray],
+    lpips: Lpips | None,
 ) -> JudgedView:
+    """Return the row of a view from its pictures [R, R, 3] by method, linear radiance."""
     target = judged.target_VRR3[view]
     hits = judged.hits_VRR[view]
     return JudgedView(
         **scene_facts(sample),
         view=view,
-        floors=noise_floors(sample, view, target, hits, config.lpips),
+        floors=noise_floors(sample, view, target, hits, lpips),
         scores={
-            name: picture_scores(picture, target, hits, config.lpips)
-            for name, picture in pictures.items()
+            name: picture_scores(picture, target, hits, lpips) for name, picture in pictures.items()
         },
     )
 
