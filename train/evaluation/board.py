@@ -158,75 +158,60 @@ def judge_all(board: Board, on_progress: OnProgress) -> None:
         TrilightError: damaged data, or a network that cannot render a scene.
     """
     total = len(board.keys) * len(board.widths)
-    done = 0
-    on_progress(done, total, "")
     samples = first_samples(board.shards, len(board.keys), BadSampleCounter(0))
-    for number, sample in enumerate(samples):
-        for width in board.widths:
-            scene_run = _SceneAtWidth(board, sample, width, timed=number < board.timed_scenes)
-            for method in scene_run.missing():
+    turns = ((row, sample, width) for row, sample in enumerate(samples) for width in board.widths)
+    for done, (row, sample, width) in enumerate(turns):
+        on_progress(done, total, "")
+        judged = functools.cache(functools.partial(validation_scene, sample, width))
+        for method in board.present(width):
+            timed = row < board.timed_scenes and not isinstance(method, StoredPictures)
+            if not _has_all(board, method, sample, timed=timed):
                 on_progress(done, total, f"{width} px, {method.name}")
-                scene_run.judge(method)
-            scene_run.judge_noise()
-            done += 1
-            on_progress(done, total, "")
+                _judge(board, method, sample, judged, timed=timed)
+        _judge_noise(board, sample, width, judged)
+    on_progress(total, total, "")
 
 
-class _SceneAtWidth:
-    """Evaluation of one scene at one width."""
+def _has_all(board: Board, method: Method, sample: Sample, *, timed: bool) -> bool:
+    """Return whether a method has the rows of a scene, and its price if it is timed there."""
+    keys = [board.key_of(method, sample.key, view) for view in range(sample.scene.num_views)]
+    is_priced = not timed or board.rows.price(keys[0], board.machine) is not None
+    return is_priced and all(board.rows.get(key) is not None for key in keys)
 
-    def __init__(self, board: Board, sample: Sample, width: int, *, timed: bool) -> None:
-        self._board = board
-        self._sample = sample
-        self._width = width
-        self._timed = timed
 
-    @functools.cached_property
-    def _judged(self) -> ValidationScene:
-        return validation_scene(self._sample, self._width)
+def _judge(
+    board: Board,
+    method: Method,
+    sample: Sample,
+    judged: Callable[[], ValidationScene],
+    *,
+    timed: bool,
+) -> None:
+    """Add a method's rows of a scene, or record why the scene is left out."""
+    try:
+        pictures, price = _show(method, sample, timed=timed)
+    except Unrenderable as error:
+        board.left_out[method.resolution, sample.key] = f"{method.name}: {error}"
+        return
+    scene = judged()
+    for view, picture in enumerate(pictures):
+        scores = picture_scores(picture, scene.target_VRR3[view], scene.hits_VRR[view], board.lpips)
+        row = Row(scores=scores)
+        if price is not None and view == 0:
+            row = Row(scores=scores, **dataclasses.asdict(price), machine=board.machine)
+        board.rows.add(board.key_of(method, sample.key, view), row)
 
-    def _views(self) -> Sequence[int]:
-        return range(self._sample.scene.num_views)
 
-    def _is_timed(self, method: Method) -> bool:
-        return self._timed and not isinstance(method, StoredPictures)
-
-    def missing(self) -> list[Method]:
-        """Return the methods that lack rows or times of the scene."""
-        return [one for one in self._board.present(self._width) if not self._has_all(one)]
-
-    def _has_all(self, method: Method) -> bool:
-        rows = self._board.rows
-        keys = [self._board.key_of(method, self._sample.key, view) for view in self._views()]
-        is_priced = not self._is_timed(method) or rows.price(keys[0], self._board.machine)
-        return bool(is_priced) and all(rows.get(key) is not None for key in keys)
-
-    def judge(self, method: Method) -> None:
-        """Add a method's rows, or record why the scene is left out."""
-        board, sample, judged = self._board, self._sample, self._judged
-        try:
-            pictures, price = _show(method, sample, timed=self._is_timed(method))
-        except Unrenderable as error:
-            board.left_out[self._width, sample.key] = f"{method.name}: {error}"
-            return
-        for view, picture in enumerate(pictures):
-            scores = picture_scores(
-                picture, judged.target_VRR3[view], judged.hits_VRR[view], board.lpips
-            )
-            row = Row(scores=scores)
-            if price is not None and view == 0:
-                row = Row(scores=scores, **dataclasses.asdict(price), machine=board.machine)
-            board.rows.add(board.key_of(method, sample.key, view), row)
-
-    def judge_noise(self) -> None:
-        """Add the scores of the targets' own noise, with facts of the scene."""
-        board, sample = self._board, self._sample
-        for view in self._views():
-            key = board.noise_key(self._width, sample.key, view)
-            if board.rows.get(key) is None:
-                target, hits = self._judged.target_VRR3[view], self._judged.hits_VRR[view]
-                floors = noise_floors(sample, view, target, hits, board.lpips)
-                board.rows.add(key, Row(scores=floors, facts=scene_facts(sample)))
+def _judge_noise(
+    board: Board, sample: Sample, width: int, judged: Callable[[], ValidationScene]
+) -> None:
+    """Add the scores of the targets' own noise, with facts of the scene."""
+    for view in range(sample.scene.num_views):
+        key = board.noise_key(width, sample.key, view)
+        if board.rows.get(key) is None:
+            target, hits = judged().target_VRR3[view], judged().hits_VRR[view]
+            floors = noise_floors(sample, view, target, hits, board.lpips)
+            board.rows.add(key, Row(scores=floors, facts=scene_facts(sample)))
 
 
 def _show(

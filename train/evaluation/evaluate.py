@@ -100,7 +100,15 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
     for number, sample in enumerate(config.samples()):
         scene = validation_scene(sample, config.resolution)
         if config.network.config.view_stage == "hits":
-            scene = with_traced_views(scene, config.network, config.resolution)
+            tensors = with_traced(
+                scene.scene.tensors,
+                config.resolution,
+                config.network.config,
+                device=next(config.network.parameters()).device,
+            )  # traced once for all predictions
+            scene = dataclasses.replace(
+                scene, scene=dataclasses.replace(scene.scene, tensors=tensors)
+            )
         contestants = {NETWORK: predict(config.network, scene.scene)}
         contestants |= withheld_pictures(config.network, scene.scene)
         grouped_VRR3 = grouped_pictures(config.network, sample.scene, config.resolution)
@@ -163,7 +171,17 @@ def _traced_pictures(
 def _add_swapped_scores(
     rows: Sequence[JudgedView], network: RenderFormer, judged: ValidationScene, other: SceneTensors
 ) -> list[JudgedView]:
-    pictures_VRR3 = swapped_pictures(network, judged.scene, other)
+    """Return rows with the scores of predictions that are given another scene's triangles.
+
+    This tests whether the network uses the scene: one that has only learned an average picture is
+    no worse with other triangles. A network of hits keeps its own hits; only the scene's tokens are
+    replaced.
+    """
+    own = judged.scene.tensors
+    seen = dataclasses.replace(other, c2w_V44=own.c2w_V44, fov_deg_V=own.fov_deg_V)
+    if own.traced is not None:
+        seen = dataclasses.replace(seen, traced=with_others_tokens(own.traced, other.traced))
+    pictures_VRR3 = predict(network, dataclasses.replace(judged.scene, tensors=seen))
     return [
         dataclasses.replace(row, swapped_psnr_log_db=psnr_log_db(picture, target))
         for row, picture, target in zip(rows, pictures_VRR3, judged.target_VRR3, strict=True)
@@ -241,15 +259,6 @@ def grouped_pictures(
     return np.stack(pictures).astype(np.float64)
 
 
-def with_traced_views(
-    judged: ValidationScene, network: RenderFormer, resolution: int
-) -> ValidationScene:
-    """Return a scene with traced inputs, so that later predictions share them."""
-    device = next(network.parameters()).device
-    tensors = with_traced(judged.scene.tensors, resolution, network.config, device=device)
-    return dataclasses.replace(judged, scene=dataclasses.replace(judged.scene, tensors=tensors))
-
-
 def withheld_pictures(
     network: RenderFormer, scene: TrainingScene
 ) -> dict[str, NDArray[np.float64]]:
@@ -271,19 +280,3 @@ def withheld_pictures(
             network, dataclasses.replace(scene, tensors=tensors)
         )
     return pictures
-
-
-def swapped_pictures(
-    network: RenderFormer, scene: TrainingScene, other: SceneTensors
-) -> NDArray[np.float64]:
-    """Predict with another scene's triangles [V, R, R, 3], linear radiance.
-
-    This tests whether the network uses the scene: one that has only learned an average picture is
-    no worse with other triangles. A network of hits keeps its own hits; only the scene's tokens are
-    replaced.
-    """
-    cameras = scene.tensors
-    seen = dataclasses.replace(other, c2w_V44=cameras.c2w_V44, fov_deg_V=cameras.fov_deg_V)
-    if cameras.traced is not None:
-        seen = dataclasses.replace(seen, traced=with_others_tokens(cameras.traced, other.traced))
-    return predict(network, dataclasses.replace(scene, tensors=seen))
