@@ -12,7 +12,7 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.safe_read import read_plain
 from storage.records.sample import Sample
-from train.evaluation.stored_pictures import StoredPictures
+from train.evaluation.stored_pictures import PictureSource
 
 _LEAST = -1e-2
 """Least radiance that still counts as a network's rounding of 0."""
@@ -21,7 +21,7 @@ Views = Sequence[tuple[str, int]]
 """Scene key and camera of every evaluated view."""
 
 
-def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> StoredPictures:
+def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> PictureSource:
     """Return a folder of pictures from elsewhere, all of one width, after checking every view's.
 
     Values slightly below 0, which networks of logarithms return, count as 0; alpha is ignored.
@@ -52,7 +52,7 @@ def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> StoredP
         found = [_picture(_bytes_of(path), path, [resolution]) for path in paths]
         return np.maximum(np.stack(found), 0)
 
-    return StoredPictures(
+    return PictureSource(
         name=f"pictures of {folder.name or folder.resolve().name}",
         resolution=resolution,
         digest=lambda key, view: sha256[key, view],
@@ -114,9 +114,9 @@ def _refuse(radiance_rgb: NDArray[np.float32], legal: NDArray[np.bool_], name: s
 
 def picture_folders(
     folders: Sequence[Path], views: Views, widths: Sequence[int]
-) -> list[StoredPictures]:
+) -> list[PictureSource]:
     """Return the checked folders; raises TrilightError for equal names."""
-    found: list[StoredPictures] = []
+    found: list[PictureSource] = []
     for folder in folders:
         one = picture_folder(folder, views, widths)
         if one.name in [other.name for other in found]:

@@ -1,5 +1,6 @@
 """`trilight evaluate`: compares a network, or all methods, with the pictures of a dataset."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,11 @@ from train.evaluation.options import EvaluationOptions
 @command("checkpoint")
 def evaluate(order: EvaluationOptions, output: OutputOptions) -> None:
     record: dict[str, Any] = {}
-    out = order.report_folder
+    board = order.leaderboard()
     if order.checkpoint:
         record, out = _judge_network(order, order.checkpoint, silent=output.json)
-    if board := order.leaderboard(out):
+        board = board and dataclasses.replace(board, out=out)
+    if board:
         standings = judge_methods(board, silent=output.json)
         record = record | {"leaderboard": standings} if record else standings
     if output.json:

@@ -37,11 +37,12 @@ from tests.train.toy import VIEWS, toy_sample, write_toy_dataset
 from train.evaluation import board as board_module
 from train.evaluation.board import NOISE
 from train.evaluation.chart import plot_leaderboard
+from train.evaluation.judged_view import NETWORK
 from train.evaluation.options import LeaderboardOptions
 from train.evaluation.pairs import METRIC
 from train.evaluation.rows import UNKNOWN_MACHINE, Row, RowKey, Rows
 from train.evaluation.standings import Standing, WidthStandings
-from train.evaluation.stored_pictures import StoredPictures, nearest_view
+from train.evaluation.stored_pictures import PictureSource, nearest_view
 from train.evaluation.timing import Price
 
 PX = 16
@@ -176,7 +177,7 @@ def test_a_set_without_training_split_looks_up_its_other_scenes(
 def test_a_scene_that_somebody_cannot_show_is_left_out_for_all(
     short: LeaderboardOptions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(*words: Any, **more: Any) -> StoredPictures:
+    def refused(*words: Any, **more: Any) -> PictureSource:
         def pictures(sample: Any) -> Any:
             if sample.key.endswith("4"):
                 raise Unrenderable("nothing shines")
@@ -215,6 +216,25 @@ def test_one_scene_has_its_table_without_intervals(
     assert plain["scenes"] == 1
     leads = [each["lead"] for each in plain["standings"] if each["lead"]]
     assert leads and all(lead["low"] is lead["high"] is None for lead in leads)
+
+
+def test_evaluate_is_a_leaderboard_without_a_network_and_beside_others(
+    short: LeaderboardOptions, tmp_path: Path
+) -> None:
+    data = ["--data", short.source, "--split", "validation", "--most-scenes", "1"]
+    words = [*data, "--resolution", str(PX), "--timed-scenes", "1", "--tracer-views", "0", "--json"]
+    alone = json.loads(trilight(["evaluate", *words, "--out", str(tmp_path / "alone")]).stdout)
+    (one,) = alone["widths"]
+    assert (one["width"], one["scenes"], alone["rival"]) == (PX, 1, "network builtin:tokens")
+    words = ["evaluate", "builtin:tokens", *words, "--beside", "builtin:"]
+    both = json.loads(trilight([*words, "--out", str(tmp_path / "both")]).stdout)
+    assert both["about"]["network"] == "builtin:tokens" and NETWORK in both["contestants"]
+    names = {each["name"] for each in both["leaderboard"]["widths"][0]["standings"]}
+    assert SHIPPED <= names and both["leaderboard"]["rival"] == "network builtin:tokens"
+    written = {path.name for path in (tmp_path / "both").iterdir()}
+    assert {"evaluation.json", "worst.png", "leaderboard.md", "pairs.csv", "rows.jsonl"} <= written
+    refused = trilight([*words, "--data", short.source]).exception
+    assert "--data is given 2 times; expected one dataset for a leaderboard" in str(refused)
 
 
 def test_prices_of_two_machines_do_not_mix(

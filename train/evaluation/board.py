@@ -24,14 +24,14 @@ from train.evaluation.judge import ValidationScene, validation_scene
 from train.evaluation.judged_view import JudgedView, scene_facts
 from train.evaluation.metrics import METRICS, noise_floors, picture_scores
 from train.evaluation.rows import Row, RowKey, Rows
-from train.evaluation.stored_pictures import StoredPictures, method_digest
+from train.evaluation.stored_pictures import PictureSource, method_digest
 from train.evaluation.timing import Price, time_scene
 from train.loss.lpips import Lpips
 
 NOISE = "noise of the references"
 """Name of the row of the targets' own noise, which bounds what any method can score."""
 
-Method = Renderer | StoredPictures
+Method = Renderer | PictureSource
 
 OnProgress = Callable[[int, int, str], None]
 """Callback with (finished, all) pairs of scene and width, and the current step as text."""
@@ -90,12 +90,12 @@ class Board:
         return {
             id(method): method_digest(method.identity)
             for method in self.methods
-            if not isinstance(method, StoredPictures)
+            if not isinstance(method, PictureSource)
         }
 
     def key_of(self, method: Method, key: str, view: int) -> RowKey:
         """Return the key of a method's row."""
-        if isinstance(method, StoredPictures):
+        if isinstance(method, PictureSource):
             made_by = method.digest(key, view)
         else:
             made_by = self._renderer_digests[id(method)]
@@ -164,7 +164,7 @@ def judge_all(board: Board, on_progress: OnProgress) -> None:
         on_progress(done, total, "")
         judged = functools.cache(functools.partial(validation_scene, sample, width))
         for method in board.present(width):
-            timed = row < board.timed_scenes and not isinstance(method, StoredPictures)
+            timed = row < board.timed_scenes and not isinstance(method, PictureSource)
             if not _has_all(board, method, sample, timed=timed):
                 on_progress(done, total, f"{width} px, {method.name}")
                 _judge(board, method, sample, judged, timed=timed)
@@ -218,7 +218,7 @@ def _show(
     method: Method, sample: Sample, *, timed: bool
 ) -> tuple[Sequence[NDArray[np.floating]], Price | None]:
     """Return the pictures [R, R, 3] of all views, and the price if it is measured."""
-    if isinstance(method, StoredPictures):
+    if isinstance(method, PictureSource):
         return list(method.pictures(sample)), None
     scene = sample.scene
     measured = time_scene(method, scene, sample.key) if timed else None

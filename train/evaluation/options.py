@@ -99,8 +99,8 @@ class EvaluationOptions:
                 return folder / "evaluation"
         return self.out or Path("evaluation" if self.checkpoint else "leaderboard")
 
-    def leaderboard(self, out: Path) -> LeaderboardOptions | None:
-        """Return the options of the leaderboard in a folder; None if none was requested.
+    def leaderboard(self) -> LeaderboardOptions | None:
+        """Return the options of the leaderboard; None if none was requested.
 
         Raises:
             TrilightError: there are several datasets, of which a leaderboard is not made.
@@ -122,5 +122,5 @@ class EvaluationOptions:
             split=self.split,
             train_data=self.train_data,
             lpips=self.lpips,
-            out=out,
+            out=self.report_folder,
         )

@@ -15,7 +15,7 @@ from train.evaluation.baselines import Baselines
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StoredPictures:
+class PictureSource:
     """Pictures of one width, by the scene's key and the camera's row."""
 
     name: str
@@ -30,7 +30,7 @@ class StoredPictures:
 
 def nearest_view(
     name: str, resolution: int, read: Callable[[], Baselines], *, pool: str, not_itself: bool
-) -> StoredPictures:
+) -> PictureSource:
     """Return the lookup of the picture of another scene that is nearest to the target.
 
     It is the bound of any lookup: it uses the target itself, so that no method that looks up a
@@ -51,7 +51,7 @@ def nearest_view(
         return np.stack([baselines().nearest(target, not_of=itself) for target in targets])
 
     digest = method_digest({"pool": pool})
-    return StoredPictures(
+    return PictureSource(
         name=name, resolution=resolution, digest=lambda key, view: digest, pictures=pictures
     )
 
