@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.render.networks import DirectLight, NetworkRenderer, traced_network
+from infra.render.networks import DirectLightRenderer, NetworkRenderer, traced_network
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import FixedSamples
 from pipeline.renders.denoiser import Quality, denoise
@@ -27,7 +27,7 @@ View = Callable[[NDArray[np.float32], float], NDArray[np.float32]]
 Method = Callable[[Scene], View]
 """Function that loads a scene and returns its `View`; all pictures have one width."""
 
-DIRECT_LIGHT = DirectLight.name
+DIRECT_LIGHT = DirectLightRenderer.name
 TRACED_LIGHT = "all traced light, no network"
 BUILTIN_NETWORKS = ("builtin:", "builtin:tokens")
 """Networks of every comparison: the hybrid one (more accurate), and the pure one."""
@@ -111,7 +111,7 @@ def direct_light_method(resolution: int) -> Method:
     """Return the method that renders the direct light of lamps."""
 
     def load(scene: Scene) -> View:
-        loaded = DirectLight(resolution=resolution).load(scene, "scene")
+        loaded = DirectLightRenderer(resolution=resolution).load(scene, "scene")
         return lambda c2w, fov_deg: loaded.render(Camera(c2w=c2w, fov_deg=fov_deg)).radiance_rgb
 
     return load
@@ -134,7 +134,7 @@ def compared_renderers(
         child: render child, which the previews share.
         levels: samples per pixel and filters of the previews.
     """
-    compared: list[Renderer] = [DirectLight(resolution=resolution)]
+    compared: list[Renderer] = [DirectLightRenderer(resolution=resolution)]
     for name, network in {**networks, TRACED_LIGHT: traced_network()}.items():
         compared.append(
             NetworkRenderer(
