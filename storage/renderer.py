@@ -69,7 +69,7 @@ class Image:
     layers_rgb: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     """[R, R, 3] linear radiance of layers by name, whose sum is the picture; may be empty."""
     remark: str = ""
-    """Remark for whoever looks at the picture, such as how far to trust its error."""
+    """Remark beside the picture, such as how far its error may be trusted."""
 
 
 OnProgress = Callable[[Sampling | Image], None]
@@ -80,7 +80,7 @@ def ignore_progress(_: Sampling | Image) -> None:
     """Do nothing with the progress of a picture."""
 
 
-class LoadedScene(Protocol):
+class ReadyScene(Protocol):
     """Scene in a renderer, ready for any number of cameras."""
 
     @property
@@ -123,7 +123,7 @@ class Renderer(Protocol):
     def identity(self) -> Mapping[str, Any]:
         """Everything but scene and camera that decides a picture, as JSON values."""
 
-    def load(self, scene: Scene, name: str) -> LoadedScene:
+    def load(self, scene: Scene, name: str) -> ReadyScene:
         """Load a scene, which messages call `name`.
 
         Args:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from infra.render.networks import DirectLight, NetworkRenderer, traced_network
+from infra.render.networks import DirectLightRenderer, NetworkRenderer, traced_network
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import FixedSamples
 from pipeline.renders.denoiser import Quality, denoise
@@ -87,7 +87,7 @@ def compared_renderers(
         child: render child, which the previews share.
         levels: samples per pixel and filters of the previews.
     """
-    compared: list[Renderer] = [DirectLight(resolution=resolution)]
+    compared: list[Renderer] = [DirectLightRenderer(resolution=resolution)]
     for name, network in {**networks, TRACED_LIGHT: traced_network()}.items():
         compared.append(
             NetworkRenderer(

@@ -121,7 +121,7 @@ class NetworkRenderer:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class DirectLight:
+class DirectLightRenderer:
     """Direct light of lamps, as the view stage `hits` traces it.
 
     Nothing is gathered or mirrored and no network runs. Light is sampled by points on the lamps

@@ -130,16 +130,16 @@ class PathTracer:
             "environment": environment(self.child.variant),
         }
 
-    def load(self, scene: Scene, name: str) -> "TracedScene":
+    def load(self, scene: Scene, name: str) -> "SceneInChild":
         """Load a scene; raises Unrenderable where it cannot be rendered."""
-        return TracedScene(self.child, scene, self.settings, self._shows_looks, self._seed, name)
+        return SceneInChild(self.child, scene, self.settings, self._shows_looks, self._seed, name)
 
     def close(self) -> None:
         """End the child."""
         self.child.close()
 
 
-class TracedScene:
+class SceneInChild:
     """Scene in a render child; it is sent again where the child no longer has it."""
 
     def __init__(

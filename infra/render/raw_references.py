@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import Curve, secant_slope
 from pipeline.renders.settings import PASS_SPP, RenderSettings
@@ -36,13 +36,13 @@ class RawReference:
     """[R, R, 3] mean of the second half."""
 
 
-def first_camera(scene: Scene, resolution: int) -> Camera:
+def first_camera(scene: Scene, resolution: int) -> PixelCamera:
     """Return the first camera of a scene for square pictures of `resolution` pixels."""
     pose = np.asarray(scene.c2w[0], np.float64)
-    return Camera(c2w=pose, fov_deg=float(scene.fov_deg[0]), resolution=resolution)
+    return PixelCamera(c2w=pose, fov_deg=float(scene.fov_deg[0]), resolution=resolution)
 
 
-def raw_reference(scene: Scene, camera: Camera, spp: int, *name: int) -> RawReference:
+def raw_reference(scene: Scene, camera: PixelCamera, spp: int, *name: int) -> RawReference:
     """Return two halves of raw samples of a view; runs in a render child.
 
     Args:

@@ -30,7 +30,7 @@ from storage.metrics import psnr_log_db
 from storage.records.lights import num_lights
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
-from storage.renderer import Facts, Image, LoadedScene, OnProgress, Renderer, Sampling
+from storage.renderer import Facts, Image, OnProgress, ReadyScene, Renderer, Sampling
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -126,7 +126,7 @@ class _SceneAtHand:
         self._source = source
         self._facts: Facts = {} if choice is None else choice.facts
         self._on_progress = on_progress
-        self._loaded: dict[str, LoadedScene] = {}
+        self._loaded: dict[str, ReadyScene] = {}
 
     def picture(self, shot: Shot, renderer: Renderer) -> tuple[PictureFile, Radiance]:
         """Return the picture of one renderer, from an equal file or rendered."""

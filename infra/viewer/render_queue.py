@@ -18,7 +18,7 @@ from infra.viewer.picture_options import PictureOptions
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.scene import Scene
-from storage.renderer import Image, LoadedScene, Sampling
+from storage.renderer import Image, ReadyScene, Sampling
 
 MOST_KEPT = 32
 """Maximum number of pictures that are kept; one of 1024 pixels takes 13 MB."""
@@ -78,7 +78,7 @@ class RenderQueue:
         self._thread: threading.Thread | None = None
         self._numbers = itertools.count(1)
         self._edited: tuple[str, Scene] | None = None
-        self._loaded: dict[str, tuple[Hashable, LoadedScene, Sequence[str]]] = {}
+        self._loaded: dict[str, tuple[Hashable, ReadyScene, Sequence[str]]] = {}
         self._closed = False
 
     def submit(self, options: PictureOptions) -> RenderJob:
@@ -200,7 +200,7 @@ class RenderQueue:
             while len(self._jobs) > MOST_KEPT:
                 self._jobs.popitem(last=False)
 
-    def _load(self, options: PictureOptions) -> tuple[LoadedScene, Sequence[str]]:
+    def _load(self, options: PictureOptions) -> tuple[ReadyScene, Sequence[str]]:
         """Return the edited scene in the renderer of a request, and the notes on its pictures."""
         key = (options.scene_key, options.resolution, options.error_db)
         kept = self._loaded.get(options.engine)

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoiser import denoise_arrays
 from pipeline.renders.kept_light import LEAST_PASSES
 from pipeline.renders.noise_floor import LINEAR_STANDARD_ERRORS, MeasuredFloor, floor_db
@@ -66,7 +66,7 @@ class DevicePictures:
     """See `ViewPictures` for the meaning of its methods."""
 
     def __init__(
-        self, samples: HalfSamples, tracer: Any, camera: Camera, settings: RenderSettings
+        self, samples: HalfSamples, tracer: Any, camera: PixelCamera, settings: RenderSettings
     ) -> None:
         """Trace what guides the denoiser.
 

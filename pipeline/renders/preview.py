@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import representable, require_surfaces
@@ -100,14 +100,14 @@ class PreviewRenderer:
         """
         settings = self._settings
         pose = np.asarray(c2w, np.float64)
-        camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
+        camera = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
         return (
             yield from preview_steps(self._tracer, camera, seed, settings.spp, settings.denoiser)
         )
 
 
 def preview_steps(
-    tracer: Tracer, camera: Camera, seed: int, spp: int, denoiser: Filtered
+    tracer: Tracer, camera: PixelCamera, seed: int, spp: int, denoiser: Filtered
 ) -> Generator[Sampling, None, Preview]:
     """Do what `PreviewRenderer.view_steps` does, for a scene that a tracer has loaded."""
     began_s = time.process_time()

@@ -10,7 +10,7 @@ from collections.abc import Generator
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.preview import preview_steps, usual_filter
 from pipeline.renders.renderer import SceneRenderer, run_to_end
 from pipeline.renders.results import GrowingPicture, RenderedView
@@ -45,7 +45,7 @@ class ProgressiveRenderer:
             Rejected: as of `SceneRenderer.render_view`.
         """
         pose = np.asarray(c2w, np.float64)
-        camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=self._settings.resolution)
+        camera = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=self._settings.resolution)
         for spp in FIRST_LOOKS_SPP:
             steps = preview_steps(self._measured.tracer, camera, seed, spp, usual_filter(spp))
             preview = run_to_end(steps)

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoiser import set_denoiser_threads
 from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans, HostPictures
 from pipeline.renders.load_tracer import load_tracer
@@ -115,7 +115,7 @@ class SceneRenderer:
         settings = self._settings
         self._used = UsedTime()
         pose = np.asarray(c2w, np.float64)
-        camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
+        camera = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
         settled = settings.first_spp
         samples = HalfSamples(
             self._tracers, camera, seed, first_spp=settled, max_spp=settings.max_spp
@@ -145,7 +145,7 @@ class SceneRenderer:
             **stored,
         )
 
-    def _pictures(self, samples: HalfSamples, camera: Camera) -> ViewPictures:
+    def _pictures(self, samples: HalfSamples, camera: PixelCamera) -> ViewPictures:
         if self._settings.arithmetic == "numpy":
             return HostPictures(samples, self._tracer, camera, self._settings)
         from pipeline.renders.device_pictures import DevicePictures  # imports mitsuba

@@ -23,7 +23,7 @@ def test_every_camera_is_rendered_but_where_some_are_named(monkeypatch: pytest.M
         def render_view(self, camera: Camera) -> tuple[float, int | None]:
             return camera.fov_deg, camera.view
 
-    monkeypatch.setattr("infra.render.path_tracer.TracedScene", Scene)
+    monkeypatch.setattr("infra.render.path_tracer.SceneInChild", Scene)
     variant = Variant(name="llvm_ad_rgb", libllvm="", note="")  # nothing is traced here
     monkeypatch.setattr("pipeline.renders.variant.choose_variant", lambda default: variant)
     scene = tiny_scene(fov_deg=np.array([45, 50], np.float32))

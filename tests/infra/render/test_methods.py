@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from infra.bench.workloads.judged_pictures import difference_db
 from infra.render.comparison import Frame, flicker
 from infra.render.networks import (
-    DirectLight,
+    DirectLightRenderer,
     NetworkRenderer,
     traced_network,
     untrained_network,
@@ -39,7 +39,7 @@ def network(opened: NeuralRenderer) -> NetworkRenderer:
 
 
 def test_light_of_lamps_is_what_is_left_when_nothing_is_gathered() -> None:
-    of_lamps = shown(DirectLight(resolution=PX))
+    of_lamps = shown(DirectLightRenderer(resolution=PX))
     config = dataclasses.replace(hits_smoke(), gather_rays=0)
     # the network's picture went through log10(1 + radiance) in float32
     np.testing.assert_allclose(

@@ -23,7 +23,7 @@ from storage.errors import TrilightError
 from storage.records.exr import decode_exr
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
-from storage.renderer import Camera, Image, LoadedScene
+from storage.renderer import Camera, Image, ReadyScene
 from tests.for_each import case
 from tests.infra.render.test_plan import HereReader
 from tests.scenes_by_hand import tiny_scene
@@ -40,7 +40,7 @@ class FlatRenderer:
         self.opened = 0
         self.rendered = 0
 
-    def load(self, scene: Scene, name: str) -> LoadedScene:
+    def load(self, scene: Scene, name: str) -> ReadyScene:
         self.opened += 1
         return LoadedFlat(self)
 

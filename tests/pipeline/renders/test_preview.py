@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders import preview
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings, usual_filter
 from pipeline.renders.preview_parts import all_parts, preview_parts, seconds_of, timed_parts
 from pipeline.renders.progressive import FIRST_LOOKS_SPP, ProgressiveRenderer
@@ -106,11 +106,11 @@ class CountingTracer:
     def __init__(self) -> None:
         self.asked: Counter[str] = Counter()
 
-    def radiance(self, camera: Camera, *, seed: int, spp: int) -> Any:
+    def radiance(self, camera: PixelCamera, *, seed: int, spp: int) -> Any:
         self.asked[f"pass of {spp}"] += 1
         return np.ones((camera.resolution, camera.resolution, 3), np.float32)
 
-    def features(self, camera: Camera, *, spp: int) -> Features:
+    def features(self, camera: PixelCamera, *, spp: int) -> Features:
         self.asked[f"guides of {spp}"] += 1
         flat = np.ones((camera.resolution, camera.resolution, 3), np.float32)
         return Features(albedo=flat, normal=flat)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from infra.render.quality import ToStatedError
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.frozen_arithmetic.halves import (
     Half,
     estimate_error,
@@ -26,7 +26,7 @@ from storage.errors import TrilightError
 from storage.metrics import MAX_DB, psnr_linear_db, psnr_log_db
 from tests.oracle.plugin_tracer import HostSum
 
-CAMERA = Camera(c2w=np.eye(4), fov_deg=40.0, resolution=8)
+CAMERA = PixelCamera(c2w=np.eye(4), fov_deg=40.0, resolution=8)
 
 
 class Recorder:
@@ -35,11 +35,11 @@ class Recorder:
     def __init__(self) -> None:
         self.asked: list[tuple[int, int]] = []
 
-    def pass_sum(self, camera: Camera) -> HostSum:
+    def pass_sum(self, camera: PixelCamera) -> HostSum:
         return HostSum(self, camera)  # type: ignore[arg-type]
 
     def radiance(
-        self, camera: Camera, *, seed: int, spp: int, chosen: Chosen = None
+        self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
     ) -> NDArray[np.float32]:
         self.asked.append((spp, seed))
         picture = np.full((camera.resolution, camera.resolution, 3), spp, np.float32)
