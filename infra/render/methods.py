@@ -17,7 +17,7 @@ from storage.renderer import Renderer
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
 
-DIRECT_LIGHT = DirectLight.name
+DIRECT_LIGHT = DirectLightRenderer.name
 TRACED_LIGHT = "all traced light, no network"
 BUILTIN_NETWORKS = ("builtin:", "builtin:tokens")
 """Networks of every comparison: the hybrid one (more accurate), and the pure one."""

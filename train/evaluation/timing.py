@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.records.scene import Scene
-from storage.renderer import Camera, LoadedScene, Renderer
+from storage.renderer import Camera, ReadyScene, Renderer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class Price:
 class TimedScene:
     """Scene that a renderer has loaded, with what that and its pictures take."""
 
-    loaded: LoadedScene
+    loaded: ReadyScene
     radiance_rgb: NDArray[np.float32]
     """[R, R, 3] linear radiance of the first view."""
     price: Price
@@ -41,7 +41,7 @@ def time_scene(renderer: Renderer, scene: Scene, name: str, rounds: int = 1) -> 
         rounds: measured rounds.
 
     Raises:
-        Unrenderable, TrilightError: as `Renderer.load` and `LoadedScene.render`.
+        Unrenderable, TrilightError: as `Renderer.load` and `ReadyScene.render`.
     """
     camera = Camera.of_scene(scene, 0)
     prices = []
