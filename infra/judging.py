@@ -131,8 +131,8 @@ def judge_network(
         views = judge_views(judged, lambda: done(next(numbers), total))
     which = spread_text(*spread_views(tracer_views, total), 1 + max(view.view for view in views))
     about = _about(Path(checkpoint).name, opened, contest, split, views)
-    told = record(views, about, same_time(views, times, which))
-    return Judgement(record=told, views=tuple(views), contest=contest)
+    figures = record(views, about, same_time(views, times, which))
+    return Judgement(record=figures, views=tuple(views), contest=contest)
 
 
 def _time_tracer(

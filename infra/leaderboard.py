@@ -210,8 +210,8 @@ def _write_leaderboard(
         "scenes": str(len(board.keys)),
         "processor": board.machine,
     }
-    told = [*board.notes, *_notes(board, tables), *_beyond(most_triangles, tables)]
-    notes = tuple(dict.fromkeys(told))
+    every_note = [*board.notes, *_notes(board, tables), *_beyond(most_triangles, tables)]
+    notes = tuple(dict.fromkeys(every_note))
     page = leaderboard_page(about, tables, notes, rival)
     write_atomically(order.out / "leaderboard.md", page.encode())
     write_atomically(order.out / "leaderboard.csv", standings_csv(tables, board.machine))

@@ -49,8 +49,8 @@ def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> Picture
     def pictures(sample: Sample) -> NDArray[np.float32]:
         names = [picture_name(sample.key, view) for view in range(sample.scene.num_views)]
         paths = [folder / name for name in names]
-        found = [_picture(_bytes_of(path), path, [resolution]) for path in paths]
-        return np.maximum(np.stack(found), 0)
+        read = [_picture(_bytes_of(path), path, [resolution]) for path in paths]
+        return np.maximum(np.stack(read), 0)
 
     return PictureSource(
         name=f"pictures of {folder.name or folder.resolve().name}",
@@ -116,12 +116,12 @@ def picture_folders(
     folders: Sequence[Path], views: Views, widths: Sequence[int]
 ) -> list[PictureSource]:
     """Return the checked folders; raises TrilightError for equal names."""
-    found: list[PictureSource] = []
+    all_folders: list[PictureSource] = []
     for folder in folders:
         one = picture_folder(folder, views, widths)
-        if one.name in [other.name for other in found]:
+        if one.name in [other.name for other in all_folders]:
             raise TrilightError(
                 f"--pictures {folder}: another folder has the same name; expected different ones."
             )
-        found.append(one)
-    return found
+        all_folders.append(one)
+    return all_folders

@@ -39,6 +39,7 @@ ALIASES = {
     "noise_floor_db": "--noise-floor",
     "noise_floor_linear_db": "--noise-floor-linear",
     "noise_floor_objects_db": "--noise-floor-objects",
+    "other_networks": "--beside",
 }
 """Second, shorter name of an option by its field; the first name is that of the field."""
 

@@ -132,13 +132,13 @@ class Board:
 
     def prices(self, width: int) -> dict[str, list[Price]]:
         """Return the prices of this machine by method, one for each timed scene."""
-        found: dict[str, list[Price]] = {}
+        prices: dict[str, list[Price]] = {}
         for method in self.present(width):
             for key in self.keys[: self.timed_scenes]:
                 price = self.rows.price(self.key_of(method, key, 0), self.machine)
                 if price is not None and (width, key) not in self.left_out:
-                    found.setdefault(method.name, []).append(price)
-        return found
+                    prices.setdefault(method.name, []).append(price)
+        return prices
 
 
 def first_keys(shards: ShardSet, limit: int) -> list[str]:

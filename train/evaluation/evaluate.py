@@ -177,10 +177,10 @@ def _add_swapped_scores(
     no worse with other triangles. A network of hits keeps its own hits; only the scene's tokens are
     replaced.
     """
-    own = judged.scene.tensors
-    seen = dataclasses.replace(other, c2w_V44=own.c2w_V44, fov_deg_V=own.fov_deg_V)
-    if own.traced is not None:
-        seen = dataclasses.replace(seen, traced=with_others_tokens(own.traced, other.traced))
+    cameras = judged.scene.tensors
+    seen = dataclasses.replace(other, c2w_V44=cameras.c2w_V44, fov_deg_V=cameras.fov_deg_V)
+    if cameras.traced is not None:
+        seen = dataclasses.replace(seen, traced=with_others_tokens(cameras.traced, other.traced))
     pictures_VRR3 = predict(network, dataclasses.replace(judged.scene, tensors=seen))
     return [
         dataclasses.replace(row, swapped_psnr_log_db=psnr_log_db(picture, target))

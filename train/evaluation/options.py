@@ -57,11 +57,11 @@ class EvaluationOptions:
     """Network to evaluate, and the data to use."""
 
     checkpoint: str | None = None
-    """Folder of a run, model.safetensors or a checkpoint; builtin: is the network that comes with
-    Trilight. Without one all methods are compared, as by trilight leaderboard."""
+    """Folder of a run, model.safetensors, a checkpoint, or builtin: for the network that comes with
+    Trilight; by default none. Without one, all methods are compared as by trilight leaderboard."""
     data: tuple[str, ...]
     """Dataset (a folder or a URL), or shards by name or pattern."""
-    beside: tuple[str, ...] = ()
+    other_networks: tuple[str, ...] = ()
     """Networks to compare it with on a leaderboard of all methods, which is written into the same
     folder; by default none."""
     pictures: tuple[Path, ...] = ()
@@ -105,7 +105,7 @@ class EvaluationOptions:
         Raises:
             TrilightError: there are several datasets, of which a leaderboard is not made.
         """
-        if self.checkpoint and not (self.beside or self.pictures):
+        if self.checkpoint and not (self.other_networks or self.pictures):
             return None
         if len(self.data) > 1:
             raise TrilightError(
@@ -114,7 +114,7 @@ class EvaluationOptions:
             )
         return LeaderboardOptions(
             source=self.data[0],
-            checkpoint=(*filter(None, [self.checkpoint]), *self.beside),
+            checkpoint=(*filter(None, [self.checkpoint]), *self.other_networks),
             pictures=self.pictures,
             width=(self.resolution,) if self.resolution else (),
             scenes=self.most_scenes,
