@@ -44,7 +44,7 @@ class Board:
     shards: ShardSet
     """Dataset shards of the evaluated split."""
     set_digest: str
-    """Digest of the dataset."""
+    """Digest of the dataset, which the first line of the rows holds."""
     keys: Sequence[str]
     """Keys of the evaluated scenes, the first ones of the split."""
     num_views: int
@@ -58,13 +58,13 @@ class Board:
     lpips: Lpips | None
     """LPIPS metric; None without its weights."""
     folder: Path
-    """Folder of the rows."""
+    """Folder in which rows.jsonl is written, and read when a run resumes."""
     methods: list[Method] = field(default_factory=list)
     """Methods, each of one width, in the order of evaluation."""
     kinds: dict[str, str] = field(default_factory=dict)
     """Kind of each method by name, which decides the chart's color."""
     notes: list[str] = field(default_factory=list)
-    """Notes for the reader."""
+    """Sentences on the methods, without full stops, which stand below the tables."""
     left_out: dict[tuple[int, str], str] = field(default_factory=dict)
     """Reason by (width, key) of scenes that a method cannot render."""
 

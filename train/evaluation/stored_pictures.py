@@ -19,7 +19,7 @@ class PictureSource:
     """Pictures of one width, by the scene's key and the camera's row."""
 
     name: str
-    """Name in rows."""
+    """Name of the row, unique on a leaderboard."""
     resolution: int
     """Width and height of the pictures in pixels."""
     digest: Callable[[str, int], str]
