@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from infra.render.cameras import own_camera
-from infra.render.quality import MOST_SPP, ToStatedError
+from infra.render.quality import MOST_TRACED_SPP, ToStatedError
 from infra.torch_library import require_torch
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import NoiseTargets
@@ -49,7 +49,7 @@ def render(
     noise_floor_db: float | None = None,
     noise_floor_linear_db: float | None = None,
     noise_floor_objects_db: float | None = None,
-    max_spp: int = MOST_SPP,
+    max_spp: int = MOST_TRACED_SPP,
     split: bool = False,
     split_lobes: bool = False,
     seed: int = 0,
@@ -106,7 +106,7 @@ def render_views(
     noise_floor_db: float | None = None,
     noise_floor_linear_db: float | None = None,
     noise_floor_objects_db: float | None = None,
-    max_spp: int = MOST_SPP,
+    max_spp: int = MOST_TRACED_SPP,
     split: bool = False,
     split_lobes: bool = False,
     seed: int = 0,

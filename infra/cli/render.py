@@ -18,11 +18,14 @@ if TYPE_CHECKING:
 @command("source")
 def render(options: RenderOptions, output: OutputOptions) -> None:
     from infra.cli.rendered import print_outcome
-    from infra.render.run import render_from_options
+    from infra.render.plan import plan_render
+    from infra.render.run import run_plan
+    from pipeline.exchange.reader import SceneReader
 
     started = time.monotonic()
-    with progress_bars() as bars:
-        outcome = render_from_options(options, _Bars(bars, visible=not output.json))
+    with progress_bars() as bars, SceneReader(options.albedo_over_one) as reader:
+        plan = plan_render(options, reader)
+        outcome = run_plan(plan, reader, _Bars(bars, visible=not output.json))
     print_outcome(outcome, time.monotonic() - started, as_json=output.json)
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from infra.render.held_out_scenes import composing_child, held_out_build, held_out_scene
+from infra.render.networks import NetworkRenderer
 from infra.render.preview_table import (
     NETWORK_SCENE,
     NETWORK_VIEW,
@@ -30,6 +31,7 @@ from pipeline.renders.preview_parts import timed_parts
 from pipeline.renders.renderer import set_threads
 from pipeline.renders.variant import choose_variant
 from storage.records.scene import Scene
+from storage.renderer import Camera
 
 PROBES = (1, 2)
 """Numbers of the held-out scenes that every machine times."""
@@ -124,22 +126,15 @@ def _network_parts(scene: Scene, threads: int) -> dict[int, dict[str, float]]:
     """Return seconds of the network's parts by width; none where torch is not installed."""
     if importlib.util.find_spec("torch") is None:
         return {}
-    import torch
-
-    from model.neural_renderer import NeuralRenderer
-
-    torch.set_num_threads(threads)
-    renderer = NeuralRenderer.load("builtin:tokens")
     seconds = {}
     for px in PROBED_PX:
+        renderer = NetworkRenderer(checkpoint="builtin:tokens", resolution=px, threads=threads)
         spent = []
         for _ in range(4):
-            marks = [time.perf_counter()]
-            prepared = renderer.prepare(scene)
-            marks.append(time.perf_counter())
-            renderer.view(prepared, scene.c2w[0], float(scene.fov_deg[0]), px)
-            marks.append(time.perf_counter())
-            spent.append(np.diff(marks))
+            loaded = renderer.load(scene, "scene")
+            began = time.perf_counter()
+            loaded.render(Camera.of_scene(scene, 0))
+            spent.append((loaded.seconds, time.perf_counter() - began))
         encoding_s, view_s = np.median(spent[1:], axis=0)  # the first allocates memory and threads
         seconds[px] = {NETWORK_SCENE: float(encoding_s), NETWORK_VIEW: float(view_s)}
     return seconds

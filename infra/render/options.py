@@ -4,8 +4,14 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from infra.render.look import ToneMap
-from infra.render.quality import MOST_SPP as MOST_TRACED_SPP
-from infra.render.quality import ErrorBudget, FixedSamples, Quality, TimeBudget, ToStatedError
+from infra.render.quality import (
+    MOST_TRACED_SPP,
+    ErrorBudget,
+    FixedSamples,
+    Quality,
+    TimeBudget,
+    ToStatedError,
+)
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.renders.preview import MOST_SPP, usual_filter
 from pipeline.renders.settings import Filtered, NoiseFloor, NoiseTargets, Resolution, Samples

@@ -118,21 +118,21 @@ class PathTracer:
         self.notes: Sequence[str] = ()
         if child.variant.note:
             self.notes = (f"{child.variant.note}; see trilight doctor",)
-        self._seed = seed
-        self._shows_looks = shows_looks
+        self.seed = seed
+        self.shows_looks = shows_looks
 
     @property
     def identity(self) -> Mapping[str, Any]:
         """Everything but scene and camera that decides a picture, as JSON values."""
         return {
-            "seed": str(self._seed),  # the integers of an EXR header end at 2^31
+            "seed": str(self.seed),  # the integers of an EXR header end at 2^31
             "settings": settings_record(self.settings),
             "environment": environment(self.child.variant),
         }
 
     def load(self, scene: Scene, name: str) -> "SceneInChild":
         """Load a scene; raises Unrenderable where it cannot be rendered."""
-        return SceneInChild(self.child, scene, self.settings, self._shows_looks, self._seed, name)
+        return SceneInChild(self, scene, name)
 
     def close(self) -> None:
         """End the child."""
@@ -142,24 +142,16 @@ class PathTracer:
 class SceneInChild:
     """Scene in a render child; it is sent again where the child no longer has it."""
 
-    def __init__(
-        self,
-        child: RenderChild,
-        scene: Scene,
-        settings: RenderSettings | PreviewSettings,
-        shows_looks: bool,
-        seed: int,
-        name: str,
-    ) -> None:
-        self._child = child
-        self._arguments = (next(_numbers), scene, settings, shows_looks)
-        self._seed = seed
+    def __init__(self, tracer: PathTracer, scene: Scene, name: str) -> None:
+        self._child = tracer.child
+        self._seed = tracer.seed
+        self._arguments = (next(_numbers), scene, tracer.settings, tracer.shows_looks)
         self._name = name
         unread = ", ".join(unread_columns(scene.materials, PUBLISHED_COLUMNS))
         self.notes = (f"the path tracer does not read {unread}",) if unread else ()
-        child.call(name, lambda each: each.call_method(RenderWorker.wait))
+        self._child.call(name, lambda each: each.call_method(RenderWorker.wait))
         began = time.perf_counter()
-        self.cpu_seconds: float | None = child.call(name, self._load)
+        self.cpu_seconds: float | None = self._child.call(name, self._load)
         self.seconds = time.perf_counter() - began
 
     def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Image:

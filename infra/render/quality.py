@@ -13,7 +13,7 @@ from pipeline.renders.settings import (
 
 USUAL_TARGETS = NoiseTargets(log_db=USUAL_FLOOR_DB)
 
-MOST_SPP = 4096
+MOST_TRACED_SPP = 4096
 """Default maximum number of samples per pixel."""
 
 
@@ -23,7 +23,7 @@ class ToStatedError:
 
     targets: NoiseTargets = USUAL_TARGETS
     """Target errors; psnr_log_db of 40 where none is set."""
-    max_spp: int = MOST_SPP
+    max_spp: int = MOST_TRACED_SPP
     """Maximum number of samples per pixel."""
     split: bool = False
     """True to keep direct and indirect light apart."""

@@ -11,7 +11,6 @@ from infra.render.budget import Choice
 from infra.render.cameras import own_camera
 from infra.render.comparison import Flicker, Frame, comparison_sheet, flicker, log_error
 from infra.render.look import Look, display_pixels
-from infra.render.options import RenderOptions
 from infra.render.picture_file import (
     PictureFile,
     Radiance,
@@ -19,7 +18,7 @@ from infra.render.picture_file import (
     load_matching_picture,
     write_picture,
 )
-from infra.render.plan import RenderPlan, Shot, plan_render
+from infra.render.plan import RenderPlan, Shot
 from infra.render.video import write_video
 from pipeline.documents.png import encode_png
 from pipeline.exchange.formats import SceneSource
@@ -74,12 +73,6 @@ class RenderProgress(Protocol):
 
     def on_samples(self, now: Sampling | Image) -> None:
         """Report a finished pass of the path tracer."""
-
-
-def render_from_options(options: RenderOptions, watcher: RenderProgress) -> RenderResult:
-    """Plan a render and run the plan; raises TrilightError as these two do."""
-    with SceneReader(options.albedo_over_one) as reader:
-        return run_plan(plan_render(options, reader), reader, watcher)
 
 
 def run_plan(plan: RenderPlan, reader: SceneReader, watcher: RenderProgress) -> RenderResult:

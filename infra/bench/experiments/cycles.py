@@ -68,14 +68,14 @@ def _measure(
         camera = first_camera(scene, RESOLUTION)
         ours = context.child.call(raw_reference, scene, camera, OUR_SHARE * spp)
         settings = adaptive(USUAL_FLOOR_DB, RESOLUTION, spp)
-        shot = context.child.call(shots, scene, {"stated": settings})["stated"]
+        view = context.child.call(shots, scene, {"stated": settings})["stated"]
         theirs = _cycles_samples(scene, spp, context.folder(), is_plain=point.name == PLAIN)
         yield (
             point.name,
             {
                 "core_s": theirs.core_s,
                 **agreement_figures(ours, theirs),
-                **_stated_figures(shot.view, ours, theirs),
+                **_stated_figures(view, ours, theirs),
             },
         )
 

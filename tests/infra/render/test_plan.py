@@ -191,5 +191,5 @@ def test_only_the_plan_reads_what_was_asked() -> None:
         for path in (ROOT / "infra/render").glob("*.py")
         if re.search(r"\boptions\.\w", path.read_text().replace("render.options", ""))
     }
-    assert readers == {"plan.py", "run.py"}, "run.py opens the reader of scenes"
+    assert readers == {"plan.py"}
     assert "options." not in (ROOT / "infra/cli/rendered.py").read_text()
