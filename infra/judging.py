@@ -147,7 +147,8 @@ def _time_tracer(
         opened=NeuralRenderer(copy.deepcopy(contest.network).cpu()),
     )
     previews: dict[Level, Renderer] = {}
-    missing, note = "no views of it were requested", ""
+    note = ""
+    missing = "" if contest.tracer_views else "no views of it were requested"
     if contest.tracer_views:
         try:
             note = choose_variant().note
