@@ -1,7 +1,6 @@
 """`trilight render`: renders scenes by path tracing, by a trained network, or by both."""
 
 import time
-from typing import TYPE_CHECKING
 
 from rich.progress import Progress
 from rich.text import Text
@@ -10,9 +9,6 @@ from infra.cli.console import progress_bars
 from infra.cli.options import OutputOptions, command
 from infra.render.options import RenderOptions
 from storage.renderer import Image, Sampling
-
-if TYPE_CHECKING:
-    from infra.render.budget import Choice
 
 
 @command("source")
@@ -25,6 +21,8 @@ def render(options: RenderOptions, output: OutputOptions) -> None:
     started = time.monotonic()
     with progress_bars() as bars, SceneReader(options.albedo_over_one) as reader:
         plan = plan_render(options, reader)
+        if plan.choice is not None and not output.json:
+            bars.console.print(Text(plan.choice.sentence), soft_wrap=True)
         outcome = run_plan(plan, reader, _Bars(bars, visible=not output.json))
     print_outcome(outcome, time.monotonic() - started, as_json=output.json)
 
@@ -37,10 +35,6 @@ class _Bars:
         self._pictures = bars.add_task("pictures", total=None, note="", visible=False)
         self._samples = bars.add_task("samples", total=None, note="", visible=False)
         self._visible = visible
-
-    def on_choice(self, choice: "Choice") -> None:
-        if self._visible:
-            self._bars.console.print(Text(choice.sentence), soft_wrap=True)
 
     def on_picture(self, done: int, total: int) -> None:
         self._bars.update(self._pictures, completed=done, total=total, visible=self._visible)

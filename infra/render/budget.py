@@ -114,7 +114,8 @@ def price_all(
     priced = []
     for samples, unsorted in rows.items():
         errors = sorted(unsorted, key=lambda each: each.width)
-        least, most = errors[0].width, errors[-1].width
+        least = errors[0].width
+        most = errors[-1].width
         # more pixels do not harm samples; a network fails beyond the widths of its training
         if samples is None and not least <= width <= most:
             continue

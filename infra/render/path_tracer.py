@@ -11,6 +11,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 from infra.render.quality import FixedSamples, ToStatedError
@@ -84,42 +85,34 @@ class RenderChild:
         self._child.close()
 
 
+@dataclass(eq=False)
 class PathTracer:
-    """Path tracing to a stated error or with fixed samples; equal arguments give equal pictures."""
+    """Path tracing to a stated error or with fixed samples; equal arguments give equal pictures.
 
-    def __init__(
-        self,
-        child: RenderChild,
-        quality: ToStatedError | FixedSamples,
-        resolution: int,
-        *,
-        seed: int = 0,
-        name: str = "mitsuba",
-        shows_looks: bool = False,
-    ) -> None:
-        """Configure the path tracer.
+    Raises:
+        TrilightError: a setting is invalid.
+    """
 
-        Args:
-            child: child that traces; others may share it.
-            quality: quality of the pictures.
-            resolution: width in pixels, a multiple of 8.
-            seed: seed of the samples of every picture, from 0.
-            name: name in rows, files and messages.
-            shows_looks: whether pictures to a stated error are shown while they improve.
+    child: RenderChild
+    """Child that traces; other path tracers may share it."""
+    quality: ToStatedError | FixedSamples
+    resolution: int
+    """Width in pixels, a multiple of 8."""
+    _: KW_ONLY
+    seed: int = 0
+    """Seed of the samples of every picture, from 0."""
+    name: str = "mitsuba"
+    shows_looks: bool = False
+    """Whether pictures to a stated error are shown while they improve."""
 
-        Raises:
-            TrilightError: a setting is invalid.
-        """
-        self.name = name
-        self.quality = quality
-        self.resolution = resolution
-        self.settings = quality.settings(resolution)
-        self.child = child
-        self.notes: Sequence[str] = ()
-        if child.variant.note:
-            self.notes = (f"{child.variant.note}; see trilight doctor",)
-        self.seed = seed
-        self.shows_looks = shows_looks
+    def __post_init__(self) -> None:
+        self.settings = self.quality.settings(self.resolution)
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """Why another device was not chosen, where there is a reason."""
+        note = self.child.variant.note
+        return (f"{note}; see trilight doctor",) if note else ()
 
     @property
     def identity(self) -> Mapping[str, Any]:

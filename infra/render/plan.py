@@ -68,7 +68,7 @@ class RenderPlan:
     fps: int
     """Frames per second of the video."""
     choice: Choice | None = None
-    """What --seconds or --error chose; None without these."""
+    """Samples or network for a budget, with their expected cost and error; None without one."""
 
 
 def plan_render(options: RenderOptions, reader: SceneReader) -> RenderPlan:

@@ -59,7 +59,7 @@ class FixedSamples:
     """A number of samples and one denoise, of unmeasured error."""
 
     spp: int
-    """Samples per pixel."""
+    """Number of paths through each pixel, from 1."""
     denoiser: Filtered
     """Filter of Open Image Denoise."""
 

@@ -65,9 +65,6 @@ class RenderResult:
 class RenderProgress(Protocol):
     """Callbacks on the progress of a render."""
 
-    def on_choice(self, choice: Choice) -> None:
-        """Report what --seconds or --error chose."""
-
     def on_picture(self, done: int, total: int) -> None:
         """Report the number of finished pictures and of all."""
 
@@ -84,8 +81,6 @@ def run_plan(plan: RenderPlan, reader: SceneReader, watcher: RenderProgress) -> 
     """
     finished = list[FinishedShot]()
     notes = dict[str, None]()
-    if plan.choice is not None:
-        watcher.on_choice(plan.choice)
     before: Frame | None = None
     with ExitStack() as stack:
         for renderer in plan.renderers:

@@ -116,12 +116,12 @@ class StoredPictures:
         """Return the pictures; raises Unrenderable for another scene than theirs."""
         if scene is not self.scene:
             raise Unrenderable("The file's picture shows the scene without your changes.")
-        return SceneHere(render_image=self._stored)
+        return SceneHere(render_image=self._look_up)
 
     def close(self) -> None:
         """Do nothing: nothing is held."""
 
-    def _stored(self, camera: Camera) -> Image:
+    def _look_up(self, camera: Camera) -> Image:
         if camera.view is None or camera.view >= len(self.radiance_rgb):
             raise Unrenderable(
                 "The file holds pictures of the scene's own cameras alone; choose one of them."

@@ -9,7 +9,6 @@ import pytest
 from PIL import Image as Picture
 
 from infra.render import look as look_module
-from infra.render.budget import Choice
 from infra.render.cameras import orbit, own_camera, pair_cameras
 from infra.render.comparison import comparison_sheet
 from infra.render.look import Look, enlarge, enlargement, tone_mapped
@@ -65,9 +64,6 @@ class LoadedFlat:
 
 class SilentProgress:
     """Progress of a render that prints nothing."""
-
-    def on_choice(self, choice: Choice) -> None:
-        pass
 
     def on_picture(self, done: int, total: int) -> None:
         pass
