@@ -209,8 +209,10 @@ def _judge_noise(
     for view in range(sample.scene.num_views):
         key = board.noise_key(width, sample.key, view)
         if board.rows.get(key) is None:
-            target, hits = judged().target_VRR3[view], judged().hits_VRR[view]
-            floors = noise_floors(sample, view, target, hits, board.lpips)
+            scene = judged()
+            floors = noise_floors(
+                sample, view, scene.target_VRR3[view], scene.hits_VRR[view], board.lpips
+            )
             board.rows.add(key, Row(scores=floors, facts=scene_facts(sample)))
 
 

@@ -47,7 +47,8 @@ def time_scene(renderer: Renderer, scene: Scene, name: str, rounds: int = 1) -> 
     prices = []
     for _ in range(1 + rounds):
         loaded = renderer.load(scene, name)
-        first, further = loaded.render(camera), loaded.render(camera)
+        first = loaded.render(camera)
+        further = loaded.render(camera)
         first_s = (loaded.cpu_seconds or 0.0) + (first.cpu_seconds or 0.0)
         prices.append(Price(first_s=first_s, further_s=further.cpu_seconds or 0.0))
     return TimedScene(
