@@ -222,7 +222,7 @@ def test_evaluate_is_a_leaderboard_without_a_network_and_beside_others(
     short: LeaderboardOptions, tmp_path: Path
 ) -> None:
     data = ["--data", short.source, "--split", "validation", "--most-scenes", "1"]
-    words = [*data, "--resolution", str(PX), "--timed-scenes", "1", "--tracer-views", "0", "--json"]
+    words = [*data, "--resolution", str(PX), "--tracer-views", "0", "--json"]
     alone = json.loads(trilight(["evaluate", *words, "--out", str(tmp_path / "alone")]).stdout)
     (one,) = alone["widths"]
     assert (one["width"], one["scenes"], alone["rival"]) == (PX, 1, "network builtin:tokens")

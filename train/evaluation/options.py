@@ -76,8 +76,6 @@ class EvaluationOptions:
     else the dataset's."""
     most_scenes: SceneCount = 10**6
     """Maximum number of scenes to evaluate, taken from the start of the split."""
-    timed_scenes: TimedScenes = 20
-    """Maximum number of scenes on which a leaderboard measures CPU seconds."""
     tracer_views: TracedViews = 64
     """Maximum number of views to judge the path tracer on as well, denoised, with the samples that
     take it the network's own time; 0 leaves it out."""
@@ -118,7 +116,6 @@ class EvaluationOptions:
             pictures=self.pictures,
             width=(self.resolution,) if self.resolution else (),
             scenes=self.most_scenes,
-            timed_scenes=self.timed_scenes,
             split=self.split,
             train_data=self.train_data,
             lpips=self.lpips,
