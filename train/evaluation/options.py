@@ -85,8 +85,8 @@ class EvaluationOptions:
     device: Literal["cpu", "cuda"] | None = None
     """Device to compute on; by default cuda if there is one, else cpu."""
     out: Path | None = None
-    """Folder for the report; by default evaluation, in the folder of a run or else here. Where the
-    report of another network is, a number is added."""
+    """Folder for the report; by default evaluation, in the folder of a run or else here, and
+    leaderboard without a network. Where the report of another network is, a number is added."""
 
     @property
     def report_folder(self) -> Path:
