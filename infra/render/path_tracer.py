@@ -103,7 +103,7 @@ class PathTracer:
     """Seed of the samples of every picture, from 0."""
     name: str = "mitsuba"
     shows_looks: bool = False
-    """Whether pictures to a stated error are shown while they improve."""
+    """True to yield intermediate pictures on the way to a stated error."""
 
     def __post_init__(self) -> None:
         self.settings = self.quality.settings(self.resolution)
