@@ -106,9 +106,8 @@ def judge_network(
     rivals = opened if train_data is None else open_training_data(train_data)
     network_file = find_network(os.fspath(checkpoint))
     shards = opened.split(split)
-    if resolution is None:
-        stored = stored_resolution(shards)
-        resolution = min(network_file.trained.resolution or stored, stored)
+    stored = stored_resolution(shards)
+    resolution = resolution or min(network_file.trained.resolution or stored, stored)
     torch_device = choose_device(device)
     distance = load_lpips(lpips)
     contest = EvalConfig(
@@ -129,10 +128,18 @@ def judge_network(
         times, tracer = _time_tracer(contest, stack)
         judged = dataclasses.replace(contest, tracer=tracer)
         views = judge_views(judged, lambda: done(next(numbers), total))
-    which = spread_text(*spread_views(tracer_views, total), 1 + max(view.view for view in views))
     about = _about(Path(checkpoint).name, opened, contest, split, views)
-    figures = record(views, about, same_time(views, times, which))
+    figures = record(views, about, _beside_tracer(contest, views, times))
     return Judgement(record=figures, views=tuple(views), contest=contest)
+
+
+def _beside_tracer(
+    contest: EvalConfig, views: Sequence[JudgedView], times: SameTimeResult
+) -> dict[str, Any]:
+    """Return the comparison with the path tracer as JSON values."""
+    every, first = spread_views(contest.tracer_views, contest.num_scenes)
+    most_views = 1 + max(view.view for view in views)
+    return same_time(views, times, spread_text(every, first, most_views))
 
 
 def _time_tracer(
