@@ -72,17 +72,17 @@ def load_matching_picture(
     """Return the picture in a file if its header matches; else, or if it is unreadable, None."""
     try:
         data = read_plain(path)
-        found = read_header(data)
-        if found.get(_PREFIX + _REQUEST) != header[_REQUEST]:
+        stored = read_header(data)
+        if stored.get(_PREFIX + _REQUEST) != header[_REQUEST]:
             return None
-        names = {channel.name.rpartition(".")[0] for channel in found["channels"]}
+        names = {channel.name.rpartition(".")[0] for channel in stored["channels"]}
         radiance_rgb = decode_picture(data, names - {""})
     except (OSError, RuntimeError, ValueError, TrilightError):
         return None
     described = {_PREFIX + name for name in header}
     facts = {
         name.removeprefix(_PREFIX): value
-        for name, value in found.items()
+        for name, value in stored.items()
         if name.startswith(_PREFIX) and name not in described
     }
     return _picture_file(path, facts, radiance_rgb, None), radiance_rgb

@@ -87,14 +87,14 @@ def run_plan(plan: RenderPlan, reader: SceneReader, watcher: RenderProgress) -> 
             stack.enter_context(closing(renderer))
         watcher.on_picture(0, len(plan.shots))
         for source, shots in itertools.groupby(plan.shots, key=lambda shot: shot.source):
-            found = reader.load(source)
-            scene = _SceneAtHand(source, found.scene, plan.choice, watcher.on_samples)
+            source_scene = reader.load(source)
+            scene = _SceneAtHand(source, source_scene.scene, plan.choice, watcher.on_samples)
             for shot in shots:
                 made = {each.name: scene.picture(shot, each) for each in plan.renderers}
                 done, before = _finish(shot, scene, made, plan.look, before)
                 finished.append(done)
                 watcher.on_picture(len(finished), len(plan.shots))
-            notes |= dict.fromkeys([*found.notes, *scene.notes])
+            notes |= dict.fromkeys([*source_scene.notes, *scene.notes])
     if plan.output.video is not None:
         write_video(plan.output.video, [done.shot.png for done in finished], plan.fps)
     for renderer in plan.renderers:

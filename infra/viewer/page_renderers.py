@@ -58,7 +58,7 @@ class PassImage(Image):
 class PassRenderer:
     """Pass of the visible surfaces, such as depth: a function of scene and camera without light."""
 
-    shown: PassView
+    pass_view: PassView
     resolution: int
     notes: Sequence[str] = ()
     identity: Mapping[str, Any] = field(default_factory=dict)
@@ -66,7 +66,7 @@ class PassRenderer:
     @property
     def name(self) -> str:
         """Word of the pass."""
-        return self.shown.word
+        return self.pass_view.word
 
     def load(self, scene: Scene, name: str) -> SceneHere:
         """Return the scene as it is."""
@@ -76,7 +76,7 @@ class PassRenderer:
         """Do nothing: nothing is held."""
 
     def _render(self, scene: Scene, camera: Camera) -> Image:
-        (name,) = pass_names([self.shown.word])
+        (name,) = pass_names([self.pass_view.word])
         angle = np.array([camera.fov_deg], np.float32)
         began_s = time.process_time()
         values = view_passes(
@@ -84,8 +84,8 @@ class PassRenderer:
         )[name]
         core_s = time.process_time() - began_s
         has_hits = (np.isfinite(values) if values.dtype.kind == "f" else values >= 0).any()
-        caption = self.shown.caption(values).partition(", in the")[0] if has_hits else ""
-        pixels = self.shown.pixels(values)
+        caption = self.pass_view.caption(values).partition(", in the")[0] if has_hits else ""
+        pixels = self.pass_view.pixels(values)
         return PassImage(
             radiance_rgb=np.zeros((*pixels.shape[:2], 3), np.float32),
             pixels=pixels,
@@ -175,7 +175,9 @@ def page_renderers(
             means="The picture that the file holds of this camera.",
             make=lambda options: target,
         )
-    return offered | {f"pass-{shown.word}": _pass_on_page(shown) for shown in PASS_VIEWS}
+    return offered | {
+        f"pass-{pass_view.word}": _pass_on_page(pass_view) for pass_view in PASS_VIEWS
+    }
 
 
 def _path_tracer(
@@ -219,9 +221,9 @@ def network_on_page(checkpoint: str, title: str, means: str) -> PageRenderer:
     )
 
 
-def _pass_on_page(shown: PassView) -> PageRenderer:
+def _pass_on_page(pass_view: PassView) -> PageRenderer:
     return PageRenderer(
-        title=shown.title.capitalize(),
+        title=pass_view.title.capitalize(),
         means="What the pixels see, without light.",
-        make=lambda options: PassRenderer(shown=shown, resolution=options.resolution),
+        make=lambda options: PassRenderer(pass_view=pass_view, resolution=options.resolution),
     )

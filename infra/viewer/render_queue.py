@@ -203,13 +203,12 @@ class RenderQueue:
     def _load(self, options: PictureOptions) -> tuple[ReadyScene, Sequence[str]]:
         """Return the edited scene in the renderer of a request, and the notes on its pictures."""
         key = (options.scene_key, options.resolution, options.error_db)
-        kept = self._loaded.get(options.engine)
-        if kept is None or kept[0] != key:
+        if self._loaded.get(options.engine, (None,))[0] != key:
             scene = self.scene(options.scene_key, options.edits)
             renderer = self._renderers[options.engine].make(options)
             loaded = renderer.load(scene, "the scene")
-            kept = self._loaded[options.engine] = (key, loaded, [*loaded.notes, *renderer.notes])
-        return kept[1], kept[2]
+            self._loaded[options.engine] = (key, loaded, [*loaded.notes, *renderer.notes])
+        return self._loaded[options.engine][1:]
 
     def _cancel(self, job: RenderJob | None) -> None:
         if job is not None:
