@@ -1,22 +1,31 @@
 """Evaluation of a trained network on a dataset: its figures, and the report's files."""
 
 import contextlib
+import copy
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import torch
 
-from infra.tracer_rival import TIMED_SCENES, TracerRival
+from infra.render.networks import NetworkRenderer
+from infra.render.path_tracer import PathTracer, RenderChild
+from infra.render.quality import FixedSamples
+from model.neural_renderer import NeuralRenderer
 from model.open import find_network
 from model.weights import network_digest
+from pipeline.renders.preview import MOST_SPP
+from pipeline.renders.variant import choose_variant
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
+from storage.renderer import Renderer
 from storage.typed_json import read_json
+from train.evaluation.chart import plot_excursions
 from train.evaluation.evaluate import (
     EvalConfig,
     judge_views,
@@ -27,15 +36,27 @@ from train.evaluation.evaluate import (
     worst_of_each_excursion,
 )
 from train.evaluation.judged_view import NETWORK, JudgedView
-from train.evaluation.report import markdown, record
-from train.evaluation.same_time import same_time
+from train.evaluation.pages import evaluation_page
+from train.evaluation.report import record
+from train.evaluation.same_time import (
+    TIMED_SCENES,
+    Filter,
+    Level,
+    SameTimeResult,
+    same_time,
+    spread_text,
+    spread_views,
+    time_both,
+)
 from train.evaluation.sheet import draw_sheet, write_picture
 from train.loop.distributed import choose_device
 from train.loss.lpips import load_lpips
 from train.result import pretty_json
 
-EqualTimeReport = Callable[[Sequence[JudgedView]], dict[str, Any]]
-"""Function that compares the evaluated views with the path tracer in equal time."""
+FILTERS: tuple[Filter, ...] = ("fast", "high")
+
+LADDER = [(1 << step, each) for step in range(MOST_SPP.bit_length()) for each in FILTERS]
+"""Samples per pixel and filters that the path tracer tries in the network's time."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,9 +72,9 @@ class Judgement:
 
 
 def judge_network(
-    checkpoint: str,
-    data: Sequence[str],
+    checkpoint: str | os.PathLike[str],
     *,
+    data: str | os.PathLike[str] | Sequence[str],
     split: str = "test",
     train_data: Sequence[str] | None = None,
     resolution: int | None = None,
@@ -73,21 +94,20 @@ def judge_network(
         resolution: width in pixels; by default the network's training width, else the data's.
         most_scenes: maximum number of scenes, from the start of the split.
         tracer_views: maximum number of views on which the path tracer is evaluated in the network's
-            time (infra.tracer_rival); 0 for none. Where it fails, the record says why.
+            time (train.evaluation.same_time); 0 for none. Where it fails, the record says why.
         lpips: folder of LPIPS' weights, or `hub`; without them LPIPS is n/a.
         device: cpu or cuda; by default cuda if there is a GPU.
         done: called with (finished, all) scenes.
 
     Raises:
-        TrilightError: the network or the data does not exist, or the split is empty.
+        TrilightError: PyTorch, the network or the data does not exist, or the split is empty.
     """
-    opened = open_training_data(data)
+    opened = open_training_data([os.fspath(data)] if isinstance(data, str | os.PathLike) else data)
     rivals = opened if train_data is None else open_training_data(train_data)
-    network_file = find_network(checkpoint)
+    network_file = find_network(os.fspath(checkpoint))
     shards = opened.split(split)
-    if resolution is None:
-        stored = stored_resolution(shards)
-        resolution = min(network_file.trained.resolution or stored, stored)
+    stored = stored_resolution(shards)
+    resolution = resolution or min(network_file.trained.resolution or stored, stored)
     torch_device = choose_device(device)
     distance = load_lpips(lpips)
     contest = EvalConfig(
@@ -99,26 +119,70 @@ def judge_network(
         else None,
         lpips=None if distance is None else distance.to(torch_device),
         most_scenes=most_scenes,
+        tracer_views=tracer_views,
     )
-    counted = _SceneCounter(done, _num_scenes(contest))
-    with _tracing(contest, tracer_views) as (contest, traced):
-        views = judge_views(contest, counted.one_more)
-    about = _about(checkpoint, opened, contest, split, views)
-    return Judgement(
-        record=record(views, about, traced(views)), views=tuple(views), contest=contest
-    )
+    total = contest.num_scenes
+    done(0, total)
+    numbers = itertools.count(1)
+    with contextlib.ExitStack() as stack:
+        times, tracer = _time_tracer(contest, stack)
+        judged = dataclasses.replace(contest, tracer=tracer)
+        views = judge_views(judged, lambda: done(next(numbers), total))
+    about = _about(Path(checkpoint).name, opened, contest, split, views)
+    figures = record(views, about, _beside_tracer(contest, views, times))
+    return Judgement(record=figures, views=tuple(views), contest=contest)
 
 
-@contextlib.contextmanager
-def _tracing(contest: EvalConfig, most_views: int) -> Iterator[tuple[EvalConfig, EqualTimeReport]]:
-    """Add the path tracer in the network's time to the evaluation, if it can trace the scenes."""
-    rival = TracerRival(contest.resolution, most_views=most_views, num_scenes=_num_scenes(contest))
-    with contextlib.closing(rival):
-        samples = list(itertools.islice(contest.samples(), TIMED_SCENES))
-        times = rival.measure(contest.network, samples)
-        if times.preview is not None:
-            contest = dataclasses.replace(contest, traced=rival)
-        yield contest, lambda views: same_time(views, times, rival.which)
+def _beside_tracer(
+    contest: EvalConfig, views: Sequence[JudgedView], times: SameTimeResult
+) -> dict[str, Any]:
+    """Return the comparison with the path tracer as JSON values."""
+    every, first = spread_views(contest.tracer_views, contest.num_scenes)
+    most_views = 1 + max(view.view for view in views)
+    return same_time(views, times, spread_text(every, first, most_views))
+
+
+def _time_tracer(
+    contest: EvalConfig, stack: contextlib.ExitStack
+) -> tuple[SameTimeResult, Renderer | None]:
+    """Time the network and the path tracer; return the latter, too, if it can trace the scenes."""
+    network = NetworkRenderer(
+        name=NETWORK,
+        checkpoint=NETWORK,
+        resolution=contest.resolution,
+        threads=1,  # core-seconds of waiting threads are not the network's
+        opened=NeuralRenderer(copy.deepcopy(contest.network).cpu()),
+    )
+    previews: dict[Level, Renderer] = {}
+    note = ""
+    missing = "" if contest.tracer_views else "no views of it were requested"
+    if contest.tracer_views:
+        try:
+            note = choose_variant().note
+            tracers = _previews(LADDER, contest.resolution, stack)
+            previews = dict(zip(LADDER, tracers, strict=True))
+        except TrilightError as error:
+            missing = str(error).rstrip(".")
+    samples = list(itertools.islice(contest.samples(), TIMED_SCENES))
+    threads = torch.get_num_threads()
+    try:
+        times = time_both(network, previews, samples, missing=missing, note=note)
+    finally:
+        torch.set_num_threads(threads)
+    chosen = times.preview
+    return times, previews[chosen.samples, chosen.denoiser] if chosen else None
+
+
+def _previews(
+    levels: Sequence[Level], resolution: int, stack: contextlib.ExitStack
+) -> list[Renderer]:
+    """Return path tracers of one thread by samples and filter, until `stack` ends their child."""
+    child = RenderChild(choose_variant(), threads=1)
+    stack.callback(child.close)
+    return [
+        PathTracer(child, FixedSamples(spp=spp, denoiser=denoiser), resolution)
+        for spp, denoiser in levels
+    ]
 
 
 def write_judgement(judgement: Judgement, out: str | Path) -> Path:
@@ -135,14 +199,18 @@ def write_judgement(judgement: Judgement, out: str | Path) -> Path:
     numbered = (f"{out}-{number}" if number > 1 else out for number in itertools.count(1))
     folder = next(place for place in map(Path, numbered) if _network_of(place) in replaceable)
     write_atomically(folder / "evaluation.json", pretty_json(evaluation))
-    write_atomically(folder / "evaluation.md", markdown(evaluation).encode())
+    write_atomically(folder / "evaluation.md", evaluation_page(evaluation).encode())
     contest = judgement.contest
     views = list(judgement.views)
     chosen = worst_and_median(views)
     if excursions := worst_of_each_excursion(views):
         chosen["worst of each axis"] = excursions
         plot_excursions(folder / "excursions.png", views)
-    with contextlib.closing(contest.traced) if contest.traced else contextlib.nullcontext():
+    with contextlib.ExitStack() as stack:
+        if preview := evaluation["path tracer"]["preview"]:
+            level = (preview["samples"], preview["denoiser"])
+            (tracer,) = _previews([level], contest.resolution, stack)
+            contest = dataclasses.replace(contest, tracer=tracer)
         pictures = sheet_views(contest, [row for rows in chosen.values() for row in rows])
     remaining = iter(pictures)
     for name, rows in chosen.items():
@@ -164,22 +232,8 @@ def _network_of(folder: Path) -> str | None:
         return "unknown"
 
 
-class _SceneCounter:
-    """Counter that reports the evaluated scenes and all scenes."""
-
-    def __init__(self, done: Callable[[int, int], None], total: int) -> None:
-        self._done = done
-        self._total = total
-        self._now = 0
-        done(0, total)
-
-    def one_more(self) -> None:
-        self._now += 1
-        self._done(self._now, self._total)
-
-
 def _about(
-    checkpoint: str,
+    network: str,
     opened: TrainingData,
     contest: EvalConfig,
     split: str,
@@ -187,7 +241,7 @@ def _about(
 ) -> dict[str, str | int]:
     """Return the report's facts about itself, without paths of this machine."""
     return {
-        "network": Path(checkpoint).name,
+        "network": network,
         "network sha256": network_digest(contest.network),
         "data": opened.display_name.rstrip("/").rsplit("/", 1)[-1],
         "build": opened.build or "unknown",
@@ -196,58 +250,3 @@ def _about(
         "resolution": contest.resolution,
         "scenes": len({view.key for view in views}),
     }
-
-
-def _num_scenes(contest: EvalConfig) -> int:
-    """Return the number of scenes to evaluate; opens only shards that are evaluated anyway."""
-    count = 0
-    for number in range(len(contest.shards.names)):
-        if count < contest.most_scenes:
-            count += contest.shards.num_samples(number)
-    return min(count, contest.most_scenes)
-
-
-COLUMNS = 3
-"""Number of plots in a row."""
-
-
-def plot_excursions(path: Path, views: Sequence[JudgedView]) -> int:
-    """Plot psnr_log_db beyond the usual range of scenes; return the number of axes.
-
-    Each axis has a plot: a dot is a view, the line the median at each value, the dashed line the
-    median of the noise floors. Nothing is written if no view leaves the usual range.
-    """
-    import matplotlib
-
-    matplotlib.use("Agg")  # before pyplot: no display is needed
-    import matplotlib.pyplot as plt
-
-    axes: dict[str, list[JudgedView]] = {}
-    for view in views:
-        if view.excursion is not None:
-            axes.setdefault(view.excursion[0], []).append(view)
-    if not axes:
-        return 0
-    rows = -(-len(axes) // COLUMNS)
-    figure, grid = plt.subplots(
-        rows, COLUMNS, figsize=(4.2 * COLUMNS, 3.2 * rows), squeeze=False, layout="constrained"
-    )
-    for place, (axis, members) in zip(grid.flat, sorted(axes.items()), strict=False):
-        at = np.array([view.excursion[1] for view in members if view.excursion is not None])
-        scores = np.array([view.scores[NETWORK]["psnr_log_db"] for view in members], float)
-        floors = np.array([view.floors["psnr_log_db"] for view in members])
-        values = np.unique(at)
-        place.plot(at, scores, ".", color="tab:blue", alpha=0.4)
-        medians = [np.median(scores[at == value]) for value in values]
-        place.plot(values, medians, "-o", color="tab:blue", label="network")
-        noise = [np.median(floors[at == value]) for value in values]
-        place.plot(values, noise, "--", color="grey", label="noise floor")
-        place.set(title=axis.replace("_", " "), xlabel="value", ylabel="psnr_log_db")
-        if values[0] > 0 and values[-1] / values[0] > 8:
-            place.set_xscale("log")
-    grid.flat[0].legend()
-    for place in grid.flat[len(axes) :]:
-        place.axis("off")
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return len(axes)

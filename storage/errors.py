@@ -27,6 +27,10 @@ class Unreadable(TrilightError):
     """A file cannot be read now, and may be whole: no permission, or no answer of a server."""
 
 
+class Unrenderable(TrilightError):
+    """A scene, or a view of it, of which a renderer can make no picture; a judge leaves it out."""
+
+
 class ShardMissing(TrilightError):
     """A shard is not there."""
 

@@ -18,6 +18,6 @@ class CrashingRenderer:
     def wait(self) -> None:
         """Start the child."""
 
-    def open(self, *arguments: object) -> None:
+    def load(self, *arguments: object) -> None:
         """Crash where a scene is loaded."""
         crash()

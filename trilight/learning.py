@@ -1,7 +1,8 @@
 """Networks: train and evaluate them; torch is loaded when a function is called."""
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ from train.runs import changed_run, named_run
 from train.settings import TrainSettings
 
 if TYPE_CHECKING:
-    from infra.judging import Judgement
+    from infra.judging import Judgement, judge_network, write_judgement
     from train.progress import TrainProgress
     from train.result import TrainResult
 
@@ -26,6 +27,14 @@ __all__ = [
     "train_network",
     "write_judgement",
 ]
+
+_PLACES = {
+    "Judgement": "infra.judging",
+    "TrainResult": "train.result",
+    "judge_network": "infra.judging",
+    "write_judgement": "infra.judging",
+}
+"""Modules of names that need torch."""
 
 
 def train_network(
@@ -120,59 +129,8 @@ def _train_alone(
     return result
 
 
-def judge_network(
-    checkpoint: str | os.PathLike[str],
-    *,
-    data: str | os.PathLike[str],
-    split: str = "test",
-    resolution: int | None = None,
-    most_scenes: int = 10**6,
-    tracer_views: int = 64,
-    lpips: str | None = None,
-    device: str | None = None,
-    done: Callable[[int, int], None] = lambda now, total: None,
-) -> "Judgement":
-    """Evaluate a network on a split of a dataset, as `trilight evaluate` does.
-
-    Arguments, result and errors are as in infra.judging.judge_network; `data` is one dataset.
-
-    Raises:
-        TrilightError: also where PyTorch is not installed.
-    """
-    require_torch("judge_network")
-    from infra import judging
-
-    return judging.judge_network(
-        os.fspath(checkpoint),
-        [os.fspath(data)],
-        split=split,
-        resolution=resolution,
-        most_scenes=most_scenes,
-        tracer_views=tracer_views,
-        lpips=lpips,
-        device=device,
-        done=done,
-    )
-
-
-def write_judgement(judgement: "Judgement", out: str | os.PathLike[str]) -> Path:
-    """Write evaluation.json, evaluation.md and sheets of pictures into a folder; return it.
-
-    The folder is `out`, or `out-2`, `out-3` ... where `out` holds another network's report.
-    """
-    from infra import judging
-
-    return judging.write_judgement(judgement, Path(out))
-
-
 def __getattr__(name: str) -> object:
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     require_torch(name)
-    if name == "Judgement":
-        from infra.judging import Judgement
-
-        return Judgement
-    if name == "TrainResult":
-        from train.result import TrainResult
-
-        return TrainResult
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_PLACES[name]), name)

@@ -1,21 +1,22 @@
 """Pictures of a scene: visible surfaces, path traced light, or a trained network's render."""
 
+import contextlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.rendering.cameras import own_camera
+from infra.render.cameras import own_camera
+from infra.render.quality import MOST_TRACED_SPP, ToStatedError
 from infra.torch_library import require_torch
 from pipeline.renders.results import RenderedView
-from pipeline.renders.settings import NoiseTargets, one_picture
+from pipeline.renders.settings import NoiseTargets
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX, preview_srgb8
 from storage.errors import TrilightError
-from storage.machine import available_cores
 from storage.raycast.first_hits import FirstHits, first_hits
 from storage.records.passes.declared import Pass, declared_passes
 from storage.records.passes.pictures import view_passes
@@ -48,7 +49,7 @@ def render(
     noise_floor_db: float | None = None,
     noise_floor_linear_db: float | None = None,
     noise_floor_objects_db: float | None = None,
-    max_spp: int = 4096,
+    max_spp: int = MOST_TRACED_SPP,
     split: bool = False,
     split_lobes: bool = False,
     seed: int = 0,
@@ -105,7 +106,7 @@ def render_views(
     noise_floor_db: float | None = None,
     noise_floor_linear_db: float | None = None,
     noise_floor_objects_db: float | None = None,
-    max_spp: int = 4096,
+    max_spp: int = MOST_TRACED_SPP,
     split: bool = False,
     split_lobes: bool = False,
     seed: int = 0,
@@ -119,37 +120,24 @@ def render_views(
         resolution, noise_floor_db, noise_floor_linear_db, noise_floor_objects_db, max_spp, split,
             split_lobes, seed, threads: as in `render`, which documents results and errors.
     """
-    from pipeline.generation.path_tracer import PathTracer
+    from infra.render.path_tracer import PathTracer, RenderChild
     from pipeline.renders.variant import choose_variant
 
     rows = range(scene.num_views) if views is None else views
     cameras = [own_camera(scene, row, named="view") for row in rows]
     scene.check()
-    tracer = PathTracer(
-        one_picture(
-            resolution=resolution,
-            max_spp=max_spp,
-            noise_targets=NoiseTargets(
-                log_db=noise_floor_db,
-                linear_db=noise_floor_linear_db,
-                objects_db=noise_floor_objects_db,
-            ),
-            split=split,
-            split_lobes=split_lobes,
-        ),
-        seed=seed,
-        variant=choose_variant("auto"),
-        threads=threads or available_cores(),
-        on_samples=lambda now: None,
+    targets = NoiseTargets(
+        log_db=noise_floor_db,
+        linear_db=noise_floor_linear_db,
+        objects_db=noise_floor_objects_db,
     )
-    try:
-        tracer.open(scene, "scene")
-        return [
-            tracer.render(camera.c2w, camera.fov_deg, f"view {row}")
-            for row, camera in zip(rows, cameras, strict=True)
-        ]
-    finally:
-        tracer.close()
+    quality = ToStatedError(targets=targets, max_spp=max_spp, split=split, split_lobes=split_lobes)
+    child = RenderChild(choose_variant("auto"), threads)
+    tracer = PathTracer(child, quality, resolution, seed=seed)
+    with contextlib.closing(tracer):
+        loaded = tracer.load(scene, "scene")
+        pictures = [loaded.render_view(camera) for camera in cameras]
+    return cast(list[RenderedView], pictures)  # none is a preview
 
 
 def open_network(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.rendering.sources import scene_sources
+from infra.render.sources import scene_sources
 from pipeline.exchange.convert import write_scene as write_in_form
 from pipeline.exchange.open_scene import LoadedScene, scene_source
 from pipeline.exchange.reader import SceneReader

@@ -15,7 +15,8 @@ from typing import Any, TypeVar
 from infra.bench.experiment import BenchScale
 from infra.bench.workloads.named_scenes import first_sample, given_scenes, sampled_scene
 from infra.bench_options import BenchOptions
-from infra.rendering.held_out_scenes import composing_child
+from infra.render.held_out_scenes import composing_child
+from infra.render.path_tracer import RenderChild
 from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
 from pipeline.generation.prepare_isolated import preload_mesh_libraries
@@ -26,6 +27,7 @@ from storage.records.scene import Scene
 from storage.settings.changes import changed
 
 Result = TypeVar("Result")
+Closable = TypeVar("Closable", IsolatedChild, RenderChild)
 
 _SAMPLES = 2
 """Number of rendered scenes for experiments on packing and reading."""
@@ -70,7 +72,10 @@ class BenchContext:
     ) -> IsolatedChild:
         """Return a child that composes scenes of a preset and renders them, until `close`."""
         allowed = dataclasses.replace(build, allowed_licences=self.options.allowed_licences)
-        child = composing_child(allowed, objects, self.folder(), threads)
+        return self.until_closed(composing_child(allowed, objects, self.folder(), threads))
+
+    def until_closed(self, child: Closable) -> Closable:
+        """Return a child that `close` closes, too."""
         return self._stack.enter_context(contextlib.closing(child))
 
     @functools.cached_property
@@ -82,8 +87,7 @@ class BenchContext:
     def mesh_child(self) -> IsolatedChild:
         """A child for mesh libraries, one thread, with a limit on its processor time."""
         limits = ChildLimits(memory_bytes=8 << 30, wall_s=600, cpu_s=240, calls_per_child=10_000)
-        child = IsolatedChild(limits=limits)
-        return self._stack.enter_context(contextlib.closing(child))
+        return self.until_closed(IsolatedChild(limits=limits))
 
     @functools.cached_property
     def mesh_files(self) -> tuple[tuple[Path, int], ...]:

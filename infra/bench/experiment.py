@@ -180,7 +180,7 @@ def columns_of(experiment: Experiment) -> tuple[Column, ...]:
 
 def public_options(options: BenchOptions) -> dict[str, Any]:
     """Return the options as JSON values that name no folder of this machine."""
-    from infra.rendering.methods import network_labels
+    from infra.render.methods import network_labels
     from storage.digests import sha256_hex
 
     values = dataclasses.asdict(options)

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from infra.bench.experiment import Experiment
 from infra.bench.rows import Row, rows_of
 from infra.bench.store import Run
-from infra.cost_charts import (
+from pipeline.documents.figures import drawing
+from train.evaluation.cost_charts import (
     SeriesPoint,
     colors_of,
     draw_legend,
@@ -18,7 +19,6 @@ from infra.cost_charts import (
     name_points,
     plain_log,
 )
-from pipeline.documents.figures import drawing
 
 _WIDE = 7.0
 _HIGH = 5.2

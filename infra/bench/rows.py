@@ -8,9 +8,9 @@ import numpy as np
 
 from infra.bench.experiment import Column, Experiment, Point, columns_of
 from infra.bench.store import Run
-from infra.cost_tables import number_text, on_front
 from storage.errors import TrilightError
 from storage.intervals import mean_interval
+from train.evaluation.cost_tables import number_text, on_front
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -48,8 +48,8 @@ def doctor(options: DoctorOptions, output: OutputOptions) -> None:
 
 def _measure_previews(*, silent: bool) -> "Finding":
     from infra.doctor import Finding
-    from infra.rendering.machine_costs import measure_costs
-    from infra.rendering.way_table import keep_machine_costs, shipped_table
+    from infra.render.machine_costs import measure_costs
+    from infra.render.preview_table import keep_machine_costs, shipped_table
 
     with console.status("measuring previews"):
         path = keep_machine_costs(measure_costs(shipped_table()))

@@ -1,5 +1,6 @@
-"""`trilight evaluate`: compares a trained network with the pictures of a dataset."""
+"""`trilight evaluate`: compares a network, or all methods, with the pictures of a dataset."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from infra.cli.console import console, first_words, look_at, print_json, progress_bars
+from infra.cli.leaderboard import judge_methods
 from infra.cli.options import OutputOptions, command
 from infra.torch_library import require_torch
 from train.evaluation.options import EvaluationOptions
@@ -14,15 +16,31 @@ from train.evaluation.options import EvaluationOptions
 
 @command("checkpoint")
 def evaluate(order: EvaluationOptions, output: OutputOptions) -> None:
-    first_words(f"Judging {order.checkpoint} on the split {order.split}", silent=output.json)
+    record: dict[str, Any] = {}
+    board = order.leaderboard()
+    if order.checkpoint:
+        record, out = _judge_network(order, order.checkpoint, silent=output.json)
+        board = board and dataclasses.replace(board, out=out)
+    if board:
+        standings = judge_methods(board, silent=output.json)
+        record = record | {"leaderboard": standings} if record else standings
+    if output.json:
+        print_json(record)
+
+
+def _judge_network(
+    order: EvaluationOptions, checkpoint: str, *, silent: bool
+) -> tuple[dict[str, Any], Path]:
+    """Evaluate a network, and print the figures unless `silent`; return figures and folder."""
+    first_words(f"Judging {checkpoint} on the split {order.split}", silent=silent)
     require_torch("evaluate")
     from infra.judging import judge_network, write_judgement
 
     with progress_bars() as bars:
-        task = bars.add_task("scenes", total=None, note="", visible=not output.json)
+        task = bars.add_task("scenes", total=None, note="", visible=not silent)
         judgement = judge_network(
-            order.checkpoint,
-            order.data,
+            checkpoint,
+            data=order.data,
             split=order.split,
             train_data=order.train_data or None,
             resolution=order.resolution,
@@ -32,13 +50,12 @@ def evaluate(order: EvaluationOptions, output: OutputOptions) -> None:
             device=order.device,
             done=lambda now, total: bars.update(task, completed=now, total=total),
         )
-    first_words("Drawing the sheets", silent=output.json)
+    first_words("Drawing the sheets", silent=silent)
     record = judgement.record
     out = write_judgement(judgement, order.report_folder)
-    if output.json:
-        print_json({name: record[name] for name in ("about", "contestants", "path tracer")})
-    else:
+    if not silent:
         _report(record, out)
+    return {name: record[name] for name in ("about", "contestants", "path tracer")}, out
 
 
 def _report(record: dict[str, Any], out: Path) -> None:

@@ -11,42 +11,48 @@ from infra.cli.console import (
     progress_bars,
 )
 from infra.cli.options import OutputOptions, command
-from infra.leaderboard.options import LeaderboardOptions
 from infra.torch_library import require_torch
 from storage.remote.safe_url import safe_url
+from train.evaluation.options import LeaderboardOptions
 
 
 @command("source")
 def leaderboard(order: LeaderboardOptions, output: OutputOptions) -> None:
-    first_words(f"Judging on {safe_url(order.source)}, into {order.out}", silent=output.json)
+    record = judge_methods(order, silent=output.json)
+    if output.json:
+        print_json(record)
+
+
+def judge_methods(order: LeaderboardOptions, *, silent: bool) -> dict[str, Any]:
+    """Make a leaderboard and print it unless `silent`; return it as JSON values."""
+    first_words(f"Judging on {safe_url(order.source)}, into {order.out}", silent=silent)
     require_torch("leaderboard")
-    from infra.leaderboard.run import make_leaderboard
+    from infra.leaderboard import make_leaderboard
 
     with progress_bars() as bars:
-        task = bars.add_task("scenes", total=None, note="", visible=not output.json)
+        task = bars.add_task("scenes", total=None, note="", visible=not silent)
         board = make_leaderboard(
             order,
             lambda now, total, what: bars.update(task, completed=now, total=total, note=what),
         )
-    if output.json:
-        print_json({"out": str(board.out), "rival": board.rival, "widths": _plain(board)})
-        return
-    for one in board.widths:
-        title = f"{one.width} x {one.width} pixels: median psnr_log_db of {one.num_views} views"
-        print_table(f"{title}, lead over {board.rival}", [_row(each) for each in one.standings])
-    for text in board.notes:
-        note(text)
-    look_at(f"Read {board.out / 'leaderboard.md'}, look at {board.out / 'leaderboard.png'}")
+    if not silent:
+        for one in board.widths:
+            title = f"{one.width} x {one.width} pixels: median psnr_log_db of {one.num_views} views"
+            rows = [_row(each) for each in one.standings]
+            print_table(f"{title}, lead over {board.rival}", rows)
+        for text in board.notes:
+            note(text)
+        look_at(f"Read {board.out / 'leaderboard.md'}, look at {board.out / 'leaderboard.png'}")
+    return {"out": str(board.out), "rival": board.rival, "widths": _plain(board)}
 
 
 def _row(standing: Any) -> dict[str, str]:
-    from infra.cost_tables import number_text
-    from infra.leaderboard.page import interval
-    from train.evaluation.pairs import METRIC
+    from train.evaluation.cost_tables import number_text
+    from train.evaluation.pairs import METRIC, interval_text
 
     lead = standing.lead
     scores = standing.scores[METRIC]
-    ends = interval(lead, 1) if lead is not None else ""
+    ends = interval_text(lead.low, lead.high, 1) if lead is not None else ""
     return {
         "": standing.name,
         "first, s": "" if standing.first_s is None else number_text(standing.first_s),

@@ -39,6 +39,7 @@ ALIASES = {
     "noise_floor_db": "--noise-floor",
     "noise_floor_linear_db": "--noise-floor-linear",
     "noise_floor_objects_db": "--noise-floor-objects",
+    "other_networks": "--beside",
 }
 """Second, shorter name of an option by its field; the first name is that of the field."""
 
@@ -59,8 +60,8 @@ def command(*arguments: str) -> Callable[[Callable[..., None]], Callable[..., No
     """Return a decorator that makes a command of a function of settings classes.
 
     Args:
-        arguments: fields that are positional arguments, and required unless they are lists that are
-            empty by default; all other fields are options.
+        arguments: fields that are positional arguments, and required unless they are empty or None
+            by default; all other fields are options.
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
@@ -95,8 +96,8 @@ def _title(kind: type) -> str:
 
 def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> inspect.Parameter:
     """Return a field as a parameter of the signature that cyclopts reads."""
-    # an argument that takes several words may be empty where the field has an empty default
-    required = field.default is MISSING or (by_place and field.default != ())
+    # an argument may be left out where the field is empty or None by default
+    required = field.default is MISSING or (by_place and field.default not in ((), None))
     several = is_repeated(field.hint) or takes_names(field.hint)
     choices = choices_of(field.hint)
     kind = kind_of(field.hint)

@@ -1,28 +1,29 @@
 """`trilight render`: renders scenes by path tracing, by a trained network, or by both."""
 
 import time
-from typing import TYPE_CHECKING
 
 from rich.progress import Progress
 from rich.text import Text
 
 from infra.cli.console import progress_bars
 from infra.cli.options import OutputOptions, command
-from infra.rendering.options import RenderOptions
-
-if TYPE_CHECKING:
-    from infra.rendering.ways import Choice
-    from pipeline.renders.results import Sampling
+from infra.render.options import RenderOptions
+from storage.renderer import Image, Sampling
 
 
 @command("source")
 def render(options: RenderOptions, output: OutputOptions) -> None:
     from infra.cli.rendered import print_outcome
-    from infra.rendering.run import render_from_options
+    from infra.render.plan import plan_render
+    from infra.render.run import run_plan
+    from pipeline.exchange.reader import SceneReader
 
     started = time.monotonic()
-    with progress_bars() as bars:
-        outcome = render_from_options(options, _Bars(bars, visible=not output.json))
+    with progress_bars() as bars, SceneReader(options.albedo_over_one) as reader:
+        plan = plan_render(options, reader)
+        if plan.choice is not None and not output.json:
+            bars.console.print(Text(plan.choice.sentence), soft_wrap=True)
+        outcome = run_plan(plan, reader, _Bars(bars, visible=not output.json))
     print_outcome(outcome, time.monotonic() - started, as_json=output.json)
 
 
@@ -35,14 +36,12 @@ class _Bars:
         self._samples = bars.add_task("samples", total=None, note="", visible=False)
         self._visible = visible
 
-    def on_choice(self, choice: "Choice") -> None:
-        if self._visible:
-            self._bars.console.print(Text(choice.sentence), soft_wrap=True)
-
     def on_picture(self, done: int, total: int) -> None:
         self._bars.update(self._pictures, completed=done, total=total, visible=self._visible)
 
-    def on_samples(self, now: "Sampling") -> None:
+    def on_samples(self, now: Sampling | Image) -> None:
+        if isinstance(now, Image):
+            return
         note = "" if now.missing_db is None else f"{now.missing_db:.1f} dB to go"
         self._bars.update(
             self._samples,

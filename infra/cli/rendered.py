@@ -9,13 +9,15 @@ import numpy as np
 from rich.text import Text
 
 from infra.cli.console import console, print_json, print_rows
-from infra.rendering.comparison import Flicker
-from infra.rendering.engines import EnginePlan, Facts, MitsubaPlan, NeuralPlan
-from infra.rendering.look import enlargement
-from infra.rendering.plan import RenderPlan
-from infra.rendering.run import FinishedShot, RenderResult
+from infra.render.comparison import Flicker
+from infra.render.look import enlargement
+from infra.render.networks import NetworkRenderer
+from infra.render.path_tracer import PathTracer
+from infra.render.plan import RenderPlan
+from infra.render.run import FinishedShot, RenderResult
 from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.settings import RenderSettings
+from storage.renderer import Facts, Renderer
 
 Rows = list[tuple[str, str]]
 
@@ -68,70 +70,69 @@ def print_outcome(outcome: RenderResult, seconds: float, *, as_json: bool) -> No
 
 
 def _shot_json(done: FinishedShot, *, timed: bool) -> dict[str, Any]:
-    """Return the figures of one shot; those of a single engine are not nested."""
-    of_engines: Mapping[str, Any] = {
+    """Return the figures of one shot; those of a single renderer are not nested."""
+    by_renderer: Mapping[str, Any] = {
         name: {**picture.facts, "exr": str(picture.path), "kept": picture.was_kept}
         | ({"picture_seconds": _round_seconds(picture.seconds)} if timed else {})
         for name, picture in done.pictures.items()
     }
-    for facts in of_engines.values():
+    for facts in by_renderer.values():
         if "at_cap" in facts:
             facts["at_cap"] = bool(facts["at_cap"])
-    if len(of_engines) == 1:
-        (of_engines,) = of_engines.values()
+    if len(by_renderer) == 1:
+        (by_renderer,) = by_renderer.values()
     else:
-        of_engines = {**of_engines, "psnr_log_db": round(done.psnr_log_db or 0, 3)}
+        by_renderer = {**by_renderer, "psnr_log_db": round(done.psnr_log_db or 0, 3)}
         if done.flicker is not None:
             flicker = dataclasses.asdict(done.flicker)
-            of_engines["flicker"] = {name: round(value, 3) for name, value in flicker.items()}
+            by_renderer["flicker"] = {name: round(value, 3) for name, value in flicker.items()}
     return {
-        "lights": done.scene.num_lights,
+        "lights": done.num_lights,
         "png": str(done.shot.png),
-        "scene_sha256": done.scene.digest,
-        "triangles": done.scene.num_triangles,
-        **of_engines,
+        "scene_sha256": done.scene_sha256,
+        "triangles": done.num_triangles,
+        **by_renderer,
     }
 
 
 def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
-    scene = done.scene
     width = plan.resolution
     factor = enlargement(width)
     enlarged = "" if factor == 1 else f"; in the PNG a pixel is {factor} x {factor}"
     rows: Rows = [
         (
             "scene",
-            f"{plan.source}, view {plan.view}; triangles: {scene.num_triangles}, "
-            f"lights: {scene.num_lights}",
+            f"{plan.source}, view {plan.view}; triangles: {done.num_triangles}, "
+            f"lights: {done.num_lights}",
         ),
         ("picture", f"{width} x {width}, linear radiance{enlarged}"),
     ]
-    for engine in plan.engines:
-        rows += _engine(engine, done.pictures[engine.name].facts)
+    for renderer in plan.renderers:
+        rows += _describe(renderer, done.pictures[renderer.name].facts)
     if done.psnr_log_db is not None:
         rows.append(("agreement", f"{done.psnr_log_db:.1f} dB (psnr_log_db)"))
     rows += _time_rows(plan, [done])
-    rows += [("wall time", f"{seconds:.1f} s"), ("scene digest", scene.digest)]
+    rows += [("wall time", f"{seconds:.1f} s"), ("scene digest", done.scene_sha256)]
     print_rows("Rendered", rows)
     measure = " and ".join(str(picture.path) for picture in done.pictures.values())
     _print_last(f"Look at {done.shot.png}; measure with {measure}", _floors([done]))
 
 
-def _engine(engine: EnginePlan, facts: Facts) -> Rows:
-    match engine:
-        case MitsubaPlan(settings=PreviewSettings() as preview):
+def _describe(renderer: Renderer, facts: Facts) -> Rows:
+    match renderer:
+        case PathTracer(settings=PreviewSettings() as preview):
             unknown = "unknown: a preview measures none"
             samples = f"{facts['spp']}, {_FILTERS[preview.denoiser]}"
             return [("samples per pixel", samples), ("noise floor", unknown)]
-        case MitsubaPlan(settings=RenderSettings() as settings):
+        case PathTracer(settings=RenderSettings() as settings):
             floors = [_floor(settings, facts, name, metric) for name, metric in _FLOORS.items()]
             rows = [("noise floor", floors[0]), *(("", floor) for floor in floors[1:])]
             mean = f"{facts['mean_radiance']:.4g} (radiance), that of its samples"
             rows = [("samples per pixel", f"{facts['spp']}"), *rows, ("mean brightness", mean)]
             return [*rows, *_layers(settings, facts)]
-        case NeuralPlan():
-            return [("network", f"{engine.checkpoint}; passes: {facts['passes']}")]
-    raise TypeError(f"{engine.name} is an engine without a description")
+        case NetworkRenderer():
+            return [("network", f"{renderer.checkpoint}; passes: {facts['passes']}")]
+    raise TypeError(f"{renderer.name} is a renderer without a description")
 
 
 def _layers(settings: RenderSettings, facts: Facts) -> Rows:
@@ -192,7 +193,7 @@ def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: fl
 
 
 def _time_rows(plan: RenderPlan, shots: Sequence[FinishedShot]) -> Rows:
-    """Return measured and expected seconds, where --seconds or --error chose the preset."""
+    """Return measured and expected seconds, where --seconds or --error chose."""
     taken = [each.seconds for shot in shots for each in shot.pictures.values() if each.seconds]
     if plan.choice is None or not taken:
         return []

@@ -19,12 +19,12 @@ from infra.release.page import write_page
 from infra.release.pictures import chosen_scenes, compare_scenes
 from infra.release.push import NETWORK_FILE, kind_of
 from model.open import BUILTIN_NETWORKS
-from pipeline.documents.markdown import front_matter
 from pipeline.documents.sums import write_sums
 from storage.atomic import write_atomically
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
+from storage.markdown import front_matter
 from storage.records.objects import read_objects_lock
 
 FREE = {"CC0-1.0"}

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from infra.release.pictures import NETWORK, SceneComparison
-from pipeline.documents.markdown import front_matter
 from pipeline.documents.pages import Figure, render_page
 from pipeline.documents.png import encode_png
 from storage.atomic import write_atomically
 from storage.conventions import preview_srgb8
+from storage.markdown import front_matter
 from train.evaluation.sheet import ERROR_WHITE, error_picture
 
 _TITLE = "Trilight: traced, learned and filtered"

@@ -7,17 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.rendering.cameras import own_camera
-from infra.rendering.engines import Engine, MitsubaPlan, NeuralPlan
-from model.weights import MAX_LIGHTS
+from infra.render.networks import NetworkRenderer
+from infra.render.path_tracer import PathTracer, RenderChild
+from infra.render.quality import FixedSamples
 from pipeline.documents.scene_choice import ChosenScene, choose_scenes, read_chosen
-from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.variant import choose_variant
 from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
-from storage.metrics import psnr_log_db
 from storage.records.sample import Sample
+from storage.renderer import Camera, Renderer
+from train.evaluation.evaluate import judge_view
+from train.evaluation.judge import validation_scene
+from train.evaluation.pairs import METRIC
 
 RIVALS = (1, 4, 16)
 """Samples per pixel of the previews in the comparison, filtered by Open Image Denoise."""
@@ -73,57 +75,43 @@ def compare_scenes(
     Raises:
         TrilightError: a sample is unreadable, or the network or the path tracer cannot render it.
     """
-    by_width: dict[int, Mapping[str, Engine]] = {}
-    with contextlib.ExitStack() as stack:
+    with contextlib.closing(RenderChild(choose_variant(), threads=1)) as child:
+        by_width: dict[int, Sequence[Renderer]] = {}
         for entry, sample in read_chosen(dataset, chosen):
             width = int(sample.radiance_rgb.shape[1])
             if width not in by_width:
-                by_width[width] = _engines(width, checkpoint)
-                for engine in by_width[width].values():
-                    stack.callback(engine.close)
+                by_width[width] = _renderers(child, width, checkpoint)
             yield _compare_scene(sample, entry.split, by_width[width])
             done()
 
 
-def _engines(resolution: int, checkpoint: str) -> Mapping[str, Engine]:
-    variant = choose_variant()
-    tracers = {
-        f"{spp} {'sample' if spp == 1 else 'samples'}, filtered": MitsubaPlan(
-            settings=PreviewSettings(resolution=resolution, spp=spp),
-            seed=0,
-            threads=1,
-            variant=variant,
+def _renderers(child: RenderChild, resolution: int, checkpoint: str) -> Sequence[Renderer]:
+    network = NetworkRenderer(name=NETWORK, checkpoint=checkpoint, resolution=resolution)
+    samples = [
+        PathTracer(
+            child,
+            FixedSamples(spp=spp, denoiser="fast"),
+            resolution,
+            name=f"{spp} {'sample' if spp == 1 else 'samples'}, filtered",
         )
         for spp in RIVALS
-    }
-    network = NeuralPlan(
-        checkpoint=checkpoint,
-        precision="float32",
-        resolution=resolution,
-        lights_per_pass=MAX_LIGHTS,
-        threads=None,
-    )
-    started = {NETWORK: network.start(_ignore_samples)}
-    return started | {name: plan.start(_ignore_samples) for name, plan in tracers.items()}
+    ]
+    return [network, *samples]
 
 
-def _ignore_samples(_sampling: object) -> None:
-    """Ignore the progress of the samples."""
-
-
-def _compare_scene(sample: Sample, split: str, engines: Mapping[str, Engine]) -> SceneComparison:
-    camera = own_camera(sample.scene, 0)
+def _compare_scene(sample: Sample, split: str, renderers: Sequence[Renderer]) -> SceneComparison:
+    camera = Camera.of_scene(sample.scene, 0)
     target = sample.radiance_rgb[0]
     pictures = {
-        name: engine.open(sample.scene, sample.key).render(camera, sample.key).radiance_rgb
-        for name, engine in engines.items()
+        each.name: each.load(sample.scene, sample.key).render(camera).radiance_rgb
+        for each in renderers
     }
-    template = sample.scene.provenance.get("template", "")
+    row = judge_view(sample, validation_scene(sample, len(target)), 0, pictures, None)
     return SceneComparison(
-        key=sample.key,
-        caption=f"{split}, {template}, {sample.scene.num_triangles} triangles",
+        key=row.key,
+        caption=f"{split}, {row.template}, {row.num_triangles} triangles",
         target_rgb=target,
-        floor_db=float(sample.views[0].noise_floor_db),
+        floor_db=row.floors[METRIC],
         pictures_rgb=pictures,
-        psnr_db={name: float(psnr_log_db(picture, target)) for name, picture in pictures.items()},
+        psnr_db={name: scores[METRIC] or 0.0 for name, scores in row.scores.items()},
     )

@@ -24,6 +24,7 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.objects import read_objects_lock
 from train.evaluation.judged_view import NETWORK
+from train.evaluation.pages import scores_table, swapped_text
 from train.evaluation.same_time import sentences
 from train.folder import RunFolder
 
@@ -157,21 +158,12 @@ def _scores(judged: Mapping[str, Any]) -> list[str]:
         f"seen (`{about['data']}`, dataset digest {about['data digest'][:8]}); medians, in "
         "brackets the worse 5 %:",
         "",
-        f"| | {' | '.join(judged['metrics'])} |",
-        f"|{'---|' * (len(judged['metrics']) + 1)}",
-        *(
-            f"| {who} | {' | '.join(_figure_text(scores[each]) for each in judged['metrics'])} |"
-            for who, scores in ordered.items()
-        ),
+        scores_table(ordered),
     ]
     if traced:
         lines += ["", " ".join(sentences(traced))]
     if swapped := judged["swapped scenes"]:
-        lines += [
-            "",
-            f"With the triangles of another scene it loses {swapped['median_db']:.2f} dB of "
-            f"psnr_log_db in the median and {swapped['mean_db']:.2f} dB on average.",
-        ]
+        lines += ["", swapped_text(swapped)]
     return [*lines, "", _worst(judged["views"])]
 
 
@@ -188,12 +180,6 @@ def _worst(views: Sequence[Mapping[str, Any]]) -> str:
 
 def _lights(count: int) -> str:
     return f"{count} light{'' if count == 1 else 's'}"
-
-
-def _figure_text(figures: Mapping[str, Any]) -> str:
-    if figures["median"] is None:
-        return "n/a"
-    return f"{figures['median']:.4g} ({figures['worse_5_percent']:.4g})"
 
 
 if __name__ == "__main__":

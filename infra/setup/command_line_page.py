@@ -7,7 +7,7 @@ from typing import Any
 from cyclopts import App
 
 from infra.cli.commands import COMMANDS, app
-from pipeline.documents.markdown import table
+from storage.markdown import table
 
 _HEAD = """# Command line
 

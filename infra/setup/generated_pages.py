@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Mapping
 
 from infra.setup.command_line_page import command_line_page
 from infra.setup.settings_page import settings_page
-from pipeline.documents.markdown import table
 from pipeline.shards.expression import TEXTS
 from scene_templates.recorded_sampler import RecordedDraw
 from scene_templates.skies.draw import SkyMapSettings
@@ -16,6 +15,7 @@ from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.surfaces.draws import LEAST_TINT, SurfaceDraws
 from scene_templates.surfaces.families import OUR_SURFACES, SURFACES
 from scene_templates.surfaces.texels import Texels
+from storage.markdown import table
 from storage.records.passes.declared import MOTION, Pass, declared_passes
 from storage.records.quantities import QUANTITIES
 from storage.seeds import rng_for

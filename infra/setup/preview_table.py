@@ -1,4 +1,4 @@
-"""Measures infra/rendering/previews.json, the table of `trilight render --seconds` and `--error`.
+"""Measures infra/render/previews.json, the table of `trilight render --seconds` and `--error`.
 
     python -m infra.setup.preview_table
 
@@ -18,32 +18,36 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from infra.processor import processor
-from infra.rendering.held_out_scenes import composing_child, held_out_build, held_out_scene
-from infra.rendering.machine_costs import PROBES
-from infra.rendering.methods import sampled_method
-from infra.rendering.raw_references import (
-    RawReference,
-    first_camera,
-    raw_reference,
-    true_error_db,
-)
-from infra.rendering.way_table import (
+from infra.render.held_out_scenes import composing_child, held_out_build, held_out_scene
+from infra.render.machine_costs import PROBES
+from infra.render.methods import SAMPLE_SEED
+from infra.render.networks import NetworkRenderer
+from infra.render.path_tracer import PathTracer, RenderChild
+from infra.render.preview_table import (
     NETWORK_SCENE,
     NETWORK_VIEW,
     SHIPPED,
     PartCost,
     PictureCosts,
-    WayError,
-    WayTable,
+    PreviewError,
+    PreviewTable,
+)
+from infra.render.quality import FixedSamples
+from infra.render.raw_references import (
+    first_camera,
+    raw_reference,
+    true_error_db,
 )
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK
 from pipeline.renders.preview_parts import SCENE, all_parts, timed_parts
 from pipeline.renders.settings import Filtered
+from pipeline.renders.variant import choose_variant
 from storage.atomic import write_atomically
 from storage.conventions import log10_radiance
 from storage.errors import Rejected
 from storage.records.scene import Scene
+from storage.renderer import Camera, Renderer
 from storage.settings.described import settings_record
 
 if TYPE_CHECKING:
@@ -72,9 +76,13 @@ _SERIAL = (SCENE,)
 
 def main() -> None:
     """Measure, and write the file."""
+    from model.neural_renderer import NeuralRenderer
+
     errors = dict[int, Errors]()
     costs = dict[int, Costs]()
-    with _held_out_child() as (renderer, child):
+    network = NeuralRenderer.load("builtin:tokens", device="cpu")
+    with _children() as (child, rendering):
+        renderers = {px: _renderers_at(px, network, rendering) for px in WIDTHS}
         for index in range(SCENES):
             sys.stdout.write(f"scene {index + 1} of {SCENES}\n")
             try:
@@ -83,8 +91,8 @@ def main() -> None:
                 if index in PROBES:
                     raise
                 continue
-            errors[index] = {px: _errors_of(renderer, child, scene, px) for px in WIDTHS}
-            costs[index] = {px: _costs_of(renderer, child, scene, px) for px in WIDTHS}
+            errors[index] = {px: _errors_of(renderers[px], child, scene, px) for px in WIDTHS}
+            costs[index] = {px: _costs_of(network, child, scene, px) for px in WIDTHS}
     table = table_of(errors, costs, f"{processor()}, one thread")
     text = json.dumps(settings_record(table), indent=1, sort_keys=True)
     write_atomically(SHIPPED, f"{text}\n".encode())
@@ -102,9 +110,11 @@ def part_names() -> tuple[str, ...]:
     return (*all_parts(), NETWORK_SCENE, NETWORK_VIEW)
 
 
-def table_of(errors: Mapping[int, Errors], costs: Mapping[int, Costs], machine: str) -> WayTable:
+def table_of(
+    errors: Mapping[int, Errors], costs: Mapping[int, Costs], machine: str
+) -> PreviewTable:
     """Return the table of scenes by their numbers: medians, and the mean of the PROBES."""
-    return WayTable(
+    return PreviewTable(
         scenes=len(errors),
         errors=tuple(
             _way_error(px, method, [one[px][method] for one in errors.values()])
@@ -116,59 +126,67 @@ def table_of(errors: Mapping[int, Errors], costs: Mapping[int, Costs], machine: 
     )
 
 
-def sampled_errors(
-    scene: Scene, px: int, reference: RawReference
-) -> Sequence[tuple[Method, float]]:
-    """Return the error of each sampled picture of the first view; runs in a render child."""
-    everywhere = np.ones((px, px), np.bool_)
-    errors = []
-    for method in ladder(px):
-        picture = sampled_method(px, *method)(scene)(scene.c2w[0], float(scene.fov_deg[0]))
-        errors.append((method, true_error_db(picture, reference, log10_radiance, everywhere)[0]))
-    return errors
-
-
 @contextlib.contextmanager
-def _held_out_child() -> "Iterator[tuple[NeuralRenderer, IsolatedChild]]":
-    import torch
-
-    from model.neural_renderer import NeuralRenderer
-
-    torch.set_num_threads(1)  # core-seconds of waiting threads are not the network's
-    with tempfile.TemporaryDirectory() as name:
-        child = composing_child(held_out_build(), BENCHMARK, Path(name), threads=1)
-        with contextlib.closing(child):
-            yield NeuralRenderer.load("builtin:tokens", device="cpu"), child
+def _children() -> Iterator[tuple[IsolatedChild, RenderChild]]:
+    """Yield a child that composes scenes and references, and one that renders."""
+    with (
+        tempfile.TemporaryDirectory() as name,
+        contextlib.closing(
+            composing_child(held_out_build(), BENCHMARK, Path(name), threads=1)
+        ) as composing,
+        contextlib.closing(RenderChild(choose_variant(), threads=1)) as rendering,
+    ):
+        yield composing, rendering
 
 
 def _errors_of(
-    renderer: "NeuralRenderer", child: IsolatedChild, scene: Scene, px: int
+    renderers: Mapping[Method, Renderer], child: IsolatedChild, scene: Scene, px: int
 ) -> dict[Method, float]:
     reference = child.call(raw_reference, scene, first_camera(scene, px), WIDTHS[px][1])
-    picture = renderer.view(renderer.prepare(scene), scene.c2w[0], float(scene.fov_deg[0]), px)
     everywhere = np.ones((px, px), np.bool_)
-    error_db, _ = true_error_db(picture, reference, log10_radiance, everywhere)
-    return {NETWORK: error_db, **dict(child.call(sampled_errors, scene, px, reference))}
+    errors = {}
+    for method, renderer in renderers.items():
+        image = renderer.load(scene, "scene").render(Camera.of_scene(scene, 0))
+        error_db, _ = true_error_db(image.radiance_rgb, reference, log10_radiance, everywhere)
+        errors[method] = error_db
+    return errors
+
+
+def _renderers_at(
+    px: int, network: "NeuralRenderer", child: RenderChild
+) -> Mapping[Method, Renderer]:
+    renderers: dict[Method, Renderer] = {
+        NETWORK: NetworkRenderer(
+            checkpoint="builtin:tokens",
+            resolution=px,
+            threads=1,  # core-seconds of waiting threads are not the network's
+            opened=network,
+        )
+    }
+    for spp, denoiser in ladder(px):
+        quality = FixedSamples(spp=spp, denoiser=denoiser)
+        renderers[spp, denoiser] = PathTracer(child, quality, px, seed=SAMPLE_SEED)
+    return renderers
 
 
 def _costs_of(
-    renderer: "NeuralRenderer", child: IsolatedChild, scene: Scene, px: int
+    network: "NeuralRenderer", child: IsolatedChild, scene: Scene, px: int
 ) -> dict[str, float]:
     core_s: dict[str, float] = child.call(timed_parts, scene, px, time.process_time)
     pose = scene.c2w[0]
     fov_deg = float(scene.fov_deg[0])
-    renderer.view(renderer.prepare(scene), pose, fov_deg, px)  # warms up
+    network.view(network.prepare(scene), pose, fov_deg, px)  # warms up
     began = time.process_time()
-    prepared = renderer.prepare(scene)
+    prepared = network.prepare(scene)
     encoded = time.process_time()
-    renderer.view(prepared, pose, fov_deg, px)
+    network.view(prepared, pose, fov_deg, px)
     core_s[NETWORK_SCENE] = encoded - began
     core_s[NETWORK_VIEW] = time.process_time() - encoded
     return core_s
 
 
-def _way_error(px: int, method: Method, errors_db: list[float]) -> WayError:
-    return WayError(
+def _way_error(px: int, method: Method, errors_db: list[float]) -> PreviewError:
+    return PreviewError(
         rung="network" if method == NETWORK else "traced",
         spp=method[0],
         denoiser=method[1],

@@ -7,18 +7,17 @@ import typing
 from collections.abc import Iterator
 from typing import Any, get_args
 
-from infra.leaderboard.options import LeaderboardOptions
-from infra.rendering.options import RenderOptions
+from infra.render.options import RenderOptions
 from infra.serving.train_model import TrainOptions
 from pipeline.builds.settings import BuildSettings
-from pipeline.documents.markdown import table
 from pipeline.flows.orders import DatasetInRuns
 from pipeline.generation.price import CorePrice
 from pipeline.generation.revisit_options import RevisitOptions
+from storage.markdown import table
 from storage.records.scene import Scene
 from storage.settings.described import describe_fields, field_sentences
 from storage.settings.ranges import declared_ranges, shown_number
-from train.evaluation.options import EvaluationOptions
+from train.evaluation.options import EvaluationOptions, LeaderboardOptions
 from train.monitoring.settings import WatchSettings
 from train.settings import TrainSettings
 

@@ -5,15 +5,15 @@ import re
 from collections import OrderedDict
 from pathlib import Path
 
+from infra.render.path_tracer import RenderChild
 from infra.viewer.dataset_filter import SceneFilter, filter_of
 from infra.viewer.dataset_index import DatasetIndex, SceneRow
 from infra.viewer.open_scenes import OpenScenes
-from infra.viewer.painters import TargetPainter, painters_of
+from infra.viewer.page_renderers import StoredPictures, page_renderers
 from infra.viewer.scene_handlers import SceneHandlers
 from infra.viewer.server import NotFound, Request, Response, Route, json_response
 from pipeline.documents.png import encode_png
 from pipeline.documents.scene_page import preview
-from pipeline.generation.progressive_tracer import ProgressiveTracer
 from storage.conventions import preview_gain
 from storage.dataset.dataset import Dataset, LocalFiles, reading
 from storage.dataset.shard import read_member, scan_samples
@@ -33,18 +33,18 @@ class DatasetHandlers:
     """Handlers of a dataset, and of its scenes that are open."""
 
     def __init__(
-        self, dataset: Dataset, source: str, tracer: ProgressiveTracer, checkpoint: str | None
+        self, dataset: Dataset, source: str, child: RenderChild, checkpoint: str | None
     ) -> None:
         """Start to read the index.
 
         Args:
             dataset: opened dataset.
             source: folder or URL of the dataset, as the user named it.
-            tracer, checkpoint: path tracer and network for the pages of its scenes.
+            child, checkpoint: render child and network for the pages of its scenes.
         """
         self._dataset = dataset
         self._source = source
-        self._tracer = tracer
+        self._child = child
         self._checkpoint = checkpoint
         self._thumbnails = OrderedDict[tuple[str, int, int], bytes]()
         self._scenes = OpenScenes(_KEY, self._open_scene)
@@ -68,7 +68,7 @@ class DatasetHandlers:
         """Stop reading and rendering."""
         self.index.close()
         self._scenes.close()
-        self._tracer.close()
+        self._child.close()
 
     def _facts(self, _: Request) -> Response:
         manifest = self._dataset.manifest
@@ -141,13 +141,15 @@ class DatasetHandlers:
         shard = self._dataset.manifest.shards[row.shard]
         (sample,) = self._dataset.read_samples(shard, [key])
         floors = [view.noise_floor_db for view in sample.views]
-        target = TargetPainter(sample.radiance_rgb, floors)
+        target = StoredPictures(
+            scene=sample.scene, radiance_rgb=sample.radiance_rgb, errors_db=floors
+        )
         is_here = isinstance(self._dataset.files, LocalFiles)
         return SceneHandlers(
             source=f"{Path(self._source) / shard.name}::{key}" if is_here else "",
             name=f"scene {key}, {row.split}",
             scene=sample.scene,
             notes=(),
-            painters=painters_of(self._tracer, target, self._checkpoint),
-            target_px=target.width_px,
+            renderers=page_renderers(self._child, target, self._checkpoint),
+            target_px=target.resolution,
         )

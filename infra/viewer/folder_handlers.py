@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from infra.render.path_tracer import PathTracer, RenderChild
+from infra.render.quality import FixedSamples
 from infra.viewer.open_scenes import OpenScenes
-from infra.viewer.painters import MOST_SPP, TargetPainter, painters_of
+from infra.viewer.page_renderers import StoredPictures, page_renderers
 from infra.viewer.scene_handlers import SceneHandlers
 from infra.viewer.scene_list import SceneList
 from infra.viewer.server import NotFound, Request, Response, Route, json_response
@@ -21,15 +23,14 @@ from pipeline.documents.scene_page import preview
 from pipeline.exchange.formats import LoadedScene
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
-from pipeline.generation.progressive_tracer import ProgressiveTracer
-from pipeline.renders.results import GrowingPicture, Sampling
-from pipeline.renders.settings import one_picture
 from storage.conventions import preview_gain
 from storage.records.lights import num_lights
+from storage.renderer import Camera
 
 THUMBNAIL_PX = 128
-THUMBNAIL_SPP = 4
-"""Width in pixels and samples per pixel of thumbnails."""
+"""Width in pixels of thumbnails."""
+
+_THUMBNAIL = FixedSamples(spp=4, denoiser="fast")
 
 _MOST_THUMBNAILS = 1000
 _NUMBER = re.compile(r"\d{1,5}", re.ASCII)
@@ -38,10 +39,10 @@ _NUMBER = re.compile(r"\d{1,5}", re.ASCII)
 class FolderHandlers:
     """Handlers of a folder, and of its scenes that are open."""
 
-    def __init__(self, files: SceneList, tracer: ProgressiveTracer, checkpoint: str | None) -> None:
-        """Store path tracer and checkpoint for the pages of the scenes; nothing is read yet."""
+    def __init__(self, files: SceneList, child: RenderChild, checkpoint: str | None) -> None:
+        """Store render child and checkpoint for the pages of the scenes; nothing is read yet."""
         self._files = files
-        self._tracer = tracer
+        self._child = child
         self._checkpoint = checkpoint
         self._reader = SceneReader()
         self._reading = threading.Lock()
@@ -65,7 +66,7 @@ class FolderHandlers:
     def close(self) -> None:
         """Stop reading and rendering."""
         self._scenes.close()
-        self._tracer.close()
+        self._child.close()
         self._reader.close()
 
     def _facts(self, _: Request) -> Response:
@@ -107,19 +108,9 @@ class FolderHandlers:
     def _small_picture(self, number: int, loaded: LoadedScene) -> NDArray[np.float32]:
         if loaded.radiance_rgb is not None and len(loaded.radiance_rgb):
             return loaded.radiance_rgb[0]
-        steps = list[Sampling]()
-        scene = loaded.scene
-        self._tracer.render(
-            scene,
-            ("thumbnail", number),
-            (scene.c2w[0], float(scene.fov_deg[0])),
-            one_picture(resolution=THUMBNAIL_PX, max_spp=MOST_SPP),
-            steps.append,
-            preview_spp=THUMBNAIL_SPP,
-        )
-        last = steps[-1]
-        assert isinstance(last, GrowingPicture)
-        return last.radiance_rgb
+        tracer = PathTracer(self._child, _THUMBNAIL, THUMBNAIL_PX)
+        traced = tracer.load(loaded.scene, self._files.names[number])
+        return traced.render(Camera.of_scene(loaded.scene, 0)).radiance_rgb
 
     def _number(self, request: Request, prefix: str) -> int:
         text = request.path.removeprefix(prefix)
@@ -142,25 +133,25 @@ class FolderHandlers:
         name = self._files.names[number]
         loaded = self._load(number)
         place = str(self._files.root / name)
-        return handlers_of_scene(name, loaded, self._tracer, self._checkpoint, place)
+        return handlers_of_scene(name, loaded, self._child, self._checkpoint, place)
 
 
 def handlers_of_scene(
     name: str,
     loaded: LoadedScene,
-    tracer: ProgressiveTracer,
+    child: RenderChild,
     checkpoint: str | None,
     source: str,
 ) -> SceneHandlers:
-    """Return the handlers of a loaded scene; they do not close the path tracer."""
+    """Return the handlers of a loaded scene; they do not close the render child."""
     target = None
     if loaded.radiance_rgb is not None and len(loaded.radiance_rgb):
-        target = TargetPainter(loaded.radiance_rgb, ())
+        target = StoredPictures(scene=loaded.scene, radiance_rgb=loaded.radiance_rgb)
     return SceneHandlers(
         name=name,
         scene=loaded.scene,
         notes=loaded.notes,
-        painters=painters_of(tracer, target, checkpoint),
-        target_px=None if target is None else target.width_px,
+        renderers=page_renderers(child, target, checkpoint),
+        target_px=None if target is None else target.resolution,
         source=source,
     )

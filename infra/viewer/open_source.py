@@ -2,16 +2,15 @@
 
 from pathlib import Path
 
+from infra.render.path_tracer import RenderChild
 from infra.viewer.dataset_handlers import DatasetHandlers
 from infra.viewer.deferred_handlers import PageHandlers, page_of
 from infra.viewer.folder_handlers import FolderHandlers, handlers_of_scene
 from infra.viewer.scene_list import scene_list
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
-from pipeline.generation.progressive_tracer import ProgressiveTracer
 from pipeline.renders.variant import choose_variant
 from storage.dataset.dataset import open_dataset
-from storage.machine import available_cores
 
 
 def open_handlers(source: str, *, checkpoint: str | None, threads: int | None) -> PageHandlers:
@@ -28,17 +27,17 @@ def open_handlers(source: str, *, checkpoint: str | None, threads: int | None) -
     """
     page = page_of(source)
     if page == "folder.html":
-        return FolderHandlers(scene_list(Path(source)), _tracer(threads), checkpoint)
+        return FolderHandlers(scene_list(Path(source)), _child(threads), checkpoint)
     if page == "dataset.html":
-        return DatasetHandlers(open_dataset(source), source, _tracer(threads), checkpoint)
+        return DatasetHandlers(open_dataset(source), source, _child(threads), checkpoint)
     file = scene_source(source)
     with SceneReader() as reader:
         loaded = reader.load(file, pictures=True)
-    tracer = _tracer(threads)
-    room = handlers_of_scene(file.name, loaded, tracer, checkpoint, source)
-    room.tracer = tracer
+    child = _child(threads)
+    room = handlers_of_scene(file.name, loaded, child, checkpoint, source)
+    room.child = child
     return room
 
 
-def _tracer(threads: int | None) -> ProgressiveTracer:
-    return ProgressiveTracer(variant=choose_variant("auto"), threads=threads or available_cores())
+def _child(threads: int | None) -> RenderChild:
+    return RenderChild(choose_variant("auto"), threads)

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from infra.rendering.cameras import ShotCamera
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError, expected_one_of
 from storage.records.scene import MAX_POSITION_M
+from storage.renderer import Camera
 
 MOST_PX = 1024
 """Maximum width in pixels of a requested picture."""
@@ -24,9 +24,7 @@ class PictureOptions:
 
     engine: str
     """Name of the renderer that makes the picture."""
-    camera: ShotCamera
-    view: int | None
-    """Row of `camera` in the scene; None for another camera."""
+    camera: Camera
     resolution: int
     """Width of the picture in pixels, a multiple of 8."""
     edits: Mapping[str, Any]
@@ -72,8 +70,7 @@ def parse_picture_options(body: Any, engines: Mapping[str, Any], views: int) -> 
         raise TrilightError(f"view is {view!r:.20}; expected 0 to {views - 1}, or none.")
     return PictureOptions(
         engine=engine,
-        camera=_camera(body),
-        view=view,
+        camera=_camera(body, view),
         resolution=int(width),
         edits=parse_edits(body),
         error_db=_number(body.get("error_db", 45), "error_db", 10, 60),
@@ -88,7 +85,7 @@ def parse_edits(body: Mapping[str, Any]) -> Mapping[str, Any]:
     return edits or {}
 
 
-def _camera(body: Mapping[str, Any]) -> ShotCamera:
+def _camera(body: Mapping[str, Any], view: int | None) -> Camera:
     pose = body.get("c2w")
     if not isinstance(pose, list) or len(pose) != _POSE_LENGTH:
         raise TrilightError("c2w: expected 16 numbers, row by row.")
@@ -103,7 +100,7 @@ def _camera(body: Mapping[str, Any]) -> ShotCamera:
     c2w[:3, :3] = u @ vt
     c2w[3] = (0, 0, 0, 1)
     fov_deg = _number(body.get("fov"), "fov", 1, 170)
-    return ShotCamera(c2w=c2w.astype(np.float32), fov_deg=fov_deg)
+    return Camera(c2w=c2w.astype(np.float32), fov_deg=fov_deg, view=view)
 
 
 def _number(value: Any, name: str, low: float, high: float) -> float:

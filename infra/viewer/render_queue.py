@@ -8,17 +8,17 @@ path traced one.
 import itertools
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from infra.viewer.edits import apply_edits
-from infra.viewer.painters import Painter, RenderedImage
+from infra.viewer.page_renderers import PageRenderer, PassImage
 from infra.viewer.picture_options import PictureOptions
-from pipeline.renders.results import Sampling
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.scene import Scene
+from storage.renderer import Image, ReadyScene, Sampling
 
 MOST_KEPT = 32
 """Maximum number of pictures that are kept; one of 1024 pixels takes 13 MB."""
@@ -47,7 +47,11 @@ class RenderJob:
     state: State = "waiting"
     version: int = 0
     """Counter of updates, by which `wait_for_update` sees a new one."""
-    image: RenderedImage | None = None
+    image: Image | None = None
+    scene_core_s: float | None = None
+    """CPU seconds of the scene's preparation; None where they are unknown."""
+    notes: Sequence[str] = ()
+    """Warnings about the scene with this renderer."""
     sampling: Sampling | None = None
     """Progress of a path tracer since the last image."""
     error: str = ""
@@ -58,21 +62,23 @@ class RenderJob:
 class RenderQueue:
     """Render queue of one scene, with a thread of its own.
 
-    `_changed` guards all fields but `_edited`, which the rendering thread and exports use: `_jobs`
+    `_changed` guards all fields but `_edited`, which the rendering thread and exports use, and
+    `_loaded`, the last scene of each renderer, which the rendering thread alone uses: `_jobs`
     (every kept job, oldest first), `_next` (the job that waits), and the state of each job. Its
     waiters are the rendering thread, for `_next` and `_closed`, and `wait_for_update`, for a newer
     version of a job.
     """
 
-    def __init__(self, scene: Scene, painters: Mapping[str, Painter]) -> None:
+    def __init__(self, scene: Scene, renderers: Mapping[str, PageRenderer]) -> None:
         self._scene = scene
-        self._painters = painters
+        self._renderers = renderers
         self._changed = threading.Condition()
         self._jobs = OrderedDict[str, RenderJob]()
         self._next: RenderJob | None = None
         self._thread: threading.Thread | None = None
         self._numbers = itertools.count(1)
         self._edited: tuple[str, Scene] | None = None
+        self._loaded: dict[str, tuple[Hashable, ReadyScene, Sequence[str]]] = {}
         self._closed = False
 
     def submit(self, options: PictureOptions) -> RenderJob:
@@ -153,18 +159,22 @@ class RenderQueue:
                 if job is None or self._closed:
                     return
                 self._update(job, state="working")
-            self._paint(job)
+            self._render(job)
 
-    def _paint(self, job: RenderJob) -> None:
-        def show(step: RenderedImage | Sampling) -> None:
+    def _render(self, job: RenderJob) -> None:
+        def show(step: Image | Sampling) -> None:
             with self._changed:
                 if self._next is not None or self._closed or job.state != "working":
                     raise _Superseded
-                if isinstance(step, RenderedImage):
+                if isinstance(step, Image):
                     job.image = step
                     job.sampling = None
                     job.costs.append(
-                        {"spp": step.spp, "core_s": step.core_s, "floor_db": step.floor_db}
+                        {
+                            "spp": step.samples,
+                            "core_s": step.cpu_seconds,
+                            "floor_db": step.stated_error_db,
+                        }
                     )
                 else:
                     job.sampling = step
@@ -173,8 +183,9 @@ class RenderQueue:
         state = "done"
         error = ""
         try:
-            scene = self.scene(job.options.scene_key, job.options.edits)
-            self._painters[job.options.engine].paint(scene, job.options, show)
+            loaded, job.notes = self._load(job.options)
+            job.scene_core_s = loaded.cpu_seconds
+            show(loaded.render(job.options.camera, show))
         except _Superseded:
             state = "cancelled"
         except TrilightError as mistake:
@@ -188,6 +199,16 @@ class RenderQueue:
             self._update(job, state=state)
             while len(self._jobs) > MOST_KEPT:
                 self._jobs.popitem(last=False)
+
+    def _load(self, options: PictureOptions) -> tuple[ReadyScene, Sequence[str]]:
+        """Return the edited scene in the renderer of a request, and the notes on its pictures."""
+        key = (options.scene_key, options.resolution, options.error_db)
+        if self._loaded.get(options.engine, (None,))[0] != key:
+            scene = self.scene(options.scene_key, options.edits)
+            renderer = self._renderers[options.engine].make(options)
+            loaded = renderer.load(scene, "the scene")
+            self._loaded[options.engine] = (key, loaded, [*loaded.notes, *renderer.notes])
+        return self._loaded[options.engine][1:]
 
     def _cancel(self, job: RenderJob | None) -> None:
         if job is not None:
@@ -203,11 +224,15 @@ def agreement_db(job: RenderJob, reference: RenderJob | None) -> float | None:
     """Return psnr_log_db of a picture against the reference; None where one is missing."""
     if reference is None or reference is job or job.image is None or reference.image is None:
         return None
-    picture = job.image.radiance_rgb
-    other = reference.image.radiance_rgb
-    if picture is None or other is None or picture.shape != other.shape:
+    if not _are_comparable(job.image, reference.image):
         return None
-    return float(psnr_log_db(picture, other))
+    return float(psnr_log_db(job.image.radiance_rgb, reference.image.radiance_rgb))
+
+
+def _are_comparable(image: Image, other: Image) -> bool:
+    if isinstance(image, PassImage) or isinstance(other, PassImage):
+        return False
+    return image.radiance_rgb.shape == other.radiance_rgb.shape
 
 
 def _is_over(job: RenderJob) -> bool:
@@ -224,18 +249,11 @@ def _is_same(job: RenderJob, options: PictureOptions) -> bool:
 
 
 def _can_judge(other: RenderJob, job: RenderJob, engine: str) -> bool:
-    image = job.image
-    other_image = other.image
     return (
         other.options.engine == engine
         and other is not job
         and other.options.camera_key == job.options.camera_key
-        and other_image is not None
-        and other_image.radiance_rgb is not None
-        and (engine == "target" or other_image.floor_db is not None)
-        and (
-            image is None
-            or image.radiance_rgb is None
-            or image.radiance_rgb.shape == other_image.radiance_rgb.shape
-        )
+        and other.image is not None
+        and (engine == "target" or other.image.stated_error_db is not None)
+        and (job.image is None or _are_comparable(job.image, other.image))
     )

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.rendering.look import Look, ToneMap, tone_mapped
-from infra.viewer.painters import Painter, render_words
+from infra.render.look import Look, ToneMap, tone_mapped
+from infra.render.path_tracer import RenderChild
+from infra.viewer.page_renderers import PageRenderer, PassImage
 from infra.viewer.picture_options import parse_edits, parse_picture_options
 from infra.viewer.render_queue import RenderJob, RenderQueue, agreement_db
 from infra.viewer.scene_bytes import scene_bytes, sky_bytes, texture_png
@@ -22,7 +23,6 @@ from pipeline.documents.png import encode_png
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.formats import FORMATS
 from pipeline.exchange.renderformer_json import camera_entry
-from pipeline.generation.progressive_tracer import ProgressiveTracer
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.lights import num_lights
@@ -54,18 +54,18 @@ class SceneHandlers:
     scene: Scene
     notes: Sequence[str]
     """Losses of the conversion from the scene's file."""
-    painters: Mapping[str, Painter]
+    renderers: Mapping[str, PageRenderer]
     """Renderers by name, in the order of the page."""
     target_px: int | None
     """Width in pixels of the pictures in the file; None without such pictures."""
     source: str = ""
     """Scene as `trilight render` takes it; empty where it cannot."""
-    tracer: ProgressiveTracer | None = None
-    """Path tracer that `close` closes; None where other pages share it."""
+    child: RenderChild | None = None
+    """Render child that `close` closes; None where other pages share it."""
     queue: RenderQueue = field(init=False)
 
     def __post_init__(self) -> None:
-        self.queue = RenderQueue(self.scene, self.painters)
+        self.queue = RenderQueue(self.scene, self.renderers)
         self._writing = threading.Lock()
 
     def gets(self) -> dict[str, Route]:
@@ -91,14 +91,14 @@ class SceneHandlers:
         """Stop rendering, and wait for its end."""
         self.queue.close()
         self.queue.join()
-        if self.tracer is not None:
-            self.tracer.close()
+        if self.child is not None:
+            self.child.close()
 
     def _facts(self, _: Request) -> Response:
         scene = self.scene
         engines = [
             {"name": name, "title": each.title, "means": each.means}
-            for name, each in self.painters.items()
+            for name, each in self.renderers.items()
         ]
         return json_response(
             {
@@ -135,7 +135,7 @@ class SceneHandlers:
         return Response(body=sky_bytes(self.scene), kind=_OCTETS)
 
     def _submit(self, request: Request) -> Response:
-        options = parse_picture_options(request.body, self.painters, self.scene.num_views)
+        options = parse_picture_options(request.body, self.renderers, self.scene.num_views)
         return json_response({"id": self.queue.submit(options).id})
 
     def _cancel_all(self, _: Request) -> Response:
@@ -154,12 +154,13 @@ class SceneHandlers:
         """Return the command that renders a picture, and its camera as a file for that command."""
         options = job.options
         camera = job.options.camera
-        place = ["--view", str(options.view), "--out", "view.exr"]
-        if options.view is None:  # a camera file means many pictures, which need a folder
+        place = ["--view", str(camera.view), "--out", "view.exr"]
+        if camera.view is None:  # a camera file means many pictures, which need a folder
             place = ["--cameras", CAMERA, "--out", "view"]
         words = ["trilight", "render", EDITED if options.edits else self.source, *place]
         words += ["--resolution", str(options.resolution)]
-        command = shlex.join([*words, *render_words(self.painters[options.engine], options)])
+        quality = self.renderers[options.engine].words
+        command = shlex.join([*words, *(quality or ("--noise-floor", f"{options.error_db:g}"))])
         camera_file = json.dumps({"cameras": [camera_entry(camera.c2w, camera.fov_deg)]})
         return {"command": command if self.source else "", "camera": camera_file}
 
@@ -169,8 +170,7 @@ class SceneHandlers:
             raise NotFound("the picture has not begun yet.")
         if request.query.get("as") == "error":
             pixels = self._error_of(job)
-        elif job.image.radiance_rgb is None:
-            assert job.image.pixels is not None
+        elif isinstance(job.image, PassImage):
             pixels = job.image.pixels
         else:
             pixels = _tone_map(job.image.radiance_rgb, request.query)
@@ -181,10 +181,7 @@ class SceneHandlers:
         if agreement_db(job, reference) is None:
             raise TrilightError("There is nothing to judge this picture by yet.")
         assert job.image is not None and reference is not None and reference.image is not None
-        picture = job.image.radiance_rgb
-        other = reference.image.radiance_rgb
-        assert picture is not None and other is not None
-        return error_picture(picture, other)
+        return error_picture(job.image.radiance_rgb, reference.image.radiance_rgb)
 
     def _export(self, request: Request) -> Response:
         body = request.body if isinstance(request.body, dict) else {}
@@ -217,12 +214,12 @@ def _job_record(job: RenderJob, reference: RenderJob | None) -> Mapping[str, Any
         record["sampling"] = {"spp": sampling.spp, "expected_spp": sampling.expected_spp}
     if image is not None:
         record |= {
-            "spp": image.spp,
-            "core_s": image.core_s,
-            "scene_core_s": image.scene_core_s,
-            "floor_db": image.floor_db,
-            "says": image.says,
-            "notes": list(image.notes),
+            "spp": image.samples,
+            "core_s": image.cpu_seconds,
+            "scene_core_s": job.scene_core_s,
+            "floor_db": image.stated_error_db,
+            "says": image.remark,
+            "notes": list(job.notes),
             "agreement_db": agreement_db(job, reference),
             "truth": None if reference is None else reference.options.engine,
             "error_white": ERROR_WHITE,

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
 from storage.dataset.derived import derivation_of
+from storage.markdown import inert
 from storage.records.objects import OBJECT, SKY, TEXTURE
 
 _COLUMNS = ("uid", "title", "licence", "licence_source", "attribution", "source_url", "changes")
@@ -17,7 +18,6 @@ _OF_KIND = {
 """Changes to textures and maps, by kind."""
 AS_IN_FILE = "rendered as its scene file says"
 """Changes to the meshes of scene files."""
-_FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 
 
 class HasRights(Protocol):
@@ -60,8 +60,3 @@ def _changes(settings: Mapping[str, Any]) -> set[str]:
         return set().union(*(_changes(source["settings"]) for source in derivation.sources))
     from_files = settings.get("splits", {}).get("listed_scenes") is not None
     return {AS_IN_FILE if from_files else _REMESHED}
-
-
-def inert(cell: str) -> str:
-    """Return untrusted text, escaped so that a spreadsheet reads no formula in it."""
-    return f"'{cell}" if cell.startswith(_FORMULA_STARTS) else cell

@@ -10,12 +10,12 @@ from typing import Any
 from markupsafe import Markup
 
 from pipeline.documents.distributions import MEASURED, Distributions
-from pipeline.documents.markdown import front_matter
 from pipeline.documents.pages import render_markdown
 from pipeline.documents.rights import Rights, hub_licence, licence_facts
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest
+from storage.markdown import front_matter
 from storage.records.objects import SKY, TEXTURE
 from storage.records.profiles import PLAIN
 from storage.records.quantities import summary

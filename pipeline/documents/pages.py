@@ -15,8 +15,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup  # of jinja2
 from numpy.typing import NDArray
 
-from pipeline.documents.markdown import code, text
 from pipeline.documents.png import encode_png
+from storage.markdown import code, text
 
 
 class Figure(NamedTuple):

@@ -3,9 +3,10 @@
 import time
 from collections.abc import Generator
 
-from pipeline.renders.results import RenderedView, Sampling
+from pipeline.renders.results import RenderedView
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import forget_views, tell_views
+from storage.renderer import Sampling
 
 _EVERY_S = 0.5
 """Seconds between two writes."""

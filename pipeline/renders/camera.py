@@ -1,4 +1,4 @@
-"""`Camera`: one pinhole and its pixel grid, which is all that a tracer knows of a view."""
+"""`PixelCamera`: one pinhole and its pixel grid, which is all that a tracer knows of a view."""
 
 from dataclasses import dataclass, replace
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Camera:
+class PixelCamera:
     """A square picture's camera, as storage.conventions means it."""
 
     c2w: NDArray[np.float64]
@@ -17,7 +17,7 @@ class Camera:
     resolution: int
     """Width and height in pixels."""
 
-    def at_scale(self, factor: float) -> "Camera":
+    def at_scale(self, factor: float) -> "PixelCamera":
         """Return the camera that sees the same of a scene that is so many times as large."""
         c2w = self.c2w.copy()
         c2w[:3, 3] *= factor

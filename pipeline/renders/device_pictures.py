@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoise_corrections import LEAST_PASSES
 from pipeline.renders.denoiser import denoise_arrays
 from pipeline.renders.noise_floor import (
@@ -70,7 +70,7 @@ class DevicePictures:
     """See `ViewPictures` for the meaning of its methods."""
 
     def __init__(
-        self, samples: DualBuffer, tracer: Any, camera: Camera, settings: RenderSettings
+        self, samples: DualBuffer, tracer: Any, camera: PixelCamera, settings: RenderSettings
     ) -> None:
         """Trace what guides the denoiser.
 

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from storage.conventions import focal_px
 
 
@@ -17,7 +17,7 @@ class Film:
     Not a dataclass: Dr.Jit would take its arrays for variables of a loop.
     """
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, camera: PixelCamera) -> None:
         focal = float(focal_px(camera.fov_deg, camera.resolution))
         self._width = dr.opaque(mi.UInt32, camera.resolution)
         self._half = dr.opaque(mi.Float, 0.5 * camera.resolution)

@@ -4,6 +4,7 @@ A measured error needs two halves of many samples (pipeline.renders.renderer). A
 of samples, so that nothing tells how far it is from the truth, and it says so.
 """
 
+import time
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from typing import Annotated
@@ -11,16 +12,16 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import representable, require_surfaces
-from pipeline.renders.results import Sampling
 from pipeline.renders.settings import PASS_SPP, Depth, Filtered, RenderSettings, Resolution
 from pipeline.renders.tracer import Tracer
 from pipeline.renders.view_pictures import require_bounded
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
+from storage.renderer import Sampling
 from storage.seeds import seed_for
 from storage.settings.described import checked
 from storage.settings.ranges import Within
@@ -72,6 +73,8 @@ class Preview:
     """[R, R, 3] linear radiance that half floats can hold."""
     spp: int
     """Number of samples of each pixel."""
+    core_s: float
+    """Core-seconds that the picture took, without loading the scene."""
 
 
 class PreviewRenderer:
@@ -97,47 +100,32 @@ class PreviewRenderer:
         """
         settings = self._settings
         pose = np.asarray(c2w, np.float64)
-        camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
-        total = np.zeros((camera.resolution, camera.resolution, 3))
-        done = 0
-        while done < settings.spp:
-            part, done = samples_sum(self._tracer, camera, seed, done, settings.spp)
-            total += part
-            yield Sampling(spp=done, expected_spp=settings.spp, missing_db=None)
-        mean = (total / done).astype(np.float32)
-        if not np.isfinite(mean).all():
-            broken = int((~np.isfinite(mean)).any(axis=-1).sum())
-            raise Rejected("nonfinite_radiance", f"{broken} pixels of raw samples")
-        require_bounded(float(mean.max()))
-        picture = denoise_preview(self._tracer, camera, mean, done, settings.denoiser)
-        return Preview(radiance_rgb=representable(picture), spp=done)
+        camera = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
+        return (
+            yield from preview_steps(self._tracer, camera, seed, settings.spp, settings.denoiser)
+        )
 
 
-def samples_sum(
-    tracer: Tracer, camera: Camera, seed: int, done: int, spp: int
-) -> tuple[NDArray[np.float64], int]:
-    """Return the sum of the samples of the next pass, [R, R, 3], and how many there are then.
-
-    Args:
-        tracer: of the scene.
-        camera: the view.
-        seed: of the view.
-        done: samples before.
-        spp: samples that are wanted in all, above `done`.
-    """
-    size = next(pass_sizes(spp - done))
-    pass_seed = seed_for(seed, "preview", done)
-    picture = tracer.radiance(camera, seed=pass_seed, spp=size)
-    return size * picture.astype(np.float64), done + size
-
-
-def denoise_preview(
-    tracer: Tracer, camera: Camera, picture_rgb: NDArray[np.float32], spp: int, quality: Filtered
-) -> NDArray[np.float32]:
-    """Return a picture [R, R, 3] of `spp` samples without noise, guided by rays to first hits."""
-    if quality == "off":
-        return picture_rgb
-    return denoise(picture_rgb, tracer.features(camera, spp=guide_rays(spp)), quality)
+def preview_steps(
+    tracer: Tracer, camera: PixelCamera, seed: int, spp: int, denoiser: Filtered
+) -> Generator[Sampling, None, Preview]:
+    """Do what `PreviewRenderer.view_steps` does, for a scene that a tracer has loaded."""
+    began_s = time.process_time()
+    total = np.zeros((camera.resolution, camera.resolution, 3))
+    done = 0
+    for size in pass_sizes(spp):
+        picture = tracer.radiance(camera, seed=seed_for(seed, "preview", done), spp=size)
+        total += size * picture.astype(np.float64)
+        done += size
+        yield Sampling(spp=done, expected_spp=spp, missing_db=None)
+    mean = (total / done).astype(np.float32)
+    if not np.isfinite(mean).all():
+        broken = int((~np.isfinite(mean)).any(axis=-1).sum())
+        raise Rejected("nonfinite_radiance", f"{broken} pixels of raw samples")
+    require_bounded(float(mean.max()))
+    if denoiser != "off":
+        mean = denoise(mean, tracer.features(camera, spp=guide_rays(done)), denoiser)
+    return Preview(radiance_rgb=representable(mean), spp=done, core_s=time.process_time() - began_s)
 
 
 def pass_sizes(spp: int) -> Iterator[int]:

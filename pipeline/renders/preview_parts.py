@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoiser import Quality, denoise
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.preview import PASSES, guide_rays, pass_sizes
@@ -51,8 +51,8 @@ def timed_parts(
     began = clock()
     tracer = load_tracer(scene, **depths)
     seconds = {SCENE: clock() - began}
-    small = Camera(c2w=pose, fov_deg=fov_deg, resolution=_SMALL)
-    camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=resolution)
+    small = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=_SMALL)
+    camera = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=resolution)
     for size in PASSES:
         tracer.radiance(small, seed=_SEED, spp=size)  # kernels are compiled, or read from disk
         seconds[_pass_name(size)] = _median_s(

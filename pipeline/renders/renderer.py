@@ -19,12 +19,12 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoiser import set_denoiser_threads
 from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans, HostPictures
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import MeasuredFloor
-from pipeline.renders.results import GrowingPicture, RenderedView, Sampling, UsedTime
+from pipeline.renders.results import GrowingPicture, RenderedView, UsedTime
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.stopping import Floors, Goal, expected_spp, gaps_db, next_spp
@@ -36,6 +36,7 @@ from storage.errors import Rejected, TrilightError
 from storage.records.lights import light_rows, rounded_to_half, sum_of_lights
 from storage.records.parts import MAX_PICTURES
 from storage.records.scene import Scene
+from storage.renderer import Sampling
 
 Result = TypeVar("Result")
 
@@ -93,11 +94,6 @@ class SceneRenderer:
         """What traces all light of the scene."""
         return self._tracer
 
-    @property
-    def used_core_s(self) -> float:
-        """Core-seconds of this process since the view at hand began, without its looks."""
-        return self._used.core_s()
-
     def render_view(self, c2w: ArrayLike, fov_deg: float, seed: int) -> RenderedView:
         """Return the picture of one camera; equal arguments give equal bits.
 
@@ -121,7 +117,7 @@ class SceneRenderer:
         settings = self._settings
         self._used = UsedTime()
         pose = np.asarray(c2w, np.float64)
-        camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
+        camera = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
         settled = settings.first_spp
         samples = DualBuffer(
             self._tracers, camera, seed, first_spp=settled, max_spp=settings.max_spp
@@ -145,12 +141,13 @@ class SceneRenderer:
             noise_floor_linear_db=floor.linear_db,
             object_noise_floor_db=floor.object_log_db,
             at_cap=bool(gaps_db(settings.targets_db, _by_metric(floor))),
+            core_s=self._used.core_s(),
             hits=pictures.hits,
             part_floors=look.part_floors or None,
             **stored,
         )
 
-    def _pictures(self, samples: DualBuffer, camera: Camera) -> ViewPictures:
+    def _pictures(self, samples: DualBuffer, camera: PixelCamera) -> ViewPictures:
         if self._settings.arithmetic == "numpy":
             return HostPictures(samples, self._tracer, camera, self._settings)
         from pipeline.renders.device_pictures import DevicePictures  # imports mitsuba

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.noise_floor import MeasuredFloor
 from storage.records.parts import Parts
+from storage.renderer import Sampling
 
 Step = TypeVar("Step")
 Result = TypeVar("Result")
@@ -32,6 +33,8 @@ class RenderedView:
     """Measured error as object_psnr_log_db over `hits`, in dB; more is better."""
     at_cap: bool
     """True if sampling ended at max_spp with a floor below its target."""
+    core_s: float
+    """Core-seconds that the picture took, without its looks and without loading the scene."""
     hits: NDArray[np.bool_]
     """[R, R] true where the ray through a pixel's center hits geometry other than emitters."""
     lights_rgb: NDArray[np.float32] | None = None
@@ -43,18 +46,6 @@ class RenderedView:
     `lights_rgb`, in every bit."""
     part_floors: Mapping[str, MeasuredFloor] | None = None
     """Measured error of each part, of all lights together."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sampling:
-    """Progress of the samples of a view."""
-
-    spp: int
-    """Samples per pixel so far."""
-    expected_spp: int
-    """Samples at which all targets should be reached, or the cap; a guess that improves."""
-    missing_db: float | None
-    """The widest gap to a target when the floors were measured last; None before that."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.settings import PASS_SPP
 from pipeline.renders.tracer import Chosen, Tracer
 from storage.seeds import seed_for
@@ -20,7 +20,13 @@ class DualBuffer:
     """
 
     def __init__(
-        self, tracers: Sequence[Tracer], camera: Camera, seed: int, *, first_spp: int, max_spp: int
+        self,
+        tracers: Sequence[Tracer],
+        camera: PixelCamera,
+        seed: int,
+        *,
+        first_spp: int,
+        max_spp: int,
     ) -> None:
         """Begin a view without any sample.
 

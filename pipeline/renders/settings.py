@@ -185,43 +185,6 @@ class NoiseTargets:
         return {} if values == (None, None, None) else dict(zip(_METRICS, values, strict=True))
 
 
-_USUAL_TARGETS = NoiseTargets(log_db=USUAL_FLOOR_DB)
-
-
-def one_picture(
-    *,
-    resolution: int,
-    max_spp: int,
-    noise_targets: NoiseTargets | None = None,
-    split: bool = False,
-    split_lobes: bool = False,
-) -> RenderSettings:
-    """Return the settings of a picture that a person asks for, who gets it even where it is dark.
-
-    Args:
-        resolution: width and height in pixels, a multiple of 8.
-        max_spp: most samples per pixel.
-        noise_targets: targets; where none is set, psnr_log_db of USUAL_FLOOR_DB.
-        split, split_lobes: what is kept apart.
-
-    Raises:
-        TrilightError: a value that is refused; the message names it.
-    """
-    targets = noise_targets if noise_targets and noise_targets.overrides else _USUAL_TARGETS
-    return RenderSettings(
-        resolution=resolution,
-        noise_floor_db=targets.log_db,
-        noise_floor_linear_db=targets.linear_db,
-        noise_floor_objects_db=targets.objects_db,
-        min_spp=min(FIRST_SPP, max_spp),
-        max_spp=max_spp,
-        min_mean_radiance=0.0,
-        split=split,
-        split_lobes=split_lobes,
-        arithmetic="device",
-    )
-
-
 def _require(law: bool, complaint: str) -> None:
     if not law:
         raise TrilightError(f"render settings: {complaint}.")

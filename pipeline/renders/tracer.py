@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from storage.records.scene import Scene
 
 
@@ -94,7 +94,7 @@ class Tracer(Protocol):
         """
 
     def radiance(
-        self, camera: Camera, *, seed: int, spp: int, chosen: Chosen = None
+        self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
     ) -> NDArray[np.float32]:
         """Return the mean of one pass of samples, linear radiance [R, R, 3]; 0 if not chosen.
 
@@ -108,13 +108,13 @@ class Tracer(Protocol):
             chosen: the pixels that are wanted. A tracer may trace the others too.
         """
 
-    def pass_sum(self, camera: Camera) -> PassSum:
+    def pass_sum(self, camera: PixelCamera) -> PassSum:
         """Return an empty sum of passes of a view."""
 
-    def features(self, camera: Camera, *, spp: int) -> Features:
+    def features(self, camera: PixelCamera, *, spp: int) -> Features:
         """Return the albedo and normal pictures, of `spp` evenly spread rays in each pixel."""
 
-    def hits(self, camera: Camera) -> NDArray[np.bool_]:
+    def hits(self, camera: PixelCamera) -> NDArray[np.bool_]:
         """Return whether the ray through each pixel's centre hits a surface, [R, R]."""
 
 

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.device_memory import own_floats, own_integers, read_back
 from pipeline.renders.emission_cone import EmissionCone
 from pipeline.renders.emitter_table import EmitterTable
@@ -108,7 +108,7 @@ class VectorTracer:
         return tracer
 
     def radiance(
-        self, camera: Camera, *, seed: int, spp: int, chosen: Chosen = None
+        self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
     ) -> NDArray[np.float32]:
         pixels = _pixels(camera, chosen)
         picture = dr.zeros(mi.Color3f, camera.resolution**2)
@@ -116,10 +116,10 @@ class VectorTracer:
         dr.scatter(picture, sum(means), pixels)
         return _picture(camera, picture)
 
-    def pass_sum(self, camera: Camera) -> "DeviceSum":
+    def pass_sum(self, camera: PixelCamera) -> "DeviceSum":
         return DeviceSum(self, camera)
 
-    def _film(self, camera: Camera) -> Film:
+    def _film(self, camera: PixelCamera) -> Film:
         return Film(camera.at_scale(self._scale))
 
     @property
@@ -132,7 +132,7 @@ class VectorTracer:
         """What traces a pass."""
         return trace_pass
 
-    def _num_light_paths(self, camera: Camera, spp: int) -> int:
+    def _num_light_paths(self, camera: PixelCamera, spp: int) -> int:
         """Return the light paths of a pass.
 
         They are as many as for the whole picture, so that the weights of the strategies stay the
@@ -142,7 +142,7 @@ class VectorTracer:
         return int(LIGHT_PATHS * camera.resolution**2 * spp)
 
     def _pass(
-        self, camera: Camera, film: Film, pixels: Any, seed: int, spp: int
+        self, camera: PixelCamera, film: Film, pixels: Any, seed: int, spp: int
     ) -> tuple[Any, ...]:
         """Return the arguments of `_means` and `_sums` for a pass."""
         count = self._num_light_paths(camera, spp)
@@ -150,7 +150,7 @@ class VectorTracer:
         inputs = KernelInputs(self._scene, film, self._parts, self._unit, numbers)
         return inputs, pixels, self._traced, camera.resolution, spp, count
 
-    def features(self, camera: Camera, *, spp: int) -> Features:
+    def features(self, camera: PixelCamera, *, spp: int) -> Features:
         named = self.feature_arrays(camera, spp=spp)
         return Features(
             albedo=_picture(camera, named.pop("albedo")),
@@ -158,16 +158,16 @@ class VectorTracer:
             lobes={name: _picture(camera, values) for name, values in named.items()},
         )
 
-    def feature_arrays(self, camera: Camera, *, spp: int) -> dict[str, Any]:
+    def feature_arrays(self, camera: PixelCamera, *, spp: int) -> dict[str, Any]:
         """Return the pictures of `features` by name, in the memory of the device (Color3f)."""
         inputs = KernelInputs(self._scene, self._film(camera), self._parts)
         arrays: dict[str, Any] = _features(inputs, camera.resolution, spp)
         return arrays
 
-    def hits(self, camera: Camera) -> NDArray[np.bool_]:
+    def hits(self, camera: PixelCamera) -> NDArray[np.bool_]:
         return read_back(self.hit_array(camera)).reshape(camera.resolution, camera.resolution)
 
-    def hit_array(self, camera: Camera) -> Any:
+    def hit_array(self, camera: PixelCamera) -> Any:
         """Return `hits` in the memory of the device (Bool)."""
         return _hits(KernelInputs(self._scene, self._film(camera)), camera.resolution)
 
@@ -285,7 +285,7 @@ def _first_hit(scene: Any, film: Film, resolution: int, spp: int) -> Any:
 class DeviceSum:
     """A `PassSum` in float64 in the memory of the device, so that no pass waits for Python."""
 
-    def __init__(self, tracer: VectorTracer, camera: Camera) -> None:
+    def __init__(self, tracer: VectorTracer, camera: PixelCamera) -> None:
         self._tracer = tracer
         self._camera = camera
         self._film = tracer._film(camera)
@@ -357,7 +357,7 @@ def _load(scene: Scene, triangles: NDArray[np.intp], child: Any = None) -> Any:
     return mi.load_dict({"type": "scene", **children})
 
 
-def _pixels(camera: Camera, chosen: Chosen = None) -> Any:
+def _pixels(camera: PixelCamera, chosen: Chosen = None) -> Any:
     """Return the numbers of the chosen pixels (UInt32), row by row.
 
     They are in memory even where they are all: one kernel serves any choice.
@@ -381,6 +381,6 @@ def _pixel_means(spp: int, samples: Any) -> Any:
     return sums / spp  # spp is a power of two: exact
 
 
-def _picture(camera: Camera, pixels: Any) -> NDArray:
+def _picture(camera: PixelCamera, pixels: Any) -> NDArray:
     """Return [R, R, 3] of the pixels of a camera, in numpy's memory."""
     return read_back(pixels).reshape(camera.resolution, camera.resolution, 3)

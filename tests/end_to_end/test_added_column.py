@@ -6,21 +6,21 @@ import itertools
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import ClassVar, cast
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 
-from infra.rendering.engines import MitsubaEngine
+from infra.render.path_tracer import PathTracer, RenderChild
+from infra.render.quality import FixedSamples
 from model.neural_renderer import NeuralRenderer
 from model.open import open_network, save_published
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.generation.inspect_scene import _facts
-from pipeline.generation.path_tracer import PathTracer
+from pipeline.renders.variant import choose_variant
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.dataset.dataset import Dataset
@@ -31,6 +31,7 @@ from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
 from tests.columns_kit import COAT, TINT, WITH_COAT, declared
 from tests.for_each import for_each
+from tests.infra.child_here import use_children_here
 from tests.model.kit import awake, tiny_config
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import FLOOR, tiny_scene
@@ -201,21 +202,14 @@ def test_the_shipped_network_gives_the_same_bytes_and_says_what_it_does_not_read
             assert np.array_equal(renderer.render(tiny_scene(), 16), shown)
 
 
-def test_the_path_tracer_says_what_it_does_not_read() -> None:
-    class Tracer:
-        identity: ClassVar[dict[str, str]] = {}
-
-        def wake(self, name: str) -> None:
-            """It needs no child."""
-
-        def open(self, scene: Scene, name: str) -> None:
-            assert scene.num_triangles
-
-    engine = MitsubaEngine(cast("PathTracer", Tracer()))
+def test_the_path_tracer_says_what_it_does_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    use_children_here(monkeypatch)
+    child = RenderChild(choose_variant(), threads=1)
+    tracer = PathTracer(child, FixedSamples(spp=1, denoiser="off"), 8)
     scene = tiny_scene()
-    assert engine.open(scene, "floor").notes == ()
+    assert tracer.load(scene, "floor").notes == ()
     scene.materials[FLOOR, -1] = 0.9
-    assert engine.open(scene, "floor").notes == ("floor: the path tracer does not read coat",)
+    assert tracer.load(scene, "floor").notes == ("the path tracer does not read coat",)
 
 
 def test_inspect_names_the_columns_in_use(tmp_path: Path) -> None:

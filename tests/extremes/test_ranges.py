@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from infra.leaderboard.options import LeaderboardOptions
-from infra.rendering.options import RenderOptions
+from infra.render.options import RenderOptions
 from infra.serving.train_model import TrainOptions
 from infra.setup.settings_page import ROOTS, reachable
 from model.base_widths import BaseWidths
@@ -54,7 +53,7 @@ from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import textured_scene
-from train.evaluation.options import EvaluationOptions
+from train.evaluation.options import EvaluationOptions, LeaderboardOptions
 from train.monitoring.settings import WatchSettings
 from train.runs import named_run
 from train.settings import AugmentationSettings, LossSettings, TrainSettings

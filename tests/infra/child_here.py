@@ -6,8 +6,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from infra.render import path_tracer
 from pipeline.exchange import reader
-from pipeline.generation import path_tracer, progressive_tracer
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Reach, Result
 from pipeline.isolation.answers import decode_answer, encode_result
 from storage.errors import Rejected, TrilightError
@@ -62,7 +62,7 @@ class ChildHere:
         """End nothing."""
 
 
-_CALLERS = (reader, path_tracer, progressive_tracer)
+_CALLERS = (reader, path_tracer)
 
 
 def use_children_here(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.tracer import Chosen, Features, Tracer
 from storage.records.scene import Scene
 from tests.oracle.plugin_scene import plugin_background, plugin_feature_scene, plugin_scene
@@ -22,7 +22,7 @@ from tests.oracle.plugin_scene import plugin_background, plugin_feature_scene, p
 class HostSum:
     """A `PassSum` in numpy's memory, for a tracer that returns its passes there anyway."""
 
-    def __init__(self, tracer: Tracer, camera: Camera) -> None:
+    def __init__(self, tracer: Tracer, camera: PixelCamera) -> None:
         self._tracer, self._camera = tracer, camera
         self._total = np.zeros((camera.resolution, camera.resolution, 3))
         self._squares = np.zeros((camera.resolution, camera.resolution))
@@ -75,23 +75,23 @@ class PluginTracer:
         raise NotImplementedError("the stock integrator returns all light together")
 
     def radiance(
-        self, camera: Camera, *, seed: int, spp: int, chosen: Chosen = None
+        self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
     ) -> NDArray[np.float32]:
         picture = _render(self._scene, self._path, camera, seed=seed, spp=spp)
         if self._background is not None:  # emitters are hidden from the camera all or none
             picture += _render(self._background, self._seen, camera, seed=seed, spp=spp)
         return picture if chosen is None else picture * chosen[..., None]
 
-    def pass_sum(self, camera: Camera) -> HostSum:
+    def pass_sum(self, camera: PixelCamera) -> HostSum:
         return HostSum(self, camera)
 
-    def features(self, camera: Camera, *, spp: int) -> Features:
+    def features(self, camera: PixelCamera, *, spp: int) -> Features:
         channels = _render(
             self._feature_scene, self._features, camera, seed=0, spp=spp, jitter=False
         )
         return Features(albedo=channels[..., 0:3].copy(), normal=channels[..., 3:6].copy())
 
-    def hits(self, camera: Camera) -> NDArray[np.bool_]:
+    def hits(self, camera: PixelCamera) -> NDArray[np.bool_]:
         depth = _render(self._feature_scene, self._depth, camera, seed=0, spp=1, jitter=False)
         return depth[..., 0] > 0
 
@@ -101,7 +101,7 @@ def _integrator(**parameters: Any) -> Any:
 
 
 def _render(
-    scene: Any, integrator: Any, camera: Camera, *, seed: int, spp: int, jitter: bool = True
+    scene: Any, integrator: Any, camera: PixelCamera, *, seed: int, spp: int, jitter: bool = True
 ) -> NDArray[np.float32]:
     """Return the picture [R, R, channels]; without jitter, samples lie on a regular grid."""
     kind = "multijitter" if jitter else "stratified"
@@ -110,7 +110,7 @@ def _render(
     return np.array(picture)
 
 
-def stock_sensor(camera: Camera, sampler: dict[str, Any]) -> Any:
+def stock_sensor(camera: PixelCamera, sampler: dict[str, Any]) -> Any:
     """Return Mitsuba's own camera for a view: box-filtered pixels, the sampler as its plugin."""
     # Mitsuba's cameras look along +Z with +X to the left.
     to_world = camera.c2w @ np.diag([-1.0, 1.0, -1.0, 1.0])

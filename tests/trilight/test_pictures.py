@@ -6,27 +6,28 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipeline.renders.variant import Variant
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr
+from storage.renderer import Camera
 from tests.scenes_by_hand import tiny_scene
 from trilight import preview_srgb8, render_views, write_picture
 
 
 def test_every_camera_is_rendered_but_where_some_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Tracer:
+    class Scene:
         """Returns the field of view in place of a picture."""
 
-        def __init__(self, *_: object, **__: object) -> None: ...
-        def open(self, *_: object) -> None: ...
-        def close(self) -> None: ...
+        def __init__(self, *_: object) -> None: ...
 
-        def render(self, c2w: object, fov_deg: float, name: str) -> tuple[float, str]:
-            return fov_deg, name
+        def render_view(self, camera: Camera) -> tuple[float, int | None]:
+            return camera.fov_deg, camera.view
 
-    monkeypatch.setattr("pipeline.generation.path_tracer.PathTracer", Tracer)
-    monkeypatch.setattr("pipeline.renders.variant.choose_variant", lambda default: None)
+    monkeypatch.setattr("infra.render.path_tracer.SceneInChild", Scene)
+    variant = Variant(name="llvm_ad_rgb", libllvm="", note="")  # nothing is traced here
+    monkeypatch.setattr("pipeline.renders.variant.choose_variant", lambda default: variant)
     scene = tiny_scene(fov_deg=np.array([45, 50], np.float32))
-    first, second = (45, "view 0"), (50, "view 1")
+    first, second = (45, 0), (50, 1)
     found: list[object] = [*render_views(scene)]
     assert found == [first, second]
     assert [*render_views(scene, views=[1, 0])] == [second, first]

@@ -17,11 +17,11 @@ from model.scene_tensors import SceneTensors
 from model.weights import MAX_LIGHTS
 from storage.conventions import radiance_from_log10
 from storage.dataset.shard_set import ShardSet
-from storage.errors import TrilightError
+from storage.errors import TrilightError, Unrenderable
 from storage.metrics import psnr_log_db
 from storage.records.sample import Sample
 from storage.records.scene import Scene
-from storage.seeds import rng_for
+from storage.renderer import Camera, Renderer
 from storage.settings.described import checked
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.scenes import TrainingScene, training_scene
@@ -30,7 +30,7 @@ from train.evaluation.judge import ValidationScene, predict, validation_scene
 from train.evaluation.judged_view import GROUPED, NETWORK, JudgedView, scene_facts
 from train.evaluation.metrics import noise_floors, picture_scores
 from train.evaluation.options import SceneCount, Width
-from train.evaluation.same_time import CAPTION, TRACER, TracedBeside
+from train.evaluation.same_time import CAPTION, TRACER, spread_views
 from train.evaluation.sheet import SheetView
 from train.loss.lpips import Lpips
 
@@ -57,8 +57,19 @@ class EvalConfig:
     """The LPIPS network; None without its weights: LPIPS is then n/a."""
     most_scenes: SceneCount
     """Maximum number of scenes, from the start of the split."""
-    traced: SkipValidation[TracedBeside | None] = None
+    tracer: SkipValidation[Renderer | None] = None
     """Path tracer at equal time; None leaves it out."""
+    tracer_views: int = 0
+    """Maximum number of views for the path tracer."""
+
+    @property
+    def num_scenes(self) -> int:
+        """Number of scenes to evaluate; opens only shards that are evaluated anyway."""
+        count = 0
+        for number in range(len(self.shards.names)):
+            if count < self.most_scenes:
+                count += self.shards.num_samples(number)
+        return min(count, self.most_scenes)
 
     def samples(self) -> Iterator[Sample]:
         """Yield the samples; a damaged one raises, since the scores would be of another set."""
@@ -85,19 +96,34 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
     """
     rows: list[JudgedView] = []
     before: SceneTensors | None = None
-    for sample in config.samples():
+    every, first = spread_views(config.tracer_views, config.num_scenes)
+    for number, sample in enumerate(config.samples()):
         scene = validation_scene(sample, config.resolution)
         if config.network.config.view_stage == "hits":
-            scene = with_traced_views(scene, config.network, config.resolution)
+            tensors = with_traced(
+                scene.scene.tensors,
+                config.resolution,
+                config.network.config,
+                device=next(config.network.parameters()).device,
+            )  # traced once for all predictions
+            scene = dataclasses.replace(
+                scene, scene=dataclasses.replace(scene.scene, tensors=tensors)
+            )
         contestants = {NETWORK: predict(config.network, scene.scene)}
         contestants |= withheld_pictures(config.network, scene.scene)
         grouped_VRR3 = grouped_pictures(config.network, sample.scene, config.resolution)
         if grouped_VRR3 is not None:
             contestants[GROUPED] = grouped_VRR3
-        scene_rows = [
-            _judge_view(config, sample, scene, view, contestants)
-            for view in range(len(scene.target_VRR3))
-        ]
+        views = range(len(scene.target_VRR3))
+        traced = _traced_pictures(config, sample, views[:first] if number % every == 0 else ())
+        scene_rows = []
+        for view in views:
+            pictures = {name: pictures_VRR3[view] for name, pictures_VRR3 in contestants.items()}
+            if config.baselines is not None:
+                pictures |= config.baselines.pictures(scene.target_VRR3[view])
+            if view in traced:
+                pictures[TRACER] = traced[view]
+            scene_rows.append(judge_view(sample, scene, view, pictures, config.lpips))
         if before is not None and config.network.config.scene_tokens:
             scene_rows = _add_swapped_scores(scene_rows, config.network, scene, before)
         rows += scene_rows
@@ -108,42 +134,54 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
     return rows
 
 
-def _judge_view(
-    config: EvalConfig,
+def judge_view(
     sample: Sample,
     judged: ValidationScene,
     view: int,
-    contestants: Mapping[str, NDArray[np.float64]],
+    pictures: Mapping[str, NDArray],
+    lpips: Lpips | None,
 ) -> JudgedView:
+    """Return the row of a view from its pictures [R, R, 3] by method, linear radiance."""
     target = judged.target_VRR3[view]
     hits = judged.hits_VRR[view]
-    pictures = {name: pictures_VRR3[view] for name, pictures_VRR3 in contestants.items()}
-    if config.baselines is not None:
-        pictures |= config.baselines.pictures(target)
-    if config.traced is not None:
-        traced = config.traced.judged(sample, view)
-        pictures |= {} if traced is None else {TRACER: traced}
     return JudgedView(
         **scene_facts(sample),
         view=view,
-        floors=noise_floors(
-            sample.views[view],
-            target,
-            hits,
-            config.lpips,
-            rng_for(0, f"noise of {sample.key}", view),
-        ),
+        floors=noise_floors(sample, view, target, hits, lpips),
         scores={
-            name: picture_scores(picture, target, hits, config.lpips)
-            for name, picture in pictures.items()
+            name: picture_scores(picture, target, hits, lpips) for name, picture in pictures.items()
         },
     )
+
+
+def _traced_pictures(
+    config: EvalConfig, sample: Sample, views: Sequence[int]
+) -> dict[int, NDArray[np.float32]]:
+    """Return the path tracer's pictures of some views; none if it cannot trace the scene."""
+    if config.tracer is None or not views:
+        return {}
+    scene = sample.scene
+    try:
+        loaded = config.tracer.load(scene, sample.key)
+        return {view: loaded.render(Camera.of_scene(scene, view)).radiance_rgb for view in views}
+    except Unrenderable:
+        return {}
 
 
 def _add_swapped_scores(
     rows: Sequence[JudgedView], network: RenderFormer, judged: ValidationScene, other: SceneTensors
 ) -> list[JudgedView]:
-    pictures_VRR3 = swapped_pictures(network, judged.scene, other)
+    """Return rows with the scores of predictions that are given another scene's triangles.
+
+    This tests whether the network uses the scene: one that has only learned an average picture is
+    no worse with other triangles. A network of hits keeps its own hits; only the scene's tokens are
+    replaced.
+    """
+    cameras = judged.scene.tensors
+    seen = dataclasses.replace(other, c2w_V44=cameras.c2w_V44, fov_deg_V=cameras.fov_deg_V)
+    if cameras.traced is not None:
+        seen = dataclasses.replace(seen, traced=with_others_tokens(cameras.traced, other.traced))
+    pictures_VRR3 = predict(network, dataclasses.replace(judged.scene, tensors=seen))
     return [
         dataclasses.replace(row, swapped_psnr_log_db=psnr_log_db(picture, target))
         for row, picture, target in zip(rows, pictures_VRR3, judged.target_VRR3, strict=True)
@@ -160,13 +198,13 @@ def sheet_views(config: EvalConfig, chosen: Sequence[JudgedView]) -> list[SheetV
         if rows := rows_of.get(sample.key):
             scene = training_scene(sample, config.resolution)
             pictures = predict(config.network, scene)
+            traced = _traced_pictures(config, sample, [row.view for row in rows])
             for row in rows:
                 sheet_view = _sheet_view(row, scene, pictures[row.view])
-                if config.traced is not None:
-                    traced = config.traced.shown(sample, row.view)
+                if config.tracer is not None:
                     black = np.zeros_like(sheet_view.target_rgb)
-                    extra_pictures = {CAPTION: black if traced is None else traced}
-                    sheet_view = dataclasses.replace(sheet_view, extra_rgb=extra_pictures)
+                    extra_rgb = {CAPTION: traced.get(row.view, black)}
+                    sheet_view = dataclasses.replace(sheet_view, extra_rgb=extra_rgb)
                 sheet_of_view[row.key, row.view] = sheet_view
     return [sheet_of_view[row.key, row.view] for row in chosen]
 
@@ -221,15 +259,6 @@ def grouped_pictures(
     return np.stack(pictures).astype(np.float64)
 
 
-def with_traced_views(
-    judged: ValidationScene, network: RenderFormer, resolution: int
-) -> ValidationScene:
-    """Return a scene with traced inputs, so that later predictions share them."""
-    device = next(network.parameters()).device
-    tensors = with_traced(judged.scene.tensors, resolution, network.config, device=device)
-    return dataclasses.replace(judged, scene=dataclasses.replace(judged.scene, tensors=tensors))
-
-
 def withheld_pictures(
     network: RenderFormer, scene: TrainingScene
 ) -> dict[str, NDArray[np.float64]]:
@@ -251,19 +280,3 @@ def withheld_pictures(
             network, dataclasses.replace(scene, tensors=tensors)
         )
     return pictures
-
-
-def swapped_pictures(
-    network: RenderFormer, scene: TrainingScene, other: SceneTensors
-) -> NDArray[np.float64]:
-    """Predict with another scene's triangles [V, R, R, 3], linear radiance.
-
-    This tests whether the network uses the scene: one that has only learned an average picture is
-    no worse with other triangles. A network of hits keeps its own hits; only the scene's tokens are
-    replaced.
-    """
-    cameras = scene.tensors
-    seen = dataclasses.replace(other, c2w_V44=cameras.c2w_V44, fov_deg_V=cameras.fov_deg_V)
-    if cameras.traced is not None:
-        seen = dataclasses.replace(seen, traced=with_others_tokens(cameras.traced, other.traced))
-    return predict(network, dataclasses.replace(scene, tensors=seen))

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from model.precision import tf32
 from storage.conventions import log10_radiance, radiance_from_log10
-from storage.records.sample import ViewRecord
+from storage.records.sample import Sample, ViewRecord
 from storage.registry import Registry
+from storage.seeds import rng_for
 from train.evaluation.scores import ViewScore, score_view
 from train.loss.lpips import Lpips
 from train.loss.ms_ssim import ssim
@@ -158,11 +159,11 @@ def picture_scores(
 
 
 def noise_floors(
-    view: ViewRecord,
+    sample: Sample,
+    view: int,
     target_rgb: NDArray,
     hits: NDArray[np.bool_],
     lpips: Lpips | None,
-    rng: np.random.Generator,
 ) -> dict[str, float]:
     """Return the score of the target's noise by metric: no picture can be expected to be better.
 
@@ -175,13 +176,15 @@ def noise_floors(
     For log_l1 it is an upper bound, since a mean absolute error is at most the root mean square.
 
     Args:
-        view: stored record of the view.
+        sample: stored sample of the view.
+        view: row of its camera.
         target_rgb: [R, R, 3] linear radiance at the resolution of the evaluation.
         hits: [R, R] True for pixels that see geometry.
         lpips: as in `picture_scores`.
-        rng: source of the noise.
     """
-    noisy = log10_radiance(target_rgb) + rng.normal(0, noise_rms(view), target_rgb.shape)
+    rng = rng_for(0, f"noise of {sample.key}", view)
+    stored = sample.views[view]
+    noisy = log10_radiance(target_rgb) + rng.normal(0, noise_rms(stored), target_rgb.shape)
     twin = JudgedPicture(
         radiance_rgb=radiance_from_log10(np.maximum(noisy, 0)),
         target_rgb=target_rgb,
@@ -189,7 +192,7 @@ def noise_floors(
         lpips=lpips,
     )
     floors = {
-        name: metric.floor(view) if metric.floor else metric.score(twin)
+        name: metric.floor(stored) if metric.floor else metric.score(twin)
         for name, metric in METRICS.items()
     }
     return {name: floor for name, floor in floors.items() if floor is not None}

@@ -1,8 +1,9 @@
-"""Options of an evaluation. Imports no torch."""
+"""Options of `trilight evaluate` and `leaderboard`. Imports no torch."""
 
 from pathlib import Path
 from typing import Annotated, Literal
 
+from storage.errors import TrilightError
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 from train.folder import RunFolder
@@ -15,15 +16,56 @@ TracedViews = Annotated[int, Within(0, 10**6, unit="views")]
 """Maximum number of views for the path tracer."""
 
 
+TimedScenes = Annotated[int, Within(1, 10**6, unit="scenes")]
+"""Maximum number of scenes on which everything is timed."""
+
+
+@checked()
+class LeaderboardOptions:
+    """Dataset, networks and pictures."""
+
+    source: str
+    """Dataset (folder or URL) with pictures, such as one of preset benchmark-v1."""
+    checkpoint: tuple[str, ...] = ()
+    """Networks in addition to the built-in ones; by default none. A network is a run, weights, or a
+    name on the Hugging Face hub such as microsoft/renderformer-v1-base. All other rows are compared
+    with the first one."""
+    pictures: tuple[Path, ...] = ()
+    """Folders of OpenEXR pictures from elsewhere, named as export names them; by default none. Each
+    has one picture a view, such as 000000003_view_0.exr."""
+    width: tuple[Width, ...] = ()
+    """Widths of pictures in pixels, divisors of the dataset's; by default those of 64, 256 and 512
+    that divide it, else the dataset's own."""
+    scenes: SceneCount = 10**6
+    """Maximum number of scenes, from the start of the split."""
+    timed_scenes: TimedScenes = 20
+    """Maximum number of scenes on which CPU seconds are measured."""
+    split: Literal["train", "validation", "test"] = "test"
+    """Split of the dataset for the evaluation."""
+    train_data: tuple[str, ...] = ()
+    """Datasets whose training pictures are looked up; by default the set itself, else the other
+    scenes of the split."""
+    lpips: str | None = None
+    """Folder of the LPIPS weights, or hub; by default the value of TRILIGHT_LPIPS. Without weights
+    LPIPS is n/a."""
+    out: Path = Path("leaderboard")
+    """Folder for table, chart and rows; with existing rows a run resumes."""
+
+
 @checked()
 class EvaluationOptions:
     """Network to evaluate, and the data to use."""
 
-    checkpoint: str
-    """Folder of a run, model.safetensors or a checkpoint; builtin: is the network that comes with
-    Trilight."""
+    checkpoint: str | None = None
+    """Folder of a run, model.safetensors, a checkpoint, or builtin: for the network that comes with
+    Trilight; by default none. Without one, all methods are compared as by trilight leaderboard."""
     data: tuple[str, ...]
     """Dataset (a folder or a URL), or shards by name or pattern."""
+    other_networks: tuple[str, ...] = ()
+    """Networks to compare it with on a leaderboard of all methods, which is written into the same
+    folder; by default none."""
+    pictures: tuple[Path, ...] = ()
+    """Folders of OpenEXR pictures from elsewhere for that leaderboard; by default none."""
     split: Literal["train", "validation", "test"] = "test"
     """Split of the dataset to evaluate on."""
     train_data: tuple[str, ...] = ()
@@ -43,14 +85,39 @@ class EvaluationOptions:
     device: Literal["cpu", "cuda"] | None = None
     """Device to compute on; by default cuda if there is one, else cpu."""
     out: Path | None = None
-    """Folder for the report; by default evaluation, in the folder of a run or else here. Where the
-    report of another network is, a number is added."""
+    """Folder for the report; by default evaluation, in the folder of a run or else here, and
+    leaderboard without a network. Where the report of another network is, a number is added."""
 
     @property
     def report_folder(self) -> Path:
         """Folder of the report, unless it holds another network's report."""
-        checkpoint = Path(self.checkpoint)
+        checkpoint = Path(self.checkpoint or "")
         for folder in (checkpoint, *list(checkpoint.parents)[:2]):
-            if self.out is None and RunFolder(folder).settings.is_file():
+            if self.checkpoint and self.out is None and RunFolder(folder).settings.is_file():
                 return folder / "evaluation"
-        return self.out or Path("evaluation")
+        return self.out or Path("evaluation" if self.checkpoint else "leaderboard")
+
+    def leaderboard(self) -> LeaderboardOptions | None:
+        """Return the options of the leaderboard; None if none was requested.
+
+        Raises:
+            TrilightError: there are several datasets, of which a leaderboard is not made.
+        """
+        if self.checkpoint and not (self.other_networks or self.pictures):
+            return None
+        if len(self.data) > 1:
+            raise TrilightError(
+                f"--data is given {len(self.data)} times; expected one dataset for a leaderboard. "
+                "Leave out --beside and --pictures, or compare on one after the other."
+            )
+        return LeaderboardOptions(
+            source=self.data[0],
+            checkpoint=(*filter(None, [self.checkpoint]), *self.other_networks),
+            pictures=self.pictures,
+            width=(self.resolution,) if self.resolution else (),
+            scenes=self.most_scenes,
+            split=self.split,
+            train_data=self.train_data,
+            lpips=self.lpips,
+            out=self.report_folder,
+        )

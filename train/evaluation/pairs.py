@@ -39,3 +39,10 @@ def paired_lead(views: Sequence[JudgedView], first: str, second: str) -> PairedL
         high=interval and interval[1],
         share_better=float(np.mean(np.array(leads_db) > 0)),
     )
+
+
+def interval_text(low: float | None, high: float | None, decimals: int = 2) -> str:
+    """Return the ends of an interval as text; empty if there is no interval."""
+    if low is None or high is None:
+        return ""
+    return f"{low:+.{decimals}f} to {high:+.{decimals}f}"

@@ -1,9 +1,6 @@
 """Scores from the RenderFormer paper, measured on its own unreleased scenes."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
-from train.evaluation.judged_view import JudgedView, summarize_views
+from collections.abc import Mapping
 
 BENCHMARK = "benchmark-v1"
 """Name of our public test set (pipeline.builds.judging)."""
@@ -33,16 +30,3 @@ PUBLISHED_WHERE = (
     "each at 256 x 256, which were never released, and it does not say how it tone-mapped: same "
     "kind of set, not the same set."
 )
-
-
-def compare_with_published(
-    views: Sequence[JudgedView], about: Mapping[str, Any]
-) -> dict[str, dict[str, float | None]] | None:
-    """Return published scores and the network's means; None if the data is not BENCHMARK."""
-    if about.get("build") != BENCHMARK:
-        return None
-    ours = summarize_views(views)
-    return {
-        metric: {"published": figure, "ours": ours[metric]["mean"]}
-        for metric, figure in PUBLISHED.items()
-    }

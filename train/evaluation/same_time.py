@@ -1,24 +1,41 @@
-"""Report on the path tracer at equal time, within an evaluation.
+"""Equal-time baseline: the path tracer with as many CPU seconds as a network.
 
-No picture is traced here: infra.tracer_rival provides the pictures and the times.
+A network is timed on a few scenes of its evaluation, and so are previews of 1, 2, 4, ... samples
+per pixel with either filter. The baseline is the preview of the most samples whose further view
+takes no longer than the network's; if even one sample takes longer, it is that one.
 """
 
+import contextlib
 import dataclasses
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal
 
-from numpy.typing import NDArray
-
+from storage.errors import TrilightError, Unrenderable
 from storage.records.sample import Sample
+from storage.renderer import Renderer
 from train.evaluation.judged_view import NETWORK, JudgedView, summarize_views
-from train.evaluation.pairs import paired_lead
+from train.evaluation.pairs import interval_text, paired_lead
+from train.evaluation.timing import Price, median_price, time_scene
 
 TRACER = "path tracer, same time"
 """Name of the path tracer among the evaluated methods."""
 
 CAPTION = "path tracer"
 """Short name of the path tracer on sheets."""
+
+TIMED_SCENES = 4
+"""Number of scenes on which both are timed."""
+
+TIMED_S = 60.0
+"""CPU seconds of the network after which no further scene is timed."""
+
+Filter = Literal["fast", "high"]
+"""Filter of the denoiser."""
+
+Level = tuple[int, Filter]
+"""Samples per pixel, and the filter."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +44,7 @@ class TracerTimes:
 
     samples: int
     """Number of samples per pixel."""
-    denoiser: str
+    denoiser: Filter
     """Name of the denoiser's filter."""
     first_s: float
     """CPU seconds of the first view of a scene."""
@@ -53,17 +70,96 @@ class SameTimeResult:
     """Reason why nothing is traced; empty otherwise."""
 
 
-class TracedBeside(Protocol):
-    """Source of traced pictures of stored scenes for an evaluation."""
+def spread_views(most_views: int, num_scenes: int) -> tuple[int, int]:
+    """Return which views the path tracer is judged on: one scene in so many, its first so many."""
+    return max(1, -(-num_scenes // max(most_views, 1))), max(1, most_views // max(num_scenes, 1))
 
-    def judged(self, sample: Sample, view: int) -> NDArray | None:
-        """Return linear radiance [R, R, 3], or None for a view that is not scored."""
 
-    def shown(self, sample: Sample, view: int) -> NDArray | None:
-        """Return linear radiance [R, R, 3] of any view, or None if it cannot be traced."""
+def spread_text(every: int, first: int, num_views: int) -> str:
+    """Return `spread_views` as text, of scenes with up to `num_views` views."""
+    views = f"the first {first} views" if first > 1 else "the first view"
+    if num_views <= first:
+        views = "all views"
+    return f"{views} of {'each scene' if every == 1 else f'one scene in {every}'}"
 
-    def close(self) -> None:
-        """Release all resources; a later picture allocates them again."""
+
+def time_both(
+    network: Renderer,
+    previews: Mapping[Level, Renderer],
+    samples: Sequence[Sample],
+    *,
+    missing: str = "",
+    note: str = "",
+) -> SameTimeResult:
+    """Time both on some scenes, and choose the samples that fit.
+
+    The network is timed first, then the path tracer, then the network once more.
+
+    Args:
+        network: the network on one thread of the processor.
+        previews: path tracers on one thread by level, from the least to the best; empty to trace
+            nothing.
+        samples: scenes, at least one.
+        missing: reason why there are no previews.
+        note: remark about the machine's path tracer.
+
+    Raises:
+        TrilightError: the network cannot render such pictures.
+    """
+    timed: list[Sample] = []
+    ours: list[Price] = []
+    began = time.process_time()
+    for sample in samples:
+        if not timed or time.process_time() - began < TIMED_S:
+            timed.append(sample)
+            ours.append(time_scene(network, sample.scene, sample.key).price)
+    theirs: Mapping[Level, Price] = {}
+    try:
+        theirs = _preview_prices(previews, timed, median_price(ours).further_s)
+        if previews and not theirs:
+            missing = "the scenes that were timed cannot be traced"
+    except TrilightError as error:
+        missing = str(error).rstrip(".")
+    ours += [time_scene(network, sample.scene, sample.key).price for sample in timed]
+    middle = median_price(ours)
+    preview = None
+    if theirs:
+        fitting = [level for level in theirs if theirs[level].further_s <= middle.further_s]
+        samples_a_pixel, denoiser = level = [next(iter(theirs)), *fitting][-1]
+        preview = TracerTimes(
+            samples=samples_a_pixel,
+            denoiser=denoiser,
+            note=note,
+            **dataclasses.asdict(theirs[level]),
+        )
+    return SameTimeResult(
+        network_first_s=middle.first_s,
+        network_further_s=middle.further_s,
+        scenes=len(timed),
+        preview=preview,
+        missing=missing,
+    )
+
+
+def _preview_prices(
+    previews: Mapping[Level, Renderer], samples: Sequence[Sample], most_s: float
+) -> Mapping[Level, Price]:
+    """Return median prices over the scenes that can be traced; empty if none can.
+
+    The first samples whose fast filter takes more than `most_s` CPU seconds are the last ones.
+    """
+    prices: dict[Level, Price] = {}
+    for level, preview in previews.items():
+        measured = []
+        for sample in samples:
+            with contextlib.suppress(Unrenderable):
+                measured.append(time_scene(preview, sample.scene, sample.key).price)
+        if not measured:
+            break
+        prices[level] = median_price(measured)
+        if level[1] == "fast" and prices[level].further_s > most_s:
+            break
+    return prices
 
 
 def same_time(views: Sequence[JudgedView], times: SameTimeResult, which: str) -> dict[str, Any]:
@@ -103,6 +199,8 @@ def sentences(figures: Mapping[str, Any]) -> list[str]:
         ]
     preview = figures["preview"]
     lead = figures["lead_db"]
+    interval = interval_text(lead["low"], lead["high"])
+    interval = f"{interval}, 95 % by scene" if interval else "no interval, of one scene"
     longer = preview["further_s"] > figures["network_further_s"]
     lines = [
         network_sentence,
@@ -113,14 +211,8 @@ def sentences(figures: Mapping[str, Any]) -> list[str]:
         f"Over {figures['views']} views ({figures['which']}) the network has "
         f"{figures['network']['psnr_log_db']['median']:.2f} dB and the path tracer "
         f"{figures['tracer']['psnr_log_db']['median']:.2f} dB, medians of psnr_log_db; view by "
-        f"view the network less the path tracer is {lead['mean']:+.2f} dB ({_interval(lead)}), "
+        f"view the network less the path tracer is {lead['mean']:+.2f} dB ({interval}), "
         f"and the network is better in {figures['share_better']:.0%}.",
         "The targets went through the same denoiser, which favours the path tracer a little.",
     ]
     return [*lines, *([f"{preview['note']}."] if preview["note"] else [])]
-
-
-def _interval(lead: Mapping[str, float | None]) -> str:
-    if lead["low"] is None:
-        return "no interval, of one scene"
-    return f"{lead['low']:+.2f} to {lead['high']:+.2f}, 95 % by scene"

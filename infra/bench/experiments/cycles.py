@@ -16,7 +16,7 @@ from infra.bench.workloads.mapped_scenes import SKIES, mapped_scene
 from infra.bench.workloads.named_scenes import given_scenes
 from infra.bench.workloads.shots import shots
 from infra.bench_options import BenchOptions
-from infra.rendering.raw_references import RawReference, first_camera, raw_reference, true_error_db
+from infra.render.raw_references import RawReference, first_camera, raw_reference, true_error_db
 from pipeline.exchange.usd.write import write_usd
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.results import RenderedView
@@ -68,14 +68,14 @@ def _measure(
         camera = first_camera(scene, RESOLUTION)
         ours = context.child.call(raw_reference, scene, camera, OUR_SHARE * spp)
         settings = adaptive(USUAL_FLOOR_DB, RESOLUTION, spp)
-        shot = context.child.call(shots, scene, {"stated": settings})["stated"]
+        view = context.child.call(shots, scene, {"stated": settings})["stated"]
         theirs = _cycles_samples(scene, spp, context.folder(), is_plain=point.name == PLAIN)
         yield (
             point.name,
             {
                 "core_s": theirs.core_s,
                 **agreement_figures(ours, theirs),
-                **_stated_figures(shot.view, ours, theirs),
+                **_stated_figures(view, ours, theirs),
             },
         )
 

@@ -26,7 +26,7 @@ from infra.bench.workloads.named_scenes import given_scenes, sampled_trials
 from infra.bench.workloads.plain_mitsuba import PlainPicture, render_levels
 from infra.bench.workloads.shots import SEED, shots
 from infra.bench_options import BenchOptions
-from infra.rendering.raw_references import RawReference, first_camera, true_error_db
+from infra.render.raw_references import RawReference, first_camera, true_error_db
 from pipeline.builds.training import pretrain_256
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.settings import USUAL_FLOOR_DB, RenderSettings
@@ -104,12 +104,12 @@ def _measure(
         point.name: each for point, each in zip(plain, errors, strict=True)
     }
     steps = [(each["spp"], each["core_s"], each["db"]) for each in errors]
-    for name, shot in taken.items():
-        judged = figures(shot.view, shrunk(full_reference, ours[name].resolution))
-        costs_and_errors = {"core_s": shot.core_s, "db": judged["log_true_db"], **judged}
+    for name, view in taken.items():
+        judged = figures(view, shrunk(full_reference, ours[name].resolution))
+        costs_and_errors = {"core_s": view.core_s, "db": judged["log_true_db"], **judged}
         if ours[name].resolution == scale.resolution:
             core_s, is_reached = cost_at_error(steps, costs_and_errors["db"])
-            costs_and_errors |= {"times": core_s / shot.core_s, "bound": float(not is_reached)}
+            costs_and_errors |= {"times": core_s / view.core_s, "bound": float(not is_reached)}
         by_point[name] = costs_and_errors
     return [(point.name, by_point[point.name]) for point in points]
 

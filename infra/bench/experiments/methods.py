@@ -1,7 +1,6 @@
 """Experiment `methods`: cost against true error, from pure networks to the path tracer."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 
 import numpy as np
 
@@ -9,33 +8,33 @@ from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
 from infra.bench.workloads.cached_references import kept_reference
 from infra.bench_options import BenchOptions
-from infra.rendering.held_out_scenes import TRIANGLES, held_out_build, held_out_scene
-from infra.rendering.methods import (
+from infra.render.held_out_scenes import TRIANGLES, held_out_build, held_out_scene
+from infra.render.methods import (
     BUILTIN_NETWORKS,
     DIRECT_LIGHT,
     SAMPLES,
     TRACED_LIGHT,
-    Method,
-    direct_light_method,
+    compared_renderers,
     kind_of,
     network_labels,
-    network_method,
     network_name,
-    sampled_method,
     samples_name,
-    traced_network,
-    warm_up_denoiser,
 )
-from infra.rendering.raw_references import RawReference, first_camera, true_error_db
-from infra.timed_views import TimedViews, timed_views
+from infra.render.path_tracer import RenderChild
+from infra.render.raw_references import RawReference, first_camera, true_error_db
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK
 from pipeline.renders.noise_floor import clamped_radiance
+from pipeline.renders.variant import choose_variant
 from storage.conventions import log10_radiance
 from storage.raycast.first_hits import first_hits
 from storage.records.scene import Scene
+from storage.renderer import Renderer
 
 WIDTHS = (64, 256)
+
+ROUNDS = 3
+"""Measured rounds after the one that warms up; their median counts."""
 
 
 def row_name(px: int, name: str) -> str:
@@ -65,69 +64,48 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
 def _measure(
     context: BenchContext, points: Sequence[Point], trial: str
 ) -> Iterator[tuple[str, Figures]]:
-    methods, child = context.get_or_make("methods", lambda: _set_up(context))
+    renderers, child = context.get_or_make("methods", lambda: _set_up(context))
     scene = held_out_scene(child, int(trial.split()[-1]))
     for px in WIDTHS:
         camera = first_camera(scene, px)
         reference = kept_reference(child, scene, camera, 2 * context.scale.max_spp)
-        for name, method in methods[px].items():
-            figures = judged_figures(timed_method(method, scene), scene, reference)
-            yield row_name(px, name), figures
-        for level, picture in zip(SAMPLES, child.call(timed_samples, scene, px), strict=True):
-            yield row_name(px, samples_name(level)), judged_figures(picture, scene, reference)
+        for renderer in renderers[px]:
+            figures = judged_figures(renderer, scene, reference)
+            yield row_name(px, renderer.name), figures
 
 
-def _set_up(context: BenchContext) -> tuple[Mapping[int, Mapping[str, Method]], IsolatedChild]:
-    """Return the methods of this process, and a render child for the others."""
-    import torch
-
+def _set_up(context: BenchContext) -> tuple[Mapping[int, Sequence[Renderer]], IsolatedChild]:
+    """Return the renderers at each width, and a child that composes scenes and references."""
     from model.neural_renderer import NeuralRenderer
 
-    torch.set_num_threads(1)  # core-seconds of waiting threads are not the network's
     paths = context.options.checkpoint
     paths_by_label = dict(zip(network_labels(paths), paths, strict=True))
-    renderers = {}
+    networks = {}
     for label, path in (
         dict(zip(BUILTIN_NETWORKS, BUILTIN_NETWORKS, strict=True)) | paths_by_label
     ).items():
-        renderer = NeuralRenderer.load(path, device="cpu")
-        renderers[network_name(label)] = renderer
-        context.note(f"{network_name(label)} is {renderer.digest[:8]}")
+        network = NeuralRenderer.load(path, device="cpu")
+        networks[network_name(label)] = network
+        context.note(f"{network_name(label)} is {network.digest[:8]}")
     context.note(f"differences are to {network_name(network_labels(paths)[0])}")
-    renderers[TRACED_LIGHT] = traced_network()
-    methods = {
-        px: {
-            **{name: network_method(renderer, px) for name, renderer in renderers.items()},
-            DIRECT_LIGHT: direct_light_method(px),
-        }
-        for px in WIDTHS
-    }
-    return methods, context.render_child(held_out_build(), BENCHMARK, threads=1)
+    child = context.until_closed(RenderChild(choose_variant(), threads=1))
+    renderers = {px: compared_renderers(px, networks, child) for px in WIDTHS}
+    return renderers, context.render_child(held_out_build(), BENCHMARK, threads=1)
 
 
-def timed_method(method: Method, scene: Scene) -> TimedViews:
-    """Return the first view of a scene with its times."""
-    camera = scene.c2w[0], float(scene.fov_deg[0])
-    return timed_views(lambda: partial(method(scene), *camera))
-
-
-def timed_samples(scene: Scene, px: int) -> list[TimedViews]:
-    """Return the first view by each level of SAMPLES; runs in a render child."""
-    warm_up_denoiser(px)
-    return [timed_method(sampled_method(px, *level), scene) for level in SAMPLES]
-
-
-def judged_figures(picture: TimedViews, scene: Scene, reference: RawReference) -> Figures:
+def judged_figures(renderer: Renderer, scene: Scene, reference: RawReference) -> Figures:
     """Return the figures of a picture; its decibels exclude the noise of the reference."""
     from train.evaluation.metrics import picture_scores
+    from train.evaluation.timing import time_scene
 
+    picture = time_scene(renderer, scene, "scene", ROUNDS)
     radiance_rgb = picture.radiance_rgb
     hits = first_hits(scene, resolution=len(radiance_rgb)).met
     everywhere = np.ones_like(hits)
     mean = 0.5 * (reference.a_rgb + reference.b_rgb)
     return {
-        "core_s": picture.first_s,
-        "view_s": picture.further_s,
+        "core_s": picture.price.first_s,
+        "view_s": picture.price.further_s,
         "db": true_error_db(radiance_rgb, reference, log10_radiance, everywhere)[0],
         "object_db": true_error_db(radiance_rgb, reference, log10_radiance, hits)[0],
         "linear_db": true_error_db(radiance_rgb, reference, clamped_radiance, everywhere)[0],

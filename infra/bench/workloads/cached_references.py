@@ -7,9 +7,9 @@ not depend on whether its reference was cached.
 import numpy as np
 from safetensors.numpy import load, save
 
-from infra.rendering.raw_references import RawReference, raw_reference
+from infra.render.raw_references import RawReference, raw_reference
 from pipeline.isolation import IsolatedChild
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.digests import canonical_json, sha256_hex
@@ -17,7 +17,9 @@ from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
 
 
-def kept_reference(child: IsolatedChild, scene: Scene, camera: Camera, spp: int) -> RawReference:
+def kept_reference(
+    child: IsolatedChild, scene: Scene, camera: PixelCamera, spp: int
+) -> RawReference:
     """Return two halves of raw samples of a view, from the cache or rendered by a child.
 
     Args:

@@ -1,9 +1,9 @@
-"""Stated errors of pictures, compared with true errors to raw references (infra.rendering)."""
+"""Stated errors of pictures, compared with true errors to raw references (infra.render)."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.rendering.raw_references import LEAST_ERROR, RawReference, true_error_db
+from infra.render.raw_references import LEAST_ERROR, RawReference, true_error_db
 from pipeline.renders.noise_floor import Curve, clamped_radiance, secant_slope
 from pipeline.renders.results import RenderedView
 from storage.conventions import log10_radiance

@@ -1,6 +1,6 @@
 """Fixed scenes with textures and skies for the comparison with another renderer."""
 
-from infra.rendering.held_out_scenes import first_composed
+from infra.render.held_out_scenes import first_composed
 from pipeline.builds.training import textured_256
 from pipeline.isolation import IsolatedChild
 from scene_templates.settings import SceneSettings

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
-from infra.rendering.held_out_scenes import first_composed
+from infra.render.held_out_scenes import first_composed
 from pipeline.assets.settings import AssetSettings
 from pipeline.builds.training import smoke
 from pipeline.exchange.gltf.read import SUFFIXES as GLTF_SUFFIXES

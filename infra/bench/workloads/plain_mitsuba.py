@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.rendering.methods import warm_up_denoiser
-from infra.rendering.raw_references import first_camera
-from pipeline.renders.camera import Camera
+from infra.render.methods import warm_up_denoiser
+from infra.render.raw_references import first_camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.settings import RenderSettings
@@ -80,7 +80,7 @@ def render_levels(
     return levels
 
 
-def _features(scene: Scene, camera: Camera) -> tuple[Features, float]:
+def _features(scene: Scene, camera: PixelCamera) -> tuple[Features, float]:
     tracer = load_tracer(scene, max_depth=RenderSettings.max_depth, rr_depth=_RR_DEPTH)
     aux_spp = RenderSettings.aux_spp
     tracer.features(camera, spp=aux_spp)  # compiles
@@ -121,7 +121,7 @@ class _Plain:
             }
         )
 
-    def radiance(self, camera: Camera, seed: int, spp: int) -> NDArray[np.float64]:
+    def radiance(self, camera: PixelCamera, seed: int, spp: int) -> NDArray[np.float64]:
         """Return the mean of `spp` samples, [R, R, 3]."""
         picture = self._mi.render(
             self._scene,

@@ -5,11 +5,9 @@ denoise. Loading the scene is not counted; kernels are warm.
 """
 
 import dataclasses
-import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 
-from infra.rendering.methods import warm_up_denoiser
+from infra.render.methods import warm_up_denoiser
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
@@ -21,16 +19,6 @@ SEED = 20_261_122
 
 _SMALL = 32
 """Width in pixels of the picture that compiles the kernels."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Shot:
-    """View under one setting."""
-
-    view: RenderedView
-    """Picture with its stated errors and its samples."""
-    core_s: float
-    """CPU seconds without loading the scene."""
 
 
 def fixed_samples(resolution: int, spp: int) -> RenderSettings:
@@ -49,19 +37,16 @@ def fixed_samples(resolution: int, spp: int) -> RenderSettings:
     )
 
 
-def shots(scene: Scene, variants: Mapping[str, RenderSettings]) -> dict[str, Shot]:
+def shots(scene: Scene, variants: Mapping[str, RenderSettings]) -> dict[str, RenderedView]:
     """Return a scene's first view under each setting, with equal seeds; runs in a render child."""
     return {name: _shot(scene, settings) for name, settings in variants.items()}
 
 
-def _shot(scene: Scene, settings: RenderSettings) -> Shot:
+def _shot(scene: Scene, settings: RenderSettings) -> RenderedView:
     small = dataclasses.replace(settings, resolution=_SMALL, max_spp=settings.min_spp)
     pose = scene.c2w[0]
     fov_deg = float(scene.fov_deg[0])
     SceneRenderer(scene, small).render_view(pose, fov_deg, seed=0)  # compiles
     if settings.denoiser != "off":
         warm_up_denoiser(settings.resolution, settings.denoiser)
-    renderer = SceneRenderer(scene, settings)
-    began = time.process_time()
-    view = renderer.render_view(pose, fov_deg, SEED)
-    return Shot(view=view, core_s=time.process_time() - began)
+    return SceneRenderer(scene, settings).render_view(pose, fov_deg, SEED)

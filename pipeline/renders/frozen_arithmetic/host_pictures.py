@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoise_corrections import LEAST_PASSES
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.frozen_arithmetic.denoise_corrections import (
@@ -34,7 +34,7 @@ class HostPictures:
     """See `ViewPictures` for the meaning of its methods."""
 
     def __init__(
-        self, samples: DualBuffer, tracer: Tracer, camera: Camera, settings: RenderSettings
+        self, samples: DualBuffer, tracer: Tracer, camera: PixelCamera, settings: RenderSettings
     ) -> None:
         self._samples = samples
         self._settings = settings

@@ -31,7 +31,7 @@ from infra.bench.workloads.manifests import write_copies
 from infra.bench.workloads.packed_samples import LAYOUTS, unpacking_figures
 from infra.bench.workloads.sized_work import WORK, measure_work, session_bytes, sizes_of
 from infra.bench_options import BenchOptions
-from infra.rendering.raw_references import RawReference, first_camera
+from infra.render.raw_references import RawReference, first_camera
 from pipeline.isolation import IsolatedChild
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError

@@ -23,11 +23,11 @@ from infra.bench.rows import Row, rows_of, table_of
 from infra.bench.run import run
 from infra.bench.store import Run, Store
 from infra.bench_options import BenchOptions
-from infra.cost_tables import COST_NOISE, on_front
 from storage.errors import Rejected, TrilightError
 from storage.intervals import mean_interval
 from tests.command_line import trilight
 from tests.for_each import case
+from train.evaluation.cost_tables import COST_NOISE, on_front
 
 TINY = dataclasses.replace(
     QUICK, scenes=1, resolution=32, max_spp=128, reference_spp=128, picture_px=64, objects=1,

@@ -13,9 +13,9 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from infra.rendering.options import RenderOptions
+from infra.render import path_tracer
+from infra.render.options import RenderOptions
 from pipeline.exchange.open_scene import load_source, scene_source
-from pipeline.generation import path_tracer
 from storage.conventions import preview_srgb8
 from storage.dataset.shard import write_shard
 from storage.errors import TrilightError
@@ -30,7 +30,7 @@ from tests.command_line import trilight
 from tests.crash import CrashingRenderer
 from tests.for_each import case
 from tests.infra.child_here import use_processes
-from tests.infra.rendering.render_kit import SMALL, mistake, render
+from tests.infra.render.render_kit import SMALL, mistake, render
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 pytestmark = pytest.mark.usefixtures("children_here")
@@ -312,6 +312,6 @@ def test_a_crash_in_native_code_is_one_line(
 ) -> None:
     """In a real child, which loads no renderer to be quick."""
     use_processes(monkeypatch)
-    monkeypatch.setattr(path_tracer, "_ChildRenderer", CrashingRenderer)
+    monkeypatch.setattr(path_tracer, "RenderWorker", CrashingRenderer)
     told = mistake(source, "--out", tmp_path / "x.exr", *SMALL)
     assert told.startswith("tiny.safetensors: rendering failed (crashed_signal_11")

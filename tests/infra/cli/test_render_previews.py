@@ -8,7 +8,7 @@ from typing import Any
 import OpenEXR
 import pytest
 
-from infra.rendering.way_table import (
+from infra.render.preview_table import (
     PartCost,
     PictureCosts,
     keep_machine_costs,
@@ -77,7 +77,7 @@ def test_the_costs_of_this_machine_choose(
     """A machine on which everything takes next to nothing is given the best of all ways."""
     variant = choose_variant()  # remembered where the cache was before
     monkeypatch.setattr(
-        "infra.rendering.way_table.cache_folder", lambda name: Path(words[3]).parent
+        "infra.render.preview_table.cache_folder", lambda name: Path(words[3]).parent
     )
     rows = tuple(
         PartCost(part=row.part, width=row.width, serial_s=1e-7, parallel_s=0)

@@ -5,31 +5,30 @@ import io
 import json
 import struct
 import threading
-from typing import Any, cast
+from collections.abc import Mapping
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image as Picture
 
 from infra.viewer import scene_bytes as module
 from infra.viewer.edits import apply_edits
-from infra.viewer.painters import (
-    NetworkPainter,
-    Painter,
-    RenderedImage,
-    SamplesPainter,
-    Show,
-    TargetPainter,
+from infra.viewer.page_renderers import (
+    PageRenderer,
+    StoredPictures,
+    network_on_page,
+    samples_on_page,
 )
 from infra.viewer.picture_options import PictureOptions, parse_picture_options
 from infra.viewer.render_queue import RenderJob, RenderQueue, agreement_db
 from infra.viewer.scene_bytes import scene_bytes, sky_bytes, texture_png
 from infra.viewer.scene_handlers import SceneHandlers
-from pipeline.renders.results import Sampling
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
 from storage.records.scene import Scene
+from storage.renderer import Camera, Image, OnProgress, Renderer, Sampling, ignore_progress
 from tests.for_each import case
 from tests.infra.viewer.served_kit import served
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
@@ -38,25 +37,46 @@ from tests.textured_by_hand import colour_texture, number_texture, textured_scen
 TARGETS = np.full((2, 16, 16, 3), 0.5, np.float32)
 
 
-class GreyPainter:
-    """Paints grey at once, or step by step until it is told to end."""
+class GreyRenderer:
+    """Renders grey at once, or step by step until it is told to end."""
 
-    title, means = "Grey", "All is grey."
+    name, resolution, notes = "grey", 16, ()
+    identity: ClassVar[dict[str, str]] = {}
+    seconds, cpu_seconds = 0.0, 0.5
 
     def __init__(self, grey: float, *, floor_db: float | None = None, waits: bool = False) -> None:
         self.grey, self.floor_db = grey, floor_db
-        self.painted, self.ended = 0, threading.Event()
+        self.rendered, self.ended = 0, threading.Event()
         if not waits:
             self.ended.set()
 
-    def paint(self, scene: Scene, wanted: PictureOptions, show: Show) -> None:
-        self.painted += 1
+    def load(self, scene: Scene, name: str) -> "GreyRenderer":
+        return self
+
+    def close(self) -> None:
+        pass
+
+    def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Image:
+        self.rendered += 1
         if self.grey < 0:
             raise ZeroDivisionError("of a library")
-        picture = np.full((wanted.resolution, wanted.resolution, 3), self.grey, np.float32)
         while not self.ended.wait(0.01):
-            show(Sampling(spp=1, expected_spp=9, missing_db=None))
-        show(RenderedImage(radiance_rgb=picture, core_s=0.25, floor_db=self.floor_db, spp=64))
+            on_progress(Sampling(spp=1, expected_spp=9, missing_db=None))
+        picture = np.full((16, 16, 3), self.grey, np.float32)
+        return Image(
+            radiance_rgb=picture, cpu_seconds=0.25, stated_error_db=self.floor_db, samples=64
+        )
+
+
+def offered(renderers: Mapping[str, Renderer]) -> dict[str, PageRenderer]:
+    def offer(renderer: Renderer) -> PageRenderer:
+        return PageRenderer(title="Grey", means="All is grey.", make=lambda options: renderer)
+
+    return {name: offer(renderer) for name, renderer in renderers.items()}
+
+
+def queue_of(renderers: Mapping[str, Renderer], scene: Scene | None = None) -> RenderQueue:
+    return RenderQueue(scene or tiny_scene(), offered(renderers))
 
 
 def request(engine: str = "traced", **changes: Any) -> dict[str, Any]:
@@ -68,11 +88,12 @@ def wanted(engine: str = "traced", **changes: Any) -> PictureOptions:
     return parse_picture_options(request(engine, **changes), {engine: None}, 2)
 
 
-def room_of(painters: dict[str, Painter], target_px: int | None = None) -> SceneHandlers:
-    scene, notes = tiny_scene(), ("a note",)
+def room_of(renderers: Mapping[str, Renderer], target_px: int | None = None) -> SceneHandlers:
+    notes = ("a note",)
     return SceneHandlers(
-        name="tiny", scene=scene, notes=notes, painters=painters, target_px=target_px
-    )
+        name="tiny", scene=tiny_scene(), notes=notes, renderers=offered(renderers),
+        target_px=target_px,
+    )  # fmt: skip
 
 
 def until_begun(easel: RenderQueue, job: RenderJob) -> RenderJob:
@@ -88,24 +109,24 @@ def over(easel: RenderQueue, job: RenderJob) -> RenderJob:
 
 
 def test_a_finished_picture_is_kept_and_an_equal_question_costs_nothing() -> None:
-    painter = GreyPainter(0.5)
-    easel = RenderQueue(tiny_scene(), {"traced": painter})
+    renderer = GreyRenderer(0.5)
+    easel = queue_of({"traced": renderer})
     first = over(easel, easel.submit(wanted()))
     assert first.state == "done" and first.image is not None
     assert easel.submit(wanted()) is first
     assert over(easel, easel.submit(wanted(fov=50.0))) is not first
-    assert painter.painted == 2
+    assert renderer.rendered == 2
     easel.close()
 
 
 def test_who_asks_for_another_gives_up_the_one_at_hand() -> None:
-    slow, quick = GreyPainter(0.1, waits=True), GreyPainter(0.5)
-    easel = RenderQueue(tiny_scene(), {"traced": slow, "hits": quick})
+    slow, quick = GreyRenderer(0.1, waits=True), GreyRenderer(0.5)
+    easel = queue_of({"traced": slow, "hits": quick})
     given_up = until_begun(easel, easel.submit(wanted()))
     never_begun = easel.submit(wanted(fov=50.0))
     last = over(easel, easel.submit(wanted("hits")))
     assert (given_up.state, never_begun.state, last.state) == ("cancelled", "cancelled", "done")
-    assert slow.painted == 1
+    assert slow.rendered == 1
     again = easel.submit(wanted())
     assert again is not given_up
     easel.cancel_all()
@@ -114,7 +135,7 @@ def test_who_asks_for_another_gives_up_the_one_at_hand() -> None:
 
 
 def test_a_failure_is_a_sentence_and_the_next_picture_comes() -> None:
-    easel = RenderQueue(tiny_scene(), {"bad": GreyPainter(-1), "good": GreyPainter(0.5)})
+    easel = queue_of({"bad": GreyRenderer(-1), "good": GreyRenderer(0.5)})
     assert over(easel, easel.submit(wanted("bad"))).error == "ZeroDivisionError: of a library"
     broken = {"materials": {"0": {"diffuse": [0.9, 0.9, 0.9]}}}
     failed = over(easel, easel.submit(wanted("good", edits=broken)))
@@ -126,19 +147,20 @@ def test_a_failure_is_a_sentence_and_the_next_picture_comes() -> None:
 
 
 def test_the_end_waits_for_the_picture_at_hand() -> None:
-    room = room_of({"traced": GreyPainter(0.1, waits=True)})
+    room = room_of({"traced": GreyRenderer(0.1, waits=True)})
     until_begun(room.queue, room.queue.submit(wanted()))
     room.close()
     assert room.queue._thread is not None and not room.queue._thread.is_alive()
 
 
 def test_pictures_of_one_place_are_judged_by_the_target_and_else_by_the_traced_one() -> None:
-    painters: dict[str, Painter] = {
-        "traced": GreyPainter(0.4, floor_db=40.0),
-        "hits": GreyPainter(0.3),
-        "target": TargetPainter(TARGETS, [33.0, 34.0]),
+    scene = tiny_scene()
+    renderers: dict[str, Renderer] = {
+        "traced": GreyRenderer(0.4, floor_db=40.0),
+        "hits": GreyRenderer(0.3),
+        "target": StoredPictures(scene=scene, radiance_rgb=TARGETS, errors_db=[33.0, 34.0]),
     }
-    easel = RenderQueue(tiny_scene(), painters)
+    easel = queue_of(renderers, scene)
     hits = over(easel, easel.submit(wanted("hits")))
     assert easel.reference(hits) is None and agreement_db(hits, None) is None
     traced = over(easel, easel.submit(wanted("traced")))
@@ -147,7 +169,7 @@ def test_pictures_of_one_place_are_judged_by_the_target_and_else_by_the_traced_o
     assert agreement_db(hits, traced) == pytest.approx(expected, abs=1e-3)
     target = over(easel, easel.submit(wanted("target")))
     assert easel.reference(hits) is target and easel.reference(traced) is target
-    assert target.image is not None and target.image.floor_db == 33.0
+    assert target.image is not None and target.image.stated_error_db == 33.0
     elsewhere = over(easel, easel.submit(wanted("hits", fov=50.0)))
     assert easel.reference(elsewhere) is None
     free = over(easel, easel.submit(wanted("target", view=None, fov=50.0)))
@@ -173,11 +195,10 @@ def test_a_wish_that_means_nothing_is_refused() -> None:
 
 
 def test_the_page_of_a_scene_is_told_all_of_it() -> None:
-    painters: dict[str, Painter] = {
-        "traced": GreyPainter(0.4, floor_db=40.0),
-        "target": TargetPainter(TARGETS, ()),
-    }
-    with served(room_of(painters, 16)) as asker:
+    room = room_of({"traced": GreyRenderer(0.4, floor_db=40.0)}, 16)
+    target = StoredPictures(scene=room.scene, radiance_rgb=TARGETS)
+    room.queue._renderers = room.renderers = {**room.renderers, **offered({"target": target})}
+    with served(room) as asker:
         facts = asker.ask("api/scene")[1]
         assert (facts["triangles"], facts["lights"], facts["views"]) == (3, 1, 2)
         for engine in ("target", "traced"):
@@ -197,7 +218,7 @@ def test_the_page_of_a_scene_is_told_all_of_it() -> None:
 def test_a_scene_is_saved_with_its_changes_and_nothing_is_written_here() -> None:
     for form in [".glb", ".usda", ".safetensors", ".h5"]:
         with case(form):
-            with served(room_of({"traced": GreyPainter(0.4)})) as asker:
+            with served(room_of({"traced": GreyRenderer(0.4)})) as asker:
                 edits = {"lamps": {"1": {"gain": 2}}}
                 plain = asker.ask("api/export", {"form": form})
                 changed = asker.ask("api/export", {"form": form, "edits": edits})
@@ -292,7 +313,7 @@ def test_every_triangle_stands_in_the_group_of_its_object_and_material() -> None
 
 def test_textures_come_with_their_bottom_row_last() -> None:
     for texture in (colour_texture(3), number_texture()):
-        pixels = np.asarray(Image.open(io.BytesIO(texture_png(texture))))
+        pixels = np.asarray(Picture.open(io.BytesIO(texture_png(texture))))
         assert pixels.shape == (*texture.texels.shape[:2], 3)
         if texture.is_srgb:
             np.testing.assert_array_equal(pixels[::-1], texture.texels)
@@ -331,12 +352,12 @@ def test_what_a_browser_cannot_draw_is_said(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_the_page_shows_the_command_of_each_way() -> None:
     """Of changes, that of the scene which is saved; of a free camera, that of the saved one."""
-    ways: dict[str, Painter] = {
-        "traced": GreyPainter(0.5),
-        "hits": NetworkPainter("a b.safetensors", "", ""),
-        "samples-4": SamplesPainter(cast(Any, None), 0, 4),
+    ways = {
+        **offered({"traced": GreyRenderer(0.5)}),
+        "hits": network_on_page("a b.safetensors", "", ""),
+        "samples-4": samples_on_page(cast(Any, None), 4),
     }
-    room = dataclasses.replace(room_of(ways), source="a set/x.tar::000000001")
+    room = dataclasses.replace(room_of({}), renderers=ways, source="a set/x.tar::000000001")
 
     def command(engine: str, **changes: Any) -> str:
         job = RenderJob(id="1", options=wanted(engine, **changes))

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from infra.render.path_tracer import RenderChild
 from infra.viewer import scene_list as list_module
 from infra.viewer.dataset_filter import filter_of
 from infra.viewer.dataset_handlers import DatasetHandlers
 from infra.viewer.folder_handlers import THUMBNAIL_PX, FolderHandlers
 from infra.viewer.scene_list import scene_list
 from pipeline.exchange.convert import write_scene
-from pipeline.generation.progressive_tracer import ProgressiveTracer
 from pipeline.renders.variant import Variant, choose_variant
 from pipeline.shards.finished_dataset import FinishedDataset
 from pipeline.shards.listing import list_scenes
@@ -51,10 +51,10 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 @pytest.fixture(scope="module")
 def asker(dataset: Dataset) -> Iterator[Asker]:
-    tracer = ProgressiveTracer(
-        variant=Variant(name="llvm_ad_rgb", libllvm="", note=""), threads=1
+    child = RenderChild(
+        Variant(name="llvm_ad_rgb", libllvm="", note=""), threads=1
     )  # nothing is traced here
-    room = DatasetHandlers(dataset, str(dataset.folder.root), tracer, None)
+    room = DatasetHandlers(dataset, str(dataset.folder.root), child, None)
     room.index.wait()
     with served(room, "dataset.html") as found:
         yield found
@@ -132,14 +132,14 @@ def test_a_damaged_shard_costs_itself_alone(tmp_path: Path) -> None:
     broken = write_dataset(tmp_path / "broken", samples(), objects=[CUBE, BALL])
     shard = broken.folder.root / "train-000000.tar"
     shard.write_bytes(shard.read_bytes()[:5000])
-    room = DatasetHandlers(broken, "broken", cast(Any, ClosedTracer()), None)
+    room = DatasetHandlers(broken, "broken", cast(Any, ClosedChild()), None)
     room.index.wait()
     assert {row.split for row in room.index.rows} >= {"validation"}
     assert len(room.index.problems) == 1 and "train-000000.tar" in room.index.problems[0]
     room.close()
 
 
-class ClosedTracer:
+class ClosedChild:
     """Traces nothing."""
 
     def close(self) -> None:
@@ -173,8 +173,8 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def folder_asker(root: Path) -> Iterator[Asker]:
-    tracer = ProgressiveTracer(variant=choose_variant(), threads=1)
-    with served(FolderHandlers(scene_list(root), tracer, None), "folder.html") as found:
+    child = RenderChild(choose_variant(), threads=1)
+    with served(FolderHandlers(scene_list(root), child, None), "folder.html") as found:
         yield found
 
 

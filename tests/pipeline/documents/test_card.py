@@ -17,10 +17,10 @@ import yaml
 from pipeline.documents.card import _size_category, encode_card
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.distributions import Distributions, dataset_distributions
-from pipeline.documents.markdown import code, front_matter, plain, text
 from pipeline.documents.rights import encode_licences, rights_of
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
+from storage.markdown import code, front_matter, plain, text
 from storage.records.objects import read_objects_lock, write_objects_lock
 from storage.records.profiles import Profile
 from storage.records.quantities import QUANTITIES, STATISTICS, summary

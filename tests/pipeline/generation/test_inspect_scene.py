@@ -11,14 +11,15 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from infra.render.path_tracer import PathTracer, RenderChild
+from infra.render.quality import ToStatedError
 from pipeline.exchange.convert import convert_scene
 from pipeline.exchange.open_scene import SceneSource
 from pipeline.exchange.reader import SceneReader
 from pipeline.exchange.usd.write import write_usd
 from pipeline.generation import inspect_scene as inspecting
 from pipeline.generation.inspect_scene import ROWS, VIEWS, inspect_scene, seen_into, turntable_poses
-from pipeline.generation.path_tracer import PathTracer
-from pipeline.renders.settings import RenderSettings
+from pipeline.renders.settings import NoiseTargets
 from pipeline.renders.variant import Device, Variant, choose_variant
 from storage.conventions import look_at_c2w
 from storage.dataset.shard import write_shard
@@ -27,6 +28,7 @@ from storage.records.profiles import PROFILES
 from storage.records.sample import encode_sample, sample_key
 from storage.records.scene import ObjectKind, SceneObject
 from storage.records.scene_file import encode_scene
+from storage.renderer import Camera
 from tests.command_line import trilight
 from tests.infra.child_here import use_children_here
 from tests.scenes_by_hand import tiny_sample, tiny_scene
@@ -172,7 +174,8 @@ def _grey(source: SceneSource, variant: Variant) -> NDArray[np.uint8]:
 def test_rendering() -> None:
     """The child is killed between two passes of samples; the next one opens the scene again."""
     scene, kills = tiny_scene(), list[int]()
-    settings = RenderSettings(resolution=8, min_spp=16, max_spp=64, noise_floor_db=99.0)
+    quality = ToStatedError(targets=NoiseTargets(log_db=99.0), max_spp=64)
+    tracer = PathTracer(RenderChild(choose_variant(), threads=1), quality, 8)
     disturbed = False
 
     def sampled(step: object) -> None:
@@ -180,11 +183,10 @@ def test_rendering() -> None:
             kills.append(kill_children())
 
     def picture() -> NDArray[np.float32]:
-        return tracer.render(scene.c2w[0], float(scene.fov_deg[0]), "a view").radiance_rgb
+        return loaded.render(Camera.of_scene(scene, 0), sampled).radiance_rgb
 
-    tracer = PathTracer(settings, seed=0, variant=choose_variant(), threads=1, on_samples=sampled)
     try:
-        tracer.open(scene, "a scene")
+        loaded = tracer.load(scene, "a scene")
         undisturbed = picture()
         disturbed = True
         assert np.array_equal(picture(), undisturbed)

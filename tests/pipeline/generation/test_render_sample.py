@@ -17,7 +17,7 @@ from pipeline.generation.begin_dataset import begin
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.render_sample import RenderInput, render_sample
 from pipeline.generation.view_progress import ViewProgress
-from pipeline.renders.results import RenderedView, Sampling
+from pipeline.renders.results import RenderedView
 from pipeline.renders.variant import activate, choose_variant
 from pipeline.scenes.compose import compose_scene
 from pipeline.shards.pack import pack_shard
@@ -31,6 +31,7 @@ from storage.records.objects import Failure
 from storage.records.passes.stored import passes_exr
 from storage.records.sample import decode_sample, encode_sample, sample_key
 from storage.records.scene import Scene
+from storage.renderer import Sampling
 from storage.seeds import SceneKey, seed_for
 from storage.settings.changes import json_or_word
 from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _locked
@@ -71,6 +72,7 @@ class _Renderer:
             noise_floor_linear_db=20.0,
             object_noise_floor_db=20.0,
             at_cap=False,
+            core_s=0.0,
             hits=np.ones((16, 16), np.bool_),
         )
 

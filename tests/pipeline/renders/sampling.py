@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
@@ -32,8 +32,8 @@ class Estimate:
     """Degrees of freedom of the errors: one less than the passes."""
 
 
-def camera_of(scene: Scene, resolution: int, view: int = 0) -> Camera:
-    return Camera(
+def camera_of(scene: Scene, resolution: int, view: int = 0) -> PixelCamera:
+    return PixelCamera(
         c2w=scene.c2w[view].astype(np.float64),
         fov_deg=float(scene.fov_deg[view]),
         resolution=resolution,

@@ -11,7 +11,7 @@ from pipeline.builds.named import named_build
 from pipeline.generation.render_sample import RenderInput, render_sample
 from pipeline.generation.view_progress import ViewProgress
 from pipeline.renders import vector_tracer
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.vector_tracer import VectorTracer
@@ -97,7 +97,7 @@ def test_guided_passes_have_one_more_set_of_kernels_for_every_scene() -> None:
     assert _launched() <= first
 
 
-def _guided(scene: Scene, *, max_depth: int) -> tuple[VectorTracer, Camera]:
+def _guided(scene: Scene, *, max_depth: int) -> tuple[VectorTracer, PixelCamera]:
     tracer = VectorTracer(scene, max_depth=max_depth, rr_depth=2).with_guide()
     assert tracer._scene.guide is not None
     return tracer, camera_of(scene, 32)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.renders import ggx, vector_tracer
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.device_memory import read_back
 from pipeline.renders.emission_cone import EmissionCone
 from pipeline.renders.film import Film
@@ -64,7 +64,7 @@ class LightPathsOnly(VectorTracer):
         # each of so many paths counts for so much less
         self._unit = SplatUnit(splat_unit(scene) / 2.0**32)
 
-    def _num_light_paths(self, camera: Camera, spp: int) -> int:
+    def _num_light_paths(self, camera: PixelCamera, spp: int) -> int:
         return camera.resolution**2 * spp
 
 

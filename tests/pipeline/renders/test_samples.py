@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import Camera
+from infra.render.quality import ToStatedError
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.frozen_arithmetic.halves import (
     Half,
     estimate_error,
@@ -17,7 +18,7 @@ from pipeline.renders.frozen_arithmetic.halves import (
 )
 from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans
 from pipeline.renders.samples import DualBuffer
-from pipeline.renders.settings import NoiseTargets, RenderSettings, one_picture
+from pipeline.renders.settings import NoiseTargets, RenderSettings
 from pipeline.renders.stopping import Goal, expected_spp, gaps_db, next_spp, slope_db
 from pipeline.renders.tracer import Chosen
 from storage.conventions import log10_radiance
@@ -25,7 +26,7 @@ from storage.errors import TrilightError
 from storage.metrics import MAX_DB, psnr_linear_db, psnr_log_db
 from tests.oracle.plugin_tracer import HostSum
 
-CAMERA = Camera(c2w=np.eye(4), fov_deg=40.0, resolution=8)
+CAMERA = PixelCamera(c2w=np.eye(4), fov_deg=40.0, resolution=8)
 
 
 class Recorder:
@@ -34,11 +35,11 @@ class Recorder:
     def __init__(self) -> None:
         self.asked: list[tuple[int, int]] = []
 
-    def pass_sum(self, camera: Camera) -> HostSum:
+    def pass_sum(self, camera: PixelCamera) -> HostSum:
         return HostSum(self, camera)  # type: ignore[arg-type]
 
     def radiance(
-        self, camera: Camera, *, seed: int, spp: int, chosen: Chosen = None
+        self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
     ) -> NDArray[np.float32]:
         self.asked.append((spp, seed))
         picture = np.full((camera.resolution, camera.resolution, 3), spp, np.float32)
@@ -126,12 +127,13 @@ def test_one_target_is_enough_and_one_is_needed() -> None:
     }
     with pytest.raises(TrilightError, match="noise_floor_db is None; expected one of"):
         RenderSettings(**{**GOOD, "noise_floor_db": None})
-    common: dict[str, Any] = {"resolution": 64, "max_spp": 512}
-    assert one_picture(**common).targets_db == {"psnr_log_db": 40.0}
-    linear = one_picture(**common, noise_targets=NoiseTargets(linear_db=35.0))
-    assert linear.targets_db == {"psnr_linear_db": 35.0}
-    both = one_picture(**common, noise_targets=NoiseTargets(log_db=44.0, objects_db=43.0))
-    assert both.targets_db == {"psnr_log_db": 44.0, "object_psnr_log_db": 43.0}
+    for targets, expected in (
+        (NoiseTargets(), {"psnr_log_db": 40.0}),
+        (NoiseTargets(linear_db=35.0), {"psnr_linear_db": 35.0}),
+        (NoiseTargets(log_db=44.0, objects_db=43.0),
+         {"psnr_log_db": 44.0, "object_psnr_log_db": 43.0}),
+    ):  # fmt: skip
+        assert ToStatedError(targets=targets).settings(64).targets_db == expected
 
 
 def log_goal(target_db: float, step: int, max_spp: int) -> Goal:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import Camera
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.frozen_arithmetic.halves import Half
 from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans, LogChanges
 from pipeline.renders.load_tracer import load_tracer
@@ -25,7 +25,7 @@ from tests.pipeline.renders.scene_kit import sampled_like_scene
 from tests.pipeline.renders.test_renderer import digest, lit_scene
 
 PASS = 64
-CAMERA = Camera(c2w=np.eye(4), fov_deg=40.0, resolution=32)
+CAMERA = PixelCamera(c2w=np.eye(4), fov_deg=40.0, resolution=32)
 EVERYWHERE = np.ones((32, 32), bool)
 
 
@@ -38,11 +38,11 @@ class RareLight:
     def __init__(self) -> None:
         self.dim = np.repeat(np.linspace(0.1, 1, 32 // TILE_PX), TILE_PX)
 
-    def pass_sum(self, camera: Camera) -> HostSum:
+    def pass_sum(self, camera: PixelCamera) -> HostSum:
         return HostSum(self, camera)  # type: ignore[arg-type]
 
     def radiance(
-        self, camera: Camera, *, seed: int, spp: int, chosen: Chosen = None
+        self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None
     ) -> NDArray[np.float32]:
         rng, across = np.random.default_rng(seed), camera.resolution // TILE_PX
         found = rng.random((across, across)) < self.ODDS * spp / PASS
@@ -166,7 +166,7 @@ def test_the_choice_is_that_of_handing_out_passes_one_by_one(
     assert ((found == given_out) | (found == given_out + 1)).all()
 
 
-def _scene_tracer(resolution: int = 32) -> tuple[Tracer, Camera]:
+def _scene_tracer(resolution: int = 32) -> tuple[Tracer, PixelCamera]:
     scene = sampled_like_scene(np.random.default_rng(5), num_views=1)
     return load_tracer(scene, max_depth=6, rr_depth=2), camera_of(scene, resolution)
 

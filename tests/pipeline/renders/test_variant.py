@@ -13,15 +13,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from infra.render.path_tracer import RenderChild
 from pipeline.generation.environment import environment
-from pipeline.generation.path_tracer import PathTracer
-from pipeline.generation.progressive_tracer import ProgressiveTracer
 from pipeline.renders import denoiser, variant_probe, vector_tracer
 from pipeline.renders import variant as variant_module
 from pipeline.renders.facts import render_facts
 from pipeline.renders.llvm_libraries import llvm_libraries
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
-from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Device, Variant, _ProbeResult, activate, choose_variant
 from pipeline.renders.variant_probe import BLOCK, probe_scene, wrong_picture
 from storage.errors import EnvironmentFailure, TrilightError
@@ -196,14 +194,9 @@ def test_an_option_names_the_device_before_the_variable_and_the_default(
 
 def test_children_on_a_gpu_may_map_what_cuda_reserves() -> None:
     """CUDA maps the memory of GPU and machine: with 16 GiB of addresses it does not start."""
-    settings = RenderSettings(resolution=8, noise_floor_db=30, min_spp=8, max_spp=8)
     for variant in (variant_module._GPU, ON_CPU):
-        path_tracer = PathTracer(
-            settings, seed=0, variant=variant, threads=1, on_samples=lambda now: None
-        )
-        for tracer in (path_tracer, ProgressiveTracer(variant=variant, threads=1)):
-            is_wide = tracer._child._limits.memory_bytes > 16 << 30
-            assert is_wide == (variant.device == "gpu")
+        is_wide = RenderChild(variant, threads=1)._child._limits.memory_bytes > 16 << 30
+        assert is_wide == (variant.device == "gpu")
 
 
 def test_a_probe_of_a_gpu_is_remembered_for_its_driver(

@@ -12,7 +12,6 @@ import pytest
 from PIL import Image
 
 from infra import judging
-from infra.judging import _num_scenes, plot_excursions
 from model.light_groups import light_groups
 from model.weights import encode_weights
 from pipeline.builds.judging import JUDGING_BUILDS
@@ -29,6 +28,7 @@ from tests.train.loss.test_objective import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
 from train.evaluation.baselines import MEDIAN, NEAREST, Baselines, median_picture
+from train.evaluation.chart import plot_excursions
 from train.evaluation.evaluate import (
     GROUPED,
     EvalConfig,
@@ -42,8 +42,9 @@ from train.evaluation.judge import predict, validation_scene
 from train.evaluation.judged_view import NETWORK, JudgedView, by_group, scene_facts, summarize_views
 from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
 from train.evaluation.options import EvaluationOptions
+from train.evaluation.pages import evaluation_page
 from train.evaluation.published import BENCHMARK
-from train.evaluation.report import markdown, record
+from train.evaluation.report import record
 from train.evaluation.same_time import TRACER
 from train.loop.state import new_state
 from train.loss.lpips import Lpips
@@ -192,7 +193,7 @@ def test_another_scenes_triangles_and_what_swapping_costs_are_told(dataset: Data
     loss = record(rows, {})["swapped scenes"]
     assert loss["views"] == 3 and loss["median_db"] == 2.0  # 30 less 28, 20 and 34
     assert loss["mean_db"] == pytest.approx(8 / 3) and loss["share_lost"] == pytest.approx(2 / 3)
-    assert "loses 2.00 dB" in markdown(record(rows, {}))
+    assert "loses 2.00 dB" in evaluation_page(record(rows, {}))
     assert record(rows[:1], {})["swapped scenes"] is None
 
 
@@ -212,14 +213,15 @@ def test_worst_median_and_excursions_are_found_and_plotted(tmp_path: Path) -> No
 
 
 def test_the_page_prints_na_escapes_text_and_puts_the_benchmark_beside_the_paper() -> None:
-    page = markdown(record([row(0, template="a|b<c>")], {"data": "x_y"}))
-    assert "a\\|b\\<c\\>" in page and "x\\_y" in page
-    (line,) = [line for line in page.splitlines() if line.startswith("| lpips (lower")]
-    assert line.endswith("| n/a |")
+    page = evaluation_page(record([row(0, template="a|b<c>")], {"data": "x_y"}))
+    assert "a\\|b&lt;c&gt;" in page and "x\\_y" in page
+    (line,) = [line for line in page.splitlines() if line.startswith("| network |")]
+    assert "| n/a |" in line and "`lpips` (lower is better)" in page
     assert record([row(0)], {"build": "smoke"})["published"] is None
-    page = markdown(record([row(0)], {"build": BENCHMARK}))
+    page = evaluation_page(record([row(0)], {"build": BENCHMARK}))
     assert BENCHMARK in JUDGING_BUILDS
-    assert "| psnr_linear_db | 29.77 | 30.00 |" in page and "| lpips | 0.0551 | n/a |" in page
+    assert "| 29.77 | 0.9526 | 0.0551 | 0.1751 |" in page
+    assert "| here: network | 30.00 | 30.0000 | n/a | 30.0000 |" in page
     assert "400 scenes" in page and "256 x 256" in page
 
 
@@ -246,7 +248,7 @@ def test_many_lights_are_judged_in_one_pass_and_in_groups(dataset: Dataset) -> N
     found = record([alone, both], {})
     assert list(found["contestants"]) == [NETWORK], "a column is of all views"
     assert found["light passes"]["groups"]["views"] == 1
-    page = markdown(found)
+    page = evaluation_page(found)
     assert "| groups | 1 | 31.00 | 31.00 | 31.00 | 0.5000 |" in page, page
 
 
@@ -255,20 +257,20 @@ def test_as_many_scenes_are_announced_as_are_judged(dataset: Dataset) -> None:
     every = dataclasses.replace(contest(dataset), shards=shards)
     for most in (1, 3, 4, 99):  # of five scenes in two shards
         some = dataclasses.replace(every, most_scenes=most)
-        assert _num_scenes(some) == len(list(some.samples())) == min(most, 5)
+        assert some.num_scenes == len(list(some.samples())) == min(most, 5)
 
 
 def test_no_report_takes_the_place_of_another_networks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And that of a run is beside it."""
-    monkeypatch.setattr(judging, "markdown", str)
+    monkeypatch.setattr(judging, "evaluation_page", str)
     for name in ("worst_and_median", "worst_of_each_excursion", "sheet_views"):
         monkeypatch.setattr(judging, name, lambda *more: {})
 
     def written(digest: str) -> str:
-        about, idle = {"network sha256": digest}, SimpleNamespace(traced=None)
-        told: Any = SimpleNamespace(record={"about": about}, views=(), contest=idle)
+        figures = {"about": {"network sha256": digest}, "path tracer": {"preview": None}}
+        told: Any = SimpleNamespace(record=figures, views=(), contest=SimpleNamespace())
         return judging.write_judgement(told, tmp_path / "evaluation").name
 
     assert [*map(written, "aba")] == ["evaluation", "evaluation-2", "evaluation"]

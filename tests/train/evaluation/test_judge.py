@@ -4,6 +4,7 @@ What noise alone would score; and the path tracer in the network's time, over vi
 """
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,8 @@ from storage.dataset.training_data import open_training_data
 from storage.metrics import object_psnr_log_db, psnr_linear_db, psnr_log_db
 from storage.records.sample import Sample
 from storage.records.scene import Scene
+from storage.renderer import Camera, OnProgress, ignore_progress
+from storage.renderer import Image as Rendered
 from storage.seeds import rng_for
 from tests.for_each import for_each
 from tests.train.kit import tiny_run
@@ -28,7 +31,8 @@ from train.evaluation.evaluate import EvalConfig, judge_views, sheet_views
 from train.evaluation.judge import hit_masks
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.metrics import METRICS, noise_floors, picture_scores
-from train.evaluation.report import markdown, record
+from train.evaluation.pages import evaluation_page
+from train.evaluation.report import record
 from train.evaluation.same_time import (
     CAPTION,
     TRACER,
@@ -180,8 +184,10 @@ def test_floors_of_metrics_without_a_measurement_are_of_drawn_noise() -> None:
     target, hits = sample.radiance_rgb[0].astype(np.float64), np.ones((32, 32), bool)
     found = {
         floor_db: noise_floors(
-            dataclasses.replace(sample.views[0], noise_floor_db=floor_db),
-            target, hits, Lpips(*small_weights()), rng_for(0, "noise"),
+            dataclasses.replace(
+                sample, views=(dataclasses.replace(sample.views[0], noise_floor_db=floor_db),)
+            ),
+            0, target, hits, Lpips(*small_weights()),
         )
         for floor_db in (20.0, 40.0)
     }  # fmt: skip
@@ -190,11 +196,12 @@ def test_floors_of_metrics_without_a_measurement_are_of_drawn_noise() -> None:
         assert found[20.0][metric] > found[40.0][metric] > 0
     assert found[40.0]["psnr_log_db"] == 40.0 and found[40.0]["log_l1"] == pytest.approx(0.01)
     # as large as stated, and less where it would make a pixel negative: there at most half is left
-    noisy = log10_radiance(target) + rng_for(0, "noise").normal(0, 0.01, target.shape)
+    rng = rng_for(0, f"noise of {sample.key}", 0)
+    noisy = log10_radiance(target) + rng.normal(0, 0.01, target.shape)
     twin = radiance_from_log10(np.maximum(noisy, 0))
     assert 39.9 < psnr_log_db(twin, target) < 43.1  # 3072 draws are good to 0.1 dB
     assert found[40.0]["ssim"] == picture_scores(twin, target, hits, None)["ssim"]
-    without = noise_floors(sample.views[0], target, hits, None, rng_for(0, "noise"))
+    without = noise_floors(sample, 0, target, hits, None)
     assert set(METRICS) - set(without) == {"lpips"}
 
 
@@ -206,14 +213,26 @@ TIMES = SameTimeResult(
 )
 
 
-class Target:
-    """Shows the stored pictures themselves, of the first view alone."""
+class StoredTargets:
+    """Shows the stored pictures themselves."""
 
-    def judged(self, sample: Sample, view: int) -> NDArray | None:
-        return self.shown(sample, view) if view == 0 else None
+    name = TRACER
+    resolution = 32
+    identity: Mapping[str, str] = {}
+    notes: Sequence[str] = ()
+    seconds = 0.0
+    cpu_seconds: float | None = None
 
-    def shown(self, sample: Sample, view: int) -> NDArray:
-        return sample.radiance_rgb[view]
+    def __init__(self, samples: Sequence[Sample]) -> None:
+        self._samples = {sample.key: sample for sample in samples}
+
+    def load(self, scene: Scene, name: str) -> "StoredTargets":
+        return StoredTargets([self._samples[name]])
+
+    def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Rendered:
+        (sample,) = self._samples.values()
+        assert camera.view is not None
+        return Rendered(radiance_rgb=sample.radiance_rgb[camera.view], cpu_seconds=None)
 
     def close(self) -> None:
         pass
@@ -229,8 +248,9 @@ def judging(tmp_path_factory: pytest.TempPathFactory) -> tuple[EvalConfig, list[
         baselines=None,
         lpips=None,
         most_scenes=99,
-        traced=Target(),
+        tracer_views=3,
     )
+    contest = dataclasses.replace(contest, tracer=StoredTargets(list(contest.samples())))
     return contest, judge_views(contest, lambda: None)
 
 
@@ -244,7 +264,7 @@ def test_both_are_judged_on_the_same_views(judging: tuple[EvalConfig, list[Judge
     assert found["lead_db"]["mean"] == pytest.approx(np.mean(leads))
     assert found["lead_db"]["low"] <= found["lead_db"]["mean"] <= found["lead_db"]["high"]
     assert found["share_better"] == 0
-    page = markdown(record(views, {}, found))
+    page = evaluation_page(record(views, {}, found))
     assert "In the network's own time".lower() in page.lower()
     assert "takes 0.022 (0.025) with 4 samples a pixel and its fast filter." in page
     assert "takes the network 0.06 core-seconds, the first of a scene 0.12" in page
@@ -263,16 +283,16 @@ def test_what_takes_longer_and_what_is_missing_is_said(
     own, line = sentences(same_time(untraced, TIMES, "all"))
     assert line.endswith("is not shown: none of the judged views could be traced.")
     lacking = dataclasses.replace(TIMES, preview=None, missing="no tracer here")
-    page = markdown(record(views, {}, same_time(views, lacking, "all")))
+    page = evaluation_page(record(views, {}, same_time(views, lacking, "all")))
     assert own in page and "is not shown: no tracer here." in page
-    assert "own time" not in markdown(record(views, {}))
+    assert "own time" not in evaluation_page(record(views, {}))
 
 
 def test_sheets_show_it_beside_the_prediction(
     judging: tuple[EvalConfig, list[JudgedView]], tmp_path: Path
 ) -> None:
     contest, views = judging
-    alone = draw_sheet(sheet_views(dataclasses.replace(contest, traced=None), views), ("title",))
+    alone = draw_sheet(sheet_views(dataclasses.replace(contest, tracer=None), views), ("title",))
     shown = sheet_views(contest, views)
     # the target went through float32 logarithms
     np.testing.assert_allclose(

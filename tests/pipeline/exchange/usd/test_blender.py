@@ -63,7 +63,7 @@ def ours(scene: Scene, resolution: int, spp: int) -> NDArray[np.float32]:
     child = IsolatedChild(limits=limits, factory=activate, args=(choose_variant(),))
     try:
         settings = {"ours": fixed_samples(resolution, spp)}
-        return child.call(shots, scene, settings)["ours"].view.radiance_rgb
+        return child.call(shots, scene, settings)["ours"].radiance_rgb
     finally:
         child.close()
 

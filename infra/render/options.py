@@ -1,0 +1,155 @@
+"""Options of `trilight render`."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from infra.render.look import ToneMap
+from infra.render.quality import (
+    MOST_TRACED_SPP,
+    ErrorBudget,
+    FixedSamples,
+    Quality,
+    TimeBudget,
+    ToStatedError,
+)
+from pipeline.exchange.from_description import AlbedoOverOne
+from pipeline.renders.preview import MOST_SPP, usual_filter
+from pipeline.renders.settings import Filtered, NoiseFloor, NoiseTargets, Resolution, Samples
+from storage.errors import TrilightError
+from storage.metrics import MAX_DB
+from storage.settings.described import checked
+from storage.settings.ranges import Seed, Within
+
+EngineChoice = Literal["mitsuba", "neural", "both"]
+"""Engine of `--engine`: path tracing, a network, or both side by side."""
+
+
+@checked()
+class RenderOptions:
+    """Scene, renderer and pictures."""
+
+    source: str
+    """Scene file, or SHARD.tar::KEY; for many, a shard, a folder, or 'NAME{000..119}.json'."""
+    out: Path
+    """X.exr for one picture; a folder, X.mp4 or X.webp for many. A PNG for viewing is written
+    beside each EXR, enlarged below 256 pixels; existing pictures of a folder or video are kept."""
+    engine: EngineChoice = "mitsuba"
+    """Renderer: mitsuba (path tracer), neural (network), or both side by side."""
+    checkpoint: str | None = None
+    """neural: model.safetensors of a run; by default the built-in network."""
+    resolution: Resolution | None = None
+    """Width of a picture in pixels; by default 512, or the training width of a pure network."""
+    noise_floor_db: NoiseFloor | None = None
+    """mitsuba: stop at this noise floor (psnr_log_db; higher is cleaner); by default 40, unless
+    another floor is given. Of several floors, all are reached."""
+    noise_floor_linear_db: NoiseFloor | None = None
+    """mitsuba: stop at this noise floor as psnr_linear_db (radiance within [0, 1]); by default
+    none. In most pictures it is 5 to 10 dB below psnr_log_db."""
+    noise_floor_objects_db: NoiseFloor | None = None
+    """mitsuba: stop at this noise floor as object_psnr_log_db (without background); by default
+    none."""
+    max_spp: Samples = MOST_TRACED_SPP
+    """mitsuba: maximum number of samples per pixel."""
+    spp: Annotated[int | None, Within(1, MOST_SPP, unit="samples")] = None
+    """mitsuba: samples per pixel of a preview with one denoise; by default sampling goes on to the
+    noise floor. The error of a preview is not measured."""
+    seconds: Annotated[float | None, Within(0, 1e9, low_open=True, unit="seconds")] = None
+    """mitsuba: best preview within these seconds a picture after start-up; by default none."""
+    error_db: Annotated[float | None, Within(0, MAX_DB, unit="dB")] = None
+    """mitsuba: fastest preview with this expected median error (psnr_log_db); by default none."""
+    denoiser: Filtered | None = None
+    """mitsuba with --spp: filter of Open Image Denoise, or off; by default fast up to 16 samples
+    and high beyond."""
+    split: bool = False
+    """mitsuba: write direct and indirect light as layers of the EXR, too."""
+    split_lobes: bool = False
+    """mitsuba: write diffuse and specular light as layers, too; with --split four."""
+    view: Annotated[int, Within(0, 999)] = 0
+    """Number of the scene's camera, counted from 0."""
+    orbit: Annotated[int | None, Within(1, 100_000, unit="pictures")] = None
+    """Number of pictures from a circle of cameras around the scene; by default one picture, from
+    the scene's camera."""
+    arc_deg: Annotated[float, Within(0, 360, low_open=True, unit="degrees")] = 360.0
+    """Angle of the orbit; below 360 the scene's camera is its middle."""
+    cameras: str | None = None
+    """File (.json or a scene) whose cameras are rendered; by default only the scene's camera."""
+    fps: Annotated[int, Within(1, 240, unit="pictures a second")] = 24
+    """Frames per second of a video."""
+    tone_map: ToneMap = "plain"
+    """Tone mapping of PNG and video: plain (sRGB) or filmic (ACES 2.0)."""
+    exposure_ev: Annotated[float, Within(-32, 32, unit="stops")] = 0.0
+    """Exposure of PNG and video in stops; EXR keeps the radiance."""
+    precision: Literal["float32", "bfloat16", "tf32", "float16"] = "float32"
+    """neural: precision of matrix products; tf32 and float16 need CUDA."""
+    lights_per_pass: Annotated[int, Within(1, 65_535, unit="triangles")] = 8
+    """neural: maximum number of emitting triangles in one pass; passes are added."""
+    albedo_over_one: AlbedoOverOne = "scale"
+    """Scale or refuse RenderFormer materials whose albedos sum to above 1."""
+    seed: Seed = 0
+    """mitsuba: seed of the samples."""
+    threads: Annotated[int | None, Within(1, 1024, unit="threads")] = None
+    """Number of CPU threads; by default one for each core."""
+
+    def __post_init__(self) -> None:
+        self._require_one_kind()
+        if self.orbit is not None and self.cameras is not None:
+            raise TrilightError(f"--cameras is {self.cameras}; expected no --orbit beside it.")
+        if self.checkpoint is not None and self.engine == "mitsuba":
+            raise TrilightError(
+                f"--checkpoint is {self.checkpoint}; expected --engine neural or both beside it."
+            )
+        if (self.split or self.split_lobes) and self.engine == "neural":
+            raise TrilightError(
+                "--split or --split-lobes is given; expected --engine mitsuba or both beside it, "
+                "since a network makes all light together."
+            )
+
+    @property
+    def quality(self) -> Quality:
+        """Quality of traced pictures, or the budget that chooses it."""
+        if self.seconds is not None:
+            return TimeBudget(seconds=self.seconds)
+        if self.error_db is not None:
+            return ErrorBudget(error_db=self.error_db)
+        if self.spp is not None:
+            return FixedSamples(spp=self.spp, denoiser=self.denoiser or usual_filter(self.spp))
+        return ToStatedError(
+            targets=NoiseTargets(
+                log_db=self.noise_floor_db,
+                linear_db=self.noise_floor_linear_db,
+                objects_db=self.noise_floor_objects_db,
+            ),
+            max_spp=self.max_spp,
+            split=self.split,
+            split_lobes=self.split_lobes,
+        )
+
+    def _require_one_kind(self) -> None:
+        """Raise TrilightError where options of a preview and of a measured picture are mixed."""
+        floors = {
+            "--noise-floor": self.noise_floor_db,
+            "--noise-floor-linear": self.noise_floor_linear_db,
+            "--noise-floor-objects": self.noise_floor_objects_db,
+            "--split": self.split or None,
+            "--split-lobes": self.split_lobes or None,
+        }
+        measured = [name for name, value in floors.items() if value is not None]
+        values = {"--spp": self.spp, "--seconds": self.seconds, "--error": self.error_db}
+        preview_options = [(name, value) for name, value in values.items() if value is not None]
+        if self.spp is None and self.denoiser is not None:
+            raise TrilightError(f"--denoiser is {self.denoiser}; expected --spp beside it.")
+        if not preview_options:
+            return
+        said = "{} is {:g}".format(*preview_options[0])
+        if measured:
+            raise TrilightError(
+                f"{said} beside {measured[0]}; expected one of them: a preview measures nothing, "
+                "and stores no layers."
+            )
+        if len(preview_options) > 1:
+            raise TrilightError(f"{said} beside {preview_options[1][0]}; expected one of them.")
+        if self.engine != "mitsuba":
+            raise TrilightError(
+                f"{said} beside --engine {self.engine}; expected --engine mitsuba: a network takes "
+                "no samples, and a preview is nothing to judge one by."
+            )

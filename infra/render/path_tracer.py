@@ -1,0 +1,259 @@
+"""`PathTracer`: renders scenes by path tracing, in a child process with limits.
+
+This process requests one pass of samples after another, so that it can report progress, show
+intermediate pictures, and stop between two passes.
+"""
+
+import dataclasses
+import itertools
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from typing import Any
+
+from infra.render.quality import FixedSamples, ToStatedError
+from pipeline.generation.environment import environment
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
+from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings
+from pipeline.renders.progressive import ProgressiveRenderer
+from pipeline.renders.renderer import SceneRenderer, set_threads
+from pipeline.renders.results import GrowingPicture, RenderedView, with_result
+from pipeline.renders.settings import FIRST_SPP, RenderSettings
+from pipeline.renders.variant import Variant, activate
+from storage.errors import Rejected, Unrenderable
+from storage.machine import available_cores
+from storage.records.material import PUBLISHED_COLUMNS, unread_columns
+from storage.records.parts import Parts
+from storage.records.scene import Scene
+from storage.renderer import Camera, Fact, Image, OnProgress, Sampling, ignore_progress
+from storage.settings.described import settings_record
+
+MOST_SCENES = 2
+"""Number of scenes that a child keeps loaded; others are sent to it again."""
+
+_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child=1 << 30)
+"""A call loads a scene or renders one pass of samples; the child keeps its state, so it is replaced
+only if it dies."""
+
+_numbers = itertools.count()
+"""Numbers of the loaded scenes of this process."""
+
+
+class RenderChild:
+    """Child that traces one picture at a time, for any number of path tracers and threads."""
+
+    def __init__(self, variant: Variant, threads: int | None = None) -> None:
+        """Configure the child, which starts when it is first needed.
+
+        Args:
+            variant: Mitsuba variant and denoiser device.
+            threads: CPU threads of renderer and denoiser; None for one for each core.
+        """
+        self.variant = variant
+        self.threads = threads or available_cores()
+        limits = dataclasses.replace(
+            _LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes)
+        )
+        args = (variant, self.threads)
+        self._child = IsolatedChild(limits=limits, factory=RenderWorker, args=args)
+        self._one_at_a_time = threading.Lock()
+
+    def call(self, name: str, work: Callable[[IsolatedChild], Result]) -> Result:
+        """Do work in the child, again in a fresh one where that may help.
+
+        Raises:
+            Unrenderable: there is no picture of `name`, or the child failed.
+        """
+        try:
+            with self._one_at_a_time:
+                return with_retries(lambda: work(self._child))
+        except Rejected as rejection:
+            raise Unrenderable(
+                f"{name} cannot be rendered ({rejection}); expected a scene with surfaces, "
+                "lights with an area, and radiance that half floats can hold."
+            ) from rejection
+        except ChildFailed as failure:
+            raise Unrenderable(
+                f"{name}: rendering failed ({failure}); try a smaller resolution, and see "
+                "`trilight doctor`."
+            ) from failure
+
+    def close(self) -> None:
+        """End the child, for all path tracers that share it."""
+        self._child.close()
+
+
+@dataclass(eq=False)
+class PathTracer:
+    """Path tracing to a stated error or with fixed samples; equal arguments give equal pictures.
+
+    Raises:
+        TrilightError: a setting is invalid.
+    """
+
+    child: RenderChild
+    """Child that traces; other path tracers may share it."""
+    quality: ToStatedError | FixedSamples
+    resolution: int
+    """Width in pixels, a multiple of 8."""
+    _: KW_ONLY
+    seed: int = 0
+    """Seed of the samples of every picture, from 0."""
+    name: str = "mitsuba"
+    shows_looks: bool = False
+    """True to yield intermediate pictures on the way to a stated error."""
+
+    def __post_init__(self) -> None:
+        self.settings = self.quality.settings(self.resolution)
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """Why another device was not chosen, where there is a reason."""
+        note = self.child.variant.note
+        return (f"{note}; see trilight doctor",) if note else ()
+
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        """Everything but scene and camera that decides a picture, as JSON values."""
+        return {
+            "seed": str(self.seed),  # the integers of an EXR header end at 2^31
+            "settings": settings_record(self.settings),
+            "environment": environment(self.child.variant),
+        }
+
+    def load(self, scene: Scene, name: str) -> "SceneInChild":
+        """Load a scene; raises Unrenderable where it cannot be rendered."""
+        return SceneInChild(self, scene, name)
+
+    def close(self) -> None:
+        """End the child."""
+        self.child.close()
+
+
+class SceneInChild:
+    """Scene in a render child; it is sent again where the child no longer has it."""
+
+    def __init__(self, tracer: PathTracer, scene: Scene, name: str) -> None:
+        self._child = tracer.child
+        self._seed = tracer.seed
+        self._arguments = (next(_numbers), scene, tracer.settings, tracer.shows_looks)
+        self._name = name
+        unread = ", ".join(unread_columns(scene.materials, PUBLISHED_COLUMNS))
+        self.notes = (f"the path tracer does not read {unread}",) if unread else ()
+        self._child.call(name, lambda each: each.call_method(RenderWorker.wait))
+        began = time.perf_counter()
+        self.cpu_seconds: float | None = self._child.call(name, self._load)
+        self.seconds = time.perf_counter() - began
+
+    def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Image:
+        """Return the picture of a camera; raises Unrenderable where there is none."""
+        return image_of(self.render_view(camera, on_progress))
+
+    def render_view(
+        self, camera: Camera, on_progress: OnProgress = ignore_progress
+    ) -> RenderedView | Preview:
+        """Do what `render` does, and return the picture with all that the path tracer measured."""
+        view = (self._arguments[0], camera.c2w, camera.fov_deg, self._seed)
+
+        def trace(child: IsolatedChild) -> RenderedView | Preview:
+            if not child.call_method(RenderWorker.begin_view, *view):
+                self._load(child)
+                child.call_method(RenderWorker.begin_view, *view)
+            while isinstance(step := child.call_method(RenderWorker.advance), Sampling):
+                on_progress(image_of(step) if isinstance(step, GrowingPicture) else step)
+            return step
+
+        return self._child.call(f"{self._name}, {camera.name}", trace)
+
+    def _load(self, child: IsolatedChild) -> float:
+        return child.call_method(RenderWorker.load, *self._arguments)
+
+
+class RenderWorker:
+    """Object that the child holds: the loaded scenes, and the view that is rendered."""
+
+    def __init__(self, variant: Variant, threads: int) -> None:
+        activate(variant)
+        set_threads(threads)
+        self._loaded = OrderedDict[int, SceneRenderer | PreviewRenderer | ProgressiveRenderer]()
+        self._steps: Iterator[Sampling | GrowingPicture | RenderedView | Preview] = iter(())
+
+    def wait(self) -> None:
+        """Do nothing: a call forces the child to start."""
+
+    def load(
+        self,
+        number: int,
+        scene: Scene,
+        settings: RenderSettings | PreviewSettings,
+        shows_looks: bool,
+    ) -> float:
+        """Load a scene as a number, and return the CPU seconds of that."""
+        while len(self._loaded) >= MOST_SCENES:
+            self._loaded.popitem(last=False)
+        began_s = time.process_time()
+        if isinstance(settings, PreviewSettings):
+            self._loaded[number] = PreviewRenderer(scene, settings)
+        elif shows_looks:
+            self._loaded[number] = ProgressiveRenderer(scene, settings)
+        else:
+            self._loaded[number] = SceneRenderer(scene, settings)
+        return time.process_time() - began_s
+
+    def begin_view(self, number: int, c2w: Any, fov_deg: float, seed: int) -> bool:
+        """Begin a view; return False if its scene is not loaded."""
+        if number not in self._loaded:
+            return False
+        self._loaded.move_to_end(number)
+        self._steps = with_result(self._loaded[number].view_steps(c2w, fov_deg, seed))
+        return True
+
+    def advance(self) -> Sampling | GrowingPicture | RenderedView | Preview:
+        """Return the next step, last the picture."""
+        return next(self._steps)
+
+
+def image_of(picture: GrowingPicture | RenderedView | Preview) -> Image:
+    """Return a picture of the path tracer with its facts."""
+    error_db = None
+    facts: dict[str, Fact] = {"spp": picture.spp}
+    layers_rgb: Parts = {}
+    if isinstance(picture, RenderedView):
+        error_db = picture.noise_floor_db
+        layers_rgb = picture.parts_rgb or {}
+        facts |= _measured_facts(picture)
+    elif isinstance(picture, GrowingPicture) and picture.floor is not None:
+        error_db = picture.floor.log_db
+    remark = ""
+    if error_db is None:
+        remark = "a preview: its error is not measured"
+    elif picture.spp < FIRST_SPP:
+        remark = f"below {FIRST_SPP} samples the stated error may flatter"
+    return Image(
+        radiance_rgb=picture.radiance_rgb,
+        samples=picture.spp,
+        stated_error_db=error_db,
+        cpu_seconds=picture.core_s,
+        facts=facts,
+        layers_rgb=layers_rgb,
+        remark=remark,
+    )
+
+
+def _measured_facts(view: RenderedView) -> Mapping[str, Fact]:
+    facts: dict[str, Fact] = {
+        "noise_floor_db": round(view.noise_floor_db, 3),
+        "noise_floor_linear_db": round(view.noise_floor_linear_db, 3),
+        "object_noise_floor_db": round(view.object_noise_floor_db, 3),
+        "at_cap": int(view.at_cap),
+        "mean_radiance": float(f"{view.radiance_rgb.mean(dtype='float64'):.6g}"),
+    }
+    for part, floor in (view.part_floors or {}).items():
+        facts |= {
+            f"{part}.noise_floor_db": round(floor.log_db, 3),
+            f"{part}.noise_floor_linear_db": round(floor.linear_db, 3),
+            f"{part}.object_noise_floor_db": round(floor.object_log_db, 3),
+        }
+    return facts

@@ -1,0 +1,99 @@
+"""Quality of a picture: a measured error, a number of samples, or a budget that chooses them."""
+
+from dataclasses import dataclass
+
+from pipeline.renders.preview import PreviewSettings
+from pipeline.renders.settings import (
+    FIRST_SPP,
+    USUAL_FLOOR_DB,
+    Filtered,
+    NoiseTargets,
+    RenderSettings,
+)
+
+USUAL_TARGETS = NoiseTargets(log_db=USUAL_FLOOR_DB)
+
+MOST_TRACED_SPP = 4096
+"""Default maximum number of samples per pixel."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ToStatedError:
+    """Samples until the measured error reaches its targets."""
+
+    targets: NoiseTargets = USUAL_TARGETS
+    """Target errors; psnr_log_db of 40 where none is set."""
+    max_spp: int = MOST_TRACED_SPP
+    """Maximum number of samples per pixel."""
+    split: bool = False
+    """True to keep direct and indirect light apart."""
+    split_lobes: bool = False
+    """True to keep diffuse and specular light apart."""
+    max_depth: int = RenderSettings.max_depth
+    """Maximum length of a path in edges; 2 is direct light."""
+
+    def settings(self, resolution: int) -> RenderSettings:
+        """Return the settings at a width in pixels, of a picture that may be dark.
+
+        Raises:
+            TrilightError: a value is invalid; the message names it.
+        """
+        targets = self.targets if self.targets.overrides else USUAL_TARGETS
+        return RenderSettings(
+            resolution=resolution,
+            noise_floor_db=targets.log_db,
+            noise_floor_linear_db=targets.linear_db,
+            noise_floor_objects_db=targets.objects_db,
+            min_spp=min(FIRST_SPP, self.max_spp),
+            max_spp=self.max_spp,
+            max_depth=self.max_depth,
+            min_mean_radiance=0.0,
+            split=self.split,
+            split_lobes=self.split_lobes,
+            arithmetic="device",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FixedSamples:
+    """A number of samples and one denoise, of unmeasured error."""
+
+    spp: int
+    """Number of paths through each pixel, from 1."""
+    denoiser: Filtered
+    """Filter of Open Image Denoise."""
+
+    def __str__(self) -> str:
+        """Return samples and filter as text."""
+        return f"{self.spp} sample{'s' if self.spp > 1 else ''} a pixel, filter {self.denoiser}"
+
+    def settings(self, resolution: int) -> PreviewSettings:
+        """Return the settings at a width in pixels; raises TrilightError if it is invalid."""
+        return PreviewSettings(resolution=resolution, spp=self.spp, denoiser=self.denoiser)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimeBudget:
+    """The least expected error within wall-clock seconds a picture."""
+
+    seconds: float
+
+    def __str__(self) -> str:
+        """Return the option of the command line."""
+        return f"--seconds {self.seconds:g}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorBudget:
+    """The least expected time to an expected median error as psnr_log_db."""
+
+    error_db: float
+
+    def __str__(self) -> str:
+        """Return the option of the command line."""
+        return f"--error {self.error_db:g}"
+
+
+Traced = ToStatedError | FixedSamples
+Budget = TimeBudget | ErrorBudget
+Quality = Traced | Budget

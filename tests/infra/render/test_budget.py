@@ -1,0 +1,378 @@
+"""Seconds or decibels choose a way, by costs that are shipped or measured here."""
+
+import dataclasses
+import itertools
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from infra.render.budget import Priced, choose, choose_reaching, choose_within, price_all
+from infra.render.machine_costs import PROBED_PX, PROBES, PartSeconds, costs_of
+from infra.render.preview_table import (
+    MEASURE,
+    NETWORK_SCENE,
+    NETWORK_VIEW,
+    KnownCosts,
+    PartCost,
+    PictureCosts,
+    PreviewError,
+    PreviewTable,
+    keep_machine_costs,
+    known_costs,
+    machine_costs_path,
+    machine_name,
+    shipped_table,
+)
+from infra.render.quality import FixedSamples, TimeBudget
+from infra.setup.preview_table import NETWORK, WIDTHS, ladder, part_names, table_of
+from pipeline.renders.preview_parts import all_parts
+from pipeline.renders.settings import Filtered
+from pipeline.renders.variant import Variant
+from storage.errors import TrilightError
+from storage.settings.described import settings_record
+from tests.for_each import case
+
+FILTERS: tuple[Filtered, ...] = ("fast", "high")
+
+
+def priced(seconds: float, db: float, spp: int = 1) -> Priced:
+    samples = FixedSamples(spp=spp, denoiser="fast")
+    return Priced(samples=samples, seconds=seconds, db=db, least_db=db - 5, judged_px=64)
+
+
+def part(name: str, width: int, serial_s: float, parallel_s: float = 0.0) -> PartCost:
+    return PartCost(part=name, width=width, serial_s=serial_s, parallel_s=parallel_s)
+
+
+some_ways = st.lists(
+    st.tuples(st.sampled_from([0.1, 0.2, 0.5, 1.0, 3.0]), st.sampled_from([20.0, 25.0, 30.0, 31.0]))
+    .map(lambda pair: priced(*pair)),
+    min_size=1,
+    max_size=12,
+)  # fmt: skip
+
+
+@given(ways=some_ways, seconds=st.floats(1e-9, 1e9))
+def test_no_way_within_the_seconds_is_better_or_as_good_and_cheaper(
+    ways: list[Priced], seconds: float
+) -> None:
+    found, fits = choose_within(ways, seconds)
+    assert fits == any(one.seconds <= seconds for one in ways)
+    for other in ways:
+        if fits and other.seconds <= seconds:
+            assert (other.db, -other.seconds) <= (found.db, -found.seconds)
+        if not fits:
+            assert (other.seconds, -other.db) >= (found.seconds, -found.db)
+
+
+@given(ways=some_ways, db=st.floats(0, 100))
+def test_no_way_that_reaches_the_error_is_quicker(ways: list[Priced], db: float) -> None:
+    if all(one.db < db for one in ways):
+        with pytest.raises(TrilightError, match="--noise-floor"):
+            choose_reaching(ways, db, 64)
+        return
+    found = choose_reaching(ways, db, 64)
+    assert found.db >= db
+    for other in ways:
+        if other.db >= db:
+            assert (other.seconds, -other.db) >= (found.seconds, -found.db)
+
+
+def test_more_seconds_are_never_worse_and_more_decibels_never_quicker() -> None:
+    for width in [8, 64, 96, 128, 512, 2048]:
+        with case(width):
+            table = shipped_table()
+            ways = price_all(table, table.costs, width=width, threads=1, per_scene=1, network=True)
+            asked_s = [1e-9, *(10 ** (k / 4) for k in range(-12, 13)), 1e9]
+            found = [choose_within(ways, seconds)[0].db for seconds in asked_s if
+                     any(one.seconds <= seconds for one in ways)]  # fmt: skip
+            assert found == sorted(found) and found[-1] == max(one.db for one in ways)
+            most = max(one.db for one in ways)
+            times = [choose_reaching(ways, most * share / 20, width).seconds for share in range(21)]
+            assert times == sorted(times)
+            assert times[0] == min(one.seconds for one in ways)
+            with pytest.raises(
+                TrilightError, match=f"most that previews reach; --noise-floor {most + 1:g}"
+            ):
+                choose_reaching(ways, most + 1, width)
+
+
+def test_what_is_said_to_be_reached_can_be_asked_for() -> None:
+    """The figure of the complaint is rounded down, so that nobody is sent round in a circle."""
+    ways = [priced(1.0, 38.49)]
+    with pytest.raises(TrilightError, match=r"expected at most 38\.4 dB"):
+        choose_reaching(ways, 38.5, 64)
+    assert choose_reaching(ways, 38.4, 64) is ways[0]
+
+
+def test_prices_are_sums_of_parts_between_widths_in_logarithms() -> None:
+    """Parts that grow by a power of the width have exactly that power in between."""
+    rows = [
+        part(name, width, 0.0, (at + 1) * width**1.5)
+        for at, name in enumerate((*all_parts(), NETWORK_SCENE, NETWORK_VIEW))
+        for width in (64, 256)
+    ]
+    error: dict[str, Any] = {"spp": 20, "denoiser": "fast", "rung": "traced"}
+    table = PreviewTable(
+        scenes=3,
+        errors=(
+            PreviewError(**error, width=64, median_db=20.0, least_db=10.0),
+            PreviewError(**error, width=256, median_db=30.0, least_db=14.0),
+        ),
+        costs=PictureCosts(machine="x", rows=tuple(rows)),
+        probe=PictureCosts(machine="x", rows=()),
+    )
+    names = list(all_parts())
+    of = {name: names.index(name) + 1 for name in names}
+    # 20 samples: a pass of 16 and one of 4, guides of 16 rays, the fast filter
+    units = of["pass of 16"] + of["pass of 4"] + of["guides of 16"] + of["fast"]
+    for threads, per_scene in itertools.product((1, 4), (1, 10)):
+        (one,) = price_all(
+            table, table.costs, width=128, threads=threads, per_scene=per_scene, network=False
+        )
+        expected = (units + of["scene"] / per_scene) * 128**1.5 / threads
+        assert one.seconds == pytest.approx(expected, rel=1e-9)  # rounding of floats
+        assert (one.db, one.least_db) == pytest.approx((25.0, 12.0))
+    for width, db, growth in ((8, 20.0, 64**1.5), (2048, 30.0, 256**1.5 * 64)):
+        (one,) = price_all(table, table.costs, width=width, threads=1, per_scene=1, network=False)
+        assert one.db == db and one.judged_px == (64 if width < 64 else 256)
+        assert one.seconds == pytest.approx((units + of["scene"]) * growth, rel=1e-9)
+
+
+def test_the_network_is_chosen_by_its_figures_alone() -> None:
+    """Made quick, it is chosen; where torch is missing, it is not among the ways."""
+    table = shipped_table()
+    rows = [
+        part(row.part, row.width, 1e-6) if row.part.startswith("network") else row
+        for row in table.costs.rows
+    ]
+    quick = PictureCosts(machine="x", rows=tuple(rows))
+    for network in (True, False):
+        ways = price_all(table, quick, width=64, threads=1, per_scene=1, network=network)
+        assert (choose_reaching(ways, 0, 64).samples is None) == network
+        assert (choose_within(ways, 1e-9)[0].samples is None) == network
+        assert choose_within(ways, 1e9)[0].samples is not None
+
+
+def test_the_network_is_no_way_at_widths_at_which_it_was_not_judged() -> None:
+    table = shipped_table()
+    judged = [row.width for row in table.errors if row.rung == "network"]
+    for width in (8, 64, 128, 256, 512, 1024):
+        ways = price_all(table, table.costs, width=width, threads=1, per_scene=1, network=True)
+        offered = any(one.samples is None for one in ways)
+        assert offered == (min(judged) <= width <= max(judged))
+
+
+def test_a_choice_says_what_it_is_and_whether_it_fits() -> None:
+    table = shipped_table()
+    known = KnownCosts(costs=table.costs, source="costs as shipped")
+    ways = [priced(0.25, 30.0, spp=4)]
+    for seconds, lead in ((1.0, "chosen"), (1e-9, "nothing is as quick; the quickest is chosen")):
+        choice = choose(TimeBudget(seconds=seconds), ways, table, known, 64)
+        assert choice.sentence == (
+            f"--seconds {seconds:g}: {lead}: 4 samples a pixel, filter fast; expected 30.0 dB in "
+            f"the median of {table.scenes} scenes at 64 pixels (25.0 in the worst), in 0.25 s "
+            "after start-up; costs as shipped"
+        )
+        assert choice.facts == {
+            "chosen_for": f"--seconds {seconds:g}", "expected_db": 30.0, "expected_seconds": 0.25
+        }  # fmt: skip
+
+
+def test_the_shipped_table_is_whole() -> None:
+    """Each way was measured at the least width, and what more samples bring is seen in it."""
+    table = shipped_table()
+    assert all(row.serial_s + row.parallel_s > 0 for row in table.costs.rows)
+    for denoiser in FILTERS:
+        of_filter = {
+            row.spp: row.median_db
+            for row in table.errors
+            if (row.denoiser, row.width) == (denoiser, 64)
+        }
+        assert {1, 16, 256} <= set(of_filter)
+        # 256 times as many samples: 24 dB of raw pictures, of which filters leave a third
+        assert of_filter[256] > of_filter[1] + 6
+    assert all(
+        math.isfinite(row.median_db) and row.least_db <= row.median_db for row in table.errors
+    )
+
+
+VARIANT = Variant(name="llvm_ad_rgb", libllvm="", note="")
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path))
+    return tmp_path
+
+
+def costs_of_here() -> PictureCosts:
+    shipped = shipped_table().costs
+    slower = [dataclasses.replace(row, serial_s=row.serial_s + 1) for row in shipped.rows]
+    return PictureCosts(machine=machine_name(VARIANT), rows=tuple(slower))
+
+
+def test_costs_that_were_measured_here_win(cache: Path) -> None:
+    found = known_costs(VARIANT)
+    assert found.costs == shipped_table().costs
+    assert f"costs as shipped: `{MEASURE}` measures this machine" == found.source
+    path = keep_machine_costs(costs_of_here())
+    assert path == machine_costs_path() and path.is_relative_to(cache)
+    found = known_costs(VARIANT)
+    assert found.costs == costs_of_here()
+    assert found.source == "costs as measured here"
+
+
+@pytest.mark.usefixtures("cache")
+def test_costs_of_another_machine_are_not_used() -> None:
+    keep_machine_costs(dataclasses.replace(costs_of_here(), machine="another, 128 cores"))
+    found = known_costs(VARIANT)
+    assert found.costs == shipped_table().costs
+    assert "is of another machine (another, 128 cores)" in found.source
+    keep_machine_costs(costs_of_here())
+    card = dataclasses.replace(VARIANT, name="cuda_ad_rgb")
+    assert "of another machine" in known_costs(card).source, "a graphics card is another machine"
+
+
+def _record(**changes: Any) -> bytes:
+    return json.dumps(settings_record(costs_of_here()) | changes).encode()
+
+
+DAMAGED = [
+    (b"", "not JSON"),
+    (b"[" * 100_000, "not JSON"),
+    (b"[1, 2]", "expected"),
+    (_record(rows=[]), "is missing; expected each part at each width"),
+    (_record().replace(b'"width": 64', b'"width": 63.5', 1), "expected a whole number"),
+    (_record().replace(b'"serial_s": 1', b'"serial_s": -1', 1), "expected a number from 0"),
+    (_record(more=1), "does not exist"),
+]
+
+
+@pytest.mark.usefixtures("cache")
+def test_damaged_costs_are_not_used() -> None:
+    for data, said in DAMAGED:
+        with case(said):
+            path = machine_costs_path()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+            found = known_costs(VARIANT)
+            assert found.costs == shipped_table().costs
+            assert f"since {path} cannot be used" in found.source and said in found.source
+            assert f"`{MEASURE}` writes it anew" in found.source
+            assert "\n" not in found.source
+    machine_costs_path().unlink()
+    machine_costs_path().mkdir()
+    assert "cannot be used" in known_costs(VARIANT).source
+
+
+CORES = 8
+
+
+def timed_as_shipped(slower: float, serial: float) -> PartSeconds:
+    """Return what probes take where everything is slower, and a share of it stays serial."""
+    table = shipped_table()
+    then = {(row.part, row.width): row.serial_s + row.parallel_s for row in table.probe.rows}
+    parts = {row.part for row in table.probe.rows}
+    return {
+        (px, threads): {
+            part: slower * then[part, px] * (serial + (1 - serial) / threads) for part in parts
+        }
+        for px in PROBED_PX
+        for threads in (1, CORES)
+    }
+
+
+def test_every_part_is_as_much_slower_and_as_serial() -> None:
+    for slower, serial in [(1.0, 0.0), (2.5, 0.25), (0.1, 1.0)]:
+        with case(slower):
+            table = shipped_table()
+            found = costs_of(table, timed_as_shipped(slower, serial), CORES, "here")
+            assert found.machine == "here"
+            for now, then in zip(found.rows, table.costs.rows, strict=True):
+                core_s = then.serial_s + then.parallel_s
+                assert (now.part, now.width) == (then.part, then.width)
+                # the table keeps four figures
+                assert now.serial_s == pytest.approx(slower * serial * core_s, rel=1e-3, abs=1e-9)
+                assert now.parallel_s == pytest.approx(
+                    slower * (1 - serial) * core_s, rel=1e-3, abs=1e-9
+                )
+
+
+def test_what_threads_seem_to_slow_down_is_serial() -> None:
+    """Beside other work all threads may take longer than one; nothing becomes negative."""
+    timed = timed_as_shipped(1.0, 0.0)
+    timed |= {(px, CORES): {p: 3 * s for p, s in timed[px, 1].items()} for px in PROBED_PX}
+    for row in costs_of(shipped_table(), timed, CORES, "here").rows:
+        assert row.parallel_s == 0 and row.serial_s > 0
+
+
+def test_one_core_is_measured_once() -> None:
+    timed: PartSeconds = {
+        (px, 1): each for (px, threads), each in timed_as_shipped(2.0, 0.0).items() if threads == 1
+    }
+    for row in costs_of(shipped_table(), timed, 1, "here").rows:
+        assert row.serial_s == 0 and row.parallel_s > 0
+
+
+def test_between_the_probed_widths_machines_differ_by_what_lies_between() -> None:
+    table = shipped_table()
+    timed = timed_as_shipped(1.0, 0.0)
+    low, high = PROBED_PX
+    timed |= {(high, n): {p: 3 * s for p, s in timed[high, n].items()} for n in (1, CORES)}
+    then = {(row.part, row.width): row.serial_s + row.parallel_s for row in table.costs.rows}
+    for row in costs_of(table, timed, CORES, "here").rows:
+        slower = float(np.interp(np.log2(row.width), np.log2((low, high)), (1.0, 3.0)))
+        assert row.parallel_s == pytest.approx(slower * then[row.part, row.width], rel=1e-3)
+
+
+def test_a_part_that_was_not_timed_costs_what_is_shipped() -> None:
+    timed: PartSeconds = {
+        key: {part: s for part, s in each.items() if not part.startswith("network")}
+        for key, each in timed_as_shipped(2.0, 0.0).items()
+    }
+    shipped = {(row.part, row.width): row for row in shipped_table().costs.rows}
+    for row in costs_of(shipped_table(), timed, CORES, "here").rows:
+        if row.part.startswith("network"):
+            assert row == shipped[row.part, row.width]
+
+
+def test_scenes_become_medians_and_probes_means() -> None:
+    methods = {px: (NETWORK, *ladder(px)) for px in WIDTHS}
+    errors = {
+        scene: {
+            px: {method: 20.0 + row + 10 * scene for row, method in enumerate(methods[px])}
+            for px in WIDTHS
+        }
+        for scene in (0, *PROBES)
+    }
+    costs = {
+        scene: {px: dict.fromkeys(part_names(), float(spent)) for px in WIDTHS}
+        for scene, spent in zip((0, *PROBES), (1, 2, 6), strict=True)
+    }
+    table = table_of(errors, costs, "some processor, one thread")
+    assert (table.scenes, table.costs.machine) == (3, "some processor, one thread")
+    first = table.errors[0]
+    assert (first.rung, first.median_db, first.least_db) == ("network", 30.0, 20.0)
+    assert len(table.errors) == sum(map(len, methods.values()))
+    for row, probe in zip(table.costs.rows, table.probe.rows, strict=True):
+        assert (row.part, row.width) == (probe.part, probe.width)
+        assert row.serial_s + row.parallel_s == 2.0
+        assert probe.serial_s + probe.parallel_s == 4.0
+        assert (row.parallel_s == 0) == (row.part == "scene")
+
+
+def test_what_is_shipped_has_the_rows_that_this_makes() -> None:
+    shipped = shipped_table()
+    assert [(row.width, row.spp, row.denoiser) for row in shipped.errors] == [
+        (px, *method) for px in WIDTHS for method in (NETWORK, *ladder(px))
+    ]
+    wanted = [(part, px) for px in WIDTHS for part in part_names()]
+    assert [(row.part, row.width) for row in shipped.costs.rows] == wanted
+    assert [(row.part, row.width) for row in shipped.probe.rows] == wanted

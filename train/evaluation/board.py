@@ -1,0 +1,230 @@
+"""Judges every method on every view of a split, and adds the missing rows.
+
+The evaluation is that of one network (`train.evaluation.evaluate`): targets, masks, metrics and
+noise floors are equal.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.dataset.shard_set import ShardSet
+from storage.digests import canonical_json, sha256_hex
+from storage.errors import Unrenderable
+from storage.records.sample import Sample
+from storage.renderer import Camera, Renderer
+from train.data.bad_samples import BadSampleCounter, first_samples
+from train.evaluation.judge import ValidationScene, validation_scene
+from train.evaluation.judged_view import JudgedView, scene_facts
+from train.evaluation.metrics import METRICS, noise_floors, picture_scores
+from train.evaluation.rows import Row, RowKey, Rows
+from train.evaluation.stored_pictures import PictureSource, method_digest
+from train.evaluation.timing import Price, time_scene
+from train.loss.lpips import Lpips
+
+NOISE = "noise of the references"
+"""Name of the row of the targets' own noise, which bounds what any method can score."""
+
+Method = Renderer | PictureSource
+
+OnProgress = Callable[[int, int, str], None]
+"""Callback with (finished, all) pairs of scene and width, and the current step as text."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Board:
+    """Scenes, widths and methods of a leaderboard, and what its reader should know of them."""
+
+    shards: ShardSet
+    """Dataset shards of the evaluated split."""
+    set_digest: str
+    """Digest of the dataset, which the first line of the rows holds."""
+    keys: Sequence[str]
+    """Keys of the evaluated scenes, the first ones of the split."""
+    num_views: int
+    """Number of cameras of each scene."""
+    timed_scenes: int
+    """Number of scenes, from the start of `keys`, on which renderers are timed."""
+    machine: str
+    """Name of this processor; times of different processors are not comparable."""
+    widths: Sequence[int]
+    """Widths of pictures in pixels, ascending."""
+    lpips: Lpips | None
+    """LPIPS metric; None without its weights."""
+    folder: Path
+    """Folder in which rows.jsonl is written, and read when a run resumes."""
+    methods: list[Method] = field(default_factory=list)
+    """Methods, each of one width, in the order of evaluation."""
+    kinds: dict[str, str] = field(default_factory=dict)
+    """Kind of each method by name, which decides the chart's color."""
+    notes: list[str] = field(default_factory=list)
+    """Sentences on the methods, without full stops, which stand below the tables."""
+    left_out: dict[tuple[int, str], str] = field(default_factory=dict)
+    """Reason by (width, key) of scenes that a method cannot render."""
+
+    def add(self, method: Method, kind: str) -> None:
+        """Add a method of one width."""
+        self.methods.append(method)
+        self.kinds[method.name] = kind
+
+    @functools.cached_property
+    def rows(self) -> Rows:
+        """Stored rows; raises TrilightError if those of the folder are of another dataset."""
+        return Rows(self.folder / "rows.jsonl", self.set_digest)
+
+    @functools.cached_property
+    def _judged_by(self) -> str:
+        """Digest of the metrics' definitions."""
+        meanings = {metric: METRICS[metric].meaning for metric in METRICS}
+        return sha256_hex(canonical_json([meanings, self.lpips is not None]))
+
+    @functools.cached_property
+    def _renderer_digests(self) -> dict[int, str]:
+        """Digest of each renderer by its `id`."""
+        return {
+            id(method): method_digest(method.identity)
+            for method in self.methods
+            if not isinstance(method, PictureSource)
+        }
+
+    def key_of(self, method: Method, key: str, view: int) -> RowKey:
+        """Return the key of a method's row."""
+        if isinstance(method, PictureSource):
+            made_by = method.digest(key, view)
+        else:
+            made_by = self._renderer_digests[id(method)]
+        return self._row_key(method.resolution, method.name, made_by, key, view)
+
+    def noise_key(self, width: int, key: str, view: int) -> RowKey:
+        """Return the key of the row of a target's own noise."""
+        return self._row_key(width, NOISE, "", key, view)
+
+    def _row_key(self, width: int, name: str, made_by: str, key: str, view: int) -> RowKey:
+        return RowKey(width, key, view, name, sha256_hex(f"{made_by} {self._judged_by}".encode()))
+
+    def present(self, width: int) -> list[Method]:
+        """Return the methods of a width."""
+        return [method for method in self.methods if method.resolution == width]
+
+    def views(self, width: int) -> Iterator[JudgedView]:
+        """Yield the views that every method of a width has, with NOISE as a further method."""
+        present = self.present(width)
+        known = {one.name for one in dataclasses.fields(JudgedView)}
+        for key in self.keys:
+            for view in range(self.num_views):
+                noise = self.rows.get(self.noise_key(width, key, view))
+                rows = {one.name: self.rows.get(self.key_of(one, key, view)) for one in present}
+                if noise is None or noise.facts is None or None in rows.values():
+                    continue
+                floors = {name: value for name, value in noise.scores.items() if value is not None}
+                scores = {name: dict(row.scores) for name, row in rows.items() if row is not None}
+                scores[NOISE] = {metric: noise.scores.get(metric) for metric in METRICS}
+                facts = {name: value for name, value in noise.facts.items() if name in known}
+                if facts["excursion"] is not None:  # JSON has no pairs
+                    facts["excursion"] = tuple(facts["excursion"])
+                yield JudgedView(view=view, floors=floors, scores=scores, **facts)
+
+    def prices(self, width: int) -> dict[str, list[Price]]:
+        """Return the prices of this machine by method, one for each timed scene."""
+        prices: dict[str, list[Price]] = {}
+        for method in self.present(width):
+            for key in self.keys[: self.timed_scenes]:
+                price = self.rows.price(self.key_of(method, key, 0), self.machine)
+                if price is not None and (width, key) not in self.left_out:
+                    prices.setdefault(method.name, []).append(price)
+        return prices
+
+
+def first_keys(shards: ShardSet, limit: int) -> list[str]:
+    """Return the keys of the first scenes of a split; no picture is read."""
+    keys: list[str] = []
+    for number in range(len(shards.names)):
+        if len(keys) < limit:
+            with closing(shards.open(number)) as shard:
+                keys += shard.keys
+    return keys[:limit]
+
+
+def judge_all(board: Board, on_progress: OnProgress) -> None:
+    """Add every missing row.
+
+    Raises:
+        TrilightError: damaged data, or a network that cannot render a scene.
+    """
+    total = len(board.keys) * len(board.widths)
+    samples = first_samples(board.shards, len(board.keys), BadSampleCounter(0))
+    turns = ((row, sample, width) for row, sample in enumerate(samples) for width in board.widths)
+    for done, (row, sample, width) in enumerate(turns):
+        on_progress(done, total, "")
+        judged = functools.cache(functools.partial(validation_scene, sample, width))
+        for method in board.present(width):
+            timed = row < board.timed_scenes and not isinstance(method, PictureSource)
+            if not _has_all(board, method, sample, timed=timed):
+                on_progress(done, total, f"{width} px, {method.name}")
+                _judge(board, method, sample, judged, timed=timed)
+        _judge_noise(board, sample, width, judged)
+    on_progress(total, total, "")
+
+
+def _has_all(board: Board, method: Method, sample: Sample, *, timed: bool) -> bool:
+    """Return whether a method has the rows of a scene, and its price if it is timed there."""
+    keys = [board.key_of(method, sample.key, view) for view in range(sample.scene.num_views)]
+    is_priced = not timed or board.rows.price(keys[0], board.machine) is not None
+    return is_priced and all(board.rows.get(key) is not None for key in keys)
+
+
+def _judge(
+    board: Board,
+    method: Method,
+    sample: Sample,
+    judged: Callable[[], ValidationScene],
+    *,
+    timed: bool,
+) -> None:
+    """Add a method's rows of a scene, or record why the scene is left out."""
+    try:
+        pictures, price = _show(method, sample, timed=timed)
+    except Unrenderable as error:
+        board.left_out[method.resolution, sample.key] = f"{method.name}: {error}"
+        return
+    scene = judged()
+    for view, picture in enumerate(pictures):
+        scores = picture_scores(picture, scene.target_VRR3[view], scene.hits_VRR[view], board.lpips)
+        row = Row(scores=scores)
+        if price is not None and view == 0:
+            row = Row(scores=scores, **dataclasses.asdict(price), machine=board.machine)
+        board.rows.add(board.key_of(method, sample.key, view), row)
+
+
+def _judge_noise(
+    board: Board, sample: Sample, width: int, judged: Callable[[], ValidationScene]
+) -> None:
+    """Add the scores of the targets' own noise, with facts of the scene."""
+    for view in range(sample.scene.num_views):
+        key = board.noise_key(width, sample.key, view)
+        if board.rows.get(key) is None:
+            scene = judged()
+            floors = noise_floors(
+                sample, view, scene.target_VRR3[view], scene.hits_VRR[view], board.lpips
+            )
+            board.rows.add(key, Row(scores=floors, facts=scene_facts(sample)))
+
+
+def _show(
+    method: Method, sample: Sample, *, timed: bool
+) -> tuple[Sequence[NDArray[np.floating]], Price | None]:
+    """Return the pictures [R, R, 3] of all views, and the price if it is measured."""
+    if isinstance(method, PictureSource):
+        return list(method.pictures(sample)), None
+    scene = sample.scene
+    measured = time_scene(method, scene, sample.key) if timed else None
+    loaded = measured.loaded if measured else method.load(scene, sample.key)
+    cameras = [Camera.of_scene(scene, view) for view in range(scene.num_views)]
+    pictures = [loaded.render(camera).radiance_rgb for camera in cameras]
+    return pictures, measured.price if measured else None

@@ -1,0 +1,137 @@
+"""Charts of a leaderboard, CPU seconds against the median error, and of unusual scenes."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from train.evaluation.board import NOISE
+from train.evaluation.cost_charts import (
+    SeriesPoint,
+    colors_of,
+    draw_legend,
+    draw_points,
+    name_points,
+)
+from train.evaluation.judged_view import NETWORK, JudgedView
+from train.evaluation.pairs import METRIC
+from train.evaluation.standings import Standing, WidthStandings
+
+_PANEL = (7.4, 6.2)
+_DPI = 110
+_FONT = 9
+_COSTS = ("a scene's first view", "a further view")
+
+
+def plot_leaderboard(widths: Sequence[WidthStandings], title: str, path: Path) -> None:
+    """Draw the panels into a PNG file; entries without a price are lines, NOISE a dashed one."""
+    import matplotlib
+
+    matplotlib.use("Agg")  # before pyplot: no display is needed
+    with matplotlib.rc_context({"text.parse_math": False}):  # names may hold dollar signs
+        _plot(widths, title, path)
+
+
+def _plot(widths: Sequence[WidthStandings], title: str, path: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(
+        1,
+        len(widths),
+        figsize=(_PANEL[0] * len(widths), _PANEL[1]),
+        dpi=_DPI,
+        squeeze=False,
+        layout="constrained",
+    )
+    figure.suptitle(title, fontsize=12)
+    points_by_width = [_points(one) for one in widths]
+    colors = colors_of([point for points in points_by_width for point in points])
+    for axes, one, points in zip(panels.flat, widths, points_by_width, strict=True):
+        axes.set_title(f"{one.width} x {one.width} pixels, {one.num_views} views", fontsize=11)
+        axes.set_xlabel("core-seconds, one thread", fontsize=_FONT)
+        axes.set_ylabel(f"median {METRIC}, higher is better", fontsize=_FONT)
+        draw_points(axes, points, colors)
+        for standing in one.standings:
+            if standing.first_s is None:
+                _line_across(axes, standing)
+    draw_legend(figure, _COSTS, colors)
+    figure.canvas.draw()  # places are known from here on
+    for axes, points in zip(panels.flat, points_by_width, strict=True):
+        name_points(axes, points)
+    figure.savefig(path, metadata={"Software": None})
+    plt.close(figure)
+
+
+def _points(one: WidthStandings) -> list[SeriesPoint]:
+    return [
+        SeriesPoint(
+            name=each.name,
+            kind=each.kind,
+            costs=[each.first_s, each.further_s],
+            error=each.median_db,
+        )
+        for each in one.standings
+        if each.first_s is not None and each.further_s is not None
+    ]
+
+
+def _line_across(axes: Any, standing: Standing) -> None:
+    is_noise = standing.name == NOISE
+    axes.axhline(standing.median_db, color="0.45", linewidth=1, linestyle="--" if is_noise else ":")
+    axes.annotate(
+        standing.name,
+        (1, standing.median_db),
+        xycoords=("axes fraction", "data"),
+        xytext=(-4, 3),
+        textcoords="offset points",
+        fontsize=_FONT,
+        color="0.3",
+        horizontalalignment="right",
+    )
+
+
+_COLUMNS = 3
+"""Number of plots of axes in a row."""
+
+
+def plot_excursions(path: Path, views: Sequence[JudgedView]) -> int:
+    """Plot psnr_log_db beyond the usual range of scenes; return the number of axes.
+
+    Each axis has a plot: a dot is a view, the line the median at each value, the dashed line the
+    median of the noise floors. Nothing is written if no view leaves the usual range.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")  # before pyplot: no display is needed
+    import matplotlib.pyplot as plt
+
+    axes: dict[str, list[JudgedView]] = {}
+    for view in views:
+        if view.excursion is not None:
+            axes.setdefault(view.excursion[0], []).append(view)
+    if not axes:
+        return 0
+    rows = -(-len(axes) // _COLUMNS)
+    figure, grid = plt.subplots(
+        rows, _COLUMNS, figsize=(4.2 * _COLUMNS, 3.2 * rows), squeeze=False, layout="constrained"
+    )
+    for place, (axis, members) in zip(grid.flat, sorted(axes.items()), strict=False):
+        at = np.array([view.excursion[1] for view in members if view.excursion is not None])
+        scores = np.array([view.scores[NETWORK]["psnr_log_db"] for view in members], float)
+        floors = np.array([view.floors["psnr_log_db"] for view in members])
+        values = np.unique(at)
+        place.plot(at, scores, ".", color="tab:blue", alpha=0.4)
+        medians = [np.median(scores[at == value]) for value in values]
+        place.plot(values, medians, "-o", color="tab:blue", label="network")
+        noise = [np.median(floors[at == value]) for value in values]
+        place.plot(values, noise, "--", color="grey", label="noise floor")
+        place.set(title=axis.replace("_", " "), xlabel="value", ylabel="psnr_log_db")
+        if values[0] > 0 and values[-1] / values[0] > 8:
+            place.set_xscale("log")
+    grid.flat[0].legend()
+    for place in grid.flat[len(axes) :]:
+        place.axis("off")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return len(axes)

@@ -1,0 +1,259 @@
+"""Evaluation and leaderboard as Markdown for people, and as CSV tables for programs."""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from storage.markdown import inert, table, text
+from train.evaluation.board import NOISE
+from train.evaluation.cost_tables import number_text
+from train.evaluation.judged_view import NEAR_DB, NETWORK
+from train.evaluation.metrics import METRICS
+from train.evaluation.pairs import METRIC, PairedLead, interval_text
+from train.evaluation.published import PUBLISHED, PUBLISHED_ROWS, PUBLISHED_WHERE
+from train.evaluation.same_time import TRACER, sentences
+from train.evaluation.standings import WidthStandings
+
+_NONE = "n/a"
+_PAPER_PX = 256
+_PARTS = ("median", "worse_5_percent", "mean", "median_worse_than_noise")
+
+
+def evaluation_page(report: Mapping[str, Any]) -> str:
+    """Return evaluation.md of a report (train.evaluation.report.record)."""
+    contestants = report["contestants"]
+    network = contestants[NETWORK]
+    lines = ["# Evaluation", "", *_facts(report["about"])]
+    lines += [
+        "",
+        "Median over all views; in brackets the worse 5 %.",
+        "",
+        scores_table(contestants),
+    ]
+    lines += ["", *_noise_lines(network), *_same_time_lines(report["path tracer"])]
+    if loss := report["swapped scenes"]:
+        lines += ["", swapped_text(loss)]
+    if report["published"]:
+        lines += ["", *_paper({NETWORK: network})]
+    if passes := report["light passes"]:
+        lines += ["", "## Many lights: one pass, or groups added up", "", _medians_table(passes)]
+    for split, parts in report["groups"].items():
+        lines += ["", f"## By {split}", "", _medians_table(parts)]
+    return "\n".join([*lines, "", *_meanings(report["metrics"])]) + "\n"
+
+
+def leaderboard_page(
+    about: Mapping[str, str], widths: Sequence[WidthStandings], notes: Sequence[str], rival: str
+) -> str:
+    """Return leaderboard.md.
+
+    Args:
+        about: facts of the dataset by name.
+        widths: table of each width.
+        notes: notes for the reader.
+        rival: name of the row that all others are compared with.
+    """
+    lines = ["# Leaderboard", "", *_facts(about)]
+    lines += [
+        "",
+        "Medians over views, in brackets the worse 5 %; sorted by psnr_log_db. Core-seconds are "
+        "medians over the timed scenes, one thread of a processor, everything warm: a scene's "
+        "first view with its loading, and a further one. A row is on the front where no other one "
+        f"is as good at its price. The first row, {NOISE}, is what the targets leave open: rows "
+        "near or above it cannot be ranked by these references.",
+        "",
+        "![Core-seconds and error](leaderboard.png)",
+    ]
+    for one in widths:
+        lines += ["", f"## {one.width} x {one.width} pixels", ""]
+        lines += [f"{one.num_views} views of {one.num_scenes} scenes.", "", _standings_table(one)]
+        if any(each.lead is not None for each in one.standings):
+            lines += ["", f"Mean difference from {text(rival)}, view by view, dB of {METRIC}:", ""]
+            lines += [_pairs_table(one)]
+    ours = [one for one in widths if one.width == _PAPER_PX]
+    means = {each.name: each.scores for one in ours for each in one.standings}
+    lines += ["", *_paper(means), "", "## Notes", "", *(f"- {text(each)}." for each in notes)]
+    meanings = {name: metric.meaning for name, metric in METRICS.items()}
+    return "\n".join([*lines, "", *_meanings(meanings)]) + "\n"
+
+
+def scores_table(contestants: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a table of summaries (judged_view.summarize_views) by method."""
+    metrics = [name for name in METRICS if all(name in each for each in contestants.values())]
+    rows = [
+        [text(who), *(_with_tail(name, scores) for name in metrics)]
+        for who, scores in contestants.items()
+    ]
+    return table(["", *metrics], rows, numbers=len(metrics))
+
+
+def swapped_text(loss: Mapping[str, Any]) -> str:
+    """Return a sentence on what the network loses with another scene's triangles."""
+    return (
+        f"With the triangles of another scene the network loses {loss['median_db']:.2f} dB of "
+        f"psnr_log_db in the median and {loss['mean_db']:.2f} dB on average, and is worse in "
+        f"{loss['share_lost']:.1%} of {loss['views']} views. What looks at no scene loses nothing."
+    )
+
+
+def _facts(about: Mapping[str, object]) -> list[str]:
+    return [f"- {name}: {text(value)}" for name, value in about.items()]
+
+
+def _meanings(meanings: Mapping[str, str]) -> list[str]:
+    better = {name: "higher" if METRICS[name].higher_is_better else "lower" for name in meanings}
+    return [
+        "## What the figures are",
+        "",
+        *(f"- `{name}` ({better[name]} is better): {text(meanings[name])}" for name in meanings),
+    ]
+
+
+def _noise_lines(network: Mapping[str, Any]) -> list[str]:
+    gaps = [_score(name, network[name]["median_worse_than_noise"]) for name in METRICS]
+    drawn = ", ".join(name for name, metric in METRICS.items() if metric.floor is None)
+    return [
+        "Median of how much worse the network's picture is than the noise of its own target. The "
+        "noise of the PSNRs was measured, at the resolution of the data; log_l1 stands against an "
+        f"upper bound of it, and against independent noise of that size stand {drawn}:",
+        "",
+        table(["", *METRICS], [["worse than noise", *gaps]], numbers=len(gaps)),
+        "",
+        f"{network['near_floor']:.1%} of {network['views']} views are within {NEAR_DB:g} dB of "
+        "their floor.",
+    ]
+
+
+def _same_time_lines(traced: Mapping[str, Any] | None) -> list[str]:
+    if traced is None:
+        return []
+    lines = ["", "## Beside the path tracer, in the network's own time", ""]
+    lines += [text(" ".join(sentences(traced)))]
+    if "tracer" not in traced:
+        return lines
+    return [*lines, "", scores_table({NETWORK: traced["network"], TRACER: traced["tracer"]})]
+
+
+def _medians_table(parts: Mapping[str, Any]) -> str:
+    rows = [
+        [
+            text(name),
+            part["views"],
+            *(_score(metric, part[metric]["median"]) for metric in METRICS),
+            _score(METRIC, part[METRIC]["median_worse_than_noise"]),
+        ]
+        for name, part in parts.items()
+    ]
+    head = ["part", "views", *METRICS, "dB below noise floor"]
+    return table(head, rows, numbers=len(head) - 1)
+
+
+def _standings_table(one: WidthStandings) -> str:
+    head = ["", "first view, core-s", "further view", *METRICS, "front"]
+    rows = [
+        [
+            text(standing.name),
+            *("" if s is None else number_text(s) for s in (standing.first_s, standing.further_s)),
+            *(_with_tail(name, standing.scores) for name in METRICS),
+            {True: "yes", False: "no", None: ""}[standing.on_front],
+        ]
+        for standing in one.standings
+    ]
+    return table(head, rows, numbers=len(head) - 1)
+
+
+def _pairs_table(one: WidthStandings) -> str:
+    rows = [
+        [
+            text(each.name),
+            f"{each.lead.mean:+.2f}",
+            interval_text(each.lead.low, each.lead.high) or _NONE,
+            f"{each.lead.share_better:.0%}",
+        ]
+        for each in one.standings
+        if each.lead is not None
+    ]
+    return table(["", "more, dB", "95 % interval by scene", "better in"], rows, numbers=3)
+
+
+def _paper(ours: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return RenderFormer's table, with means of methods below it."""
+    rows = [
+        [name, *(f"{figures[metric]:g}" for metric in PUBLISHED)]
+        for name, figures in PUBLISHED_ROWS.items()
+    ]
+    rows += [
+        [f"here: {text(name)}", *(_score(metric, scores[metric]["mean"]) for metric in PUBLISHED)]
+        for name, scores in ours.items()
+    ]
+    return [
+        "## Beside the paper",
+        "",
+        f"{PUBLISHED_WHERE} Means, as there{', ours below it' if ours else ''}.",
+        "",
+        table(["", *PUBLISHED], rows, numbers=len(PUBLISHED)),
+    ]
+
+
+def _with_tail(name: str, scores: Mapping[str, Any]) -> str:
+    figures = scores[name]
+    if figures["median"] is None:
+        return _NONE
+    return f"{_score(name, figures['median'])} ({_score(name, figures['worse_5_percent'])})"
+
+
+def _score(metric: str, value: float | None) -> str:
+    return _NONE if value is None else f"{value:.{METRICS[metric].decimals}f}"
+
+
+def standings_csv(widths: Sequence[WidthStandings], machine: str) -> bytes:
+    """Return leaderboard.csv: a row for each width and method, a column for each figure.
+
+    Each row names the machine of its times, since tables of several machines may be merged.
+    """
+    columns = [f"{metric}_{part}" for metric in METRICS for part in _PARTS]
+    head = [
+        "width",
+        "name",
+        "kind",
+        "scenes",
+        "views",
+        "first_core_s",
+        "further_core_s",
+        "processor",
+    ]
+    lead = ["lead_mean_db", "lead_low_db", "lead_high_db", "lead_share_better", "on_front"]
+    rows = [
+        [
+            one.width, inert(each.name), each.kind, one.num_scenes, one.num_views,
+            each.first_s, each.further_s, None if each.first_s is None else inert(machine),
+            *(each.scores[metric][part] for metric in METRICS for part in _PARTS),
+            *_lead_cells(each.lead), each.on_front,
+        ]
+        for one in widths for each in one.standings
+    ]  # fmt: skip
+    return _csv([*head, *columns, *lead], rows)
+
+
+def pairs_csv(widths: Sequence[WidthStandings]) -> bytes:
+    """Return pairs.csv: the difference of every method from every other one."""
+    head = ["width", "name", "than", "mean_db", "low_db", "high_db", "share_better"]
+    rows = [
+        [one.width, inert(first), inert(second), *_lead_cells(lead)]
+        for one in widths
+        for (first, second), lead in one.pairs.items()
+    ]
+    return _csv(head, rows)
+
+
+def _lead_cells(lead: PairedLead | None) -> list[float | None]:
+    return [None] * 4 if lead is None else [lead.mean, lead.low, lead.high, lead.share_better]
+
+
+def _csv(head: Sequence[str], rows: Sequence[Sequence[object]]) -> bytes:
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows(rows)  # None is an empty cell
+    return stream.getvalue().encode(errors="replace")
