@@ -19,7 +19,7 @@ from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, 
 from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings
 from pipeline.renders.progressive import ProgressiveRenderer
 from pipeline.renders.renderer import SceneRenderer, set_threads
-from pipeline.renders.results import GrowingPicture, RenderedView, with_result
+from pipeline.renders.results import GrowingPicture, RenderedView
 from pipeline.renders.settings import FIRST_SPP, RenderSettings
 from pipeline.renders.variant import Variant, activate
 from storage.errors import Rejected, Unrenderable
@@ -207,7 +207,7 @@ class RenderWorker:
         if number not in self._loaded:
             return False
         self._loaded.move_to_end(number)
-        self._steps = with_result(self._loaded[number].view_steps(c2w, fov_deg, seed))
+        self._steps = self._loaded[number].view_steps(c2w, fov_deg, seed)
         return True
 
     def advance(self) -> Sampling | GrowingPicture | RenderedView | Preview:

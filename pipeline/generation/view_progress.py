@@ -1,7 +1,7 @@
 """`ViewProgress`: a render child writes the progress of a scene's views to the dataset's folder."""
 
 import time
-from collections.abc import Generator
+from collections.abc import Iterator
 
 from pipeline.renders.results import RenderedView
 from storage.dataset.layout import DatasetFolder
@@ -20,20 +20,19 @@ class ViewProgress:
         self._scene_index = scene_index
         self._written_s = 0.0
 
-    def render_view(
-        self, view: int, steps: Generator[Sampling, None, RenderedView]
-    ) -> RenderedView:
+    def render_view(self, view: int, steps: Iterator[Sampling | RenderedView]) -> RenderedView:
         """Render view number `view`, from 0, and report progress; raises as the renderer does."""
-        while True:
-            try:
-                now = next(steps)
-            except StopIteration as end:
-                rendered: RenderedView = end.value
-                return rendered
-            if self._folder is not None and time.monotonic() - self._written_s >= _EVERY_S:
-                self._written_s = time.monotonic()
-                fraction = min(1.0, now.spp / now.expected_spp)
-                tell_views(self._folder, self._scene_index, view + fraction)
+        for step in steps:
+            if not isinstance(step, Sampling):
+                return step
+            self._write(view, step)
+        raise AssertionError("a rendering yields its picture last")
+
+    def _write(self, view: int, now: Sampling) -> None:
+        if self._folder is not None and time.monotonic() - self._written_s >= _EVERY_S:
+            self._written_s = time.monotonic()
+            fraction = min(1.0, now.spp / now.expected_spp)
+            tell_views(self._folder, self._scene_index, view + fraction)
 
     def end(self) -> None:
         """Delete the progress of the scene."""

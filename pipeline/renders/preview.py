@@ -5,7 +5,7 @@ of samples, so that nothing tells how far it is from the truth, and it says so.
 """
 
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -90,10 +90,8 @@ class PreviewRenderer:
         self._settings = settings
         self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
 
-    def view_steps(
-        self, c2w: ArrayLike, fov_deg: float, seed: int
-    ) -> Generator[Sampling, None, Preview]:
-        """Yield after each pass and return the picture; equal arguments give equal bits.
+    def view_steps(self, c2w: ArrayLike, fov_deg: float, seed: int) -> Iterator[Sampling | Preview]:
+        """Yield after each pass, and last the picture; equal arguments give equal bits.
 
         Raises:
             Rejected: "nonfinite_radiance" or "radiance_overflow", as of `SceneRenderer`.
@@ -101,14 +99,12 @@ class PreviewRenderer:
         settings = self._settings
         pose = np.asarray(c2w, np.float64)
         camera = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
-        return (
-            yield from preview_steps(self._tracer, camera, seed, settings.spp, settings.denoiser)
-        )
+        return preview_steps(self._tracer, camera, seed, settings.spp, settings.denoiser)
 
 
 def preview_steps(
     tracer: Tracer, camera: PixelCamera, seed: int, spp: int, denoiser: Filtered
-) -> Generator[Sampling, None, Preview]:
+) -> Iterator[Sampling | Preview]:
     """Do what `PreviewRenderer.view_steps` does, for a scene that a tracer has loaded."""
     began_s = time.process_time()
     total = np.zeros((camera.resolution, camera.resolution, 3))
@@ -125,7 +121,7 @@ def preview_steps(
     require_bounded(float(mean.max()))
     if denoiser != "off":
         mean = denoise(mean, tracer.features(camera, spp=guide_rays(done)), denoiser)
-    return Preview(radiance_rgb=representable(mean), spp=done, core_s=time.process_time() - began_s)
+    yield Preview(radiance_rgb=representable(mean), spp=done, core_s=time.process_time() - began_s)
 
 
 def pass_sizes(spp: int) -> Iterator[int]:

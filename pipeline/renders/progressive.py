@@ -5,15 +5,15 @@ grows to its target, shown at each measurement. What comes at the end is, bit by
 `SceneRenderer` alone makes.
 """
 
-from collections.abc import Generator
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pipeline.renders.camera import PixelCamera
 from pipeline.renders.preview import preview_steps, usual_filter
-from pipeline.renders.renderer import SceneRenderer, run_to_end
-from pipeline.renders.results import GrowingPicture, RenderedView
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.settings import RenderSettings
 from storage.records.scene import Scene
 from storage.renderer import Sampling
@@ -33,8 +33,8 @@ class ProgressiveRenderer:
 
     def view_steps(
         self, c2w: ArrayLike, fov_deg: float, seed: int
-    ) -> Generator[Sampling, None, RenderedView]:
-        """Yield looks, and the progress of sampling between them; return the finished picture.
+    ) -> Iterator[Sampling | RenderedView]:
+        """Yield looks, the progress of sampling between them, and last the finished picture.
 
         Args:
             c2w: [4, 4] camera to world.
@@ -57,4 +57,4 @@ class ProgressiveRenderer:
                 floor=None,
                 core_s=preview.core_s,
             )
-        return (yield from self._measured.view_steps(c2w, fov_deg, seed))
+        yield from self._measured.view_steps(c2w, fov_deg, seed)

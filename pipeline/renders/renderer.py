@@ -13,8 +13,8 @@ picture is their sum; with `split` direct and indirect light are kept apart, and
 Mitsuba is imported inside functions only: `activate` must come first.
 """
 
-from collections.abc import Generator
-from typing import Any, TypeVar
+from collections.abc import Generator, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +24,7 @@ from pipeline.renders.denoiser import set_denoiser_threads
 from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans, HostPictures
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import MeasuredFloor
-from pipeline.renders.results import GrowingPicture, RenderedView, UsedTime
+from pipeline.renders.results import GrowingPicture, RenderedView, UsedTime, run_to_end
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.stopping import Floors, Goal, expected_spp, gaps_db, next_spp
@@ -37,9 +37,6 @@ from storage.records.lights import light_rows, rounded_to_half, sum_of_lights
 from storage.records.parts import MAX_PICTURES
 from storage.records.scene import Scene
 from storage.renderer import Sampling
-
-Result = TypeVar("Result")
-
 
 _FAST_HALVES_SPP = 256
 """Up to so many samples the halves are denoised by the fast filter, whose own error makes the floor
@@ -112,8 +109,8 @@ class SceneRenderer:
 
     def view_steps(
         self, c2w: ArrayLike, fov_deg: float, seed: int
-    ) -> Generator[Sampling, None, RenderedView]:
-        """Do what `render_view` does, yielding after each pass of one half."""
+    ) -> Iterator[Sampling | RenderedView]:
+        """Do what `render_view` does: yield after each pass of one half, and last the picture."""
         settings = self._settings
         self._used = UsedTime()
         pose = np.asarray(c2w, np.float64)
@@ -135,7 +132,7 @@ class SceneRenderer:
         floor = look.floor
         self._refuse_noisy(floor)
         stored = self._to_stored(pictures.finish())
-        return RenderedView(
+        yield RenderedView(
             spp=samples.spp,
             noise_floor_db=floor.log_db,
             noise_floor_linear_db=floor.linear_db,
@@ -271,16 +268,6 @@ def _refuse_sky(scene: Scene) -> None:
             "render settings: per_light is True and an environment lights the scene; expected "
             "emitters alone, whose pictures add up to all light. Leave out --per-light."
         )
-
-
-def run_to_end(steps: Generator[Any, None, Result]) -> Result:
-    """Run a generator to its end and return its result, without its progress."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            result: Result = end.value
-            return result
 
 
 def require_surfaces(scene: Scene) -> None:

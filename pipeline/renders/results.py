@@ -1,9 +1,10 @@
 """Results of a renderer: progress, pictures that grow, and finished pictures."""
 
 import time
-from collections.abc import Generator, Iterator, Mapping
+from collections import deque
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,6 @@ from pipeline.renders.noise_floor import MeasuredFloor
 from storage.records.parts import Parts
 from storage.renderer import Sampling
 
-Step = TypeVar("Step")
 Result = TypeVar("Result")
 
 
@@ -74,7 +74,6 @@ class UsedTime:
         self._began_s += core_s
 
 
-def with_result(steps: Generator[Step, None, Result]) -> Iterator[Step | Result]:
-    """Yield the steps of a rendering and, last, its result."""
-    result = yield from steps
-    yield result
+def run_to_end(steps: Iterator[Sampling | Result]) -> Result:
+    """Return what a rendering yields last, its result, without the progress before."""
+    return cast(Result, deque(steps, maxlen=1).pop())

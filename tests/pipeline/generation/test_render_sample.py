@@ -1,7 +1,7 @@
 """A sample as it is rendered: cameras that are replaced, stored passes, and how far it is."""
 
 import dataclasses
-from collections.abc import Generator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -60,12 +60,12 @@ class _Renderer:
 
     def view_steps(
         self, c2w: NDArray[np.float32], fov_deg: float, seed: int
-    ) -> Generator[Sampling, None, RenderedView]:
+    ) -> Iterator[Sampling | RenderedView]:
         self.turns += 1
         if 2 <= self.turns <= 3:
             raise Rejected("black_view", f"seed {seed}")
         yield Sampling(spp=8, expected_spp=8, missing_db=None)
-        return RenderedView(
+        yield RenderedView(
             radiance_rgb=np.full((16, 16, 3), 0.5, np.float32),
             spp=8,
             noise_floor_db=20.0,
@@ -207,10 +207,10 @@ def test_a_dataset_with_passes_verifies_and_goes_on(tmp_path: Path) -> None:
 DONE: Any = object()
 
 
-def _steps() -> Generator[Sampling, None, RenderedView]:
+def _steps() -> Iterator[Sampling | RenderedView]:
     for spp in (32, 64, 96, 256):
         yield Sampling(spp=spp, expected_spp=128, missing_db=None)
-    return DONE
+    yield DONE
 
 
 def _told(folder: DatasetFolder) -> list[str]:

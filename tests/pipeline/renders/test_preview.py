@@ -12,13 +12,14 @@ from pipeline.renders.camera import PixelCamera
 from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings, usual_filter
 from pipeline.renders.preview_parts import all_parts, preview_parts, seconds_of, timed_parts
 from pipeline.renders.progressive import FIRST_LOOKS_SPP, ProgressiveRenderer
-from pipeline.renders.renderer import SceneRenderer, run_to_end
-from pipeline.renders.results import GrowingPicture, RenderedView, with_result
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tracer import Features
 from storage.errors import Rejected, TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.scene import Scene
+from storage.renderer import Sampling
 from tests.pipeline.renders.sampling import SIGMAS
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 from tests.scenes_by_hand import tiny_scene
@@ -35,15 +36,10 @@ def loaded(scene: Scene, spp: int, **changes: Any) -> PreviewRenderer:
 
 def shown(renderer: PreviewRenderer, scene: Scene, spp: int, seed: int) -> Preview:
     steps = renderer.view_steps(scene.c2w[0], float(scene.fov_deg[0]), seed)
-    told = []
-    while True:
-        try:
-            told.append(next(steps))
-        except StopIteration as end:
-            found: Preview = end.value
-            assert told[-1].spp == found.spp == spp
-            assert all(step.missing_db is None for step in told)
-            return found
+    *told, found = steps
+    assert isinstance(found, Preview) and told[-1].spp == found.spp == spp
+    assert all(isinstance(step, Sampling) and step.missing_db is None for step in told)
+    return found
 
 
 def picture(scene: Scene, spp: int, seed: int = 0, **changes: Any) -> NDArray[np.float32]:
@@ -153,9 +149,7 @@ GROWING = RenderSettings(
 def test_the_first_looks_are_previews_and_the_last_picture_is_the_measured_one() -> None:
     scene = tiny_scene()
     view = run_to_end(SceneRenderer(scene, GROWING).view_steps(scene.c2w[0], 45.0, 7))
-    *steps, last = with_result(
-        ProgressiveRenderer(scene, GROWING).view_steps(scene.c2w[0], 45.0, 7)
-    )
+    *steps, last = ProgressiveRenderer(scene, GROWING).view_steps(scene.c2w[0], 45.0, 7)
     assert isinstance(last, RenderedView) and last.noise_floor_db == view.noise_floor_db
     np.testing.assert_array_equal(last.radiance_rgb, view.radiance_rgb)
     seen = [step for step in steps if isinstance(step, GrowingPicture)]

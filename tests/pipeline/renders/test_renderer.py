@@ -104,14 +104,8 @@ def test_sampling_stops_at_the_target_or_at_the_cap() -> None:
 def test_a_view_says_how_far_it_is() -> None:
     scene = simple_scene()
     settings = dataclasses.replace(GROWING, noise_floor_db=95.0)
-    steps = SceneRenderer(scene, settings).view_steps(scene.c2w[0], float(scene.fov_deg[0]), 0)
-    seen = []
-    while True:
-        try:
-            seen.append(next(steps))
-        except StopIteration as end:
-            view = end.value
-            break
+    steps: Any = SceneRenderer(scene, settings).view_steps(scene.c2w[0], float(scene.fov_deg[0]), 0)
+    *seen, view = steps
     # passes of 16 to 64 samples a half, then one of 64 of each half
     assert [step.spp for step in seen] == [*range(16, 129, 16), 192, 256]
     assert all(step.spp <= step.expected_spp <= 256 for step in seen)
