@@ -70,12 +70,27 @@ def make_leaderboard(order: LeaderboardOptions, on_progress: OnProgress) -> Lead
         TrilightError: the dataset, a network or a folder of pictures is unusable, the folder's rows
             are of another dataset, or no view could be evaluated.
     """
+    with _open_board(order) as (board, opened, most_triangles):
+        judge_all(board, on_progress)
+        return _write_leaderboard(order, opened, board, most_triangles)
+
+
+def check_leaderboard(order: LeaderboardOptions) -> None:
+    """Raise TrilightError for wrong options or pictures of a leaderboard that is made later."""
+    with _open_board(order):
+        pass
+
+
+@contextlib.contextmanager
+def _open_board(
+    order: LeaderboardOptions,
+) -> Iterator[tuple[Board, TrainingData, dict[str, int]]]:
+    """Yield board, dataset, and the most triangles that each network was trained on."""
     opened = open_training_data([order.source])
     shards = opened.split(order.split)
     if opened.num_views is None:
         raise TrilightError(
-            f"SOURCE is {opened.display_name}, a list of shards; expected a dataset with its "
-            "manifest."
+            f"{opened.display_name} is a list of shards; expected a dataset with its manifest."
         )
     board = Board(
         shards=shards,
@@ -91,16 +106,14 @@ def make_leaderboard(order: LeaderboardOptions, on_progress: OnProgress) -> Lead
     _add_folders(board, order.pictures)
     _add_nearest(board, order, opened)
     with contextlib.closing(RenderChild(choose_variant(), threads=1)) as child:
-        most_triangles = _add_renderers(board, order.checkpoint, child)
-        judge_all(board, on_progress)
-    return _write_leaderboard(order, opened, board, most_triangles)
+        yield board, opened, _add_renderers(board, order.checkpoint, child)
 
 
 def widths_of(requested: Sequence[int], stored: int) -> list[int]:
     """Return the widths to evaluate, ascending; raises TrilightError if one does not divide."""
     if wrong := [width for width in requested if stored % width]:
         raise TrilightError(
-            f"--width is {wrong[0]}; expected a divisor of {stored}, the width of the set. "
+            f"the width is {wrong[0]}; expected a divisor of {stored}, the width of the set. "
             "Generate it at another --resolution for wider pictures."
         )
     usual = [width for width in USUAL_WIDTHS if stored % width == 0]
@@ -159,8 +172,7 @@ def _add_renderers(board: Board, checkpoints: Sequence[str], child: RenderChild)
     names = _names(places)
     if twice := [name for name in names if names.count(name) > 1]:
         raise TrilightError(
-            f"--checkpoint: {twice[0]} is there twice; expected each network once, in folders of "
-            "different names."
+            f"{twice[0]} is there twice; expected each network once, in folders of different names."
         )
     networks: dict[str, NeuralRenderer] = {}
     most_triangles: dict[str, int] = {}

@@ -68,7 +68,8 @@ def _require_all(folder: Path, views: Views) -> None:
         raise TrilightError(
             f"--pictures {folder}: {len(missing)} of {len(views)} pictures are missing, the first "
             f"is {picture_name(*missing[0])}; expected one for each view, called as `trilight "
-            "export SET --form exr` calls them. --scenes judges fewer."
+            "export SET --form exr` calls them. Fewer scenes can be judged (--scenes of "
+            "leaderboard, --most-scenes of evaluate)."
         )
 
 
@@ -94,7 +95,7 @@ def _picture(data: bytes, path: Path, widths: Sequence[int]) -> NDArray[np.float
         expected = " or ".join(f"{each} x {each}" for each in widths)
         raise TrilightError(
             f"{path.name}: {width} x {height} pixels; expected {expected}. Render it at that size, "
-            "or name another --width."
+            "or choose another width."
         )
     radiance_rgb = np.asarray(pixels[..., :3], np.float32)
     legal = np.isfinite(radiance_rgb) & (radiance_rgb >= _LEAST)

@@ -178,45 +178,48 @@ def describe_run(order: DatasetOrder, folder: DatasetFolder) -> str:
     if order.scenes_from or order.revisits or settings.revisit:
         return ""
     scenes = _num_scenes(order)
-    said = f"; {_rough_time(settings, scenes)}; `trilight plan` measures it"
+    remaining = scenes
+    core_s: list[float] = []
+    size = ""
     if folder.manifest.exists():
         manifest = read_manifest(folder.manifest)
         last = sample_logs(folder).last
         scenes = max(scenes, manifest.num_scenes)
         remaining = max(scenes - read_progress(folder).scenes_done, 0)
-        cores = available_cores()
-        if last:
-            core_s = [row.seconds * row.cores for row in last]
-            minutes = _total(core_s, remaining / cores / 60).to_text("{:,.1f}".format)
-            said = f"; {remaining} of them are still to make: {minutes} minutes on {cores} cores"
+        core_s = [row.seconds * row.cores for row in last]
         if sizes := [
             each.num_bytes / each.num_samples for each in manifest.shards if each.num_samples
         ]:
-            said = f", about {_total(sizes, scenes / 1e6).value:,.1f} MB{said}"
+            size = f", about {_total(sizes, scenes / 1e6).value:,.1f} MB"
     shards = shards_for(scenes, settings.splits)
     lacking = lacks_validation(scenes, settings.splits)
     lacking = f" ({lacking})" if lacking else ""
     part = f", of which this run makes {order.shards}" if order.shards else ""
     views = f"{settings.scenes.num_views} views each"
     counts = f"{_count_text(scenes, 'scene')} of {views} in {_count_text(shards, 'shard')}"
-    return f"{counts}{lacking}{part}{said}"
+    return f"{counts}{lacking}{part}{size}; {_expected_time(settings, remaining, core_s)}"
 
 
-def _rough_time(settings: BuildSettings, scenes: int) -> str:
-    """Return about how long scenes take here, by the cost of scenes elsewhere."""
+def _expected_time(settings: BuildSettings, remaining: int, core_s: Sequence[float]) -> str:
+    """Return about how long the remaining scenes take, by earlier ones of the set or by ours."""
+    cores = available_cores()
+    on_cores = f"on {_count_text(cores, 'core')}"
+    if core_s:
+        minutes = _total(core_s, remaining / cores / 60).to_text("{:,.1f}".format)
+        return f"{remaining} of them are still to make: {minutes} minutes {on_cores}"
     if visible_gpus():
         return "how long that takes is known after the first scenes"
     (low_db, low_s), (high_db, high_s) = _VIEW_CORE_S
     target_db = settings.renders.targets_db.get("psnr_log_db", low_db)
     power = (target_db - low_db) / (high_db - low_db)
     pixels = (settings.renders.resolution / 256) ** 2
-    views = scenes * settings.scenes.num_views
-    cores = available_cores()
-    minutes = views * pixels * low_s * (high_s / low_s) ** power / cores / 60
-    said = (
-        _count_text(math.ceil(minutes), "minute") if minutes < 100 else f"{minutes / 60:,.0f} hours"
+    views = remaining * settings.scenes.num_views
+    hours = views * pixels * low_s * (high_s / low_s) ** power / cores / 3600
+    said = f"{hours:,.0f} hours" if hours > 2 else _count_text(math.ceil(60 * hours), "minute")
+    return (
+        f"all together roughly {said} {on_cores}, where scenes cost what ours did; `trilight plan` "
+        "measures it"
     )
-    return f"roughly {said} on {_count_text(cores, 'core')}, where scenes cost what ours did"
 
 
 def _count_text(count: int, noun: str) -> str:

@@ -6,6 +6,7 @@ each loads a scene and then renders any camera of it.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import metadata
 from typing import Any, Protocol
 
 import numpy as np
@@ -139,6 +140,6 @@ class Renderer(Protocol):
         """Release processes and memory; loaded scenes are of no use afterwards."""
 
 
-def fingerprint(renderer: Renderer) -> str:
-    """Return the SHA-256 of everything but scene and camera that decides a renderer's pictures."""
-    return sha256_hex(canonical_json(renderer.identity))
+def fingerprint(identity: Mapping[str, object]) -> str:
+    """Return the SHA-256 of a renderer's identity, this version of Trilight included."""
+    return sha256_hex(canonical_json({**identity, "trilight": metadata.version("trilight")}))

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from pipeline.generation.pipeline import make_dataset as make_dataset
     from pipeline.generation.pipeline import prepare_dataset as prepare_dataset
     from pipeline.generation.run import Outcome as Outcome
+    from pipeline.generation.runner import Runner as Runner
     from pipeline.objects.listing import Listing as Listing
     from pipeline.objects.ply import encode_ply as encode_ply
     from pipeline.objects.sources import SOURCES as SOURCES

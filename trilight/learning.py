@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from infra.torch_library import require_torch
+from storage.installation import module_name
 from train.monitoring.settings import WatchSettings
 from train.resume import StartOptions
 from train.runs import changed_run, named_run
@@ -133,4 +134,4 @@ def __getattr__(name: str) -> object:
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     require_torch(name)
-    return getattr(import_module(_PLACES[name]), name)
+    return getattr(import_module(module_name(_PLACES[name])), name)

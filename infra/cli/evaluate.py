@@ -19,6 +19,10 @@ def evaluate(order: EvaluationOptions, output: OutputOptions) -> None:
     record: dict[str, Any] = {}
     board = order.leaderboard()
     if order.checkpoint:
+        if board:
+            from infra.leaderboard import check_leaderboard
+
+            check_leaderboard(board)  # the evaluation before it may take hours
         record, out = _judge_network(order, order.checkpoint, silent=output.json)
         board = board and dataclasses.replace(board, out=out)
     if board:

@@ -212,7 +212,10 @@ class RenderWorker:
 
     def advance(self) -> Sampling | GrowingPicture | RenderedView | Preview:
         """Return the next step, last the picture."""
-        return next(self._steps)
+        step = next(self._steps)
+        if not isinstance(step, Sampling):
+            self._steps = iter(())  # frees the samples
+        return step
 
 
 def image_of(picture: GrowingPicture | RenderedView | Preview) -> Image:

@@ -7,7 +7,6 @@ machine and writes them into the user's cache.
 
 import functools
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,6 +19,7 @@ from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.digests import canonical_json
 from storage.errors import TrilightError
+from storage.machine import available_cores
 from storage.metrics import MAX_DB
 from storage.settings.described import checked, from_record, settings_record
 from storage.settings.ranges import Within
@@ -112,7 +112,7 @@ def shipped_table() -> PreviewTable:
 
 def machine_name(variant: Variant) -> str:
     """Return processor, cores and Mitsuba variant, on which costs depend."""
-    return f"{processor()}, {os.cpu_count()} cores, {variant.name}"
+    return f"{processor()}, {available_cores()} cores, {variant.name}"
 
 
 def machine_costs_path() -> Path:

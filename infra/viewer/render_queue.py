@@ -8,7 +8,7 @@ path traced one.
 import itertools
 import threading
 from collections import OrderedDict
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -78,7 +78,7 @@ class RenderQueue:
         self._thread: threading.Thread | None = None
         self._numbers = itertools.count(1)
         self._edited: tuple[str, Scene] | None = None
-        self._loaded: dict[str, tuple[Hashable, ReadyScene, Sequence[str]]] = {}
+        self._loaded: dict[str, tuple[object, ReadyScene, Sequence[str]]] = {}
         self._closed = False
 
     def submit(self, options: PictureOptions) -> RenderJob:
@@ -202,10 +202,10 @@ class RenderQueue:
 
     def _load(self, options: PictureOptions) -> tuple[ReadyScene, Sequence[str]]:
         """Return the edited scene in the renderer of a request, and the notes on its pictures."""
-        key = (options.scene_key, options.resolution, options.error_db)
+        renderer = self._renderers[options.engine].make(options)
+        key = (options.scene_key, renderer.identity)
         if self._loaded.get(options.engine, (None,))[0] != key:
             scene = self.scene(options.scene_key, options.edits)
-            renderer = self._renderers[options.engine].make(options)
             loaded = renderer.load(scene, "the scene")
             self._loaded[options.engine] = (key, loaded, [*loaded.notes, *renderer.notes])
         return self._loaded[options.engine][1:]

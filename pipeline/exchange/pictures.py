@@ -44,7 +44,7 @@ def decode_pixels(data: bytes, name: str, lost: list[str] | None = None) -> NDAr
     try:
         picture = read_linear_picture(data, MAX_PIXELS)
         if picture is None:
-            return decode_image(data, name, MAX_PIXELS, lost)[::-1]
+            return decode_image(data, name, MAX_PIXELS, lost, replaces_nan=True)[::-1]
     except Rejected as error:
         if error.reason in ("too_many_pixels", "texture_too_large"):
             raise _too_large(error, name) from error

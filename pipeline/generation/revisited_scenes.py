@@ -99,7 +99,7 @@ class RevisitedScenes:
         step = {"dataset_digest": self.digest, "key": key, "seed": seed, "attempt": attempt}
         origin = {**before, "revisited": [*before.get("revisited", []), step]}
         if revisit.new_cameras and not (revisit.kept_cameras and revisit.camera_layout is None):
-            layout = revisit.camera_layout or before["template"]
+            layout = revisit.camera_layout or before.get("template", "unknown")
             origin["new_cameras"] = {"layout": layout, "seed": seed}
         return origin
 

@@ -110,7 +110,7 @@ def test_the_wheel_holds_one_package_and_what_belongs_to_it(wheel: Path) -> None
     assert {top for top in tops if not top.endswith(".dist-info")} == {"trilight"}
     for name in (
         "py.typed", "prefect.yaml", "model/builtin/hits/model.safetensors",
-        "infra/slurm/train.sbatch",
+        "infra/slurm/train.sbatch", "pipeline/documents/templates/report.html",
         "infra/kubernetes/pool.yaml", "infra/images/cpu.Dockerfile", "infra/serving/pool.json",
     ):  # fmt: skip
         assert f"trilight/{name}" in names

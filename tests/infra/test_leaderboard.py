@@ -222,11 +222,13 @@ def test_evaluate_is_a_leaderboard_without_a_network_and_beside_others(
     short: LeaderboardOptions, tmp_path: Path
 ) -> None:
     data = ["--data", short.source, "--split", "validation", "--most-scenes", "1"]
-    words = [*data, "--resolution", str(PX), "--tracer-views", "0", "--json"]
+    words = [*data, "--resolution", str(PX), "--json"]
+    without_effect = trilight(["evaluate", *words, "--tracer-views", "0"]).exception
+    assert "--tracer-views is 0; expected it with a network alone" in str(without_effect)
     alone = json.loads(trilight(["evaluate", *words, "--out", str(tmp_path / "alone")]).stdout)
     (one,) = alone["widths"]
     assert (one["width"], one["scenes"], alone["rival"]) == (PX, 1, "network builtin:tokens")
-    words = ["evaluate", "builtin:tokens", *words, "--beside", "builtin:"]
+    words = ["evaluate", "builtin:tokens", *words, "--tracer-views", "0", "--beside", "builtin:"]
     both = json.loads(trilight([*words, "--out", str(tmp_path / "both")]).stdout)
     assert both["about"]["network"] == "builtin:tokens" and NETWORK in both["contestants"]
     names = {each["name"] for each in both["leaderboard"]["widths"][0]["standings"]}
@@ -234,7 +236,7 @@ def test_evaluate_is_a_leaderboard_without_a_network_and_beside_others(
     written = {path.name for path in (tmp_path / "both").iterdir()}
     assert {"evaluation.json", "worst.png", "leaderboard.md", "pairs.csv", "rows.jsonl"} <= written
     refused = trilight([*words, "--data", short.source]).exception
-    assert "--data is given 2 times; expected one dataset for a leaderboard" in str(refused)
+    assert "--data is given 2 times; expected one dataset to compare methods on" in str(refused)
 
 
 def test_prices_of_two_machines_do_not_mix(
@@ -265,13 +267,13 @@ def test_prices_of_two_machines_do_not_mix(
 def test_widths_are_those_that_the_set_has() -> None:
     assert widths_of((), 256) == [64, 256] and widths_of((), 512) == [64, 256, 512]
     assert widths_of((), 96) == [96] and widths_of((128, 64), 256) == [64, 128]
-    with pytest.raises(TrilightError, match=r"--width is 512; expected a divisor of 256"):
+    with pytest.raises(TrilightError, match=r"the width is 512; expected a divisor of 256"):
         widths_of((512,), 256)
 
 
 def test_mistakes_are_one_line(order: LeaderboardOptions, root: Path) -> None:
     twice = dataclasses.replace(order, checkpoint=(str(root / "renderformer-v1-base"),) * 2)
-    with pytest.raises(TrilightError, match=r"--checkpoint: .*is there twice"):
+    with pytest.raises(TrilightError, match=r"is there twice"):
         board_of(twice)
     lacks = dataclasses.replace(order, pictures=(root / "toy",))
     with pytest.raises(TrilightError, match=r"4 of 4 pictures are missing"):
@@ -399,7 +401,7 @@ def test_a_line_that_a_kill_cut_short_is_judged_again(tmp_path: Path) -> None:
 
 
 OTHERS = [
-    ('{"set": "another"}\n', r"are of the set another, and SOURCE is set a.*another --out"),
+    ('{"set": "another"}\n', r"are of the set another, and this set is set a.*another --out"),
     ("nothing\n", "not the rows of a leaderboard.*another --out, or delete the file"),
     ('{"set": "set a"}\n{"width": 64}\n', "not the rows of a leaderboard"),
     ("[" * 100_000 + "\n", "not the rows of a leaderboard"),

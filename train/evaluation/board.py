@@ -18,13 +18,13 @@ from storage.dataset.shard_set import ShardSet
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import Unrenderable
 from storage.records.sample import Sample
-from storage.renderer import Camera, Renderer
+from storage.renderer import Camera, Renderer, fingerprint
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.evaluation.judge import ValidationScene, validation_scene
 from train.evaluation.judged_view import JudgedView, scene_facts
 from train.evaluation.metrics import METRICS, noise_floors, picture_scores
 from train.evaluation.rows import Row, RowKey, Rows
-from train.evaluation.stored_pictures import PictureSource, method_digest
+from train.evaluation.stored_pictures import PictureSource
 from train.evaluation.timing import Price, time_scene
 from train.loss.lpips import Lpips
 
@@ -88,7 +88,7 @@ class Board:
     def _renderer_digests(self) -> dict[int, str]:
         """Digest of each renderer by its `id`."""
         return {
-            id(method): method_digest(method.identity)
+            id(method): fingerprint(method.identity)
             for method in self.methods
             if not isinstance(method, PictureSource)
         }

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from storage.errors import TrilightError
-from storage.settings.described import checked
+from storage.settings.described import checked, option_of
 from storage.settings.ranges import Within
 from train.folder import RunFolder
 
@@ -101,14 +101,20 @@ class EvaluationOptions:
         """Return the options of the leaderboard; None if none was requested.
 
         Raises:
-            TrilightError: there are several datasets, of which a leaderboard is not made.
+            TrilightError: there are several datasets, or an option has no effect without a network.
         """
         if self.checkpoint and not (self.other_networks or self.pictures):
             return None
+        for option, value in (("device", self.device), ("tracer_views", self.tracer_views)):
+            if not self.checkpoint and value != getattr(EvaluationOptions, option):
+                raise TrilightError(
+                    f"{option_of(option)} is {value!r}; expected it with a network alone. All "
+                    "methods are compared on the processor."
+                )
         if len(self.data) > 1:
             raise TrilightError(
-                f"--data is given {len(self.data)} times; expected one dataset for a leaderboard. "
-                "Leave out --beside and --pictures, or compare on one after the other."
+                f"--data is given {len(self.data)} times; expected one dataset to compare methods "
+                "on. Compare on one after the other."
             )
         return LeaderboardOptions(
             source=self.data[0],

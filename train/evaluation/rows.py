@@ -80,7 +80,7 @@ class Rows:
             ) from error
         if stored_digest != set_digest:
             raise TrilightError(
-                f"{path}: its rows are of the set {stored_digest[:12]}, and SOURCE is "
+                f"{path}: its rows are of the set {stored_digest[:12]}, and this set is "
                 f"{set_digest[:12]}; expected the same set. Choose another --out."
             )
 

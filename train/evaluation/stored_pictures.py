@@ -1,15 +1,14 @@
 """Stored pictures that are judged beside renderers: looked up, not rendered, without a price."""
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import metadata
 
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.digests import canonical_json, sha256_hex
 from storage.records.sample import Sample
+from storage.renderer import fingerprint
 from train.data.resolution import block_mean
 from train.evaluation.baselines import Baselines
 
@@ -50,12 +49,7 @@ def nearest_view(
         itself = sample.key if not_itself else ""
         return np.stack([baselines().nearest(target, not_of=itself) for target in targets])
 
-    digest = method_digest({"pool": pool})
+    digest = fingerprint({"pool": pool})
     return PictureSource(
         name=name, resolution=resolution, digest=lambda key, view: digest, pictures=pictures
     )
-
-
-def method_digest(identity: Mapping[str, object]) -> str:
-    """Return the digest of what decides a method's pictures, this version of Trilight included."""
-    return sha256_hex(canonical_json({**identity, "trilight": metadata.version("trilight")}))

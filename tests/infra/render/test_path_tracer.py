@@ -71,5 +71,7 @@ def test_a_fingerprint_tells_quality_width_and_seed_apart() -> None:
         PathTracer(child, FEW, 64),
         PathTracer(child, MEASURED, 32),
     ]
-    assert len({fingerprint(tracer) for tracer in tracers}) == len(tracers)
-    assert fingerprint(PathTracer(child, FEW, 32, name="other")) == fingerprint(tracers[0])
+    assert len({fingerprint(tracer.identity) for tracer in tracers}) == len(tracers)
+    assert fingerprint(PathTracer(child, FEW, 32, name="other").identity) == fingerprint(
+        tracers[0].identity
+    )

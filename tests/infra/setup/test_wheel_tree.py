@@ -121,6 +121,7 @@ assert not ours, ours
 assert module_name("pipeline.flows") == "trilight.pipeline.flows"
 assert (IMPORT_ROOT / "trilight") == FILES_ROOT
 assert (FILES_ROOT / "prefect.yaml").is_file()
+assert trilight.judge_network.__module__ == "trilight.infra.judging"
 """
 
 

@@ -244,6 +244,8 @@ def test_one_licence_is_stated_as_the_hub_spells_it(tmp_path: Path) -> None:
         assert ("license_link" in front) == (spelling == "other")
         assert re.fullmatch(r"[a-z0-9.-]+", front.get("license_name", "none"))
         assert ("not known here" in body) == (spelling == "other")
+    write_objects_lock(dataset.folder.objects_lock, [locked("a", "mine"), locked("b", "yours")])
+    assert "duties of `mine`, `yours` are" in card_of(dataset)[1]
 
 
 def test_the_body_counts_by_split_and_licence(tmp_path: Path) -> None:
