@@ -136,7 +136,7 @@ def measure_scenes(
     )
 
 
-def predict(
+def predict_cost(
     measured: MeasuredScenes, order: DatasetOrder, *, cores: int, usd_per_core_hour: float
 ) -> Prediction:
     """Return the predicted cost of the whole dataset from the means of measured scenes.

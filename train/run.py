@@ -29,7 +29,7 @@ from train.loop.recorder import Recorder
 from train.loop.state import TrainState
 from train.loop.trainer import Trainer, scene_flops
 from train.loss.lpips import load_lpips
-from train.loss.objective import Objective
+from train.loss.objective import TrainingLoss
 from train.monitoring.notes import add_note
 from train.monitoring.settings import WatchSettings
 from train.monitoring.weights_and_biases import require_wandb
@@ -125,7 +125,7 @@ def _train(
     plan = plan_start(settings, folder, dataset.digest, start, dist_context, early_notes)
     settings = plan.settings
     lpips = dist_context.run_once_per_machine(partial(load_lpips, start.lpips))
-    objective = Objective(settings.loss, lpips).to(dist_context.device)
+    objective = TrainingLoss(settings.loss, lpips).to(dist_context.device)
     _check_data(dataset, settings)
     state = init_or_resume_state(plan, folder, dataset, dist_context, early_notes)
     judge = _make_judge(dataset, settings, state.bad_samples) if dist_context.is_first else None

@@ -57,12 +57,12 @@ def plan(
     samples = options.samples
     cores = options.cores
     first_words(f"Measuring {samples} scenes of {build}", silent=output.json)
-    from infra.planning import measure_scenes, predict  # slow: every stage
+    from infra.planning import measure_scenes, predict_cost  # slow: every stage
 
     with progress_bars() as bars, temporary_folder("trilight-plan-") as place:
         task = bars.add_task("scenes", total=samples, note="", visible=not output.json)
         measured = measure_scenes(order, samples, place, lambda: bars.advance(task))
-    prediction = predict(measured, order, cores=cores, usd_per_core_hour=core.price)
+    prediction = predict_cost(measured, order, cores=cores, usd_per_core_hour=core.price)
     if output.json:
         print_json(dataclasses.asdict(prediction))
         return

@@ -145,7 +145,7 @@ def _is_scene(path: Path) -> bool:
         return False  # the mesh stage reports the reason
 
 
-def drop_copies(names: Sequence[str]) -> list[str]:
+def drop_duplicates(names: Sequence[str]) -> list[str]:
     """Return object files without copies of other objects; one note counts the copies.
 
     Args:

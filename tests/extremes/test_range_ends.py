@@ -46,7 +46,7 @@ from train.data.buckets import TrainingBatch, collate_batch
 from train.data.scenes import training_scene
 from train.loop.schedule import learning_rate
 from train.loop.state import new_state
-from train.loss.objective import Objective
+from train.loss.objective import TrainingLoss
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
 
 GROUPS: dict[type, str] = {
@@ -339,7 +339,9 @@ def test_losses_and_their_gradients_are_finite_wherever_predictions_are(
 ) -> None:
     size = (1, 1, 32, 32, 3)
     prediction = torch.full(size, shown, requires_grad=True)
-    losses = Objective(terms, None)(prediction, torch.full(size, wanted), torch.full((1, 1), noise))
+    losses = TrainingLoss(terms, None)(
+        prediction, torch.full(size, wanted), torch.full((1, 1), noise)
+    )
     losses.total_BV.sum().backward()
     assert prediction.grad is not None and torch.isfinite(prediction.grad).all()
     assert losses.total_BV.item() >= 0

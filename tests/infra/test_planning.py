@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from infra import doctor
-from infra.planning import MeasuredScenes, describe_run, measure_scenes, predict
+from infra.planning import MeasuredScenes, describe_run, measure_scenes, predict_cost
 from pipeline.executors.threads import ThreadRunner
 from pipeline.flows import prefect_server
 from pipeline.generation.dataset_order import DatasetOrder
@@ -29,7 +29,7 @@ def _measured(core_s: tuple[float, ...], num_bytes: int = 150_000) -> MeasuredSc
 def test_equal_scenes_add_up_exactly() -> None:
     """The first scene, which compiles, is left out; nothing varies, so intervals are points."""
     order = DatasetOrder(build="pretrain-256", scenes=2560)
-    found = predict(_measured((99.0, 36.0, 36.0)), order, cores=16, usd_per_core_hour=0.5)
+    found = predict_cost(_measured((99.0, 36.0, 36.0)), order, cores=16, usd_per_core_hour=0.5)
     assert (found.num_scenes, found.num_shards) == (2560, 10)
     assert found.core_hours.value == pytest.approx(25.6)  # floating point only
     assert (found.core_hours.low, found.core_hours.high) == pytest.approx((25.6, 25.6))
@@ -51,7 +51,7 @@ def test_an_interval_covers_the_mean_as_often_as_it_says() -> None:
     hits = 0
     for _ in range(200):
         core_s = tuple(float(value) for value in rng.lognormal(0.0, 0.6, 41))
-        interval = predict(_measured(core_s), order, cores=1, usd_per_core_hour=1).core_hours
+        interval = predict_cost(_measured(core_s), order, cores=1, usd_per_core_hour=1).core_hours
         assert interval.low <= interval.value <= interval.high
         hits += interval.low <= truth <= interval.high
     assert hits >= 160
@@ -60,11 +60,13 @@ def test_an_interval_covers_the_mean_as_often_as_it_says() -> None:
 def test_two_million_scenes_come_with_warnings() -> None:
     order = DatasetOrder(build="pretrain-256", scenes=2_000_000)
     measured = _measured((400.0, 400.0))
-    found = predict(measured, order, cores=4096, usd_per_core_hour=0.04)
+    found = predict_cost(measured, order, cores=4096, usd_per_core_hour=0.04)
     assert found.num_tasks == MAX_TASKS
     assert found.manifest_mb < 2  # it lists 7,813 shards, however many views they hold
     assert any("flow runs" in note for note in found.notes)
-    fewer = predict(measured, dataclasses.replace(order, scenes=500), cores=1, usd_per_core_hour=1)
+    fewer = predict_cost(
+        measured, dataclasses.replace(order, scenes=500), cores=1, usd_per_core_hour=1
+    )
     assert fewer.notes == ()
 
 
@@ -106,7 +108,7 @@ def test_what_is_measured_are_the_first_scenes_of_the_dataset_in_order(
                 by_key[member.key] = by_key.get(member.key, 0) + size
     expected = [size for _, size in sorted(by_key.items())]
     assert measured.num_bytes == tuple(expected[:10])
-    found = predict(measured, order, cores=1, usd_per_core_hour=1)
+    found = predict_cost(measured, order, cores=1, usd_per_core_hour=1)
     assert found.core_hours.value == pytest.approx(24 * cores * 5 / 3600)  # floating point only
 
 

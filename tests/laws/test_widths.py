@@ -25,7 +25,7 @@ from train.data.scenes import training_scene
 from train.loop.distributed import DistributedContext
 from train.loop.state import new_state
 from train.loop.step import Stepper
-from train.loss.objective import Objective
+from train.loss.objective import TrainingLoss
 
 PX, STEPS, RATE = 16, 4, 2e-3
 BASE = BaseWidths(width=32, head_width=32, pixel_width=16, filter_width=8)
@@ -72,7 +72,7 @@ def changes(config: ModelConfig, muon_rate: float, base: BaseWidths, seed: int) 
     state, batch = new_state(settings, muon_precision="float32"), batch_for(config)
     before = outputs(state.model, batch)
     crew = DistributedContext(device=torch.device("cpu"))
-    stepper = Stepper(state, settings, Objective(settings.loss, None), crew)
+    stepper = Stepper(state, settings, TrainingLoss(settings.loss, None), crew)
     for _ in range(STEPS):
         assert stepper.step([batch], RATE).applied
         state.step += 1

@@ -20,7 +20,7 @@ from train.data.stream import StreamSettings, stream_batches
 from train.loop.distributed import DistributedContext
 from train.loop.state import TrainState
 from train.loop.step import Stepper
-from train.loss.objective import Objective
+from train.loss.objective import TrainingLoss
 from train.progress import TrainProgress
 from train.result import TrainResult
 from train.resume import StartOptions
@@ -99,7 +99,7 @@ def trained(
 
 
 def stepper(state: TrainState, settings: TrainSettings) -> Stepper:
-    return Stepper(state, settings, Objective(settings.loss, None), ALONE)
+    return Stepper(state, settings, TrainingLoss(settings.loss, None), ALONE)
 
 
 def take(

@@ -15,7 +15,7 @@ from model.hits.decoder import HitDecoder
 from model.renderformer import RenderFormer
 from storage.errors import TrilightError
 from train.loss.lpips import Lpips
-from train.loss.objective import Objective
+from train.loss.objective import TrainingLoss
 from train.settings import Compile
 
 MAX_GRAPHS = 32
@@ -24,7 +24,7 @@ See above for the variants; windows, which are cut in two ways, double them."""
 
 
 def compile_parts(
-    model: RenderFormer, objective: Objective, mode: Compile, device: torch.device
+    model: RenderFormer, objective: TrainingLoss, mode: Compile, device: torch.device
 ) -> bool:
     """Enable compilation in place, at first use; return whether it is enabled.
 
@@ -51,7 +51,7 @@ def compile_parts(
     return True
 
 
-def undo_compiling(model: RenderFormer, objective: Objective) -> None:
+def undo_compiling(model: RenderFormer, objective: TrainingLoss) -> None:
     """Disable the compilation that `compile_parts` enabled."""
     for _, module, method in compiled_parts(model, objective):
         if method == "forward":
@@ -80,7 +80,7 @@ def _without_tiling_analysis() -> None:
 
 
 def compiled_parts(
-    model: RenderFormer, objective: Objective
+    model: RenderFormer, objective: TrainingLoss
 ) -> Iterator[tuple[str, nn.Module, str]]:
     """Yield what is compiled: a display name, the module, and the method that is called."""
     if model.encoder is not None:

@@ -21,7 +21,7 @@ from train.loop.compiled import compile_parts, is_compiler_error, undo_compiling
 from train.loop.decision import defers_sync, make_decision
 from train.loop.distributed import DistributedContext
 from train.loop.state import TrainState
-from train.loss.objective import Objective
+from train.loss.objective import TrainingLoss
 from train.monitoring.activity import Activity
 from train.monitoring.layers import LayerNorms
 from train.settings import Precision, TrainSettings
@@ -65,7 +65,7 @@ class Stepper:
         self,
         state: TrainState,
         settings: TrainSettings,
-        objective: Objective,
+        objective: TrainingLoss,
         dist_context: DistributedContext,
     ) -> None:
         self._state = state

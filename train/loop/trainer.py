@@ -28,7 +28,7 @@ from train.loop.schedule import decay_start_step, learning_rate
 from train.loop.state import TrainState
 from train.loop.step import PendingStats, Stepper, StepReport
 from train.loop.window import Window, device_peak
-from train.loss.objective import Objective
+from train.loss.objective import TrainingLoss
 from train.monitoring.process_monitor import ProcessMonitor
 from train.monitoring.settings import WatchSettings
 from train.progress import TrainProgress
@@ -129,7 +129,7 @@ class Trainer:
         *,
         state: TrainState,
         settings: TrainSettings,
-        objective: Objective,
+        objective: TrainingLoss,
         dist_context: DistributedContext,
         folder: RunFolder,
         data_digest: str,

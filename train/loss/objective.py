@@ -22,7 +22,7 @@ class ViewLosses:
     """L1 term alone, unweighted and detached from the gradient."""
 
 
-class Objective(nn.Module):
+class TrainingLoss(nn.Module):
     """Loss function of a run's settings."""
 
     def __init__(self, settings: LossSettings, lpips: Lpips | None) -> None:

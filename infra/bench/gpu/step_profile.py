@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from train.loss.lpips import Lpips
-from train.loss.objective import Objective
+from train.loss.objective import TrainingLoss
 
 MARK = "trilight: "
 """Prefix of the names of parts in a trace."""
@@ -17,7 +17,7 @@ REST = "backward and rest"
 
 
 @contextmanager
-def marked_parts(model: nn.Module, objective: Objective, updater: Any) -> Iterator[None]:
+def marked_parts(model: nn.Module, objective: TrainingLoss, updater: Any) -> Iterator[None]:
     """Mark the parts of a step in a trace; the optimizer is the call of `updater.step`."""
     with ExitStack() as stack:
         for name, module in _parts(model, objective):
@@ -33,7 +33,7 @@ def marked_parts(model: nn.Module, objective: Objective, updater: Any) -> Iterat
         yield
 
 
-def _parts(model: Any, objective: Objective) -> Iterator[tuple[str, nn.Module]]:
+def _parts(model: Any, objective: TrainingLoss) -> Iterator[tuple[str, nn.Module]]:
     if model.encoder is not None:
         yield "encoder", model.encoder
     for layer in model.decoder.layers:

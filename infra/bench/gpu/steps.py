@@ -17,7 +17,7 @@ from model.costs import training_flops
 from train.loop.distributed import DistributedContext
 from train.loop.state import new_state
 from train.loop.step import Stepper
-from train.loss.objective import Objective
+from train.loss.objective import TrainingLoss
 from train.runs import named_run
 from train.settings import TrainSettings
 
@@ -89,7 +89,7 @@ def _measure_steps(
 ) -> tuple[dict[str, float], Mapping[str, float]]:
     state = new_state(settings, device)
     lpips = drawn_lpips(settings) if device.type == "cuda" else drawn_lpips(settings, THIN)
-    objective = Objective(settings.loss, lpips).to(device)
+    objective = TrainingLoss(settings.loss, lpips).to(device)
     stepper = Stepper(state, settings, objective, DistributedContext(device=device))
     batch = drawn_batch(settings, scenes).to(device)  # a run sends the next while one is computed
 

@@ -22,7 +22,7 @@ from train.loop.muon import choose_muon_precision
 from train.loop.schedule import learning_rate
 from train.loop.state import new_state
 from train.loop.step import Stepper
-from train.loss.objective import Objective
+from train.loss.objective import TrainingLoss
 from train.run import stream_settings
 from train.settings import TrainSettings
 
@@ -87,7 +87,7 @@ def _trained_network(
 ) -> RenderFormer:
     crew = DistributedContext(device=device)
     state = new_state(settings, device, muon_precision=choose_muon_precision(crew))
-    stepper = Stepper(state, settings, Objective(settings.loss, None), crew)
+    stepper = Stepper(state, settings, TrainingLoss(settings.loss, None), crew)
 
     def flops(triangles: int) -> int:
         views = settings.views_per_scene

@@ -74,7 +74,7 @@ class Surface:
         self._tree = igl.AABB()
         self._tree.init(mesh.positions, mesh.faces)
 
-    def deviation(self, other: TriangleMesh) -> Deviation:
+    def hausdorff_deviation(self, other: TriangleMesh) -> Deviation:
         """Return the sampled Hausdorff distances to and from `other`, point by point."""
         points = self.points.positions
         squared, nearest, _ = igl.point_mesh_squared_distance(points, other.positions, other.faces)

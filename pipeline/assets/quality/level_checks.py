@@ -41,7 +41,7 @@ def check_level(
             f"{source.area_ratio(mesh):.2f} times the source's area at {budget} faces; "
             f"expected {low} to {high}",
         )
-    deviation = source.surface.deviation(mesh)
+    deviation = source.surface.hausdorff_deviation(mesh)
     error = deviation.two_way(99)
     if error > max_error_p99:
         raise Rejected(

@@ -44,7 +44,7 @@ class MeasuredSource:
 
     def quality(self, result: TriangleMesh, deviation: Deviation | None = None) -> LevelQuality:
         """Return all measures of a clean result; a known `deviation` saves its computation."""
-        measured = deviation or self.surface.deviation(result)
+        measured = deviation or self.surface.hausdorff_deviation(result)
         return LevelQuality(
             error_mean=_round_digits(max(measured.to_other.mean(), measured.from_other.mean())),
             error_p99=_round_digits(measured.two_way(99)),

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.objects.file_filters import (
-    drop_copies,
+    drop_duplicates,
     drop_outputs,
     drop_scenes,
     warn_unread_formats,
@@ -56,7 +56,7 @@ def scan_folder(folder: Path, licence: StatedLicence) -> Listing:
     names = drop_outputs(walk_files(root))
     files = [name for name in names if is_object_file(name)]
     warn_unread_formats(names, files)
-    uids, failures = assign_uids(drop_copies(drop_scenes(root, files)))
+    uids, failures = assign_uids(drop_duplicates(drop_scenes(root, files)))
     records = []
     for name, uid in uids.items():
         # Not Path.resolve: links that go round in a circle make it raise.

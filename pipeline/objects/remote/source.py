@@ -4,7 +4,7 @@ import dataclasses
 from functools import partial
 from pathlib import Path
 
-from pipeline.objects.file_filters import drop_copies, drop_outputs, warn_unread_formats
+from pipeline.objects.file_filters import drop_duplicates, drop_outputs, warn_unread_formats
 from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
 from pipeline.objects.listing import (
     CountDone,
@@ -90,7 +90,7 @@ def _list_object_files(
     names = drop_outputs(names)
     objects = [name for name in names if is_object_file(name)]
     warn_unread_formats(names, objects)
-    uids, failures = assign_uids(drop_copies(objects))
+    uids, failures = assign_uids(drop_duplicates(objects))
     records = []
     for name, uid in uids.items():
         try:

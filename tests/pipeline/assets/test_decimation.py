@@ -41,7 +41,7 @@ grid."""
 
 
 def p99(mesh: TriangleMesh, budget: int, method: str) -> float:
-    return Surface(mesh, EVEN).deviation(decimate(mesh, budget, method)).two_way(99)
+    return Surface(mesh, EVEN).hausdorff_deviation(decimate(mesh, budget, method)).two_way(99)
 
 
 @for_each("method", METHODS)
@@ -52,7 +52,7 @@ def test_budgets_are_met_and_the_error_falls_with_them(method: str) -> None:
         result = decimate(mesh, budget, method)
         # A budget is worth little if much of it stays unused.
         assert USED.get(method, 0.8) * budget <= len(result.faces) <= budget
-        errors.append(surface.deviation(result).two_way(99))
+        errors.append(surface.hausdorff_deviation(result).two_way(99))
     assert errors == sorted(errors)
     # Cells of clustering at 1600 faces are 1/19 of the box; vertices move by a good part of half.
     assert errors[0] < 0.02

@@ -68,7 +68,7 @@ def test_the_error_holds_on_other_points(asset: Asset) -> None:
     surface = Surface(source, np.random.default_rng(99).random((8192, 3)))
     for level in asset.levels:
         assert level.record.quality.error_p99 <= SETTINGS.gate.max_error_p99
-        deviation = surface.deviation(mesh_of(level))
+        deviation = surface.hausdorff_deviation(mesh_of(level))
         for way in (deviation.to_other, deviation.from_other):
             # The recorded percentile comes from 8192 points: its rank is known to 0.33 % (3 sigma).
             assert np.percentile(way, 98.6) <= level.record.quality.error_p99
@@ -248,7 +248,7 @@ def test_any_turn_keeps_budgets_and_surfaces(tmp_path: Path, straight: Asset, se
         bound = here.record.quality.error_p99 * knot().diagonal
         bound += there.record.quality.error_p99 * turned_source.diagonal
         bound += 2 * np.sqrt(3) / GRID * turned_source.diagonal
-        deviation = Surface(expected, uniform).deviation(actual)
+        deviation = Surface(expected, uniform).hausdorff_deviation(actual)
         # By the triangle inequality, all but 1 % + 1 % of the points are within the sum.
         assert deviation.two_way(98) * expected.diagonal <= bound
 

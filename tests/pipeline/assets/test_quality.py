@@ -148,7 +148,7 @@ FEWER = np.random.default_rng(0).random((4000, 3))
 
 
 def p99(mesh: TriangleMesh, other: TriangleMesh) -> float:
-    return Surface(mesh, FEWER).deviation(other).two_way(99)
+    return Surface(mesh, FEWER).hausdorff_deviation(other).two_way(99)
 
 
 def square(height: float = 0.0, size: float = 1.0) -> TriangleMesh:
@@ -183,7 +183,7 @@ def test_distances_count_both_ways_at_any_scale_as_in_the_slow_twin() -> None:
     grown = [TriangleMesh(positions=m.positions * 8, faces=m.faces) for m in (mesh, other)]
     assert p99(*grown) == pytest.approx(error, rel=1e-12)
     mesh, other = sphere(rings=5, columns=8), knot(segments=12, sides=4)
-    fast = Surface(mesh, FEWER[:40]).deviation(other).to_other
+    fast = Surface(mesh, FEWER[:40]).hausdorff_deviation(other).to_other
     points = sample_surface(mesh, FEWER[:40]).positions
     slow = np.array([slow_distance(point, other) for point in points]) / mesh.diagonal
     assert (fast <= slow + 1e-12).all()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.objects.file_filters import drop_copies, drop_outputs, drop_scenes, warn_once
+from pipeline.objects.file_filters import drop_duplicates, drop_outputs, drop_scenes, warn_once
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.local.folder import list_folder
 from pipeline.objects.maps.listing import find_maps
@@ -91,4 +91,4 @@ def test_other_formats_without_a_twin_are_named_once(
     ],
 )  # fmt: skip
 def test_an_object_of_a_collection_is_one_object(names: str, kept: str) -> None:
-    assert " ".join(drop_copies(names.split())) == kept
+    assert " ".join(drop_duplicates(names.split())) == kept

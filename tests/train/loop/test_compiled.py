@@ -22,7 +22,7 @@ from train.loop import compiled
 from train.loop.compiled import compile_parts, compiled_parts, undo_compiling
 from train.loop.state import new_state
 from train.loop.step import Stepper
-from train.loss.objective import Objective
+from train.loss.objective import TrainingLoss
 from train.settings import Compile, LossSettings
 
 PASSES = ((3, 5), (4, 9, 2), (6, 6), (7,), (11, 2), (8, 3, 5, 1))
@@ -36,7 +36,7 @@ def forgets() -> Iterator[None]:
     torch._dynamo.reset()
 
 
-OBJECTIVE = Objective(LossSettings(perceptual="none"), None)
+OBJECTIVE = TrainingLoss(LossSettings(perceptual="none"), None)
 
 
 def _compile_by(patch: pytest.MonkeyPatch, backend: Callable[..., Any]) -> None:

@@ -31,7 +31,7 @@ from train.loss.lpips import (
     load_lpips,
 )
 from train.loss.ms_ssim import SCALE_WEIGHTS, ms_ssim, ssim
-from train.loss.objective import Objective, tone_map
+from train.loss.objective import TrainingLoss, tone_map
 from train.settings import LossSettings
 
 WIDTHS = (4, 5, 6, 7, 8)
@@ -235,7 +235,7 @@ def test_the_loss_adds_up_its_terms(term: str) -> None:
     lpips = Lpips(*small_weights())
     settings = LossSettings(perceptual=term, perceptual_weight=0.05)  # type: ignore[arg-type]
     prediction, target = log10_pictures("p"), log10_pictures("t").abs()
-    losses = Objective(settings, lpips)(prediction, target, torch.zeros(2, 3))
+    losses = TrainingLoss(settings, lpips)(prediction, target, torch.zeros(2, 3))
     assert torch.equal(losses.l1_BV, (prediction - target).abs().mean(dim=(2, 3, 4)))
     for scene in range(2):
         for view in range(3):
@@ -250,14 +250,14 @@ def test_a_view_as_noisy_as_the_setting_counts_half() -> None:
     settings = LossSettings(perceptual="none", noise_half=0.02)
     noise = torch.tensor([[0.0, 0.02, 0.06]]).expand(2, 3)
     prediction, target = log10_pictures("p"), log10_pictures("t")
-    losses = Objective(settings, None)(prediction, target, noise)
+    losses = TrainingLoss(settings, None)(prediction, target, noise)
     shares = losses.total_BV / losses.l1_BV
     torch.testing.assert_close(shares, torch.tensor([[1.0, 0.5, 0.25]]).expand(2, 3))
 
 
 def test_nothing_takes_the_place_of_lpips_by_itself() -> None:
     with pytest.raises(TrilightError, match=r"--lpips FOLDER .* --set loss.perceptual=ms_ssim"):
-        Objective(LossSettings(perceptual="lpips"), None)
+        TrainingLoss(LossSettings(perceptual="lpips"), None)
 
 
 def test_the_hub_has_both_files_and_the_large_one_is_checked(
