@@ -22,7 +22,8 @@ from infra.cli.completion import NAMES
 from infra.cli.extend_option import resolve_reference
 from infra.cli.words import FileName, choices_of, is_repeated, kind_of, takes_names, value_of
 from storage.errors import TrilightError
-from storage.settings.described import FieldDescription, checked, describe_fields, option_of
+from storage.settings.described import checked
+from storage.settings.fields import FieldDescription, describe_fields, option_of
 from storage.settings.ranges import shown_number
 
 ALIASES = {

@@ -15,8 +15,8 @@ from pipeline.generation.price import CorePrice
 from pipeline.generation.revisit_options import RevisitOptions
 from storage.markdown import table
 from storage.records.scene import Scene
-from storage.settings.described import describe_fields, field_sentences
-from storage.settings.ranges import declared_ranges, shown_number
+from storage.settings.fields import declared_ranges, describe_fields, field_sentences
+from storage.settings.ranges import shown_number
 from train.evaluation.options import EvaluationOptions, LeaderboardOptions
 from train.monitoring.settings import WatchSettings
 from train.settings import TrainSettings

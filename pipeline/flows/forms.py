@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from pipeline.builds.named import BUILDS
 from pipeline.builds.settings import BuildSettings
 from pipeline.objects.sources import SOURCES
-from storage.settings.described import describe_fields
+from storage.settings.fields import describe_fields
 
 Returned = TypeVar("Returned")
 

@@ -25,7 +25,8 @@ from storage.records.material import (
 from storage.records.scene_laws import broken_law, require_law
 from storage.records.scene_maps import MAX_TEXTURES, MAX_UV, check_maps, has_maps
 from storage.records.texture import CONSTANT, Texture
-from storage.settings.ranges import FLOAT32_MAX, Columns, Within, declared_ranges
+from storage.settings.fields import declared_ranges
+from storage.settings.ranges import FLOAT32_MAX, Columns, Within
 
 ObjectKind = Literal["object", "shell", "emitter"]
 OBJECT_KINDS: tuple[ObjectKind, ...] = ("object", "shell", "emitter")

@@ -47,8 +47,9 @@ from storage.errors import TrilightError
 from storage.records.scene import Scene
 from storage.records.scene_maps import MAP_ARRAYS, MAX_TEXTURES
 from storage.records.texture import CONSTANT
-from storage.settings.described import checked, describe_fields
-from storage.settings.ranges import Columns, Declared, Within, declared_ranges
+from storage.settings.described import checked
+from storage.settings.fields import FieldDescription, declared_ranges, describe_fields
+from storage.settings.ranges import Columns, Within
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
@@ -160,7 +161,7 @@ FIELDS = [
 """Every declared range of settings."""
 
 
-def at_end(settings: type, field: Declared, end: End, number: Any) -> Any:
+def at_end(settings: type, field: FieldDescription, end: End, number: Any) -> Any:
     """Return valid settings with one number of a field replaced; raises what they raise."""
     example, value = EXAMPLES[settings], number
     old = getattr(example, field.name)
@@ -176,7 +177,7 @@ every_end = pytest.mark.parametrize("end", ["low", "high"])
 every_field = for_each(("settings", "field"), FIELDS)
 
 
-def last_inside(field: Declared, end: End) -> float:
+def last_inside(field: FieldDescription, end: End) -> float:
     """Return the extreme number that a range admits."""
     within = field.within
     bound, is_open = {
@@ -189,7 +190,7 @@ def last_inside(field: Declared, end: End) -> float:
     return math.nextafter(bound, {"low": math.inf, "high": -math.inf}[end]) if is_open else bound
 
 
-def first_outside(field: Declared, end: End) -> float:
+def first_outside(field: FieldDescription, end: End) -> float:
     """Return the next number beyond."""
     inside = last_inside(field, end)
     if field.kind is int:
@@ -199,13 +200,17 @@ def first_outside(field: Declared, end: End) -> float:
 
 @every_end
 @every_field
-def test_an_end_of_each_field_is_accepted(settings: type, field: Declared, end: End) -> None:
+def test_an_end_of_each_field_is_accepted(
+    settings: type, field: FieldDescription, end: End
+) -> None:
     at_end(settings, field, end, last_inside(field, end))
 
 
 @every_end
 @every_field
-def test_one_step_outside_is_refused_by_name(settings: type, field: Declared, end: End) -> None:
+def test_one_step_outside_is_refused_by_name(
+    settings: type, field: FieldDescription, end: End
+) -> None:
     number = first_outside(field, end)
     option = re.sub("_(db|deg|ev)$", "", field.name).replace("_", "-")
     with pytest.raises(TrilightError) as caught:
@@ -218,7 +223,7 @@ def test_one_step_outside_is_refused_by_name(settings: type, field: Declared, en
 
 
 @every_field
-def test_other_kinds_of_values_are_refused(settings: type, field: Declared) -> None:
+def test_other_kinds_of_values_are_refused(settings: type, field: FieldDescription) -> None:
     wrong: list[Any] = [math.nan, math.inf, -math.inf, True, "1", (1, 2, 3) * 3]
     if field.kind is int:
         wrong.append(last_inside(field, "low") + 0.5)
@@ -315,7 +320,7 @@ PLACES = {
 """One number of each array, and of each part of the materials."""
 
 
-def _with(field: Declared, number: Any) -> Scene:
+def _with(field: FieldDescription, number: Any) -> Scene:
     """Return a dark floor under a light, with one number of an array replaced."""
     scene = textured_scene() if field.name in MAP_ARRAYS else tiny_scene()
     scene.materials[FLOOR] = 0
@@ -327,13 +332,13 @@ def _with(field: Declared, number: Any) -> Scene:
     return dataclasses.replace(scene, **changes)
 
 
-def _place(field: Declared) -> Any:
+def _place(field: FieldDescription) -> Any:
     return PLACES[field.part.name if field.part else field.name]
 
 
 @every_end
 @for_each("field", ARRAYS)
-def test_an_array_of_a_scene_may_reach_the_end(field: Declared, end: End) -> None:
+def test_an_array_of_a_scene_may_reach_the_end(field: FieldDescription, end: End) -> None:
     inwards = {"low": np.float32(np.inf), "high": np.float32(-np.inf)}[end]
     number: Any = getattr(field.within, end)
     if field.kind is float:
@@ -361,7 +366,7 @@ def test_an_array_of_a_scene_may_reach_the_end(field: Declared, end: End) -> Non
 
 @every_end
 @for_each("field", [field for field in ARRAYS if field.kind is float])
-def test_an_array_of_a_scene_beyond_the_end_is_refused(field: Declared, end: End) -> None:
+def test_an_array_of_a_scene_beyond_the_end_is_refused(field: FieldDescription, end: End) -> None:
     """But for integers, whose ranges are those of their types: nothing is beyond."""
     outwards = {"low": np.float32(-np.inf), "high": np.float32(np.inf)}[end]
     number = np.float32(getattr(field.within, end))

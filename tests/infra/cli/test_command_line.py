@@ -22,7 +22,7 @@ from infra.setup.command_line_page import every_command
 from infra.setup.generated_pages import PAGES
 from pipeline.shards.expression import TEXTS, condition, kind_of
 from storage.records.quantities import QUANTITIES
-from storage.settings.described import option_of
+from storage.settings.fields import option_of
 from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.for_each import case
