@@ -4,9 +4,8 @@ from pathlib import Path
 
 from cyclopts import App
 
-from infra.cli.changes import BaseSettings
+from infra.cli.changes import BaseSettings, with_base_settings
 from infra.cli.console import first_words, next_step
-from infra.cli.dataset_changes import with_base_settings
 from infra.cli.flow_runs import FlowRunOptions, run_flow
 from infra.cli.options import OutputOptions, command
 from infra.cli.submit_array import ARRAYS, ArrayOptions, submit_to_array
