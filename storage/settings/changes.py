@@ -79,24 +79,26 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, 
 
 
 def _replace_fields(group: Any, changes: Sequence[Change]) -> Any:
-    fields = {field.name: field for field in describe_fields(type(group))}
+    kind: Any = type(group)
+    fields = {field.name: field for field in describe_fields(kind)}
     by_field: dict[str, list[Change]] = {}
-    for (first, *path), value, name in changes:
-        if first in removed_fields(type(group)):
+    for path, value, name in changes:
+        first, *rest = path
+        if first in removed_fields(kind):
             raise TrilightError(removal_message(f"setting {name!r}"))
         if first not in fields:
             raise TrilightError(
                 f"setting {name!r} does not exist: {first!r} is unknown there; "
                 f"{expected_one_of(first, fields)}."
             )
-        by_field.setdefault(first, []).append((path, value, name))
+        by_field.setdefault(first, []).append((rest, value, name))
     values: dict[str, Any] = {}
     for field, inner in by_field.items():
         value = getattr(group, field)
         for path, new, name in inner:
             if not path:  # first as a whole, then single settings within it
                 record = _without_presets(new, value, name)
-                value = field_value(type(group), fields[field], record, name)
+                value = field_value(kind, fields[field], record, name)
         values[field] = _change_within(value, [change for change in inner if change[0]])
     try:
         return dataclasses.replace(group, **values)

@@ -211,8 +211,9 @@ def option_words(settings: Any, *, leave_out: tuple[str, ...] = ()) -> list[str]
         settings: an instance of a class of settings.
         leave_out: fields that are not stated.
     """
+    kind: Any = type(settings)
     words: list[str] = []
-    for field in describe_fields(type(settings)):
+    for field in describe_fields(kind):
         value = getattr(settings, field.name)
         if field.name in leave_out or value == field.default:
             continue

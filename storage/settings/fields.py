@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.array_hints import array_scalar
-from storage.settings.ranges import EXECUTION, Columns, LowFirst, Within
+from storage.settings.ranges import EXECUTION, Columns, LowFirst, Within, shown_number
 
 _KINDS = {bool: "true or false", str: "a text", int: "a whole number", float: "a number"}
 
@@ -105,13 +105,13 @@ def describe_fields(kind: type) -> tuple[FieldDescription, ...]:
     hints = typing.get_type_hints(kind, include_extras=True)
     descriptions = []
     for field in dataclasses.fields(kind):
-        made = field.default_factory is not dataclasses.MISSING
+        make: Any = field.default_factory
         bare, notes = unwrap(hints[field.name])
         description = FieldDescription(
             owner=kind,
             name=field.name,
             hint=hints[field.name],
-            default=field.default_factory() if made else field.default,  # type: ignore[misc]
+            default=field.default if make is dataclasses.MISSING else make(),
             bare=bare,
             notes=notes,
         )
@@ -205,3 +205,11 @@ def expected_of(hint: Any) -> str:
     if origin in (dict, Mapping) or group_of(hint):
         return "names with values"
     return _KINDS.get(hint, f"a {getattr(hint, '__name__', hint)}".lower())
+
+
+def default_text(default: Any, *, quote: str = "") -> str:
+    """Return a default value for a person; `quote` stands around each word."""
+    if isinstance(default, tuple):
+        return ", ".join(default_text(entry, quote=quote) for entry in default)
+    is_number = isinstance(default, int | float)
+    return shown_number(default) if is_number else f"{quote}{default}{quote}"

@@ -25,7 +25,7 @@ from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSet
 from pipeline.builds.named import named_build
 from pipeline.builds.revisit import GivenCamera, RevisitSettings
 from pipeline.builds.settings import BuildSettings
-from pipeline.flows.orders import DatasetInRuns
+from pipeline.flows.forms import DatasetInRuns
 from pipeline.generation.price import CorePrice
 from pipeline.generation.revisit_options import RevisitOptions
 from pipeline.renders.settings import MAX_SPP, RenderSettings
@@ -180,6 +180,7 @@ every_field = for_each(("settings", "field"), FIELDS)
 def last_inside(field: FieldDescription, end: End) -> float:
     """Return the extreme number that a range admits."""
     within = field.within
+    assert within is not None
     bound, is_open = {
         "low": (within.low, within.low_open),
         "high": (within.high, within.high_open),
