@@ -13,12 +13,11 @@ from pipeline.flows.forms import DatasetInRuns
 from pipeline.generation.price import CorePrice
 from pipeline.generation.revisit_options import RevisitOptions
 from storage.markdown import table
+from storage.records.material import PUBLISHED_COLUMNS, laid_out
 from storage.records.scene import Scene
 from storage.settings.fields import (
-    declared_ranges,
     default_text,
     describe_fields,
-    field_sentences,
     group_of,
     parts_of,
 )
@@ -79,10 +78,14 @@ def reachable(*roots: type) -> list[type]:
 
 def _rows(kind: type) -> Iterator[tuple[str, ...]]:
     if kind is Scene:  # its fields are arrays, and no settings
-        for declared in declared_ranges(Scene):
-            part = "" if declared.part is None else f", {declared.part.name}"
-            sentence = _first_sentence(field_sentences(Scene)[declared.name])
-            yield f"`{declared.name}`{part}", sentence, str(declared.within), ""
+        for field in describe_fields(Scene):
+            ranges = {"": field.within}
+            if field.name == "materials":
+                columns = laid_out(PUBLISHED_COLUMNS)
+                ranges = {f", {column.name}": column.within for column, _ in columns}
+            for part, within in ranges.items():
+                if within is not None:
+                    yield f"`{field.name}`{part}", _first_sentence(field.sentence), str(within), ""
         return
     fields = describe_fields(kind) if hasattr(kind, "__pydantic_fields__") else ()
     is_marked = any(field.is_execution for field in fields)

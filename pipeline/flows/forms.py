@@ -26,7 +26,6 @@ from storage.settings.fields import describe_fields
 from storage.settings.ranges import Within
 
 Returned = TypeVar("Returned")
-Order = TypeVar("Order", bound=DatasetOrder)
 
 
 def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
@@ -134,16 +133,15 @@ class DatasetInRuns(DatasetOrder):
             )
 
 
-def order_of(parameters: Mapping[str, Any], kind: type[Order]) -> Order:
+def order_of(parameters: Mapping[str, Any], kind: Callable[..., Returned]) -> Returned:
     """Return the options of a class that a flow's parameters state.
 
     Raises:
         TrilightError: an invalid value that the form's schema cannot detect; the message names it.
     """
-    values = {name: parameters[name] for name in kind.__dataclass_fields__}
-    values["allow_licences"] = tuple(values["allow_licences"])
-    values["changes"] = changed_values(values["changes"])
-    return kind(**values)
+    values = {name: parameters[name] for name in inspect.signature(kind).parameters}
+    lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
+    return kind(**{**values, **lists, "changes": changed_values(parameters["changes"])})
 
 
 def run_name() -> str:

@@ -49,14 +49,10 @@ _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 20
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(dataclass_field,))
-def checked(
-    called: str = "", *, option: Callable[[str], str] = str
-) -> Callable[[type[Settings]], type[Settings]]:
+def checked(called: str = "") -> Callable[[type[Settings]], type[Settings]]:
     """Return a decorator that makes a class a frozen dataclass whose values are checked.
 
-    Args:
-        called: begins every complaint, such as `render settings`; empty for none.
-        option: returns what a field is called where people write it.
+    `called` begins every complaint, such as `render settings`; empty for none.
 
     An instance raises TrilightError for the first field whose value is of another type or outside
     its range: the field, the value, and what was expected.
@@ -71,7 +67,7 @@ def checked(
             try:
                 plain(self, **values)
             except pydantic.ValidationError as error:
-                raise _complaint(error, type(self), called=called, option=option) from None
+                raise _complaint(error, type(self), called=called) from None
 
         group.__init__ = init_or_complain
         return typing.cast(type[Settings], group)
@@ -123,18 +119,23 @@ def _read(value: Any, hint: Any, kind: type, **place: Any) -> Any:
         raise _complaint(error, kind, option="setting {!r}".format, **place) from None
 
 
-def strict_adapter(kind: Any) -> "pydantic.TypeAdapter[Any]":
-    """Return the strict reader of a type that is made of plain dataclasses; it takes null too."""
+def parse_strictly(data: bytes | str, kind: Any, source: str) -> Any:
+    """Return the value of a JSON text, of a type that is made of plain dataclasses, or None.
+
+    Raises:
+        TrilightError: other JSON than the type says; `source` begins the complaint.
+    """
+    try:
+        return _strict_adapter(kind).validate_json(data)
+    except pydantic.ValidationError as error:
+        complaint = str(_complaint(error, kind, called=source))
+    raise TrilightError(complaint if complaint.startswith(source) else f"{source}: {complaint}")
+
+
+@functools.cache
+def _strict_adapter(kind: Any) -> "pydantic.TypeAdapter[Any]":
     # pydantic takes rules for a union, and hands them on to the plain dataclasses in it
     return pydantic.TypeAdapter(kind | None, config={"extra": "forbid", "strict": True})
-
-
-def read_error(error: ValueError, kind: Any, source: str) -> TrilightError:
-    """Return the complaint of a value of JSON that was read; `source` begins it."""
-    assert isinstance(error, pydantic.ValidationError)
-    complaint = _complaint(error, kind, called=source)
-    message = str(complaint)
-    return complaint if message.startswith(source) else TrilightError(f"{source}: {message}")
 
 
 @functools.cache

@@ -16,10 +16,9 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import numpy as np
-from numpy.typing import NDArray
 
 from storage.array_hints import array_scalar
-from storage.settings.ranges import EXECUTION, Columns, LowFirst, Within, shown_number
+from storage.settings.ranges import EXECUTION, LowFirst, Within, shown_number
 
 _KINDS = {bool: "true or false", str: "a text", int: "a whole number", float: "a number"}
 
@@ -48,8 +47,6 @@ class FieldDescription:
     """The type without its notes and without None."""
     notes: Sequence[Any]
     """Notes of the type."""
-    part: Columns | None = None
-    """Columns of an array that are meant (declared_ranges); None: the whole value."""
 
     @property
     def sentence(self) -> str:
@@ -90,14 +87,6 @@ class FieldDescription:
         order = ", the lower one first" if LowFirst() in self.notes else ""
         return f"{_NUMBERS[self.shape, self.kind]} {self.within}{order}"
 
-    def outside(self, array: NDArray) -> NDArray[np.bool_]:
-        """Return where an array breaks the range, in its shape."""
-        assert self.within is not None
-        columns = slice(None) if self.part is None else self.part.columns
-        wrong = np.zeros(array.shape, np.bool_)
-        wrong[..., columns] = ~self.within.holds(array[..., columns])
-        return wrong
-
 
 @functools.cache
 def describe_fields(kind: type) -> tuple[FieldDescription, ...]:
@@ -117,19 +106,6 @@ def describe_fields(kind: type) -> tuple[FieldDescription, ...]:
         )
         descriptions.append(description)
     return tuple(descriptions)
-
-
-@functools.cache
-def declared_ranges(kind: type) -> tuple[FieldDescription, ...]:
-    """Return the fields of a dataclass that have a range, once for each range of columns."""
-    return tuple(
-        field
-        if isinstance(note, Within)
-        else dataclasses.replace(field, notes=(note.within,), part=note)
-        for field in describe_fields(kind)
-        for note in field.notes
-        if isinstance(note, Within | Columns)
-    )
 
 
 @functools.cache

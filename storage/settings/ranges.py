@@ -104,18 +104,6 @@ class LowFirst:
         return pair
 
 
-@dataclass(frozen=True)
-class Columns:
-    """A range of some columns of an array."""
-
-    name: str
-    """Noun for the columns in messages."""
-    columns: slice
-    """The columns, as a slice of the last axis."""
-    within: Within
-    """Range that holds for every value."""
-
-
 EXECUTION = "execution"
 """Marks a field that changes how something is executed, and not its meaning.
 

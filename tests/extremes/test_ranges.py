@@ -44,12 +44,13 @@ from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.textures import TextureSettings
 from storage.dataset.settings import ListedShard, SplitSettings
 from storage.errors import TrilightError
+from storage.records.material import PUBLISHED_COLUMNS, laid_out
 from storage.records.scene import Scene
 from storage.records.scene_maps import MAP_ARRAYS, MAX_TEXTURES
 from storage.records.texture import CONSTANT
 from storage.settings.described import checked
-from storage.settings.fields import FieldDescription, declared_ranges, describe_fields
-from storage.settings.ranges import Columns, Within
+from storage.settings.fields import FieldDescription, describe_fields
+from storage.settings.ranges import Within
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
@@ -156,7 +157,8 @@ FIELDS = [
     (settings, field)
     for settings in reachable(*(root for roots in ROOTS.values() for root in roots))
     if settings is not Scene
-    for field in declared_ranges(settings)
+    for field in describe_fields(settings)
+    if field.within is not None
 ]
 """Every declared range of settings."""
 
@@ -244,7 +246,7 @@ def _numbers(hint: Any) -> Iterator[bool]:
     """Yield for each number of a type whether a range is declared around it."""
     if get_origin(hint) is Annotated:
         inner, *notes = get_args(hint)
-        declared = any(isinstance(note, Within | Columns) for note in notes)
+        declared = any(isinstance(note, Within) for note in notes)
         yield from (declared or found for found in _numbers(inner))
     elif hint in (int, float) or (isinstance(hint, type) and issubclass(hint, np.number)):
         yield False
@@ -260,6 +262,7 @@ def test_no_number_is_without_a_range() -> None:
         for settings in reachable(*roots)
         if settings is Scene or settings in EXAMPLES or _is_settings(settings.__name__)
         for name, hint in typing.get_type_hints(settings, include_extras=True).items()
+        if name != "materials"  # whose columns have ranges
         if not all(_numbers(hint))
     ]
     assert undeclared == []
@@ -298,21 +301,28 @@ def test_no_class_of_settings_is_forgotten() -> None:
 def test_what_is_checked_is_what_is_declared() -> None:
     """A field is looked at by its range and by nothing before it: the first wrong one is named."""
 
-    @checked("group", option=str.upper)
+    @checked("group")
     class Group:
         share: Annotated[float, Within(0, 1, high_open=True, unit="parts")] = 0.5
 
     Group(share=0.0)
     with pytest.raises(TrilightError) as caught:
         Group(share=1.0)
-    expected = "group: SHARE is 1.0; expected a number from 0 to below 1 parts."
+    expected = "group: share is 1.0; expected a number from 0 to below 1 parts."
     assert str(caught.value) == expected
 
 
-ARRAYS = declared_ranges(Scene)
+DESCRIBED = {field.name: field for field in describe_fields(Scene)}
+ARRAYS = [
+    *((name, field) for name, field in DESCRIBED.items() if field.within is not None),
+    *(
+        (column.name, dataclasses.replace(DESCRIBED["materials"], notes=[column.within]))
+        for column, _ in laid_out(PUBLISHED_COLUMNS)
+    ),
+]
+"""Every range of arrays, by the name of the array or of the columns of materials."""
 
-
-PLACES = {
+PLACES: dict[str, Any] = {
     "vertex_positions": (1, 2), "vertex_normals": (0, 0), "faces": (1, 2), "material_index": 1,
     "object_index": 1, "c2w": (1, 0, 3), "fov_deg": 1,
     "uv": (1, 0), "material_textures": (FLOOR, 1),
@@ -321,25 +331,23 @@ PLACES = {
 """One number of each array, and of each part of the materials."""
 
 
-def _with(field: FieldDescription, number: Any) -> Scene:
+def _with(place: str, field: FieldDescription, number: Any) -> Scene:
     """Return a dark floor under a light, with one number of an array replaced."""
     scene = textured_scene() if field.name in MAP_ARRAYS else tiny_scene()
     scene.materials[FLOOR] = 0
     if field.name == "vertex_normals":
         scene.vertex_normals[0] = 0
     array: NDArray = getattr(scene, field.name).copy()
-    array[_place(field)] = number
+    array[PLACES[place]] = number
     changes: dict[str, Any] = {field.name: array}
     return dataclasses.replace(scene, **changes)
 
 
-def _place(field: FieldDescription) -> Any:
-    return PLACES[field.part.name if field.part else field.name]
-
-
 @every_end
-@for_each("field", ARRAYS)
-def test_an_array_of_a_scene_may_reach_the_end(field: FieldDescription, end: End) -> None:
+@for_each(("place", "field"), ARRAYS)
+def test_an_array_of_a_scene_may_reach_the_end(
+    place: str, field: FieldDescription, end: End
+) -> None:
     inwards = {"low": np.float32(np.inf), "high": np.float32(-np.inf)}[end]
     number: Any = getattr(field.within, end)
     if field.kind is float:
@@ -348,7 +356,7 @@ def test_an_array_of_a_scene_may_reach_the_end(field: FieldDescription, end: End
         # a normal's length, rounded to float32, is held to the same end by a law of its own
         if is_open or field.name == "vertex_normals":
             number = np.nextafter(number, inwards)
-    scene = _with(field, number)
+    scene = _with(place, field, number)
     if field.kind is float:
         scene.check()
         return
@@ -358,7 +366,7 @@ def test_an_array_of_a_scene_may_reach_the_end(field: FieldDescription, end: End
     if field.name == "material_textures":  # -1 stands for no texture
         ends = (CONSTANT, MAX_TEXTURES - 1)
     assert number == dict(zip(("low", "high"), ends, strict=True))[end]
-    assert not field.outside(array).any()
+    assert field.within is not None and field.within.holds(array).all()
     if end == "low":
         return
     with pytest.raises(TrilightError, match=rf"{field.name}\[.*{number}; expected .*rows below"):
@@ -366,15 +374,17 @@ def test_an_array_of_a_scene_may_reach_the_end(field: FieldDescription, end: End
 
 
 @every_end
-@for_each("field", [field for field in ARRAYS if field.kind is float])
-def test_an_array_of_a_scene_beyond_the_end_is_refused(field: FieldDescription, end: End) -> None:
+@for_each(("place", "field"), [each for each in ARRAYS if each[1].kind is float])
+def test_an_array_of_a_scene_beyond_the_end_is_refused(
+    place: str, field: FieldDescription, end: End
+) -> None:
     """But for integers, whose ranges are those of their types: nothing is beyond."""
     outwards = {"low": np.float32(-np.inf), "high": np.float32(np.inf)}[end]
     number = np.float32(getattr(field.within, end))
     if not getattr(field.within, f"{end}_open"):
         with np.errstate(over="ignore"):
             number = np.nextafter(number, outwards)
-    place = _place(field)
-    index = ", ".join(str(at) for at in (place if isinstance(place, tuple) else (place,)))
+    at = PLACES[place]
+    index = ", ".join(map(str, at if isinstance(at, tuple) else (at,)))
     with pytest.raises(TrilightError, match=rf"{field.name}\[{index}\] is .*; expected"):
-        _with(field, number).check()
+        _with(place, field, number).check()
