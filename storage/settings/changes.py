@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from storage.errors import TrilightError, expected_one_of
 from storage.removed import removal_message
-from storage.settings.described import field_value, removed_fields, settings_record
+from storage.settings.described import field_value, settings_record
 from storage.settings.fields import describe_fields
 
 Settings = TypeVar("Settings")
@@ -84,7 +84,7 @@ def _replace_fields(group: Any, changes: Sequence[Change]) -> Any:
     by_field: dict[str, list[Change]] = {}
     for path, value, name in changes:
         first, *rest = path
-        if first in removed_fields(kind):
+        if first in getattr(kind, "REMOVED", ()):
             raise TrilightError(removal_message(f"setting {name!r}"))
         if first not in fields:
             raise TrilightError(

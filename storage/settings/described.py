@@ -75,12 +75,6 @@ def checked(called: str = "") -> Callable[[type[Settings]], type[Settings]]:
     return decorate
 
 
-def removed_fields(kind: type) -> Sequence[str]:
-    """Return the names of fields that a class once had (its REMOVED)."""
-    names: Sequence[str] = getattr(kind, "REMOVED", ())
-    return names
-
-
 def settings_record(group: Any, *, stated: bool = False) -> dict[str, Any]:
     """Return settings as JSON values, as manifests and checkpoints hold them.
 
@@ -175,7 +169,7 @@ def _complaint(
     if first["type"] == "json_invalid":
         return TrilightError(f"{where} is not JSON ({law}); expected it as it was written.")
     if first["type"] in ("unexpected_keyword_argument", "unexpected_property"):
-        if steps[-1] in removed_fields(holder):
+        if steps[-1] in getattr(holder, "REMOVED", ()):
             return TrilightError(removal_message(where))
         known = [each.name for each in describe_fields(holder)]
         return TrilightError(f"{where} does not exist; {expected_one_of(steps[-1], known)}.")

@@ -15,21 +15,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args, get_origin
 
-import numpy as np
-
-from storage.array_hints import array_scalar
 from storage.settings.ranges import EXECUTION, LowFirst, Within, shown_number
 
 _KINDS = {bool: "true or false", str: "a text", int: "a whole number", float: "a number"}
 
-_NUMBERS = {
-    ("one", int): "a whole number",
-    ("one", float): "a number",
-    ("pair", int): "two whole numbers",
-    ("pair", float): "two numbers",
-    ("many", int): "whole numbers",
-    ("many", float): "numbers",
-}
+_NUMBERS = {int: "whole numbers", float: "numbers"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,26 +56,24 @@ class FieldDescription:
     @property
     def kind(self) -> type:
         """Int or float, of a field with a range; a float may be given as an int."""
-        inner = get_args(self.bare)[0] if get_origin(self.bare) is tuple else self.bare
-        if inner == int | float:  # a whole number stays one
-            return float
-        scalar = array_scalar(inner)
-        return inner if scalar is None else (float if issubclass(scalar, np.floating) else int)
+        return float if float in parts_of(self.bare) else int
 
     @property
-    def shape(self) -> Literal["one", "pair", "many", "array"]:
-        """Of a field with a range: a number, a pair, a tuple of any length, or an array."""
-        if get_origin(self.bare) is tuple:
-            return "many" if get_args(self.bare)[1] is ... else "pair"
-        return "one" if array_scalar(self.bare) is None else "array"
+    def shape(self) -> Literal["one", "pair", "many"]:
+        """Of a field with a range: a number, a pair, or a tuple of any length."""
+        if get_origin(self.bare) is not tuple:
+            return "one"
+        return "many" if get_args(self.bare)[1] is ... else "pair"
 
     @property
     def expected(self) -> str:
         """Description of valid values, for error messages; not for arrays."""
         if self.within is None:
             return expected_of(self.hint)
+        numbers = _NUMBERS[self.kind]
+        shapes = {"one": _KINDS[self.kind], "pair": f"two {numbers}", "many": numbers}
         order = ", the lower one first" if LowFirst() in self.notes else ""
-        return f"{_NUMBERS[self.shape, self.kind]} {self.within}{order}"
+        return f"{shapes[self.shape]} {self.within}{order}"
 
 
 @functools.cache
