@@ -65,10 +65,9 @@ def changes_form(settings: type, example: Any) -> type[BaseModel]:
     fields: dict[str, Any] = {}
     for field in describe_fields(settings):
         value = getattr(example, field.name)
-        kind = field.hint
         first = value[0] if isinstance(value, tuple) and value else value
-        if dataclasses.is_dataclass(first) and not isinstance(first, type):
-            kind = changes_form(type(first), first)
+        is_group = dataclasses.is_dataclass(first) and not isinstance(first, type)
+        kind = changes_form(type(first), first) if is_group else field.hint
         fields[field.name] = (kind | None, Field(default=None, description=field.sentence))
     return create_model(
         f"{settings.__name__}Changes", __config__=ConfigDict(extra="forbid"), **fields

@@ -31,12 +31,17 @@ class FieldDescription:
     name: str
     hint: Any
     """Type annotation, with its notes."""
-    default: Any
-    """Default value; dataclasses.MISSING where a value must be given."""
     bare: Any
     """The type without its notes and without None."""
     notes: Sequence[Any]
     """Notes of the type."""
+
+    @property
+    def default(self) -> Any:
+        """Default value; dataclasses.MISSING where a value must be given."""
+        field = self.owner.__dataclass_fields__[self.name]  # type: ignore[attr-defined]
+        make = field.default_factory
+        return field.default if make is dataclasses.MISSING else make()
 
     @property
     def sentence(self) -> str:
@@ -82,17 +87,11 @@ def describe_fields(kind: type) -> tuple[FieldDescription, ...]:
     hints = typing.get_type_hints(kind, include_extras=True)
     descriptions = []
     for field in dataclasses.fields(kind):
-        make: Any = field.default_factory
-        bare, notes = unwrap(hints[field.name])
-        description = FieldDescription(
-            owner=kind,
-            name=field.name,
-            hint=hints[field.name],
-            default=field.default if make is dataclasses.MISSING else make(),
-            bare=bare,
-            notes=notes,
+        hint = hints[field.name]
+        bare, notes = unwrap(hint)
+        descriptions.append(
+            FieldDescription(owner=kind, name=field.name, hint=hint, bare=bare, notes=notes)
         )
-        descriptions.append(description)
     return tuple(descriptions)
 
 
