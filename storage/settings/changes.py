@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 from storage.errors import TrilightError, expected_one_of
 from storage.removed import removal_message
 from storage.settings.described import field_value, settings_record
-from storage.settings.fields import describe_fields
+from storage.settings.fields import describe_fields, option_of
 
 Settings = TypeVar("Settings")
 
@@ -44,6 +44,35 @@ def json_or_word(text: str) -> Any:
         raise TrilightError(
             f"{text:.40}... has too many digits or is nested too deeply; expected a value."
         ) from error
+
+
+def option_words(settings: Any, *, leave_out: tuple[str, ...] = ()) -> list[str]:
+    """Return the options of a command that state settings, but for those at their default.
+
+    Args:
+        settings: an instance of a class of settings.
+        leave_out: fields that are not stated.
+    """
+    kind: Any = type(settings)
+    words: list[str] = []
+    for field in describe_fields(kind):
+        value = getattr(settings, field.name)
+        if field.name in leave_out or value == field.default:
+            continue
+        if isinstance(value, bool):
+            words.append(option_of(field.name))
+            continue
+        if isinstance(value, Mapping):
+            value = tuple(f"{name}={_typed(new)}" for name, new in value.items())
+        for entry in value if isinstance(value, tuple) else (value,):
+            words += (option_of(field.name), str(entry))
+    return words
+
+
+def _typed(value: Any) -> str:
+    """Return a value as `json_or_word` reads it: a word stands for itself."""
+    is_word = isinstance(value, str) and json_or_word(value) == value
+    return value if is_word else json.dumps(value)
 
 
 def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:

@@ -15,7 +15,7 @@ import functools
 import json
 import reprlib
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import field as dataclass_field
 from typing import Any, TypeVar, dataclass_transform
 
@@ -29,7 +29,6 @@ from storage.settings.fields import (
     describe_fields,
     expected_of,
     group_of,
-    option_of,
     parts_of,
 )
 
@@ -197,36 +196,3 @@ def _place(
         field = {each.name: each for each in fields}.get(step, field)
         known_steps.append(step)
     return known_steps, holder, field
-
-
-def option_words(settings: Any, *, leave_out: tuple[str, ...] = ()) -> list[str]:
-    """Return the options of a command that state settings, but for those at their default.
-
-    Args:
-        settings: an instance of a class of settings.
-        leave_out: fields that are not stated.
-    """
-    kind: Any = type(settings)
-    words: list[str] = []
-    for field in describe_fields(kind):
-        value = getattr(settings, field.name)
-        if field.name in leave_out or value == field.default:
-            continue
-        if isinstance(value, bool):
-            words.append(option_of(field.name))
-            continue
-        if isinstance(value, Mapping):
-            value = tuple(f"{name}={_json_or_word(new)}" for name, new in value.items())
-        for entry in value if isinstance(value, tuple) else (value,):
-            words += (option_of(field.name), str(entry))
-    return words
-
-
-def _json_or_word(value: Any) -> str:
-    """Return a value as the command line reads it: a word that is no JSON stands for itself."""
-    if isinstance(value, str):
-        try:
-            json.loads(value)
-        except json.JSONDecodeError:
-            return value
-    return json.dumps(value)
