@@ -1,21 +1,36 @@
 """Names that a shell completes; each press of the tab key imports this module."""
 
 from collections.abc import Callable
-from importlib import import_module
-from typing import Any
 
-_TABLES = {
-    "build": ("pipeline.builds.named", "BUILDS"),
-    "run": ("train.runs", "RUNS"),
-    "network": ("model.config", "SIZES"),
-    "runner": ("pipeline.executors.registry", "EXECUTORS"),
+
+def _builds() -> list[str]:
+    from pipeline.builds.named import BUILDS
+
+    return list(BUILDS)
+
+
+def _runs() -> list[str]:
+    from train.runs import RUNS
+
+    return list(RUNS)
+
+
+def _sizes() -> list[str]:
+    from model.config import SIZES
+
+    return list(SIZES)
+
+
+def _runners() -> list[str]:
+    from pipeline.executors.registry import EXECUTORS
+
+    return list(EXECUTORS)
+
+
+NAMES: dict[str, Callable[[], list[str]]] = {
+    "build": _builds,
+    "run": _runs,
+    "network": _sizes,
+    "runner": _runners,
 }
-"""Table of known names by the field that takes one; a field may also take another name."""
-
-
-def completer(field: str) -> Callable[[Any], list[str]] | None:
-    """Return the function that lists the names which a field takes; None where any text goes."""
-    if field not in _TABLES:
-        return None
-    module, table = _TABLES[field]
-    return lambda _: list(getattr(import_module(module), table))
+"""Known names by the field that takes one; a field may also take a name that is not listed."""

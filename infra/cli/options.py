@@ -21,7 +21,7 @@ from typing import Annotated, Any, get_origin
 from cyclopts import Group, Parameter, Token
 
 from infra.cli.changes import parse_changes
-from infra.cli.completion import completer
+from infra.cli.completion import NAMES
 from infra.cli.extend_option import resolve_reference
 from storage.errors import TrilightError
 from storage.remote.url import parse_local_path
@@ -115,7 +115,7 @@ def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> insp
     several = is_repeated(field.hint) or takes_names(field.hint)
     choices = choices_of(field.hint)
     kind = kind_of(field.hint)
-    complete = completer(field.name)
+    complete = (lambda _: NAMES[field.name]()) if field.name in NAMES else None
     word: Any = bool if kind is bool else str  # numbers are read when the class is made
     if kind is str and not (choices or complete or takes_names(field.hint)):
         word = FileName

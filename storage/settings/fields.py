@@ -34,7 +34,7 @@ class FieldDescription:
     bare: Any
     """The type without its notes and without None."""
     notes: Sequence[Any]
-    """Notes of the type."""
+    """Annotated metadata in order: ranges, laws, marks."""
 
     @property
     def default(self) -> Any:

@@ -314,12 +314,9 @@ def test_what_is_checked_is_what_is_declared() -> None:
 
 
 DESCRIBED = {field.name: field for field in describe_fields(Scene)}
-ARRAYS = [
-    *((name, field) for name, field in DESCRIBED.items() if field.within is not None),
-    *(
-        (column.name, dataclasses.replace(DESCRIBED["materials"], notes=[column.within]))
-        for column, _ in laid_out(PUBLISHED_COLUMNS)
-    ),
+ARRAYS = [(name, field) for name, field in DESCRIBED.items() if field.within is not None] + [
+    (column.name, dataclasses.replace(DESCRIBED["materials"], notes=[column.within]))
+    for column, _ in laid_out(PUBLISHED_COLUMNS)
 ]
 """Every range of arrays, by the name of the array or of the columns of materials."""
 
