@@ -63,13 +63,13 @@ def option_words(settings: Any, *, leave_out: tuple[str, ...] = ()) -> list[str]
             words.append(option_of(field.name))
             continue
         if isinstance(value, Mapping):
-            value = tuple(f"{name}={_typed(new)}" for name, new in value.items())
+            value = tuple(f"{name}={_write_value(new)}" for name, new in value.items())
         for entry in value if isinstance(value, tuple) else (value,):
             words += (option_of(field.name), str(entry))
     return words
 
 
-def _typed(value: Any) -> str:
+def _write_value(value: Any) -> str:
     """Return a value as `json_or_word` reads it: a word stands for itself."""
     is_word = isinstance(value, str) and json_or_word(value) == value
     return value if is_word else json.dumps(value)
