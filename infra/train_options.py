@@ -8,7 +8,8 @@ from typing import Annotated, Any, Literal
 
 from storage.errors import TrilightError
 from storage.extensions import function_name
-from storage.settings.described import checked, option_words
+from storage.settings.changes import option_words
+from storage.settings.described import checked
 from storage.settings.ranges import Within
 from train.resume import StartOptions
 from train.runs import changed_run

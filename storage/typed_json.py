@@ -6,9 +6,7 @@ The type is a dataclass, or made of dataclasses; ranges and spellings are notes 
 (`Within`, `Spelled`, `FINITE`). Numbers of 5,000 digits, depth and unknown fields are refused too.
 """
 
-import functools
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar, cast
 
@@ -79,13 +77,9 @@ def read_json(data: bytes | str, kind: type[T], source: str) -> T:
         TrilightError: other JSON than the type says; names source, field, value and what was
             expected.
     """
-    hint: Any = kind
-    try:
-        value = _reader_of(hint)(data)
-    except ValueError as error:
-        from storage.settings.described import read_error  # pydantic takes time to import
+    from storage.settings.described import parse_strictly  # pydantic takes time to import
 
-        raise read_error(error, kind, source) from None
+    value = parse_strictly(data, kind, source)
     if value is None:
         raise TrilightError(f"{source}: null; expected the file as it was written.")
     return cast(T, value)
@@ -109,10 +103,3 @@ def read_json_lines(data: bytes, kind: type[T], source: str, *, torn_end: bool =
             if not torn_end or number < len(lines) or data.endswith(b"\n"):
                 raise
     return rows
-
-
-@functools.cache
-def _reader_of(kind: Any) -> Callable[[bytes | str], Any]:
-    from storage.settings.described import strict_adapter
-
-    return strict_adapter(kind).validate_json

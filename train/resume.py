@@ -13,7 +13,8 @@ from typing import Any, Literal
 
 from storage.errors import TrilightError
 from storage.settings.changes import changed, differences
-from storage.settings.described import describe_fields, from_record, settings_record
+from storage.settings.described import from_record, settings_record
+from storage.settings.fields import describe_fields
 from train.loop.schedule import decay_start_step
 from train.settings import TrainSettings
 from train.stored_settings import known_settings

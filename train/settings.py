@@ -13,8 +13,7 @@ from model.base_widths import BaseWidths
 from model.config import ModelConfig
 from storage.errors import TrilightError
 from storage.settings.described import checked
-from storage.settings.execution import EXECUTION
-from storage.settings.ranges import Seed, Share, Within
+from storage.settings.ranges import EXECUTION, Seed, Share, Within
 
 Rotation = Literal["none", "recipe", "uniform"]
 """`recipe`: a rotation vector of three normal numbers, which favors small angles; `uniform`: every

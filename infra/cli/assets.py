@@ -24,7 +24,8 @@ from storage.errors import TrilightError
 from storage.machine import available_cores
 from storage.records.objects import count_by_reason
 from storage.remote.safe_url import safe_url
-from storage.settings.described import checked, describe_fields
+from storage.settings.described import checked
+from storage.settings.fields import describe_fields
 from storage.settings.ranges import Within
 
 if TYPE_CHECKING:

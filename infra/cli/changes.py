@@ -1,20 +1,30 @@
-"""Changes to the settings of a preset: from a dataset, a run, a YAML file, or `--set`."""
+"""Base settings: changes to a preset from a dataset, a run, a YAML file, or `--set`."""
 
-from collections.abc import Iterable, Mapping
+import dataclasses
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from storage.errors import TrilightError
-from storage.records.safe_read import read_plain
+from storage.records.safe_read import open_plain, read_plain
 from storage.settings.changes import changed, differences, json_or_word
 from storage.settings.described import checked, settings_record
 from storage.typed_json import read_json
 
+if TYPE_CHECKING:
+    from pipeline.generation.dataset_order import DatasetOrder
+
+Order = TypeVar("Order", bound="DatasetOrder")
+
+_LICENCES = "allowed_licences"
 _OF_SOURCES = ("build", "derived", "revisit")
 """Settings of a dataset that name its preset and the datasets that it was made from."""
 
-if TYPE_CHECKING:
-    from infra.cli.settings_file import StatedSettings
+_MOST_BYTES = 1 << 16
+_EXAMPLE = "such as scenes.lights.coloured_share: 0.5"
+
+StatedSettings = dict[str, tuple[Any, int]]
+"""Value and line of each setting of a file, by its dotted name."""
 
 
 @checked()
@@ -47,11 +57,27 @@ def parse_changes(texts: Iterable[str]) -> dict[str, Any]:
                 f"--set {text!r}: expected NAME=VALUE with each name once, such as "
                 "scenes.lights.coloured_share=0.5."
             )
-        try:
-            changes[name] = json_or_word(value)
-        except TrilightError as error:
-            raise TrilightError(f"--set {name:.200}: {error}") from error
+        changes[name] = _value(value, f"--set {name:.200}")
     return changes
+
+
+def with_base_settings(order: Order, base: BaseSettings) -> Order:
+    """Return dataset options whose `changes` hold all differences from the preset.
+
+    Raises:
+        TrilightError: settings cannot be read, or the preset refuses a value, also one that the
+            options state.
+    """
+    from pipeline.builds.named import named_build, option_changes  # train does without
+
+    options = option_changes(order.seed, order.resolution, order.noise_targets)
+    stated = {**options, **order.changes}
+    changes = all_changes(named_build(order.build), base, _dataset_record(base), stated)
+    if not base.is_given:
+        return order
+    if _LICENCES in changes:  # the option adds licences to those of any source of settings
+        changes[_LICENCES] = sorted({*changes[_LICENCES], *order.allow_licences})
+    return dataclasses.replace(order, changes=changes)
 
 
 def all_changes(
@@ -69,7 +95,7 @@ def all_changes(
         TrilightError: a file cannot be read, or a value is refused; for a value of the file, the
             message names its line.
     """
-    filed = {} if base.settings is None else _read(base.settings)
+    filed = {} if base.settings is None else read_settings_file(base.settings)
     values = {name: value for name, (value, _) in filed.items()}
     merged: dict[str, Any] = {}
     for layer in (differences(settings_record(settings), liked), values, stated):
@@ -86,13 +112,7 @@ def all_changes(
     return merged
 
 
-def _read(file: str) -> "StatedSettings":
-    from infra.cli.settings_file import read_settings_file  # YAML takes time to import
-
-    return read_settings_file(file)
-
-
-def dataset_record(base: BaseSettings) -> dict[str, Any]:
+def _dataset_record(base: BaseSettings) -> dict[str, Any]:
     """Return the settings of the dataset of `--like`, without the name of its preset."""
     from storage.dataset.dataset import open_dataset
 
@@ -112,7 +132,7 @@ def run_record(base: BaseSettings) -> dict[str, Any]:
     """
     if base.like is None:
         return {}
-    from train.stored_settings import known_settings  # slow: imports pydantic
+    from train.stored_settings import known_settings
 
     path = Path(base.like) / "settings.json"
     try:
@@ -123,3 +143,86 @@ def run_record(base: BaseSettings) -> dict[str, Any]:
         ) from error
     known = known_settings(settings, f"--like {base.like}")
     return {name: value for name, value in known.items() if name != "run"}
+
+
+def read_settings_file(file: str) -> StatedSettings:
+    """Return the settings of a YAML file, nested or by dotted names.
+
+    Values are read as `--set` reads them: a quoted one is a text, a plain one is JSON or a word.
+
+    Raises:
+        TrilightError: the file cannot be read, is no mapping, holds an alias, or states a setting
+            twice; the message names file and line.
+    """
+    import yaml  # takes time, and most commands need none
+
+    try:
+        with open_plain(Path(file)) as stream:
+            data = stream.read(_MOST_BYTES + 1)
+        if len(data) > _MOST_BYTES:
+            raise TrilightError(
+                f"--settings {file}: too large; expected at most {_MOST_BYTES} bytes."
+            )
+        root = yaml.compose(data.decode(), yaml.SafeLoader)
+        for event in yaml.parse(data.decode(), yaml.SafeLoader):
+            if isinstance(event, yaml.AliasEvent):  # it could expand without limit
+                raise _mistake(file, event, "an alias; expected the value itself")
+        values = () if root is None else _entries(root, file)
+        stated: StatedSettings = {}
+        for name, value, line in values:
+            if name in stated:
+                raise TrilightError(
+                    f"{file}, line {line}: {name} is given twice; expected it once."
+                )
+            stated[name] = value, line
+    except RecursionError as error:
+        raise TrilightError(
+            f"--settings {file}: nested too deeply; expected names with values, {_EXAMPLE}."
+        ) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise TrilightError(f"--settings {file}: not readable ({error}).") from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        problem = getattr(error, "problem", None) or "it holds a character that YAML does not"
+        raise TrilightError(f"{file}, line {mark.line + 1 if mark else 1}: {problem}.") from error
+    return stated
+
+
+def _mistake(file: str, node: Any, problem: str) -> TrilightError:
+    """Return the complaint about a node of YAML, or an event."""
+    return TrilightError(f"{file}, line {node.start_mark.line + 1}: {problem}.")
+
+
+def _entries(node: Any, file: str, prefix: str = "") -> Iterator[tuple[str, Any, int]]:
+    """Yield dotted name, value and line of each setting below a node of YAML."""
+    if node.id != "mapping":
+        raise _mistake(file, node, f"expected names with values, {_EXAMPLE}")
+    for key, value in node.value:
+        if key.id != "scalar":
+            raise _mistake(file, key, "expected the name of a setting")
+        name = prefix + key.value
+        if value.id == "mapping":
+            yield from _entries(value, file, f"{name}.")
+        else:
+            yield name, _json(value, file, name), key.start_mark.line + 1
+
+
+def _json(node: Any, file: str, name: str) -> Any:
+    """Return a node as a JSON value; `name` is the setting, for messages."""
+    if node.id == "sequence":
+        return [_json(entry, file, name) for entry in node.value]
+    if node.id == "mapping":
+        values = {str(key.value): _json(value, file, name) for key, value in node.value}
+        if len(values) < len(node.value):
+            raise _mistake(file, node, "a name is given twice; expected it once")
+        return values
+    line = node.start_mark.line + 1
+    return node.value if node.style else _value(node.value, f"{file}, line {line}: {name}")
+
+
+def _value(text: str, where: str) -> Any:
+    """Return a value as it is typed; `where` begins the complaint."""
+    try:
+        return json_or_word(text)
+    except TrilightError as error:
+        raise TrilightError(f"{where}: {error}") from error

@@ -2,9 +2,8 @@
 
 import time
 
-from infra.cli.changes import BaseSettings
+from infra.cli.changes import BaseSettings, with_base_settings
 from infra.cli.console import first_words, note
-from infra.cli.dataset_changes import with_base_settings
 from infra.cli.generate_progress import show_progress
 from infra.cli.generate_report import report
 from infra.cli.options import OutputOptions, command

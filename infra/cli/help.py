@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from cyclopts.help import HelpEntry, HelpPanel
+from cyclopts.help import HelpPanel
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -27,11 +27,7 @@ class Sections:
         table.add_column(style="cyan", max_width=_NAMES_WIDTH)
         table.add_column(ratio=1, overflow="fold")
         for entry in panel.entries:
-            table.add_row("", Text(_names(entry)), entry.description or "")
+            names = ", ".join(entry.display_labels_with_metavar)
+            table.add_row("", Text(names), entry.description or "")
         console.print(table)
         console.print()
-
-
-def _names(entry: HelpEntry) -> str:
-    """Return the names of an option with its value's name."""
-    return ", ".join(entry.display_labels_with_metavar)

@@ -5,25 +5,35 @@
 
 makes the argument BUILD, and an option of every other field. Each parameter of the function is a
 class of settings (storage.settings.described) and a section of the help, with the class's first
-sentence as its title. This module only converts words to values (infra.cli.words); the class checks
-them, and its complaint about a wrong value then names the option.
+sentence as its title. This module only converts words to values; the class checks them, and its
+complaint about a wrong one then names the option.
 """
 
 import inspect
+import os
 import re
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, get_origin
 
 from cyclopts import Group, Parameter, Token
 
+from infra.cli.changes import parse_changes
 from infra.cli.completion import NAMES
 from infra.cli.extend_option import resolve_reference
-from infra.cli.words import FileName, choices_of, is_repeated, kind_of, takes_names, value_of
 from storage.errors import TrilightError
-from storage.settings.described import FieldDescription, checked, describe_fields, option_of
-from storage.settings.ranges import shown_number
+from storage.remote.url import parse_local_path
+from storage.settings.described import checked
+from storage.settings.fields import (
+    FieldDescription,
+    default_text,
+    describe_fields,
+    option_of,
+    parts_of,
+    unwrap,
+)
 
 ALIASES = {
     "allow_licences": "--allow-licence",
@@ -54,6 +64,10 @@ class OutputOptions:
 
     json: bool = False
     """Print the result as one JSON document, and nothing else."""
+
+
+class FileName(Path):
+    """Type of an option that takes any text; shells complete it as a file name."""
 
 
 def command(*arguments: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -101,16 +115,17 @@ def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> insp
     several = is_repeated(field.hint) or takes_names(field.hint)
     choices = choices_of(field.hint)
     kind = kind_of(field.hint)
-    complete = _completer(field.name)
+    complete = (lambda _: NAMES[field.name]()) if field.name in NAMES else None
     word: Any = bool if kind is bool else str  # numbers are read when the class is made
     if kind is str and not (choices or complete or takes_names(field.hint)):
         word = FileName
     names = [option_of(field.name), *filter(None, [ALIASES.get(field.name)])]
+    metavar = "CHOICE" if choices else _METAVARS.get(kind, "TEXT")
     declared = Parameter(
         name=None if by_place else names,
         help=_help(field, choices, several=several, required=required),
         group=group,
-        metavar=None if kind is bool else _metavar(field, choices),
+        metavar=None if kind is bool else "NAME=VALUE" if takes_names(field.hint) else metavar,
         negative=(),
         show_default=False,
         show_choices=False,
@@ -142,27 +157,11 @@ def _help(
     if required:
         facts.append("required")
     elif field.default is not None and field.default is not False and field.default not in ((), {}):
-        facts.append(f"default: {_default_text(field.default)}")
+        facts.append(f"default: {default_text(field.default)}")
     elif clause is not None:
         sentence = f"{sentence[: clause.start()]}.{sentence[clause.end() :]}"
         facts.append(f"default: {_NONE.sub('none', clause[1])}")
     return f"{sentence} [{'; '.join(facts)}]" if facts else sentence
-
-
-def _default_text(default: Any) -> str:
-    if isinstance(default, tuple):
-        return ", ".join(map(_default_text, default))
-    return shown_number(default) if isinstance(default, int | float) else str(default)
-
-
-def _metavar(field: FieldDescription, choices: tuple[str, ...]) -> str:
-    if takes_names(field.hint):
-        return "NAME=VALUE"
-    return "CHOICE" if choices else _METAVARS.get(kind_of(field.hint), "TEXT")
-
-
-def _completer(name: str) -> Callable[[Any], list[str]] | None:
-    return (lambda _: NAMES[name]()) if name in NAMES else None
 
 
 def _word(_: Any, tokens: tuple[Token, ...]) -> str:
@@ -189,3 +188,56 @@ def _settings(kind: type, words_by_name: Mapping[str, Any]) -> Any:
         if name is None or name[0] not in fields:
             raise
         raise TrilightError(option_of(name[0]) + str(error)[name.end() :]) from error
+
+
+def value_of(words: bool | str | Sequence[str], hint: Any) -> Any:
+    """Return the value of a field from its words.
+
+    Args:
+        words: the typed word, a list for a field that takes several, or a bool for a switch.
+        hint: type of the field. A word that is no value of it is returned unchanged, so that the
+            class reports what it expects.
+
+    Raises:
+        TrilightError: the field takes names with values, and a word is not NAME=VALUE.
+    """
+    if isinstance(words, bool):
+        return words
+    if isinstance(words, str):
+        return _one(words, hint)
+    if takes_names(hint):
+        return parse_changes(words)
+    return tuple(_one(word, hint) for word in words)
+
+
+def _one(word: str, hint: Any) -> Any:
+    word = os.path.expanduser(word)  # a shell leaves the ~ of --out=~/x as it is
+    kinds = list(parts_of(hint))
+    for kind, parse in ((int, int), (float, float), (Path, parse_local_path)):
+        if kind in kinds:
+            try:
+                return parse(word)
+            except ValueError:
+                pass
+    return word
+
+
+def choices_of(hint: Any) -> tuple[str, ...]:
+    """Return the choices of a field; empty where it takes other words too."""
+    return tuple(part for part in parts_of(hint) if isinstance(part, str))
+
+
+def kind_of(hint: Any) -> type:
+    """Return the type of one word of a field: bool, int, float, or str for any text."""
+    kinds = list(parts_of(hint))
+    return next((kind for kind in (bool, int, float) if kind in kinds), str)
+
+
+def is_repeated(hint: Any) -> bool:
+    """Return whether a field takes several words."""
+    return get_origin(unwrap(hint)[0]) is tuple
+
+
+def takes_names(hint: Any) -> bool:
+    """Return whether a field takes names with values."""
+    return get_origin(unwrap(hint)[0]) in (Mapping, dict)

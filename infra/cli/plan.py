@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 from typing import TYPE_CHECKING, Annotated
 
-from infra.cli.changes import BaseSettings
+from infra.cli.changes import BaseSettings, with_base_settings
 from infra.cli.console import (
     duration,
     first_words,
@@ -14,7 +14,6 @@ from infra.cli.console import (
     print_rows,
     progress_bars,
 )
-from infra.cli.dataset_changes import with_base_settings
 from infra.cli.options import OutputOptions, command
 from infra.cli.process_exit import temporary_folder
 from pipeline.generation.dataset_order import DatasetOrder, generate_words

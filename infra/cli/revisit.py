@@ -1,8 +1,7 @@
 """`trilight revisit`: makes a new dataset from the scenes of a finished one."""
 
-from infra.cli.changes import BaseSettings
+from infra.cli.changes import BaseSettings, with_base_settings
 from infra.cli.console import first_words
-from infra.cli.dataset_changes import with_base_settings
 from infra.cli.generate import ExecutorOptions, make
 from infra.cli.options import OutputOptions, command
 from pipeline.generation.revisit_options import RevisitOptions, revisit_order

@@ -4,9 +4,8 @@ from pathlib import Path
 
 from cyclopts import App
 
-from infra.cli.changes import BaseSettings
+from infra.cli.changes import BaseSettings, with_base_settings
 from infra.cli.console import first_words, next_step
-from infra.cli.dataset_changes import with_base_settings
 from infra.cli.flow_runs import FlowRunOptions, run_flow
 from infra.cli.options import OutputOptions, command
 from infra.cli.submit_array import ARRAYS, ArrayOptions, submit_to_array
@@ -61,14 +60,7 @@ def submit(
             f"submit {submission.flow}: --shards-per-task, --at-once, --dry-run and the options of "
             f"machines are those of submit {', '.join(ARRAYS)}; leave them out."
         )
-    first_words(f"Submitting {submission.flow} with the build {order.build}", silent=output.json)
-    load_prefect()
-    from pipeline.flows.submission import parameters
-
-    values = parameters(with_base_settings(order, base))
-    ended = run_flow(submission.flow, values, runs, where=order.place, as_json=output.json)
-    if ended and not output.json and Path(order.place).is_dir():
-        next_step(["verify", order.place], ["inspect", order.place])
+    _submit_flow(submission.flow, order, base, runs, output)
 
 
 @app.command(
@@ -79,11 +71,18 @@ def submit(
 def submit_by_array(
     order: DatasetByArray, base: BaseSettings, runs: FlowRunOptions, output: OutputOptions
 ) -> None:
-    first_words(f"Submitting {BY_ARRAY} with the build {order.build}", silent=output.json)
+    _submit_flow(BY_ARRAY, order, base, runs, output)
+
+
+def _submit_flow(
+    flow: str, order: DatasetOrder, base: BaseSettings, runs: FlowRunOptions, output: OutputOptions
+) -> None:
+    """Submit a flow run and report it; once it has ended, name the next commands."""
+    first_words(f"Submitting {flow} with the build {order.build}", silent=output.json)
     load_prefect()
     from pipeline.flows.submission import parameters
 
     values = parameters(with_base_settings(order, base))
-    ended = run_flow(BY_ARRAY, values, runs, where=order.place, as_json=output.json)
+    ended = run_flow(flow, values, runs, where=order.place, as_json=output.json)
     if ended and not output.json and Path(order.place).is_dir():
         next_step(["verify", order.place], ["inspect", order.place])

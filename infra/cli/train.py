@@ -20,7 +20,7 @@ from infra.torch_library import require_torch
 from infra.train_options import TrainOptions
 from storage.errors import TrilightError
 from storage.installation import child_environment
-from storage.settings.described import option_words
+from storage.settings.changes import option_words
 from train.monitoring.settings import WatchSettings
 from train.progress import TrainProgress
 from train.runs import named_run, scale_intervals

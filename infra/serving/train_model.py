@@ -13,7 +13,7 @@ from prefect.concurrency.sync import concurrency
 from prefect.logging import get_run_logger
 
 from infra.train_options import TrainOptions
-from pipeline.flows.forms import PublicUrl, changed_values, changes_form, parameters_of
+from pipeline.flows.forms import PublicUrl, changes_form, order_of, parameters_of
 from pipeline.flows.limits import GPU_LIMIT
 from pipeline.flows.process import run_to_end
 from pipeline.renders.visible_gpus import visible_gpus
@@ -45,11 +45,7 @@ def train_order(parameters: Mapping[str, Any]) -> TrainOptions:
         TrilightError: a value that no schema can refuse, such as one that contradicts another
             setting; the message names it.
     """
-    converted = {
-        "data": tuple(parameters["data"]),
-        "changes": changed_values(parameters["changes"]),
-    }
-    order = TrainOptions(**{**parameters, **converted})
+    order = order_of(parameters, TrainOptions)
     order.settings()
     return order
 

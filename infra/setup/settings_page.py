@@ -3,20 +3,24 @@
 import dataclasses
 import inspect
 import re
-import typing
 from collections.abc import Iterator
-from typing import Any, get_args
+from typing import Any
 
 from infra.render.options import RenderOptions
 from infra.serving.train_model import TrainOptions
 from pipeline.builds.settings import BuildSettings
-from pipeline.flows.orders import DatasetInRuns
+from pipeline.flows.forms import DatasetInRuns
 from pipeline.generation.price import CorePrice
 from pipeline.generation.revisit_options import RevisitOptions
 from storage.markdown import table
+from storage.records.material import PUBLISHED_COLUMNS, laid_out
 from storage.records.scene import Scene
-from storage.settings.described import describe_fields, field_sentences
-from storage.settings.ranges import declared_ranges, shown_number
+from storage.settings.fields import (
+    default_text,
+    describe_fields,
+    group_of,
+    parts_of,
+)
 from train.evaluation.options import EvaluationOptions, LeaderboardOptions
 from train.monitoring.settings import WatchSettings
 from train.settings import TrainSettings
@@ -67,33 +71,26 @@ def reachable(*roots: type) -> list[type]:
     kinds: dict[type, None] = {}
     for root in roots:
         kinds[root] = None
-        hints = typing.get_type_hints(root)
-        for field in dataclasses.fields(root):
-            for kind in _kinds(hints[field.name]):
-                if dataclasses.is_dataclass(kind):
-                    kinds |= dict.fromkeys(reachable(kind))
+        for field in describe_fields(root):
+            kinds |= dict.fromkeys(reachable(*filter(group_of, parts_of(field.hint))))
     return list(kinds)
-
-
-def _kinds(hint: Any) -> Iterator[type]:
-    """Yield the classes within a type."""
-    if isinstance(hint, type) and not get_args(hint):
-        yield hint
-    for part in get_args(hint):
-        yield from _kinds(part)
 
 
 def _rows(kind: type) -> Iterator[tuple[str, ...]]:
     if kind is Scene:  # its fields are arrays, and no settings
-        for declared in declared_ranges(Scene):
-            part = "" if declared.part is None else f", {declared.part.name}"
-            sentence = _first_sentence(field_sentences(Scene)[declared.name])
-            yield f"`{declared.name}`{part}", sentence, str(declared.within), ""
+        for field in describe_fields(Scene):
+            ranges = {"": field.within}
+            if field.name == "materials":
+                columns = laid_out(PUBLISHED_COLUMNS)
+                ranges = {f", {column.name}": column.within for column, _ in columns}
+            for part, within in ranges.items():
+                if within is not None:
+                    yield f"`{field.name}`{part}", _first_sentence(field.sentence), str(within), ""
         return
     fields = describe_fields(kind) if hasattr(kind, "__pydantic_fields__") else ()
     is_marked = any(field.is_execution for field in fields)
     for field in fields:
-        named = [name for kind in _kinds(field.hint) for name in getattr(kind, "PRESETS", ())]
+        named = [name for kind in parts_of(field.hint) for name in getattr(kind, "PRESETS", ())]
         presets = f", or one of {', '.join(named)}" if named else ""
         yield (
             f"`{field.name}`",
@@ -109,11 +106,9 @@ def _default_text(default: Any) -> str:
         return ""
     if default is None or default in ((), {}):
         return "none"
-    if isinstance(default, tuple):
-        return ", ".join(map(_default_text, default))
     if isinstance(default, bool):
         return str(default).lower()
-    return shown_number(default) if isinstance(default, int | float) else f"`{default}`"
+    return default_text(default, quote="`")
 
 
 def _first_sentence(doc: str) -> str:

@@ -79,13 +79,18 @@ def named_build(
             f"own; expected another name, such as dataclasses.replace(..., "
             f"build='my-{build.build}')."
         )
-    named = {"seed": seed, "renders.resolution": resolution}
-    overrides: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
-    targets = (noise_targets or NoiseTargets()).overrides
-    overrides |= {f"renders.{name}": db for name, db in targets.items()}
-    build = changed(build, overrides)
+    build = changed(build, option_changes(seed, resolution, noise_targets or NoiseTargets()))
     licences = tuple(sorted({*build.allowed_licences, *allow_licences}))
     return changed(dataclasses.replace(build, allowed_licences=licences), changes or {})
+
+
+def option_changes(
+    seed: int | None, resolution: int | None, noise_targets: NoiseTargets
+) -> dict[str, Any]:
+    """Return the settings that single options state, by dotted name; None states nothing."""
+    stated = {"seed": seed, "renders.resolution": resolution}
+    changes: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
+    return changes | {f"renders.{name}": db for name, db in noise_targets.overrides.items()}
 
 
 def object_source(settings: BuildSettings, objects: str | None) -> str:

@@ -22,8 +22,7 @@ from prefect.logging import get_run_logger
 from pipeline.executors.array_job import DatasetByArray, array_job
 from pipeline.executors.kubernetes_array import options_from_environment, submit_job
 from pipeline.executors.slurm_array import submit_array
-from pipeline.flows.forms import parameters_of
-from pipeline.flows.orders import DATASET_FORMS, order_of, run_name
+from pipeline.flows.forms import DATASET_FORMS, order_of, parameters_of, run_name
 from pipeline.flows.run_artifacts import BestEffort, small_picture
 from storage.dataset.layout import dataset_folder
 from storage.dataset.progress import DatasetStatus, missing_shards, read_status

@@ -7,12 +7,11 @@ from prefect import flow
 from prefect.deployments import run_deployment
 from prefect.logging import get_run_logger
 
-from pipeline.flows.forms import parameters_of
-from pipeline.flows.orders import (
+from pipeline.flows.forms import (
     DATASET_FORMS,
     DatasetInRuns,
-    dataset_in_runs,
-    dataset_order,
+    order_of,
+    parameters_of,
     run_name,
 )
 from pipeline.flows.prefect_runner import PrefectRunner
@@ -28,7 +27,7 @@ from storage.dataset.progress import read_status
 @parameters_of(DatasetOrder, **DATASET_FORMS)
 def prepare_assets(**parameters: Any) -> None:
     """Begin a dataset: list, clean, decimate and freeze its objects, without a picture."""
-    run = prepare_dataset(dataset_order(parameters))
+    run = prepare_dataset(order_of(parameters, DatasetOrder))
     get_run_logger().info(
         "%d of %d objects accepted", run.accepted.num_objects, run.accepted.num_found
     )
@@ -38,7 +37,7 @@ def prepare_assets(**parameters: Any) -> None:
 @parameters_of(DatasetOrder, **DATASET_FORMS)
 def generate_scenes(**parameters: Any) -> Outcome:
     """Make a dataset: all its missing shards, or those of a range."""
-    return make_with_artifacts(dataset_order(parameters), PrefectRunner())
+    return make_with_artifacts(order_of(parameters, DatasetOrder), PrefectRunner())
 
 
 @flow(name="build-dataset", flow_run_name=run_name, persist_result=False)
@@ -50,7 +49,7 @@ def build_dataset(**parameters: Any) -> None:
     the first. Then it makes all remaining shards that no worker has claimed, so that it ends even
     if no other worker ever starts.
     """
-    order = dataset_in_runs(parameters)
+    order = order_of(parameters, DatasetInRuns)
     values = {field.name: parameters[field.name] for field in dataclasses.fields(DatasetOrder)}
     prepare_assets(**values)
     if order.flow_runs > 1:

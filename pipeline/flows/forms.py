@@ -1,4 +1,4 @@
-"""Converts settings classes to typed parameters of flows, so that Prefect's forms show their docs.
+"""Converts settings classes to typed parameters of flows for Prefect's forms, and back to options.
 
 A flow takes the fields of a settings class as its parameters: their descriptions
 (storage.settings.described) become the schema that Prefect checks before a run exists, and from
@@ -9,17 +9,21 @@ field may stay empty.
 import dataclasses
 import inspect
 import re
-import typing
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING
-from typing import Annotated, Any, TypeVar, get_origin
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from pipeline.builds.named import BUILDS
 from pipeline.builds.settings import BuildSettings
+from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.objects.sources import SOURCES
-from storage.settings.described import describe_fields
+from storage.dataset.shard_places import MAX_SHARDS
+from storage.errors import TrilightError
+from storage.settings.described import checked
+from storage.settings.fields import describe_fields
+from storage.settings.ranges import Within
 
 Returned = TypeVar("Returned")
 
@@ -38,7 +42,7 @@ def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
                 field.name,
                 inspect.Parameter.KEYWORD_ONLY,
                 default=inspect.Parameter.empty if field.default is MISSING else field.default,
-                annotation=annotations.get(field.name, _form_type(field.hint)),
+                annotation=annotations.get(field.name, field.hint),
             )
             for field in describe_fields(settings)
         ]
@@ -61,10 +65,9 @@ def changes_form(settings: type, example: Any) -> type[BaseModel]:
     fields: dict[str, Any] = {}
     for field in describe_fields(settings):
         value = getattr(example, field.name)
-        kind = _form_type(field.hint)
         first = value[0] if isinstance(value, tuple) and value else value
-        if dataclasses.is_dataclass(first) and not isinstance(first, type):
-            kind = changes_form(type(first), first)
+        is_group = dataclasses.is_dataclass(first) and not isinstance(first, type)
+        kind = changes_form(type(first), first) if is_group else field.hint
         fields[field.name] = (kind | None, Field(default=None, description=field.sentence))
     return create_model(
         f"{settings.__name__}Changes", __config__=ConfigDict(extra="forbid"), **fields
@@ -74,21 +77,12 @@ def changes_form(settings: type, example: Any) -> type[BaseModel]:
 def changed_values(form: BaseModel | None) -> dict[str, Any]:
     """Return the filled-in fields by dotted name, as `storage.settings.changes` takes them."""
     values: dict[str, Any] = {}
-    fields = (
-        type(form).model_fields if form else {}
-    )  # in declared order; `model_fields_set` has none
-    for name in fields:
-        value = getattr(form, name)
+    for name, value in form or ():  # in declared order; `model_fields_set` has none
         if isinstance(value, BaseModel):
             values |= {f"{name}.{below}": entry for below, entry in changed_values(value).items()}
         elif value is not None:
             values[name] = value
     return values
-
-
-def _form_type(hint: Any) -> Any:
-    """Return the type of a field in a form: mappings become objects with any values."""
-    return dict[str, Any] if get_origin(hint) in (Mapping, dict) else hint
 
 
 _NAMED = "|".join(re.escape(name) for name, source in SOURCES.items() if not source.is_place)
@@ -106,7 +100,53 @@ PublicPlace = Annotated[
     Field(pattern=r"^(?:[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|(?:[^:]|:+[^:/]|:+/[^:/])*:*/?)$"),
 ]
 """An output folder of any name, or a URL without secrets."""
-BuildName = typing.Literal[tuple(BUILDS)]  # type: ignore[valid-type]
+BuildName = Literal[tuple(BUILDS)]  # type: ignore[valid-type]
 """Names of the registered builds, as a list to choose from."""
 BuildChanges = changes_form(BuildSettings, BUILDS["smoke"].settings())
 """Every setting of a build."""
+
+DATASET_FORMS: Mapping[str, Any] = {
+    "build": BuildName,
+    "objects": PublicUrl | None,
+    "out": PublicPlace | None,
+    "changes": BuildChanges | None,
+}
+"""Types of parameters that are narrower in a form than in the options."""
+
+
+@checked()
+class DatasetInRuns(DatasetOrder):
+    """A dataset made by several flow runs, each of which makes a range of the shards."""
+
+    flow_runs: Annotated[int, Within(1, MAX_SHARDS, unit="flow runs")] = 1
+    """Total number of flow runs: this one, and one run of the deployment for each other range."""
+    deployment: str = "generate-scenes/local"
+    """Deployment that makes the other ranges, as FLOW/DEPLOYMENT."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.shards is not None:
+            raise TrilightError(
+                f"shards is {self.shards!r}; expected no range, since the whole dataset is made. "
+                "Run generate-scenes for a range."
+            )
+
+
+def order_of(parameters: Mapping[str, Any], kind: Callable[..., Returned]) -> Returned:
+    """Return the options of a class that a flow's parameters state.
+
+    Raises:
+        TrilightError: an invalid value that the form's schema cannot detect; the message names it.
+    """
+    values = {name: parameters[name] for name in inspect.signature(kind).parameters}
+    lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
+    return kind(**{**values, **lists, "changes": changed_values(parameters["changes"])})
+
+
+def run_name() -> str:
+    """Return the name of the starting flow run: build, number of scenes and output folder."""
+    from prefect.runtime import flow_run
+
+    parameters = {"build": DatasetOrder.build, **flow_run.parameters}
+    parts = (parameters["build"], parameters.get("scenes"), parameters.get("out"))
+    return "-".join(str(part) for part in parts if part is not None)

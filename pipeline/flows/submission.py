@@ -25,7 +25,7 @@ from prefect.settings import get_current_settings
 from pipeline.flows.prefect_server import prefect_client
 from storage.errors import TrilightError
 from storage.remote.safe_url import safe_text
-from storage.settings.described import describe_fields
+from storage.settings.fields import describe_fields
 
 POLL_S = 1.0
 """Seconds between two polls of a run."""

@@ -3,7 +3,7 @@
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -90,22 +90,17 @@ def revisit_order(options: RevisitOptions) -> DatasetOrder:
         **_lights(options.lights),
         materials=options.materials,
     )
-    return DatasetOrder(
-        build=options.build or manifest.build,
-        revisits=os.path.realpath(options.dataset),
-        out=options.out,
-        seed=options.seed,
-        resolution=options.resolution,
-        noise_floor_db=options.noise_floor_db,
-        noise_floor_linear_db=options.noise_floor_linear_db,
-        noise_floor_objects_db=options.noise_floor_objects_db,
-        workers=options.workers,
-        device=options.device,
-        failure_budget=options.failure_budget,
-        accept_environment=options.accept_environment,
-        shards=options.shards,
-        changes={**options.changes, "revisit": settings_record(revisit)},
-    )
+    same = {
+        each.name: getattr(options, each.name)
+        for each in fields(DatasetOrder)
+        if hasattr(options, each.name)
+    }
+    stated = {
+        "build": options.build or manifest.build,
+        "revisits": os.path.realpath(options.dataset),
+        "changes": {**options.changes, "revisit": settings_record(revisit)},
+    }
+    return DatasetOrder(**{**same, **stated})
 
 
 def _cameras(words: str, num_views: int) -> dict[str, Any]:

@@ -16,7 +16,6 @@ from storage.records.environment import Environment
 from storage.records.material import (
     DIFFUSE,
     EMISSION,
-    PUBLISHED_COLUMNS,
     SPECULAR,
     laid_out,
     material_columns,
@@ -25,7 +24,8 @@ from storage.records.material import (
 from storage.records.scene_laws import broken_law, require_law
 from storage.records.scene_maps import MAX_TEXTURES, MAX_UV, check_maps, has_maps
 from storage.records.texture import CONSTANT, Texture
-from storage.settings.ranges import FLOAT32_MAX, Columns, Within, declared_ranges
+from storage.settings.fields import describe_fields
+from storage.settings.ranges import FLOAT32_MAX, Within
 
 ObjectKind = Literal["object", "shell", "emitter"]
 OBJECT_KINDS: tuple[ObjectKind, ...] = ("object", "shell", "emitter")
@@ -88,10 +88,7 @@ class Scene:
     """[T, 3] rows of `vertex_positions`, counter-clockwise seen from outside."""
     material_index: Annotated[NDArray[np.uint16], Within(0, 2**16 - 1)]
     """Row of `materials` of each triangle [T]."""
-    materials: Annotated[
-        NDArray[np.float32],
-        *(Columns(each.name, part, each.within) for each, part in laid_out(PUBLISHED_COLUMNS)),
-    ]
+    materials: NDArray[np.float32]
     """[M, 10 or more] the declared columns: diffuse rgb, specular rgb, roughness, emission rgb, and
     those that were added (storage.records.material)."""
     object_index: Annotated[NDArray[np.uint16], Within(0, 2**16 - 1)]
@@ -190,14 +187,13 @@ def _check_arrays(scene: Scene) -> None:
         if np.issubdtype(dtype, np.floating):
             require_law(np.isfinite(array), name, array, "finite values")
     _check_columns(scene)
-    for field in declared_ranges(Scene):
+    for field in describe_fields(Scene):
         values = getattr(scene, field.name)
-        if values is None:
+        if field.within is None or values is None:
             continue
-        outside = field.outside(values)
-        if outside.any():  # what was expected is put into words only then
-            part = "" if field.part is None else f"{field.part.name} "
-            require_law(~outside, field.name, values, f"{part}{field.within}")
+        holds = field.within.holds(values)
+        if not holds.all():  # what was expected is put into words only then
+            require_law(holds, field.name, values, str(field.within))
     for name, other in (("vertex_normals", "vertex_positions"), ("fov_deg", "c2w")):
         _same_length(scene, name, other)
     for name in ("material_index", "object_index"):
@@ -205,7 +201,7 @@ def _check_arrays(scene: Scene) -> None:
 
 
 def _check_columns(scene: Scene) -> None:
-    """Check the width of a material row, and the ranges of the columns that were added to four."""
+    """Check the width of a material row, and the ranges of its columns."""
     got = scene.materials.shape
     expected = material_width()
     if got[1] != expected:
@@ -214,9 +210,9 @@ def _check_columns(scene: Scene) -> None:
             f"materials has shape {got}", f"(None, {expected}), since its columns are {names}"
         )
     for column, part in laid_out():
-        if column.name not in PUBLISHED_COLUMNS:
-            holds = np.ones(got, np.bool_)
-            holds[:, part] = column.within.holds(scene.materials[:, part])
+        holds = np.ones(got, np.bool_)
+        holds[:, part] = column.within.holds(scene.materials[:, part])
+        if not holds.all():
             require_law(holds, "materials", scene.materials, f"{column.name} {column.within}")
 
 

@@ -15,7 +15,8 @@ from typing import Any, TypeVar
 
 from storage.errors import TrilightError, expected_one_of
 from storage.removed import removal_message
-from storage.settings.described import field_value, removed_fields, settings_record
+from storage.settings.described import field_value, settings_record
+from storage.settings.fields import describe_fields, option_of
 
 Settings = TypeVar("Settings")
 
@@ -43,6 +44,35 @@ def json_or_word(text: str) -> Any:
         raise TrilightError(
             f"{text:.40}... has too many digits or is nested too deeply; expected a value."
         ) from error
+
+
+def option_words(settings: Any, *, leave_out: tuple[str, ...] = ()) -> list[str]:
+    """Return the options of a command that state settings, but for those at their default.
+
+    Args:
+        settings: an instance of a class of settings.
+        leave_out: fields that are not stated.
+    """
+    kind: Any = type(settings)
+    words: list[str] = []
+    for field in describe_fields(kind):
+        value = getattr(settings, field.name)
+        if field.name in leave_out or value == field.default:
+            continue
+        if isinstance(value, bool):
+            words.append(option_of(field.name))
+            continue
+        if isinstance(value, Mapping):
+            value = tuple(f"{name}={_write_value(new)}" for name, new in value.items())
+        for entry in value if isinstance(value, tuple) else (value,):
+            words += (option_of(field.name), str(entry))
+    return words
+
+
+def _write_value(value: Any) -> str:
+    """Return a value as `json_or_word` reads it: a word stands for itself."""
+    is_word = isinstance(value, str) and json_or_word(value) == value
+    return value if is_word else json.dumps(value)
 
 
 def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:
@@ -78,10 +108,27 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, 
 
 
 def _replace_fields(group: Any, changes: Sequence[Change]) -> Any:
-    values = {
-        field: _new_field_value(group, field, field_changes)
-        for field, field_changes in _by_field(group, changes).items()
-    }
+    kind: Any = type(group)
+    fields = {field.name: field for field in describe_fields(kind)}
+    by_field: dict[str, list[Change]] = {}
+    for path, value, name in changes:
+        first, *rest = path
+        if first in getattr(kind, "REMOVED", ()):
+            raise TrilightError(removal_message(f"setting {name!r}"))
+        if first not in fields:
+            raise TrilightError(
+                f"setting {name!r} does not exist: {first!r} is unknown there; "
+                f"{expected_one_of(first, fields)}."
+            )
+        by_field.setdefault(first, []).append((rest, value, name))
+    values: dict[str, Any] = {}
+    for field, inner in by_field.items():
+        value = getattr(group, field)
+        for path, new, name in inner:
+            if not path:  # first as a whole, then single settings within it
+                record = _without_presets(new, value, name)
+                value = field_value(kind, fields[field], record, name)
+        values[field] = _change_within(value, [change for change in inner if change[0]])
     try:
         return dataclasses.replace(group, **values)
     except TrilightError as error:
@@ -92,32 +139,7 @@ def _replace_fields(group: Any, changes: Sequence[Change]) -> Any:
         raise TrilightError(f"setting{'s' * (len(names) > 1)} {quoted}: {error}") from error
 
 
-def _by_field(group: Any, changes: Sequence[Change]) -> Mapping[str, Sequence[Change]]:
-    """Return the changes by the field of the group that they lead through."""
-    fields = [field.name for field in dataclasses.fields(group)]
-    by_field: dict[str, list[Change]] = {}
-    for path, value, name in changes:
-        if path[0] in removed_fields(type(group)):
-            raise TrilightError(removal_message(f"setting {name!r}"))
-        if path[0] not in fields:
-            raise TrilightError(
-                f"setting {name!r} does not exist: {path[0]!r} is unknown there; "
-                f"{expected_one_of(path[0], fields)}."
-            )
-        by_field.setdefault(path[0], []).append((path[1:], value, name))
-    return by_field
-
-
-def _new_field_value(group: Any, field: str, changes: Sequence[Change]) -> Any:
-    """Return a field's new value: first as a whole, then single settings within it."""
-    value = getattr(group, field)
-    for path, new, name in changes:
-        if not path:
-            value = field_value(type(group), field, _without_names(new, value, name), name)
-    return _change_within(value, [change for change in changes if change[0]])
-
-
-def _without_names(new: Any, old: Any, name: str) -> Any:
+def _without_presets(new: Any, old: Any, name: str) -> Any:
     """Return a new value with the record of a preset wherever its name stands."""
     many = isinstance(old, tuple) and bool(old)
     first = old[0] if many else old
@@ -132,11 +154,15 @@ def _without_names(new: Any, old: Any, name: str) -> Any:
     for each in records:
         if not isinstance(each, Mapping):
             choices = f"{expected_one_of(str(each), presets)}, or" if presets else "expected"
-            raise TrilightError(
-                f"setting {name!r} is {new!r}; {choices} one of its settings by name, such as "
-                f"{name}.{dataclasses.fields(first)[0].name}, since it is a group."
-            )
+            raise _no_group(new, name, first, choices)
     return records if many else records[0]
+
+
+def _no_group(new: Any, name: str, group: Any, choices: str = "expected") -> TrilightError:
+    return TrilightError(
+        f"setting {name!r} is {new!r}; {choices} one of its settings by name, such as "
+        f"{name}.{dataclasses.fields(group)[0].name}, since it is a group."
+    )
 
 
 def _change_within(value: Any, changes: Sequence[Change]) -> Any:
@@ -146,10 +172,7 @@ def _change_within(value: Any, changes: Sequence[Change]) -> Any:
     if dataclasses.is_dataclass(value):
         for path, new, name in changes:
             if not path:
-                raise TrilightError(
-                    f"setting {name!r} is {new!r}; expected one of its settings by name, such as "
-                    f"{name}.{dataclasses.fields(value)[0].name}."
-                )
+                raise _no_group(new, name, value)
         return _replace_fields(value, changes)
     if not isinstance(value, tuple) or not all(map(dataclasses.is_dataclass, value)):
         path, _, name = changes[0]
@@ -157,19 +180,14 @@ def _change_within(value: Any, changes: Sequence[Change]) -> Any:
         raise TrilightError(f"setting {name!r} does not exist: {plain!r} has no settings within.")
     by_entry: list[list[Change]] = [[] for _ in value]
     for path, new, name in changes:
-        for index in _entries(path[0], len(value), name):
-            inner = path[1:] if path[0].isdigit() else path
-            by_entry[index].append((inner, new, name))
+        if not path[0].isdigit():  # all entries are meant
+            for entry in by_entry:
+                entry.append((path, new, name))
+        elif int(path[0]) < len(value):
+            by_entry[int(path[0])].append((path[1:], new, name))
+        else:
+            raise TrilightError(
+                f"setting {name!r} does not exist: the list has {len(value)} entries; expected a "
+                f"number from 0 to {len(value) - 1}."
+            )
     return tuple(map(_change_within, value, by_entry))
-
-
-def _entries(step: str, count: int, name: str) -> Sequence[int]:
-    """Return which entries of a list a step means: the one of its number, or all."""
-    if not step.isdigit():
-        return range(count)
-    if int(step) >= count:
-        raise TrilightError(
-            f"setting {name!r} does not exist: the list has {count} entries; expected a number "
-            f"from 0 to {count - 1}."
-        )
-    return [int(step)]

@@ -1,22 +1,16 @@
-"""Ranges of numeric fields: declared once, at the field; checked and printed from there.
+"""Notes of fields, above all ranges: declared once, at the field; checked and printed from there.
 
     fov_deg: Annotated[Range, Within(1, 170, unit="degrees")] = (30.0, 60.0)
+    scenes_per_pass: Annotated[int, Within(1, 65_536, unit="scenes"), EXECUTION] = 16
 
 `storage.settings.described` checks them, and tests/extremes goes to both ends of each and one step
 outside. Laws between fields are none of this: they stay in `__post_init__`, or in `Scene.check`.
 """
 
-import functools
-import types
-import typing
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
-
-from storage.array_hints import array_scalar
 
 
 @dataclass(frozen=True)
@@ -110,17 +104,12 @@ class LowFirst:
         return pair
 
 
-@dataclass(frozen=True)
-class Columns:
-    """A range of some columns of an array."""
+EXECUTION = "execution"
+"""Marks a field that changes how something is executed, and not its meaning.
 
-    name: str
-    """Noun for the columns in messages."""
-    columns: slice
-    """The columns, as a slice of the last axis."""
-    within: Within
-    """Range that holds for every value."""
-
+Execution is what would change nothing if numbers had no rounding, so it is free to differ whenever
+work goes on. All that is not marked is meaning.
+"""
 
 Share = Annotated[float, Within(0, 1)]
 """A part of a whole, or a probability."""
@@ -131,60 +120,6 @@ Seed = Annotated[int, Within(0, 2**256 - 1)]
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 """The largest finite float32."""
 
-Shape = Literal["one", "pair", "many", "array"]
-
-_EXPECTED: dict[tuple[Shape, type], str] = {
-    ("one", int): "a whole number",
-    ("one", float): "a number",
-    ("pair", int): "two whole numbers",
-    ("pair", float): "two numbers",
-    ("many", int): "whole numbers",
-    ("many", float): "numbers",
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Declared:
-    """Declared range of a field, or of some of its columns."""
-
-    name: str
-    kind: type
-    """int or float; a float may be given as an int."""
-    shape: Shape
-    """One number, a pair, a tuple of any length, or an array of numpy."""
-    optional: bool
-    """True: None is allowed."""
-    within: Within
-    """Range that holds for every value."""
-    ordered: bool = False
-    """True: the lower number of a pair comes first."""
-    part: Columns | None = None
-    """The columns that are meant, where it is not the whole array."""
-
-    @property
-    def expected(self) -> str:
-        """Description of valid values, for messages; not for arrays."""
-        order = ", the lower one first" if self.ordered else ""
-        return f"{_EXPECTED[self.shape, self.kind]} {self.within}{order}"
-
-    def outside(self, array: NDArray) -> NDArray[np.bool_]:
-        """Return where an array breaks the range, in its shape."""
-        if self.part is None:
-            return ~np.asarray(self.within.holds(array))
-        wrong = np.zeros(array.shape, np.bool_)
-        columns = self.part.columns
-        wrong[..., columns] = ~self.within.holds(array[..., columns])
-        return wrong
-
-
-@functools.cache
-def declared_ranges(settings: type) -> tuple[Declared, ...]:
-    """Return what the fields of a dataclass declare, in their order."""
-    hints = typing.get_type_hints(settings, include_extras=True)
-    return tuple(
-        declared for name, hint in hints.items() for declared in _declarations_of(name, hint)
-    )
-
 
 def shown_number(number: float) -> str:
     """Return a number for a person: 2^64 - 1 instead of twenty digits."""
@@ -192,41 +127,3 @@ def shown_number(number: float) -> str:
         power = (number + 1).bit_length() - 1
         return f"2^{power} - 1" if power > 30 and number + 1 == 1 << power else str(number)
     return f"{number:.6g}"
-
-
-def _declarations_of(name: str, hint: Any) -> Iterator[Declared]:
-    optional = False
-    ordered = False
-    declarations = list[Within | Columns]()
-    while True:
-        if get_origin(hint) is Annotated:
-            hint, *notes = get_args(hint)
-            declarations += [note for note in notes if isinstance(note, Within | Columns)]
-            ordered = any(isinstance(note, LowFirst) for note in notes)
-        elif get_origin(hint) in (typing.Union, types.UnionType) and type(None) in get_args(hint):
-            optional = True
-            hint = next(arg for arg in get_args(hint) if arg is not type(None))
-        else:
-            break
-    for note in declarations:
-        kind, shape = _kind_and_shape(hint)
-        yield Declared(
-            name=name,
-            kind=kind,
-            shape=shape,
-            optional=optional,
-            ordered=ordered,
-            within=note.within if isinstance(note, Columns) else note,
-            part=note if isinstance(note, Columns) else None,
-        )
-
-
-def _kind_and_shape(hint: Any) -> tuple[type, Shape]:
-    if hint in (int, float):
-        return hint, "one"
-    if hint == int | float:  # a whole number stays one
-        return float, "one"
-    if get_origin(hint) is tuple:
-        first, second = get_args(hint)
-        return first, "many" if second is ... else "pair"
-    return (float if issubclass(array_scalar(hint), np.floating) else int), "array"

@@ -34,7 +34,7 @@ from storage.dataset.splits import MOST_SHARDS, scenes_of_shard, shard_name, sha
 from storage.errors import Rejected, TrilightError
 from storage.seeds import SceneKey
 from storage.settings.changes import changed
-from storage.settings.ranges import Declared
+from storage.settings.fields import FieldDescription
 from tests.extremes.test_ranges import FIELDS, SMOKE, End
 from tests.for_each import case, for_each
 from tests.model.kit import awake, random_scene, tiny_config
@@ -98,7 +98,7 @@ SCENE_FIELDS = [(GROUPS[group] + field.name, field) for group, field in FIELDS i
 ONE_FAMILY = dataclasses.replace(SMOKE.scenes, families=SMOKE.scenes.families[:1])
 
 
-def _value(field: Declared, end: End) -> Any:
+def _value(field: FieldDescription, end: End) -> Any:
     number = getattr(field.within, end)
     return [number, number] if field.shape == "pair" else number
 
@@ -116,7 +116,9 @@ def test_a_scene_is_filled_to_the_most_triangles(pool: list[PooledAsset]) -> Non
     _require_scene_or_reason(pool, "fill_to", dict(SCENE_FIELDS)["fill_to"], "high")
 
 
-def _require_scene_or_reason(pool: list[PooledAsset], name: str, field: Declared, end: End) -> None:
+def _require_scene_or_reason(
+    pool: list[PooledAsset], name: str, field: FieldDescription, end: End
+) -> None:
     blind = {} if name.startswith("views.") else BLIND
     beside = BESIDE.get((name, end), {})
     wanted = changed(ONE_FAMILY, {**blind, **beside, name: _value(field, end)})

@@ -25,7 +25,7 @@ from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSet
 from pipeline.builds.named import named_build
 from pipeline.builds.revisit import GivenCamera, RevisitSettings
 from pipeline.builds.settings import BuildSettings
-from pipeline.flows.orders import DatasetInRuns
+from pipeline.flows.forms import DatasetInRuns
 from pipeline.generation.price import CorePrice
 from pipeline.generation.revisit_options import RevisitOptions
 from pipeline.renders.settings import MAX_SPP, RenderSettings
@@ -42,13 +42,16 @@ from scene_templates.skies.draw import SkyMapSettings
 from scene_templates.skies.settings import SkySettings
 from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.textures import TextureSettings
+from storage.array_hints import array_scalar
 from storage.dataset.settings import ListedShard, SplitSettings
 from storage.errors import TrilightError
+from storage.records.material import PUBLISHED_COLUMNS, laid_out
 from storage.records.scene import Scene
 from storage.records.scene_maps import MAP_ARRAYS, MAX_TEXTURES
 from storage.records.texture import CONSTANT
-from storage.settings.described import checked, describe_fields
-from storage.settings.ranges import Columns, Declared, Within, declared_ranges
+from storage.settings.described import checked
+from storage.settings.fields import FieldDescription, describe_fields
+from storage.settings.ranges import Within
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
@@ -155,12 +158,13 @@ FIELDS = [
     (settings, field)
     for settings in reachable(*(root for roots in ROOTS.values() for root in roots))
     if settings is not Scene
-    for field in declared_ranges(settings)
+    for field in describe_fields(settings)
+    if field.within is not None
 ]
 """Every declared range of settings."""
 
 
-def at_end(settings: type, field: Declared, end: End, number: Any) -> Any:
+def at_end(settings: type, field: FieldDescription, end: End, number: Any) -> Any:
     """Return valid settings with one number of a field replaced; raises what they raise."""
     example, value = EXAMPLES[settings], number
     old = getattr(example, field.name)
@@ -176,9 +180,10 @@ every_end = pytest.mark.parametrize("end", ["low", "high"])
 every_field = for_each(("settings", "field"), FIELDS)
 
 
-def last_inside(field: Declared, end: End) -> float:
+def last_inside(field: FieldDescription, end: End) -> float:
     """Return the extreme number that a range admits."""
     within = field.within
+    assert within is not None
     bound, is_open = {
         "low": (within.low, within.low_open),
         "high": (within.high, within.high_open),
@@ -189,7 +194,7 @@ def last_inside(field: Declared, end: End) -> float:
     return math.nextafter(bound, {"low": math.inf, "high": -math.inf}[end]) if is_open else bound
 
 
-def first_outside(field: Declared, end: End) -> float:
+def first_outside(field: FieldDescription, end: End) -> float:
     """Return the next number beyond."""
     inside = last_inside(field, end)
     if field.kind is int:
@@ -199,13 +204,17 @@ def first_outside(field: Declared, end: End) -> float:
 
 @every_end
 @every_field
-def test_an_end_of_each_field_is_accepted(settings: type, field: Declared, end: End) -> None:
+def test_an_end_of_each_field_is_accepted(
+    settings: type, field: FieldDescription, end: End
+) -> None:
     at_end(settings, field, end, last_inside(field, end))
 
 
 @every_end
 @every_field
-def test_one_step_outside_is_refused_by_name(settings: type, field: Declared, end: End) -> None:
+def test_one_step_outside_is_refused_by_name(
+    settings: type, field: FieldDescription, end: End
+) -> None:
     number = first_outside(field, end)
     option = re.sub("_(db|deg|ev)$", "", field.name).replace("_", "-")
     with pytest.raises(TrilightError) as caught:
@@ -218,7 +227,7 @@ def test_one_step_outside_is_refused_by_name(settings: type, field: Declared, en
 
 
 @every_field
-def test_other_kinds_of_values_are_refused(settings: type, field: Declared) -> None:
+def test_other_kinds_of_values_are_refused(settings: type, field: FieldDescription) -> None:
     wrong: list[Any] = [math.nan, math.inf, -math.inf, True, "1", (1, 2, 3) * 3]
     if field.kind is int:
         wrong.append(last_inside(field, "low") + 0.5)
@@ -238,7 +247,7 @@ def _numbers(hint: Any) -> Iterator[bool]:
     """Yield for each number of a type whether a range is declared around it."""
     if get_origin(hint) is Annotated:
         inner, *notes = get_args(hint)
-        declared = any(isinstance(note, Within | Columns) for note in notes)
+        declared = any(isinstance(note, Within) for note in notes)
         yield from (declared or found for found in _numbers(inner))
     elif hint in (int, float) or (isinstance(hint, type) and issubclass(hint, np.number)):
         yield False
@@ -254,6 +263,7 @@ def test_no_number_is_without_a_range() -> None:
         for settings in reachable(*roots)
         if settings is Scene or settings in EXAMPLES or _is_settings(settings.__name__)
         for name, hint in typing.get_type_hints(settings, include_extras=True).items()
+        if name != "materials"  # whose columns have ranges
         if not all(_numbers(hint))
     ]
     assert undeclared == []
@@ -292,21 +302,25 @@ def test_no_class_of_settings_is_forgotten() -> None:
 def test_what_is_checked_is_what_is_declared() -> None:
     """A field is looked at by its range and by nothing before it: the first wrong one is named."""
 
-    @checked("group", option=str.upper)
+    @checked("group")
     class Group:
         share: Annotated[float, Within(0, 1, high_open=True, unit="parts")] = 0.5
 
     Group(share=0.0)
     with pytest.raises(TrilightError) as caught:
         Group(share=1.0)
-    expected = "group: SHARE is 1.0; expected a number from 0 to below 1 parts."
+    expected = "group: share is 1.0; expected a number from 0 to below 1 parts."
     assert str(caught.value) == expected
 
 
-ARRAYS = declared_ranges(Scene)
+DESCRIBED = {field.name: field for field in describe_fields(Scene)}
+ARRAYS = [(name, field) for name, field in DESCRIBED.items() if field.within is not None] + [
+    (column.name, dataclasses.replace(DESCRIBED["materials"], notes=[column.within]))
+    for column, _ in laid_out(PUBLISHED_COLUMNS)
+]
+"""Every range of arrays, by the name of the array or of the columns of materials."""
 
-
-PLACES = {
+PLACES: dict[str, Any] = {
     "vertex_positions": (1, 2), "vertex_normals": (0, 0), "faces": (1, 2), "material_index": 1,
     "object_index": 1, "c2w": (1, 0, 3), "fov_deg": 1,
     "uv": (1, 0), "material_textures": (FLOOR, 1),
@@ -315,35 +329,37 @@ PLACES = {
 """One number of each array, and of each part of the materials."""
 
 
-def _with(field: Declared, number: Any) -> Scene:
+def _is_float(field: FieldDescription) -> bool:
+    return issubclass(array_scalar(field.bare), np.floating)
+
+
+def _with(place: str, field: FieldDescription, number: Any) -> Scene:
     """Return a dark floor under a light, with one number of an array replaced."""
     scene = textured_scene() if field.name in MAP_ARRAYS else tiny_scene()
     scene.materials[FLOOR] = 0
     if field.name == "vertex_normals":
         scene.vertex_normals[0] = 0
     array: NDArray = getattr(scene, field.name).copy()
-    array[_place(field)] = number
+    array[PLACES[place]] = number
     changes: dict[str, Any] = {field.name: array}
     return dataclasses.replace(scene, **changes)
 
 
-def _place(field: Declared) -> Any:
-    return PLACES[field.part.name if field.part else field.name]
-
-
 @every_end
-@for_each("field", ARRAYS)
-def test_an_array_of_a_scene_may_reach_the_end(field: Declared, end: End) -> None:
+@for_each(("place", "field"), ARRAYS)
+def test_an_array_of_a_scene_may_reach_the_end(
+    place: str, field: FieldDescription, end: End
+) -> None:
     inwards = {"low": np.float32(np.inf), "high": np.float32(-np.inf)}[end]
     number: Any = getattr(field.within, end)
-    if field.kind is float:
+    if _is_float(field):
         number = np.float32(number)
         is_open = getattr(field.within, f"{end}_open")
         # a normal's length, rounded to float32, is held to the same end by a law of its own
         if is_open or field.name == "vertex_normals":
             number = np.nextafter(number, inwards)
-    scene = _with(field, number)
-    if field.kind is float:
+    scene = _with(place, field, number)
+    if _is_float(field):
         scene.check()
         return
     # What rows there are is a law between arrays; the range is that of the type.
@@ -352,7 +368,7 @@ def test_an_array_of_a_scene_may_reach_the_end(field: Declared, end: End) -> Non
     if field.name == "material_textures":  # -1 stands for no texture
         ends = (CONSTANT, MAX_TEXTURES - 1)
     assert number == dict(zip(("low", "high"), ends, strict=True))[end]
-    assert not field.outside(array).any()
+    assert field.within is not None and field.within.holds(array).all()
     if end == "low":
         return
     with pytest.raises(TrilightError, match=rf"{field.name}\[.*{number}; expected .*rows below"):
@@ -360,15 +376,17 @@ def test_an_array_of_a_scene_may_reach_the_end(field: Declared, end: End) -> Non
 
 
 @every_end
-@for_each("field", [field for field in ARRAYS if field.kind is float])
-def test_an_array_of_a_scene_beyond_the_end_is_refused(field: Declared, end: End) -> None:
+@for_each(("place", "field"), [each for each in ARRAYS if _is_float(each[1])])
+def test_an_array_of_a_scene_beyond_the_end_is_refused(
+    place: str, field: FieldDescription, end: End
+) -> None:
     """But for integers, whose ranges are those of their types: nothing is beyond."""
     outwards = {"low": np.float32(-np.inf), "high": np.float32(np.inf)}[end]
     number = np.float32(getattr(field.within, end))
     if not getattr(field.within, f"{end}_open"):
         with np.errstate(over="ignore"):
             number = np.nextafter(number, outwards)
-    place = _place(field)
-    index = ", ".join(str(at) for at in (place if isinstance(place, tuple) else (place,)))
+    at = PLACES[place]
+    index = ", ".join(map(str, at if isinstance(at, tuple) else (at,)))
     with pytest.raises(TrilightError, match=rf"{field.name}\[{index}\] is .*; expected"):
-        _with(field, number).check()
+        _with(place, field, number).check()

@@ -21,7 +21,8 @@ from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import TrilightError
 from storage.settings.changes import changed
-from storage.settings.described import describe_fields, from_record, settings_record
+from storage.settings.described import from_record, settings_record
+from storage.settings.fields import describe_fields
 from tests.for_each import for_each
 from tests.scene_templates.balls import DEFAULTS, template_settings
 

@@ -15,14 +15,13 @@ import pytest
 
 from infra.cli import console
 from infra.cli.commands import COMMANDS
-from infra.cli.options import ALIASES
-from infra.cli.words import choices_of, is_repeated, takes_names, value_of
-from infra.cli.words import kind_of as kind_of_field
+from infra.cli.options import ALIASES, choices_of, is_repeated, takes_names, value_of
+from infra.cli.options import kind_of as kind_of_field
 from infra.setup.command_line_page import every_command
 from infra.setup.generated_pages import PAGES
 from pipeline.shards.expression import TEXTS, condition, kind_of
 from storage.records.quantities import QUANTITIES
-from storage.settings.described import option_of
+from storage.settings.fields import option_of
 from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.for_each import case

@@ -15,10 +15,8 @@ from typing import Any, NoReturn
 
 import pytest
 
-from infra.cli.changes import BaseSettings, all_changes
+from infra.cli.changes import BaseSettings, all_changes, read_settings_file, with_base_settings
 from infra.cli.console import progress_bars
-from infra.cli.dataset_changes import with_base_settings
-from infra.cli.settings_file import read_settings_file
 from infra.cli.train import _BarProgress, _QuietProgress, _report, _validation_rows
 from model.checkpoint_format import saved_steps
 from pipeline.builds.named import BUILDS, named_build

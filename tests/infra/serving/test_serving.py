@@ -28,7 +28,7 @@ from infra.serving.train_model import RunChanges, TrainOptions, train_model, tra
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
 from pipeline.flows.prefect_server import STOPPED_BY_PARENT, wait_until_healthy
 from storage.errors import TrilightError
-from storage.settings.described import describe_fields
+from storage.settings.fields import describe_fields
 from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.for_each import case

@@ -17,7 +17,7 @@ from packaging.utils import canonicalize_name
 from infra.serving import deployments
 from infra.setup.locks import LockedPackage, read_lock, write_lock
 from infra.setup.sbom import plain_name
-from pipeline.flows.orders import DatasetInRuns
+from pipeline.flows.forms import DatasetInRuns
 from tests.conftest import ROOT
 from tests.for_each import case
 from tests.infra.setup.manifests_kit import IMAGES, MANIFESTS, containers

@@ -10,8 +10,7 @@ from infra.serving.train_model import train_model
 from pipeline.builds.settings import BuildSettings
 from pipeline.flows.array_flow import make_by_array
 from pipeline.flows.dataset_flows import build_dataset, generate_scenes, prepare_assets
-from pipeline.flows.forms import BuildChanges, changed_values
-from pipeline.flows.orders import dataset_order
+from pipeline.flows.forms import BuildChanges, changed_values, order_of
 from pipeline.flows.prefect_runner import is_retryable
 from pipeline.generation.dataset_order import DatasetOrder
 from storage.errors import EnvironmentFailure, TrilightError
@@ -68,9 +67,9 @@ def test_changes_become_dotted_names() -> None:
     form = BuildChanges(**{"renders": {"max_spp": 64}, "storage": {"profile": "lossless"}})
     expected = {"renders.max_spp": 64, "storage.profile": "lossless"}
     assert changed_values(form) == expected
-    order = dataset_order(_defaults(scenes=3, changes=form))
+    order = order_of(_defaults(scenes=3, changes=form), DatasetOrder)
     assert order == DatasetOrder(scenes=3, changes=expected)
-    assert dataset_order(_defaults()) == DatasetOrder()
+    assert order_of(_defaults(), DatasetOrder) == DatasetOrder()
 
 
 @for_each(
@@ -127,7 +126,7 @@ def test_a_place_that_cannot_be_written_is_refused_by_name() -> None:
     """Before anything is begun: a flow makes its order first."""
     for out in ("https://host/set", "hf://datasets/ada/set", "ftp://host/set"):
         with pytest.raises(TrilightError, match=f"^out '{out}'"):
-            dataset_order(_defaults(out=out))
+            order_of(_defaults(out=out), DatasetOrder)
 
 
 def test_only_what_can_pass_is_tried_again() -> None:

@@ -13,8 +13,8 @@ import pytest
 from pipeline.flows import dataset_flows as building
 from pipeline.flows import on_dask
 from pipeline.flows import prefect_runner as runner
+from pipeline.flows.forms import DatasetInRuns, order_of
 from pipeline.flows.limits import GPU_LIMIT
-from pipeline.flows.orders import DatasetInRuns, dataset_in_runs
 from pipeline.flows.process import run_to_end
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.tasks import shard_ranges
@@ -68,7 +68,7 @@ def test_there_are_no_more_ranges_than_shards() -> None:
 )
 def test_wrong_numbers_of_runs_are_named(given: dict[str, Any], message: str) -> None:
     with pytest.raises(TrilightError, match=message):
-        dataset_in_runs(_parameters(**given))
+        order_of(_parameters(**given), DatasetInRuns)
 
 
 @for_each(("device", "held"), [("gpu", [1]), ("cpu", [])])

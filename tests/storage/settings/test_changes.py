@@ -18,9 +18,9 @@ from storage import array_hints
 from storage.array_hints import array_scalar
 from storage.errors import TrilightError
 from storage.settings.changes import changed
-from storage.settings.described import checked, describe_fields
-from storage.settings.execution import EXECUTION
-from storage.settings.ranges import Within
+from storage.settings.described import checked
+from storage.settings.fields import describe_fields
+from storage.settings.ranges import EXECUTION, Within
 from tests.for_each import for_each
 
 

@@ -1,0 +1,178 @@
+"""What the declaration of a field says: type, default, range, sentence, and valid values.
+
+The checks, complaints, options, forms and pages are made from these descriptions. Nothing here
+imports pydantic, because readers of scenes do without it.
+"""
+
+import ast
+import dataclasses
+import functools
+import inspect
+import textwrap
+import types
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+from storage.settings.ranges import EXECUTION, LowFirst, Within, shown_number
+
+_KINDS = {bool: "true or false", str: "a text", int: "a whole number", float: "a number"}
+
+_NUMBERS = {int: "whole numbers", float: "numbers"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldDescription:
+    """Description of one field of a dataclass."""
+
+    owner: type
+    """Dataclass of the field."""
+    name: str
+    hint: Any
+    """Type annotation, with its notes."""
+    bare: Any
+    """The type without its notes and without None."""
+    notes: Sequence[Any]
+    """Annotated metadata in order: ranges, laws, marks."""
+
+    @property
+    def default(self) -> Any:
+        """Default value; dataclasses.MISSING where a value must be given."""
+        field = self.owner.__dataclass_fields__[self.name]  # type: ignore[attr-defined]
+        make = field.default_factory
+        return field.default if make is dataclasses.MISSING else make()
+
+    @property
+    def sentence(self) -> str:
+        """The sentence under the field, in one line."""
+        return field_sentences(self.owner).get(self.name, "")
+
+    @property
+    def within(self) -> Within | None:
+        """The range of its numbers."""
+        return next((note for note in self.notes if isinstance(note, Within)), None)
+
+    @property
+    def is_execution(self) -> bool:
+        """True: the field changes how something is executed, and not its meaning."""
+        return EXECUTION in self.notes
+
+    @property
+    def kind(self) -> type:
+        """Int or float, of a field with a range; a float may be given as an int."""
+        return float if float in parts_of(self.bare) else int
+
+    @property
+    def shape(self) -> Literal["one", "pair", "many"]:
+        """Of a field with a range: a number, a pair, or a tuple of any length."""
+        if get_origin(self.bare) is not tuple:
+            return "one"
+        return "many" if get_args(self.bare)[1] is ... else "pair"
+
+    @property
+    def expected(self) -> str:
+        """Description of valid values, for error messages; not for arrays."""
+        if self.within is None:
+            return expected_of(self.hint)
+        numbers = _NUMBERS[self.kind]
+        shapes = {"one": _KINDS[self.kind], "pair": f"two {numbers}", "many": numbers}
+        order = ", the lower one first" if LowFirst() in self.notes else ""
+        return f"{shapes[self.shape]} {self.within}{order}"
+
+
+@functools.cache
+def describe_fields(kind: type) -> tuple[FieldDescription, ...]:
+    """Return the descriptions of the fields of a dataclass, in their order."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    descriptions = []
+    for field in dataclasses.fields(kind):
+        hint = hints[field.name]
+        bare, notes = unwrap(hint)
+        descriptions.append(
+            FieldDescription(owner=kind, name=field.name, hint=hint, bare=bare, notes=notes)
+        )
+    return tuple(descriptions)
+
+
+@functools.cache
+def field_sentences(kind: type) -> Mapping[str, str]:
+    """Return what stands under each field of a dataclass, its bases' included, by name.
+
+    Read from the source on demand: pydantic would read it whenever settings are imported.
+    """
+    sentences: dict[str, str] = {}
+    for cls in reversed(kind.__mro__[:-1]):
+        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
+        assert isinstance(tree, ast.ClassDef)
+        for field, below in zip(tree.body, tree.body[1:], strict=False):
+            match field, below:
+                case (
+                    ast.AnnAssign(target=ast.Name(id=name)),
+                    ast.Expr(value=ast.Constant(value=str(text))),
+                ):
+                    sentences[name] = " ".join(text.split())
+    return sentences
+
+
+def unwrap(hint: Any) -> tuple[Any, list[Any]]:
+    """Return a type without its notes and without None, and the notes."""
+    notes: list[Any] = []
+    while True:
+        if get_origin(hint) is Annotated:
+            hint, *more = get_args(hint)
+            notes += more
+        elif get_origin(hint) in (typing.Union, types.UnionType):
+            kinds = [kind for kind in get_args(hint) if kind is not types.NoneType]
+            if len(kinds) == len(get_args(hint)):
+                return hint, notes
+            hint = typing.Union[tuple(kinds)]  # noqa: UP007
+        else:
+            return hint, notes
+
+
+def parts_of(hint: Any) -> Iterator[Any]:
+    """Yield the types and choices that a type is made of, without notes."""
+    hint, _ = unwrap(hint)
+    if get_args(hint):
+        for part in get_args(hint):
+            yield from parts_of(part)
+    else:
+        yield hint
+
+
+def group_of(hint: Any) -> bool:
+    """Return whether a type is a class of settings, which has fields of its own."""
+    return isinstance(hint, type) and dataclasses.is_dataclass(hint)
+
+
+def option_of(field: str) -> str:
+    """Return the option of the command line that fills a field."""
+    return "--" + field.replace("_", "-")
+
+
+def expected_of(hint: Any) -> str:
+    """Return what a value of a type without a range looks like, for a person."""
+    origin = get_origin(hint)
+    args = get_args(hint)
+    if origin is Annotated:
+        stated = (getattr(note, "expected", "") for note in args[1:])
+        return next(filter(None, stated), "") or expected_of(args[0])
+    if origin is Literal:
+        *choices, last = map(str, args)
+        return f"{', '.join(choices)} or {last}" if choices else last
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join("none" if arg is types.NoneType else expected_of(arg) for arg in args)
+    if origin is tuple:
+        return f"a list, each entry {expected_of(args[0])}"
+    if origin in (dict, Mapping) or group_of(hint):
+        return "names with values"
+    return _KINDS.get(hint, f"a {getattr(hint, '__name__', hint)}".lower())
+
+
+def default_text(default: Any, *, quote: str = "") -> str:
+    """Return a default value for a person; `quote` stands around each word."""
+    if isinstance(default, tuple):
+        return ", ".join(default_text(entry, quote=quote) for entry in default)
+    is_number = isinstance(default, int | float)
+    return shown_number(default) if is_number else f"{quote}{default}{quote}"
