@@ -4,7 +4,8 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from storage.errors import TrilightError
-from storage.settings.described import checked, option_of
+from storage.settings.described import checked
+from storage.settings.fields import option_of
 from storage.settings.ranges import Within
 from train.folder import RunFolder
 
