@@ -5,7 +5,7 @@ No heavy library is imported here: the list of experiments is made without measu
 
 import dataclasses
 import importlib.util
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -86,14 +86,19 @@ class Column:
     """Conversion of that number, such as `3600 / seconds`; None leaves it as it is."""
 
 
+Measure = Callable[["BenchContext", str], Figures]
+"""Function that measures a point in one trial. It raises `Rejected` or `ChildFailed` if the trial's
+scene or object is unusable; the trial then counts for no point."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """Measured setting, a row of the table; the results hold all fields but `settings`."""
+    """Measured setting, a row of the table; the results hold all fields but `measure`."""
 
     name: str
     """Name of its row in the table."""
-    settings: Any = None
-    """Value for the experiment's measure."""
+    measure: Measure | None = field(default=None, repr=False)
+    """Function that measures it; None of a point that was read from results."""
     default: bool = False
     """True for the default of the product."""
     judged: bool = True
@@ -109,12 +114,7 @@ class Point:
 
     def record(self) -> dict[str, Any]:
         """Return the fields for the results as JSON values."""
-        return {name: value for name, value in vars(self).items() if name != "settings"}
-
-
-Measure = Callable[["BenchContext", Sequence[Point], str], Iterable[tuple[str, Figures]]]
-"""Function that measures all points in one trial and yields their figures by name. It raises
-`Rejected` or `ChildFailed` if the trial's scene or object is unusable; it counts for no point."""
+        return {name: value for name, value in vars(self).items() if name != "measure"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,8 +133,6 @@ class Experiment:
     """Function that returns the points, in the order of the table."""
     trials: Callable[[BenchScale, BenchOptions], Sequence[str]]
     """Scenes, objects or repeats: in each trial every point is measured once."""
-    measure: Measure = field(repr=False)
-    """Function that measures all points in one trial."""
     error: Column | None = None
     """Second column of the table; None if only costs are compared."""
     better: Literal["higher", "lower"] = "lower"

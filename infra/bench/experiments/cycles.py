@@ -1,8 +1,6 @@
 """Experiment `cycles`: Trilight's pictures compared with raw ones of Blender's Cycles."""
 
-import os
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,14 +8,13 @@ from numpy.typing import NDArray
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
 from infra.bench.experiments.frontier import adaptive
-from infra.bench.workloads.cycles import CyclesOptions, CyclesSamples, cycles_of_usd, cycles_picture
+from infra.bench.workloads.cycles import CyclesSamples, cycles_samples
 from infra.bench.workloads.judged_pictures import difference_db, shrunk
 from infra.bench.workloads.mapped_scenes import SKIES, mapped_scene
 from infra.bench.workloads.named_scenes import given_scenes
-from infra.bench.workloads.shots import shots
+from infra.bench.workloads.shots import shot
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera, raw_reference, true_error_db
-from pipeline.exchange.usd.write import write_usd
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import USUAL_FLOOR_DB
@@ -45,7 +42,9 @@ _MOST_SCENES = 10
 
 def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     kinds = [PLAIN, TEXTURED, SKY, *([GIVEN] if options.scenes else [])]
-    return [Point(name=kind, kind=kind, judged=False) for kind in kinds]
+    return [
+        Point(name=kind, measure=partial(_measure, kind), kind=kind, judged=False) for kind in kinds
+    ]
 
 
 def _scene(context: BenchContext, kind: str, index: int) -> Scene:
@@ -55,45 +54,21 @@ def _scene(context: BenchContext, kind: str, index: int) -> Scene:
         names = list(given_scenes(context.options.scenes))
         return context.scene(names[index % len(names)])
     name = f"surfaces {index}" if kind == TEXTURED else f"sky {SKIES[index % len(SKIES)]}"
-    scene = mapped_scene(context.child, name)
-    return scene
+    return mapped_scene(context.child, name)
 
 
-def _measure(
-    context: BenchContext, points: Sequence[Point], trial: str
-) -> Iterator[tuple[str, Figures]]:
+def _measure(kind: str, context: BenchContext, trial: str) -> Figures:
     spp = context.scale.max_spp
-    for point in points:
-        scene = _scene(context, point.name, int(trial.split()[-1]))
-        camera = first_camera(scene, RESOLUTION)
-        ours = context.child.call(raw_reference, scene, camera, OUR_SHARE * spp)
-        settings = adaptive(USUAL_FLOOR_DB, RESOLUTION, spp)
-        view = context.child.call(shots, scene, {"stated": settings})["stated"]
-        theirs = _cycles_samples(scene, spp, context.folder(), is_plain=point.name == PLAIN)
-        yield (
-            point.name,
-            {
-                "core_s": theirs.core_s,
-                **agreement_figures(ours, theirs),
-                **_stated_figures(view, ours, theirs),
-            },
-        )
-
-
-def _cycles_samples(scene: Scene, spp: int, folder: Path, *, is_plain: bool) -> CyclesSamples:
-    """Return two raw pictures of Cycles, from a plain scene's arrays, else from its USD."""
-    options = CyclesOptions(
-        resolution=RESOLUTION, spp=spp, denoise=False, threads=os.cpu_count() or 1
-    )
-    if not is_plain:
-        usd = folder / "scene.usdc"
-        write_usd(usd, scene)
-        return cycles_of_usd(usd, options, (0, 1))
-    pictures = [cycles_picture(scene, 0, options.with_seed(seed)) for seed in (0, 1)]
-    return CyclesSamples(
-        pictures_rgb=tuple(each.radiance_rgb for each in pictures),
-        core_s=sum(each.core_s for each in pictures),
-    )
+    scene = _scene(context, kind, int(trial.split()[-1]))
+    camera = first_camera(scene, RESOLUTION)
+    ours = context.child.call(raw_reference, scene, camera, OUR_SHARE * spp)
+    view = context.child.call(shot, scene, adaptive(USUAL_FLOOR_DB, RESOLUTION, spp))
+    theirs = cycles_samples(scene, RESOLUTION, spp, seeds=(0, 1))
+    return {
+        "core_s": theirs.core_s,
+        **agreement_figures(ours, theirs),
+        **_stated_figures(view, ours, theirs),
+    }
 
 
 def agreement_figures(ours: RawReference, theirs: CyclesSamples) -> dict[str, float]:
@@ -170,6 +145,5 @@ EXPERIMENT = Experiment(
     trials=lambda scale, options: [
         f"scene {index}" for index in range(min(_MOST_SCENES, scale.scenes))
     ],
-    measure=_measure,
     needs=("blender",),
 )

@@ -1,8 +1,9 @@
 """Experiment `gpu`: throughput, correct pictures, and steps of every training preset on a GPU."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import (
@@ -13,13 +14,18 @@ from infra.bench.experiment import (
     Point,
     device_of,
 )
+from infra.bench.workloads.reading import time_reading, write_copies
 from infra.bench_options import BenchOptions
+from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
-from train.runs import RUNS
+from train.runs import RUNS, named_run
 
 NETWORKS = ("builtin:tokens", "builtin:hits")
 _QUICK_RUNS = ("pretrain", "hits")
 _STEPS = {"full": 10, "quick": 3}
+READ_AS = "pretrain"
+"""Training preset whose augmentation is applied to samples that are read."""
+_BATCH = 8
 _READ_S = {"full": 10.0, "quick": 2.0}
 _PRODUCT_WIDTH = {"cuda": 8192, "cpu": 512}
 _COPIED_BYTES = {"cuda": 1 << 30, "cpu": 1 << 26}
@@ -47,7 +53,7 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
         "rendering a view": _rendering,
         **{f"reading a sample, {count} threads": partial(_reading, count) for count in threads},
     }
-    return [Point(name=name, settings=measure) for name, measure in named.items()]
+    return [Point(name=name, measure=partial(_measure, name, part)) for name, part in named.items()]
 
 
 def _runs(scale: BenchScale, options: BenchOptions) -> Sequence[str]:
@@ -61,22 +67,18 @@ def _runs(scale: BenchScale, options: BenchOptions) -> Sequence[str]:
     return _QUICK_RUNS if scale.name == "quick" else [name for name in RUNS if RUNS.is_ours(name)]
 
 
-def _measure(
-    context: BenchContext, points: Sequence[Point], trial: str
-) -> Iterator[tuple[str, Figures]]:
-    """Measure point by point; a failed point has no figures, and a note with the reason."""
+def _measure(name: str, part: Measured, context: BenchContext, trial: str) -> Figures:
+    """Measure a part; one that fails has no figures, and a note with the reason."""
     import torch
 
     from infra.bench.gpu.probe import device_facts
 
     context.note(device_facts(torch.device(device_of(context.options))))
-    for point in points:
-        try:
-            figures = point.settings(context)
-        except (RuntimeError, TrilightError) as error:  # those of CUDA and of torch's compiler too
-            context.note(f"{point.name} was not measured: {type(error).__name__}")
-            figures = {}
-        yield point.name, figures
+    try:
+        return part(context)
+    except (RuntimeError, TrilightError) as error:  # those of CUDA and of torch's compiler too
+        context.note(f"{name} was not measured: {type(error).__name__}")
+        return {}
 
 
 def _product(kind: str, context: BenchContext) -> Figures:
@@ -122,26 +124,36 @@ def _step(run: str, context: BenchContext) -> Figures:
 
 
 def _rendering(context: BenchContext) -> Figures:
-    return _render_data(context)[0]
+    return context.rendered[0]
 
 
 def _reading(threads: int, context: BenchContext) -> Figures:
-    from infra.bench.gpu.supply import read_figures
+    """Decode and augment samples as a training preset does."""
+    from train.data.stream import StreamSettings
 
-    data = context.options.data or _render_data(context)[1]
-    seconds = _READ_S[context.scale.name]
-    return read_figures(data, threads, context.scale.picture_px, seconds)
+    run = named_run(READ_AS)
+    settings = StreamSettings(
+        seed=0,
+        window=run.shuffle_shards,
+        batch_size=_BATCH,
+        resolution=context.scale.picture_px,
+        views_per_scene=run.views_per_scene,
+        augmentation=run.augmentation,
+    )
+    data = context.get_or_make("data", lambda: _training_data(context))
+    least_s = _READ_S[context.scale.name]
+    seconds, core_s = time_reading(data, settings, threads, least_s=least_s)
+    return {
+        "ms": 1e3 * seconds, "views_per_s": run.views_per_scene / seconds, "core_s": core_s
+    }  # fmt: skip
 
 
-def _render_data(context: BenchContext) -> tuple[Figures, str]:
-    """Return the figures of rendering here, and a dataset of the rendered scenes."""
-    from infra.bench.gpu.supply import rendered_figures
-
-    def render() -> tuple[Figures, str]:
-        figures, data = rendered_figures(context.scale.picture_px, context.folder())
-        return figures, str(data)
-
-    return context.get_or_make("rendered", render)
+def _training_data(context: BenchContext) -> TrainingData:
+    root = context.options.data
+    if not root:
+        root = str(context.folder())
+        write_copies(Path(root), context.rendered[1])
+    return open_training_data([root])
 
 
 EXPERIMENT = Experiment(
@@ -166,6 +178,5 @@ EXPERIMENT = Experiment(
     "names no host, user or folder; to send it, attach it to an issue.",
     points=_points,
     trials=lambda scale, options: ["round 1"],
-    measure=_measure,
     needs=("torch",),
 )

@@ -1,6 +1,7 @@
 """Experiment `paired-training`: two trainings with different settings and equal seeds."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 from infra.bench.context import BenchContext
@@ -45,8 +46,8 @@ def settings_of(side: str, seed: int, scale: BenchScale, options: BenchOptions) 
 
 def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     return [
-        Point(name=SIDE_A, kind=SIDE_A, default=True),
-        Point(name=SIDE_B, kind=SIDE_B, rival=SIDE_A),
+        Point(name=SIDE_A, measure=partial(_measure, SIDE_A), kind=SIDE_A, default=True),
+        Point(name=SIDE_B, measure=partial(_measure, SIDE_B), kind=SIDE_B, rival=SIDE_A),
     ]
 
 
@@ -63,16 +64,12 @@ def scene_of(trial: str) -> str:
     return trial.partition(", ")[2]
 
 
-def _measure(
-    context: BenchContext, points: Sequence[Point], trial: str
-) -> Iterator[tuple[str, Figures]]:
+def _measure(side: str, context: BenchContext, trial: str) -> Figures:
     seed, scene = (int(part.split()[1]) for part in trial.split(", "))
-    for point in points:
-        key = (point.name, seed)
-        scenes = context.get_or_make(key, lambda key=key: _train(context, *key))  # type: ignore[misc]
-        if scene >= len(scenes):
-            raise Rejected("no_scene", f"the validation split has {len(scenes)} scenes")
-        yield point.name, scenes[scene]
+    scenes = context.get_or_make((side, seed), lambda: _train(context, side, seed))
+    if scene >= len(scenes):
+        raise Rejected("no_scene", f"the validation split has {len(scenes)} scenes")
+    return scenes[scene]
 
 
 def _train(context: BenchContext, side: str, seed: int) -> Sequence[Mapping[str, float]]:
@@ -120,7 +117,6 @@ EXPERIMENT = Experiment(
     "bootstrapped over scenes: it says nothing of other seeds where there are few.",
     points=_points,
     trials=_trials,
-    measure=_measure,
     cluster=scene_of,
     needs=("torch", "data"),
 )

@@ -1,11 +1,10 @@
-"""Renders one view by Trilight's path tracer under several settings, with the cost of each.
+"""Renders one view by Trilight's path tracer under any settings, with its cost.
 
 CPU seconds are those of the process: sampling, guide pictures, measuring the stated error, and one
 denoise. Loading the scene is not counted; kernels are warm.
 """
 
 import dataclasses
-from collections.abc import Mapping
 
 from infra.render.methods import warm_up_denoiser
 from pipeline.renders.renderer import SceneRenderer
@@ -37,12 +36,8 @@ def fixed_samples(resolution: int, spp: int) -> RenderSettings:
     )
 
 
-def shots(scene: Scene, variants: Mapping[str, RenderSettings]) -> dict[str, RenderedView]:
-    """Return a scene's first view under each setting, with equal seeds; runs in a render child."""
-    return {name: _shot(scene, settings) for name, settings in variants.items()}
-
-
-def _shot(scene: Scene, settings: RenderSettings) -> RenderedView:
+def shot(scene: Scene, settings: RenderSettings) -> RenderedView:
+    """Return a scene's first view, always of one seed; runs in a render child."""
     small = dataclasses.replace(settings, resolution=_SMALL, max_spp=settings.min_spp)
     pose = scene.c2w[0]
     fov_deg = float(scene.fov_deg[0])

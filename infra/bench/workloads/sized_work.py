@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from infra.bench.workloads.cost_scene import cost_scene
-from infra.bench.workloads.manifests import write_copies
+from infra.bench.workloads.reading import write_copies
 from storage.errors import TrilightError
 from storage.installation import IMPORT_ROOT, child_environment
 
@@ -134,11 +134,11 @@ def _prepare(num_objects: int, folder: Path) -> None:
 
 
 def _trace(num_triangles: int, folder: Path) -> None:
-    from infra.bench.workloads.shots import fixed_samples, shots
+    from infra.bench.workloads.shots import fixed_samples, shot
     from pipeline.renders.variant import activate, choose_variant
 
     activate(choose_variant())
-    shots(cost_scene(num_triangles, _LIGHTS), {"view": fixed_samples(_PX, 64)})
+    shot(cost_scene(num_triangles, _LIGHTS), fixed_samples(_PX, 64))
 
 
 def _show_by_network(num_triangles: int, folder: Path) -> None:

@@ -27,8 +27,8 @@ from infra.bench.workloads import sized_work
 from infra.bench.workloads.blender_environment import installed_python
 from infra.bench.workloads.cached_references import kept_reference
 from infra.bench.workloads.cycles import CyclesSamples
-from infra.bench.workloads.manifests import write_copies
 from infra.bench.workloads.packed_samples import LAYOUTS, unpacking_figures
+from infra.bench.workloads.reading import write_copies
 from infra.bench.workloads.sized_work import WORK, measure_work, session_bytes, sizes_of
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera

@@ -7,7 +7,7 @@ import trimesh
 from infra.bench.workloads.judged_pictures import shrunk
 from infra.bench.workloads.mesh_pictures import picture_db
 from infra.bench.workloads.plain_mitsuba import render_levels
-from infra.bench.workloads.shots import fixed_samples, shots
+from infra.bench.workloads.shots import fixed_samples, shot
 from infra.render.raw_references import raw_reference
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.renders.load_tracer import load_tracer
@@ -38,7 +38,7 @@ def test_a_small_reference_is_that_of_its_own_width() -> None:
 def test_plain_mitsuba_comes_to_the_same_picture() -> None:
     """With other samples of another sampler: its error falls with samples, towards our picture."""
     scene = tiny_scene()
-    ours = shots(scene, {"ours": fixed_samples(32, 2048)})["ours"].radiance_rgb
+    ours = shot(scene, fixed_samples(32, 2048)).radiance_rgb
     levels = render_levels(scene, 32, (16, 64, 1024), 5)
     assert [level.spp for level in levels] == [16, 64, 1024]
     assert levels[0].core_s > 0

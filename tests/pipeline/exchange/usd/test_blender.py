@@ -2,8 +2,6 @@
 
 import dataclasses
 import json
-import os
-import subprocess
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -13,8 +11,9 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from infra.bench.workloads import cycles
 from infra.bench.workloads.blender_environment import installed_python
-from infra.bench.workloads.shots import fixed_samples, shots
+from infra.bench.workloads.shots import fixed_samples, shot
 from pipeline.exchange.usd.read import UsdScene, read_usd
 from pipeline.exchange.usd.write import write_usd
 from pipeline.isolation import ChildLimits, IsolatedChild
@@ -45,14 +44,7 @@ def run_blender(process: str, folder: Path, request: dict[str, Any]) -> NDArray[
     folder.mkdir(exist_ok=True)
     asked = {"bounces": 8, "denoise": True, "seed": 0, "threads": 2, **request}
     (folder / "request.json").write_text(json.dumps(asked))
-    result = subprocess.run(
-        [str(python), "-I", str(Path(__file__).with_name(process)), str(folder)],
-        env={**os.environ, "HOME": str(folder), "BLENDER_USER_RESOURCES": str(folder)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr[-2000:]
+    cycles.run_blender(Path(__file__).with_name(process), folder, python)
     picture: NDArray[np.float32] = np.load(folder / "picture.npy")
     return picture
 
@@ -62,8 +54,7 @@ def ours(scene: Scene, resolution: int, spp: int) -> NDArray[np.float32]:
     limits = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1)
     child = IsolatedChild(limits=limits, factory=activate, args=(choose_variant(),))
     try:
-        settings = {"ours": fixed_samples(resolution, spp)}
-        return child.call(shots, scene, settings)["ours"].radiance_rgb
+        return child.call(shot, scene, fixed_samples(resolution, spp)).radiance_rgb
     finally:
         child.close()
 
