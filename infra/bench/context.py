@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 from infra.bench.experiment import BenchScale, Figures
 from infra.bench.workloads.named_scenes import given_scenes, read_given, sampled_scene
-from infra.bench.workloads.reading import Members, render_scenes
+from infra.bench.workloads.reading import Members, render_scenes, write_copies
 from infra.bench_options import BenchOptions
 from infra.render.held_out_scenes import composing_child
 from infra.render.path_tracer import RenderChild
@@ -22,6 +22,7 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
 from pipeline.generation.prepare_isolated import preload_mesh_libraries
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
+from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import Rejected
 from storage.records.scene import Scene
 
@@ -92,7 +93,7 @@ class BenchContext:
         Raises:
             TrilightError: as `find_objects`.
         """
-        from infra.bench.workloads.remeshing import count_faces
+        from infra.bench.workloads.coarser_meshes import count_faces
         from pipeline.objects.sources import find_objects
         from storage.cache import cache_folder
 
@@ -122,3 +123,12 @@ class BenchContext:
     def rendered(self) -> tuple[Figures, list[Members]]:
         """Costs and files of some scenes of the preset `smoke`, at the scale's width."""
         return render_scenes(self.scale.picture_px, self.folder())
+
+    @functools.cached_property
+    def data(self) -> TrainingData:
+        """Data of the options, or a dataset with copies of the rendered scenes."""
+        if self.options.data:
+            return open_training_data([self.options.data])
+        root = self.folder()
+        write_copies(root, self.rendered[1])
+        return open_training_data([str(root)])

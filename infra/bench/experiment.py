@@ -1,15 +1,18 @@
-"""Declarations of experiments: their points, their measure, and the columns of their table.
+"""Experiments: their points with what measures them, and the columns of their table.
 
 No heavy library is imported here: the list of experiments is made without measuring anything.
 """
 
 import dataclasses
+import importlib
 import importlib.util
+import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from infra.bench_options import BenchOptions
+from storage.errors import TrilightError
 
 if TYPE_CHECKING:
     from infra.bench.context import BenchContext
@@ -188,3 +191,26 @@ def public_options(options: BenchOptions) -> dict[str, Any]:
         name = options.data.rstrip("/").rpartition("/")[2]
         values["data"] = f"{name} ({sha256_hex(options.data.encode())[:8]})"
     return values
+
+
+def every_experiment() -> dict[str, Experiment]:
+    """Return all experiments by name, in the order of the alphabet."""
+    from infra.bench import experiments
+
+    modules = sorted(module.name for module in pkgutil.iter_modules(experiments.__path__))
+    experiments_found = [
+        importlib.import_module(f"{experiments.__name__}.{name}").EXPERIMENT for name in modules
+    ]
+    return {one.name: one for one in experiments_found}
+
+
+def experiment_of(name: str) -> Experiment:
+    """Return the experiment of a name.
+
+    Raises:
+        TrilightError: the name is unknown; the message has all that exist.
+    """
+    known = every_experiment()
+    if name not in known:
+        raise TrilightError(f"experiment {name!r} is unknown; expected one of {', '.join(known)}.")
+    return known[name]

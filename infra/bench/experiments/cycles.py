@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
 from infra.bench.experiments.frontier import adaptive
-from infra.bench.workloads.cycles import CyclesSamples, cycles_samples
+from infra.bench.workloads.cycles import cycles_pictures
 from infra.bench.workloads.judged_pictures import difference_db, shrunk
-from infra.bench.workloads.mapped_scenes import SKIES, mapped_scene
-from infra.bench.workloads.named_scenes import given_scenes
-from infra.bench.workloads.shots import shot
+from infra.bench.workloads.named_scenes import SKIES, given_scenes, mapped_scene
+from infra.bench.workloads.traced_pictures import shot
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera, raw_reference, true_error_db
 from pipeline.renders.noise_floor import clamped_radiance
@@ -63,37 +62,37 @@ def _measure(kind: str, context: BenchContext, trial: str) -> Figures:
     camera = first_camera(scene, RESOLUTION)
     ours = context.child.call(raw_reference, scene, camera, OUR_SHARE * spp)
     view = context.child.call(shot, scene, adaptive(USUAL_FLOOR_DB, RESOLUTION, spp))
-    theirs = cycles_samples(scene, RESOLUTION, spp, seeds=(0, 1))
+    pictures, core_s = cycles_pictures(scene, RESOLUTION, spp, seeds=(0, 1))
+    a_rgb, b_rgb = (picture.astype(np.float64) for picture in pictures)
+    theirs = RawReference(a_rgb=a_rgb, b_rgb=b_rgb)
     return {
-        "core_s": theirs.core_s,
+        "core_s": core_s,
         **agreement_figures(ours, theirs),
         **_stated_figures(view, ours, theirs),
     }
 
 
-def agreement_figures(ours: RawReference, theirs: CyclesSamples) -> dict[str, float]:
+def agreement_figures(ours: RawReference, theirs: RawReference) -> dict[str, float]:
     """Return the agreement of Trilight with Cycles in dB, also without the noise of both.
 
     All pictures have one exposure, so that nine tenths of the pixels are below EXPOSED; values
     above 1 count as 1.
     """
-    one, other = (picture.astype(np.float64) for picture in theirs.pictures_rgb)
-    level = float(np.quantile((one + other).mean(axis=-1) / 2, 0.9))
+    level = float(np.quantile((theirs.a_rgb + theirs.b_rgb).mean(axis=-1) / 2, 0.9))
     exposure = EXPOSED / level if level > 0 else 1.0
-    one = one * exposure
-    other = other * exposure
+    one, other = theirs.a_rgb * exposure, theirs.b_rgb * exposure
     ours = RawReference(a_rgb=ours.a_rgb * exposure, b_rgb=ours.b_rgb * exposure)
-    their_halves = RawReference(a_rgb=one, b_rgb=other)
+    theirs = RawReference(a_rgb=one, b_rgb=other)
     pixels_db = _linear_db(0.5 * (ours.a_rgb + ours.b_rgb), one)
     seeds_db = _linear_db(one, other)
     blocks = len(ours.a_rgb) // _BLOCK_PX
-    coarse = shrunk(ours, blocks), shrunk(their_halves, blocks)
+    coarse = shrunk(ours, blocks), shrunk(theirs, blocks)
     return {
         "pixels_db": pixels_db,
         "seeds_db": seeds_db,
         "margin_db": pixels_db - min(AIM_DB, seeds_db - 1),
         "blocks_db": _linear_db(*(0.5 * (half.a_rgb + half.b_rgb) for half in coarse)),
-        "noiseless_db": difference_db(ours, their_halves, clamped_radiance),
+        "noiseless_db": difference_db(ours, theirs, clamped_radiance),
         "brightness": 100 * float((ours.a_rgb + ours.b_rgb).mean() / (one + other).mean() - 1),
     }
 
@@ -103,14 +102,12 @@ def _linear_db(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
 
 
 def _stated_figures(
-    view: RenderedView, ours: RawReference, theirs: CyclesSamples
+    view: RenderedView, ours: RawReference, theirs: RawReference
 ) -> dict[str, float]:
     """Return a picture's stated error, and its true errors to Trilight's and Cycles' samples."""
-    one, other = (picture.astype(np.float64) for picture in theirs.pictures_rgb)
-    references = {"ours": ours, "theirs": RawReference(a_rgb=one, b_rgb=other)}
     everywhere = np.ones_like(view.hits)
     figures = {"stated_db": view.noise_floor_db}
-    for name, reference in references.items():
+    for name, reference in (("ours", ours), ("theirs", theirs)):
         error_db, _ = true_error_db(view.radiance_rgb, reference, log10_radiance, everywhere)
         figures[f"to_{name}_db"] = error_db
     return figures

@@ -21,17 +21,17 @@ from infra.bench.experiment import (
     Point,
     percent,
 )
-from infra.bench.workloads.cached_references import kept_reference
-from infra.bench.workloads.judged_pictures import figures, shrunk
+from infra.bench.workloads.judged_pictures import figures, kept_reference, shrunk
 from infra.bench.workloads.named_scenes import given_scenes, sampled_trials
-from infra.bench.workloads.plain_mitsuba import PlainPicture, render_levels
-from infra.bench.workloads.shots import SEED, shot
+from infra.bench.workloads.traced_pictures import render_levels, shot
 from infra.bench_options import BenchOptions
+from infra.render.methods import SAMPLE_SEED
 from infra.render.raw_references import RawReference, first_camera, true_error_db
 from pipeline.builds.training import pretrain_256
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.settings import USUAL_FLOOR_DB, RenderSettings
 from storage.conventions import log10_radiance
+from storage.renderer import Image
 
 TARGETS_DB = (38.0, 42.0, 46.0, 50.0)
 STATED_PX = (64, 256)
@@ -119,21 +119,23 @@ def _plain_levels(context: BenchContext, trial: str) -> dict[int, dict[str, floa
     def render() -> dict[int, dict[str, float]]:
         px = context.scale.resolution
         spps = plain_spps(context.scale)
-        levels = context.child.call(render_levels, context.scene(trial), px, spps, SEED)
+        levels = context.child.call(render_levels, context.scene(trial), px, spps, SAMPLE_SEED)
         reference = shrunk(_reference(context, trial), px)
-        return {level.spp: plain_figures(level, reference) for level in levels}
+        return {
+            spp: plain_figures(level, reference) for spp, level in zip(spps, levels, strict=True)
+        }
 
     return context.get_or_make(("plain", trial), render)
 
 
-def plain_figures(level: PlainPicture, reference: RawReference) -> dict[str, float]:
+def plain_figures(level: Image, reference: RawReference) -> dict[str, float]:
     """Return cost and true errors of a picture of plain Mitsuba."""
     everywhere = np.ones(level.radiance_rgb.shape[:2], np.bool_)
     db, open_db = true_error_db(level.radiance_rgb, reference, log10_radiance, everywhere)
     linear_db, _ = true_error_db(level.radiance_rgb, reference, clamped_radiance, everywhere)
     return {
-        "core_s": level.core_s,
-        "spp": float(level.spp),
+        "core_s": level.cpu_seconds or 0.0,
+        "spp": float(level.samples or 0),
         "db": db,
         "linear_true_db": linear_db,
         "log_open_db": open_db,

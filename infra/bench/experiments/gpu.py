@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import (
@@ -14,11 +14,13 @@ from infra.bench.experiment import (
     Point,
     device_of,
 )
-from infra.bench.workloads.reading import time_reading, write_copies
+from infra.bench.workloads.reading import time_reading
 from infra.bench_options import BenchOptions
-from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
 from train.runs import RUNS, named_run
+
+if TYPE_CHECKING:
+    import torch
 
 NETWORKS = ("builtin:tokens", "builtin:hits")
 _QUICK_RUNS = ("pretrain", "hits")
@@ -31,7 +33,7 @@ _PRODUCT_WIDTH = {"cuda": 8192, "cpu": 512}
 _COPIED_BYTES = {"cuda": 1 << 30, "cpu": 1 << 26}
 _THREADS = (1, 2, 4, 8, 16)
 
-Measured = Callable[[BenchContext], Figures]
+Measured = Callable[[BenchContext, "torch.device"], Figures]
 
 
 def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
@@ -73,46 +75,38 @@ def _measure(name: str, part: Measured, context: BenchContext, trial: str) -> Fi
 
     from infra.bench.gpu.probe import device_facts
 
-    context.note(device_facts(torch.device(device_of(context.options))))
+    device = torch.device(device_of(context.options))
+    context.note(device_facts(device))
     try:
-        return part(context)
+        return part(context, device)
     except (RuntimeError, TrilightError) as error:  # those of CUDA and of torch's compiler too
         context.note(f"{name} was not measured: {type(error).__name__}")
         return {}
 
 
-def _product(kind: str, context: BenchContext) -> Figures:
-    import torch
-
+def _product(kind: str, context: BenchContext, device: "torch.device") -> Figures:
     from infra.bench.gpu.probe import product_figures
 
-    device = device_of(context.options)
-    return product_figures(torch.device(device), kind, _PRODUCT_WIDTH[device])
+    return product_figures(device, kind, _PRODUCT_WIDTH[device.type])
 
 
-def _copy(kind: str, context: BenchContext) -> Figures:
-    import torch
-
+def _copy(kind: str, context: BenchContext, device: "torch.device") -> Figures:
     from infra.bench.gpu.probe import copy_figures
 
-    device = device_of(context.options)
-    return copy_figures(torch.device(device), kind, _COPIED_BYTES[device])
+    return copy_figures(device, kind, _COPIED_BYTES[device.type])
 
 
-def _picture(network: str, precision: str, context: BenchContext) -> Figures:
-    import torch
-
+def _picture(
+    network: str, precision: str, context: BenchContext, device: "torch.device"
+) -> Figures:
     from infra.bench.gpu.twin import twin_figures
 
-    return twin_figures(network, precision, torch.device(device_of(context.options)))
+    return twin_figures(network, precision, device)
 
 
-def _step(run: str, context: BenchContext) -> Figures:
-    import torch
-
+def _step(run: str, context: BenchContext, device: "torch.device") -> Figures:
     from infra.bench.gpu.steps import step_figures
 
-    device = torch.device(device_of(context.options))
     figures, parts = step_figures(run, _STEPS[context.scale.name], device)
     if not figures:
         context.note(f"{run}: too little memory, even for one scene a pass")
@@ -123,11 +117,11 @@ def _step(run: str, context: BenchContext) -> Figures:
     return figures
 
 
-def _rendering(context: BenchContext) -> Figures:
+def _rendering(context: BenchContext, device: "torch.device") -> Figures:
     return context.rendered[0]
 
 
-def _reading(threads: int, context: BenchContext) -> Figures:
+def _reading(threads: int, context: BenchContext, device: "torch.device") -> Figures:
     """Decode and augment samples as a training preset does."""
     from train.data.stream import StreamSettings
 
@@ -140,20 +134,11 @@ def _reading(threads: int, context: BenchContext) -> Figures:
         views_per_scene=run.views_per_scene,
         augmentation=run.augmentation,
     )
-    data = context.get_or_make("data", lambda: _training_data(context))
     least_s = _READ_S[context.scale.name]
-    seconds, core_s = time_reading(data, settings, threads, least_s=least_s)
+    seconds, core_s = time_reading(context.data, settings, threads, least_s=least_s)
     return {
         "ms": 1e3 * seconds, "views_per_s": run.views_per_scene / seconds, "core_s": core_s
     }  # fmt: skip
-
-
-def _training_data(context: BenchContext) -> TrainingData:
-    root = context.options.data
-    if not root:
-        root = str(context.folder())
-        write_copies(Path(root), context.rendered[1])
-    return open_training_data([root])
 
 
 EXPERIMENT = Experiment(

@@ -8,11 +8,10 @@ from functools import partial
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, rounds
-from infra.bench.workloads.packed_samples import LAYOUTS, unpacking_figures
-from infra.bench.workloads.reading import time_reading, write_copies
+from infra.bench.workloads.reading import LAYOUTS, time_reading, unpacking_figures
 from infra.bench_options import BenchOptions
 from storage.dataset.settings import StorageSettings
-from storage.dataset.training_data import TrainingData, open_training_data
+from storage.dataset.training_data import TrainingData
 from storage.records.sample import decode_sample
 
 UNPACK = "unpacking, one thread"
@@ -52,21 +51,10 @@ def _unpack(layout: str, context: BenchContext, trial: str) -> Figures:
 
 
 def _read(threads: int, context: BenchContext, trial: str) -> Figures:
-    data, count = context.get_or_make("data", lambda: _training_data(context))
-    return read_figures(data, count, threads)
-
-
-def _training_data(context: BenchContext) -> tuple[TrainingData, int]:
-    """Return the data to read, and the number of samples to read."""
-    if context.options.data:
-        data = open_training_data([context.options.data])
-        shards = data.split("train")
-        held = sum(shards.num_samples(number) for number in range(len(shards.names)))
-        return data, max(BATCH, min(_SAMPLES * context.scale.repeats, held))
-    root = context.folder()
-    _, members = context.rendered
-    count = write_copies(root, members)
-    return open_training_data([str(root)]), count
+    shards = context.data.split("train")
+    held = sum(shards.num_samples(number) for number in range(len(shards.names)))
+    count = max(BATCH, min(_SAMPLES * context.scale.repeats, held))
+    return read_figures(context.data, count, threads)
 
 
 def read_figures(data: TrainingData, count: int, threads: int) -> Figures:

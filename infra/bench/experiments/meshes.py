@@ -5,9 +5,9 @@ from pathlib import Path
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, percent
-from infra.bench.workloads import remeshing
-from infra.bench.workloads.mesh_pictures import coarser, picture_db
-from infra.bench.workloads.shots import fixed_samples
+from infra.bench.workloads import coarser_meshes
+from infra.bench.workloads.coarser_meshes import coarser, picture_db
+from infra.bench.workloads.traced_pictures import fixed_samples
 from infra.bench_options import BenchOptions
 from pipeline.assets.settings import AssetSettings
 from storage.errors import Rejected
@@ -32,7 +32,7 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
             group=METHOD_GROUP,
             kind="methods",
         )
-        for method in (remeshing.REFERENCE, *remeshing.METHODS)
+        for method in (coarser_meshes.REFERENCE, *coarser_meshes.METHODS)
     ]
     budgets = [
         Point(
@@ -47,7 +47,7 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
 
 
 def _simplify(method: str, budget: int, context: BenchContext, trial: str) -> Figures:
-    return context.mesh_child.call(remeshing.remesh, _object(context, trial), method, budget)
+    return context.mesh_child.call(coarser_meshes.remesh, _object(context, trial), method, budget)
 
 
 def _simplify_and_render(budget: int, context: BenchContext, trial: str) -> Figures:
@@ -62,7 +62,7 @@ def _simplify_and_render(budget: int, context: BenchContext, trial: str) -> Figu
 
 
 def _picture_db(context: BenchContext, trial: str) -> list[float]:
-    method = remeshing.METHODS["faithful"]
+    method = coarser_meshes.METHODS["faithful"]
     meshes = context.mesh_child.call(coarser, _object(context, trial), CURVE, method)
     renders = fixed_samples(context.scale.picture_px, context.scale.max_spp // 4)
     return context.child.call(picture_db, meshes, renders)

@@ -7,7 +7,7 @@ import numpy as np
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
-from infra.bench.workloads.cached_references import kept_reference
+from infra.bench.workloads.judged_pictures import kept_reference
 from infra.bench_options import BenchOptions
 from infra.render.held_out_scenes import TRIANGLES, held_out_build, held_out_scene
 from infra.render.methods import (

@@ -1,6 +1,6 @@
 """Experiment `paired-training`: two trainings with different settings and equal seeds."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -17,7 +17,6 @@ from infra.bench_options import BenchOptions
 from storage.errors import Rejected, TrilightError
 
 if TYPE_CHECKING:
-    from infra.bench.workloads.trainings import TrainingScenes
     from train.settings import TrainSettings
 
 SIDE_A = "a"
@@ -72,16 +71,18 @@ def _measure(side: str, context: BenchContext, trial: str) -> Figures:
     return scenes[scene]
 
 
-def _train(context: BenchContext, side: str, seed: int) -> Sequence[Mapping[str, float]]:
+def _train(context: BenchContext, side: str, seed: int) -> Sequence[Figures]:
+    """Train one side, and return the figures of each judged scene."""
     import torch
 
-    from infra.bench.workloads.trainings import training_figures
+    from infra.bench.workloads.trainings import scenes_of, training_figures
     from train.loop.distributed import choose_device
 
     options = context.options
     settings = settings_of(side, seed, context.scale, options)
+    px = settings.resolution
     scenes = context.get_or_make(
-        ("scenes", settings.resolution), lambda: _scenes(context, settings)
+        ("scenes", px), lambda: scenes_of(options.data or "", context.scale.held_out, px)
     )
     context.note(scenes.about)
     side_changes = options.set_a if side == SIDE_A else options.set_b
@@ -90,12 +91,6 @@ def _train(context: BenchContext, side: str, seed: int) -> Sequence[Mapping[str,
     if device_of(options) == "cpu":
         torch.set_num_threads(context.cores)
     return training_figures(scenes, settings, choose_device(device_of(options)))
-
-
-def _scenes(context: BenchContext, settings: "TrainSettings") -> "TrainingScenes":
-    from infra.bench.workloads.trainings import scenes_of
-
-    return scenes_of(context.options.data or "", context.scale.held_out, settings.resolution)
 
 
 EXPERIMENT = Experiment(

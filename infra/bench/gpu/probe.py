@@ -48,7 +48,7 @@ def product_figures(device: torch.device, kind: str, width: int) -> dict[str, fl
     dtype = torch.float32 if kind == "tf32" else getattr(torch, kind)
     matrix = torch.randn(width, width, device=device).to(dtype)
     with fast_float32_products(device, enabled=kind == "tf32"):
-        seconds = best_s(lambda: matrix @ matrix, device)
+        seconds = min(time_calls(lambda: matrix @ matrix, device))
     return {"ms": 1e3 * seconds, "teraflop_per_s": 2 * width**3 / seconds / 1e12}
 
 
@@ -66,25 +66,21 @@ def copy_figures(device: torch.device, kind: str, size: int) -> dict[str, float]
     else:
         source = torch.zeros(size, dtype=torch.uint8)
         source = source.pin_memory() if kind == "to_pinned" else source
-    seconds = best_s(lambda: target.copy_(source, non_blocking=kind == "to_pinned"), device)
+    non_blocking = kind == "to_pinned"
+    seconds = min(time_calls(lambda: target.copy_(source, non_blocking=non_blocking), device))
     moved = 2 * size if kind == "within" else size
     return {"ms": 1e3 * seconds, "gigabyte_per_s": moved / seconds / 1e9}
 
 
-def best_s(work: Callable[[], object], device: torch.device, repeats: int = REPEATS) -> float:
-    """Return the seconds of the fastest of several calls, after a warm-up call."""
-    work()
-    wait_for(device)
+def time_calls(
+    work: Callable[[], object], device: torch.device, repeats: int = REPEATS, *, warm_up: int = 1
+) -> list[float]:
+    """Return the seconds of several calls until the device is done, after some that warm it up."""
     times = []
-    for _ in range(repeats):
+    for _ in range(warm_up + repeats):
         began = time.perf_counter()
         work()
-        wait_for(device)
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
         times.append(time.perf_counter() - began)
-    return min(times)
-
-
-def wait_for(device: torch.device) -> None:
-    """Wait until a device has finished its queue."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+    return times[warm_up:]

@@ -2,35 +2,21 @@
 
 import json
 import os
-import subprocess
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.bench.workloads.blender_environment import blender_python
+from infra.bench.workloads.blender_environment import run_blender
 from pipeline.exchange.usd.write import write_usd
-from storage.errors import TrilightError
 from storage.records.scene import Scene
 
 _SCRIPT = Path(__file__).with_name("blender_process.py")
-_TIMEOUT_S = 4 * 3600
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CyclesSamples:
-    """Independent pictures of one view, and their cost."""
-
-    pictures_rgb: tuple[NDArray[np.float32], ...]
-    """[R, R, 3] linear radiance, a picture for each seed."""
-    core_s: float
-    """CPU seconds of all renders, without reading the file and building the tree of triangles."""
-
-
-def cycles_samples(
+def cycles_pictures(
     scene: Scene,
     resolution: int,
     spp: int,
@@ -38,7 +24,7 @@ def cycles_samples(
     seeds: Sequence[int] = (0,),
     bounces: int = 8,
     threads: int | None = None,
-) -> CyclesSamples:
+) -> tuple[list[NDArray[np.float32]], float]:
     """Render raw pictures of a scene's first view in a separate process.
 
     Args:
@@ -50,10 +36,13 @@ def cycles_samples(
             and 0 direct light.
         threads: threads of Cycles; None for one for each core.
 
+    Returns:
+        Linear radiance [R, R, 3] for each seed; and the CPU seconds of all renders, without reading
+        the file and building the tree of triangles.
+
     Raises:
         TrilightError: Blender cannot be installed (blender_environment), or it failed.
     """
-    python = blender_python()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
         write_usd(folder / "scene.usdc", scene)
@@ -67,34 +56,9 @@ def cycles_samples(
             "threads": threads or os.cpu_count() or 1,
         }
         (folder / "request.json").write_text(json.dumps(request))
-        run_blender(_SCRIPT, folder, python)
-        pictures = [folder / f"picture{number}.npy" for number in range(len(seeds))]
-        return CyclesSamples(
-            pictures_rgb=tuple(np.load(path, allow_pickle=False) for path in pictures),
-            core_s=json.loads((folder / "timing.json").read_text())["core_s"],
-        )
-
-
-def run_blender(script: Path, folder: Path, python: Path) -> None:
-    """Run a script in Blender's Python; files that Blender writes by itself stay in the folder.
-
-    Raises:
-        TrilightError: it failed; the message has its last line.
-    """
-    surroundings = {**os.environ, "HOME": str(folder), "BLENDER_USER_RESOURCES": str(folder)}
-    try:
-        result = subprocess.run(
-            [str(python), "-I", str(script), str(folder)],
-            env=surroundings,
-            capture_output=True,
-            text=True,
-            timeout=_TIMEOUT_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired as error:
-        raise TrilightError(f"Cycles: no picture within {_TIMEOUT_S} s.") from error
-    if result.returncode:
-        said = (result.stderr or result.stdout).strip().splitlines()
-        raise TrilightError(
-            f"Cycles: exit status {result.returncode}: {said[-1] if said else 'no message'}."
-        )
+        run_blender(_SCRIPT, folder)
+        pictures = [
+            np.load(folder / f"picture{number}.npy", allow_pickle=False)
+            for number in range(len(seeds))
+        ]
+        return pictures, json.loads((folder / "timing.json").read_text())["core_s"]

@@ -1,19 +1,29 @@
-"""Rendering of a few scenes, and reading of many copies of them as training does."""
+"""Rendered scenes packed in several layouts, and reading of many copies as training does."""
 
+import io
 import itertools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
+import h5py
+import numpy as np
+
+from infra.planning import measure_scenes
+from pipeline.builds.named import named_build
+from pipeline.exchange.renderformer_h5 import TextureType, write_renderformer_h5
+from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, index_shard, write_manifest
 from storage.dataset.shard import write_shard
 from storage.dataset.splits import shard_name
 from storage.dataset.staging import read_staged_scene
 from storage.dataset.training_data import TrainingData
-from storage.records.sample import sample_key
+from storage.records.profiles import PROFILES, Profile
+from storage.records.sample import Sample, decode_sample, encode_sample, sample_key
+from storage.records.scene import ARRAY_FIELDS
 
 if TYPE_CHECKING:
     from train.data.stream import StreamSettings
@@ -34,10 +44,6 @@ def render_scenes(px: int, place: Path) -> tuple[dict[str, float], list[Members]
     Returns:
         Wall-clock milliseconds and CPU seconds of a view; and the files of each scene.
     """
-    from infra.planning import measure_scenes
-    from pipeline.builds.named import named_build
-    from pipeline.generation.dataset_order import DatasetOrder
-
     splits = named_build(BUILD).splits
     order = DatasetOrder(build=BUILD, resolution=px, scenes=splits.scenes_per_shard)
     marks: list[float] = []
@@ -113,3 +119,54 @@ def time_reading(
             count += settings.batch_size
         seconds = time.perf_counter() - began
         return seconds / count, (time.process_time() - core_began) / count
+
+
+TEXTURES: Mapping[str, TextureType] = {"HDF5 float16": "float16", "HDF5 float32": "float32"}
+LAYOUTS = (*PROFILES, *TEXTURES)
+
+Packed = TypeVar("Packed")
+
+
+def unpacking_figures(samples: Sequence[Sample], layout: str, work: Path) -> Mapping[str, float]:
+    """Unpack samples of one of LAYOUTS in memory, in one thread.
+
+    Returns:
+        Mean bytes of a sample before and after, and mean CPU milliseconds.
+    """
+    if layout in TEXTURES:
+        files = [_h5_bytes(sample, work, TEXTURES[layout]) for sample in samples]
+        return _time_unpacking(files, _unpacked_h5, len)
+    profile: Profile = "lossless" if layout == "lossless" else "compact"
+    members = [encode_sample(sample, profile) for sample in samples]
+    return _time_unpacking(members, _unpacked_sample, lambda packed: sum(map(len, packed.values())))
+
+
+def _unpacked_sample(members: Mapping[str, bytes]) -> int:
+    sample = decode_sample("0", members)
+    arrays = sum(getattr(sample.scene, name).nbytes for name in ARRAY_FIELDS)
+    return int(arrays + sample.radiance_rgb.nbytes)
+
+
+def _h5_bytes(sample: Sample, work: Path, texture_type: TextureType) -> bytes:
+    path = work / "scene.h5"
+    write_renderformer_h5(path, sample.scene, sample.radiance_rgb, texture_type=texture_type)
+    return path.read_bytes()
+
+
+def _unpacked_h5(data: bytes) -> int:
+    """Read every array without checks, as a loader that trusts its files does."""
+    with h5py.File(io.BytesIO(data)) as file:
+        return sum(file[name][()].nbytes for name in file)
+
+
+def _time_unpacking(
+    packed: Sequence[Packed], unpack: Callable[[Packed], int], size: Callable[[Packed], int]
+) -> Mapping[str, float]:
+    began = time.process_time()
+    memory = sum(map(unpack, packed))
+    spent_s = time.process_time() - began
+    return {
+        "bytes": float(np.mean([size(one) for one in packed])),
+        "memory_bytes": memory / len(packed),
+        "sample_ms": 1000 * spent_s / len(packed),
+    }

@@ -14,9 +14,18 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from infra.bench import run as running
-from infra.bench.catalogue import every_experiment, experiment_of
 from infra.bench.context import BenchContext
-from infra.bench.experiment import FULL, QUICK, Column, Experiment, Figures, Point, columns_of
+from infra.bench.experiment import (
+    FULL,
+    QUICK,
+    Column,
+    Experiment,
+    Figures,
+    Point,
+    columns_of,
+    every_experiment,
+    experiment_of,
+)
 from infra.bench.machine import commit_text, machine_record
 from infra.bench.plot import plot
 from infra.bench.rows import Row, rows_of, table_of
@@ -259,7 +268,7 @@ def test_an_unknown_name_is_answered_with_those_that_exist() -> None:
 
 
 def test_an_installed_trilight_says_where_the_bench_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "infra.bench.catalogue")
+    monkeypatch.delitem(sys.modules, "infra.bench.experiment")
     monkeypatch.setitem(sys.modules, "infra.bench", None)
     done = trilight(["bench", "frontier"])
     assert done.mistake.startswith("bench: an installed Trilight has no experiments; expected a")

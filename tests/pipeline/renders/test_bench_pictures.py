@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from infra.bench.workloads.coarser_meshes import picture_db
 from infra.bench.workloads.judged_pictures import shrunk
-from infra.bench.workloads.mesh_pictures import picture_db
-from infra.bench.workloads.plain_mitsuba import render_levels
-from infra.bench.workloads.shots import fixed_samples, shot
+from infra.bench.workloads.traced_pictures import fixed_samples, render_levels, shot
 from infra.render.raw_references import raw_reference
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.renders.load_tracer import load_tracer
@@ -40,8 +39,8 @@ def test_plain_mitsuba_comes_to_the_same_picture() -> None:
     scene = tiny_scene()
     ours = shot(scene, fixed_samples(32, 2048)).radiance_rgb
     levels = render_levels(scene, 32, (16, 64, 1024), 5)
-    assert [level.spp for level in levels] == [16, 64, 1024]
-    assert levels[0].core_s > 0
+    assert [level.samples for level in levels] == [16, 64, 1024]
+    assert levels[0].cpu_seconds
     errors = [psnr_log_db(level.radiance_rgb, ours) for level in levels]
     # With three seeds 57 to 59, 60 to 62, and 68 to 69 dB; light off by half a percent is at 60.
     assert errors[0] < errors[2]

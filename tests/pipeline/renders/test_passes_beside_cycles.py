@@ -16,8 +16,8 @@ import OpenEXR
 import pytest
 from numpy.typing import NDArray
 
-from infra.bench.workloads.blender_environment import installed_python
-from infra.bench.workloads.cycles import cycles_samples, run_blender
+from infra.bench.workloads.blender_environment import installed_python, run_blender
+from infra.bench.workloads.cycles import cycles_pictures
 from pipeline.exchange.convert import convert_scene
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.usd.write import write_usd
@@ -50,9 +50,7 @@ def _blender(scene: Scene, folder: Path) -> dict[str, NDArray[np.float32]]:
         "threads": 2,
     }
     (folder / "request.json").write_text(json.dumps(request))
-    run_blender(
-        Path(__file__).with_name("cycles_passes_process.py"), folder, installed_python() or folder
-    )
+    run_blender(Path(__file__).with_name("cycles_passes_process.py"), folder)
     with OpenEXR.File(str(folder / "passes.exr"), separate_channels=True) as file:
         channels = {name: each.pixels for name, each in file.channels().items()}
     found: dict[str, list[str]] = {}
@@ -124,7 +122,8 @@ def blender() -> None:
 
 
 def _cycles(scene: Scene, resolution: int, spp: int, bounces: int = 8) -> NDArray[np.float32]:
-    return cycles_samples(scene, resolution, spp, bounces=bounces, threads=1).pictures_rgb[0]
+    (picture,), _ = cycles_pictures(scene, resolution, spp, bounces=bounces, threads=1)
+    return picture
 
 
 @pytest.mark.usefixtures("blender")

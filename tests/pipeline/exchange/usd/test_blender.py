@@ -11,9 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from infra.bench.workloads import cycles
-from infra.bench.workloads.blender_environment import installed_python
-from infra.bench.workloads.shots import fixed_samples, shot
+from infra.bench.workloads import blender_environment as environment
+from infra.bench.workloads.traced_pictures import fixed_samples, shot
 from pipeline.exchange.usd.read import UsdScene, read_usd
 from pipeline.exchange.usd.write import write_usd
 from pipeline.isolation import ChildLimits, IsolatedChild
@@ -38,13 +37,12 @@ def run_blender(process: str, folder: Path, request: dict[str, Any]) -> NDArray[
 
     Skips where Blender has not been installed: that is 380 MB, which tests do not download.
     """
-    python = installed_python()
-    if python is None:
+    if environment.installed_python() is None:
         pytest.skip("Blender is not installed: run `trilight bench cycles` once")
     folder.mkdir(exist_ok=True)
     asked = {"bounces": 8, "denoise": True, "seed": 0, "threads": 2, **request}
     (folder / "request.json").write_text(json.dumps(asked))
-    cycles.run_blender(Path(__file__).with_name(process), folder, python)
+    environment.run_blender(Path(__file__).with_name(process), folder)
     picture: NDArray[np.float32] = np.load(folder / "picture.npy")
     return picture
 
