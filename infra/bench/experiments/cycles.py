@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
 from infra.bench.experiments.frontier import adaptive
-from infra.bench.workloads.cycles import cycles_pictures
-from infra.bench.workloads.judged_pictures import difference_db, shrunk
+from infra.bench.workloads.cycles import render_with_cycles
+from infra.bench.workloads.judged_pictures import difference_db, shrink_reference
 from infra.bench.workloads.named_scenes import SKIES, given_scenes, mapped_scene
-from infra.bench.workloads.traced_pictures import shot
+from infra.bench.workloads.traced_pictures import render_shot
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera, raw_reference, true_error_db
 from pipeline.renders.noise_floor import clamped_radiance
@@ -61,8 +61,8 @@ def _measure(kind: str, context: BenchContext, trial: str) -> Figures:
     scene = _scene(context, kind, int(trial.split()[-1]))
     camera = first_camera(scene, RESOLUTION)
     ours = context.child.call(raw_reference, scene, camera, OUR_SHARE * spp)
-    view = context.child.call(shot, scene, adaptive(USUAL_FLOOR_DB, RESOLUTION, spp))
-    pictures, core_s = cycles_pictures(scene, RESOLUTION, spp, seeds=(0, 1))
+    view = context.child.call(render_shot, scene, adaptive(USUAL_FLOOR_DB, RESOLUTION, spp))
+    pictures, core_s = render_with_cycles(scene, RESOLUTION, spp, seeds=(0, 1))
     a_rgb, b_rgb = (picture.astype(np.float64) for picture in pictures)
     theirs = RawReference(a_rgb=a_rgb, b_rgb=b_rgb)
     return {
@@ -86,7 +86,7 @@ def agreement_figures(ours: RawReference, theirs: RawReference) -> dict[str, flo
     pixels_db = _linear_db(0.5 * (ours.a_rgb + ours.b_rgb), one)
     seeds_db = _linear_db(one, other)
     blocks = len(ours.a_rgb) // _BLOCK_PX
-    coarse = shrunk(ours, blocks), shrunk(theirs, blocks)
+    coarse = shrink_reference(ours, blocks), shrink_reference(theirs, blocks)
     return {
         "pixels_db": pixels_db,
         "seeds_db": seeds_db,

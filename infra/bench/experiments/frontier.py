@@ -21,9 +21,13 @@ from infra.bench.experiment import (
     Point,
     percent,
 )
-from infra.bench.workloads.judged_pictures import figures, kept_reference, shrunk
+from infra.bench.workloads.judged_pictures import (
+    figures,
+    load_or_render_reference,
+    shrink_reference,
+)
 from infra.bench.workloads.named_scenes import given_scenes, sampled_trials
-from infra.bench.workloads.traced_pictures import render_levels, shot
+from infra.bench.workloads.traced_pictures import render_levels, render_shot
 from infra.bench_options import BenchOptions
 from infra.render.methods import SAMPLE_SEED
 from infra.render.raw_references import RawReference, first_camera, true_error_db
@@ -92,8 +96,8 @@ def _trials(scale: BenchScale, options: BenchOptions) -> list[str]:
 
 
 def _measure_ours(settings: RenderSettings, context: BenchContext, trial: str) -> Figures:
-    view = context.child.call(shot, context.scene(trial), settings)
-    judged = figures(view, shrunk(_reference(context, trial), settings.resolution))
+    view = context.child.call(render_shot, context.scene(trial), settings)
+    judged = figures(view, shrink_reference(_reference(context, trial), settings.resolution))
     found = {"core_s": view.core_s, "db": judged["log_true_db"], **judged}
     if settings.resolution == context.scale.resolution:
         levels = _plain_levels(context, trial).values()
@@ -110,7 +114,7 @@ def _measure_plain(spp: int, context: BenchContext, trial: str) -> Figures:
 def _reference(context: BenchContext, trial: str) -> RawReference:
     scene = context.scene(trial)
     camera = first_camera(scene, REFERENCE_PX)
-    return kept_reference(context.child, scene, camera, context.scale.reference_spp)
+    return load_or_render_reference(context.child, scene, camera, context.scale.reference_spp)
 
 
 def _plain_levels(context: BenchContext, trial: str) -> dict[int, dict[str, float]]:
@@ -120,7 +124,7 @@ def _plain_levels(context: BenchContext, trial: str) -> dict[int, dict[str, floa
         px = context.scale.resolution
         spps = plain_spps(context.scale)
         levels = context.child.call(render_levels, context.scene(trial), px, spps, SAMPLE_SEED)
-        reference = shrunk(_reference(context, trial), px)
+        reference = shrink_reference(_reference(context, trial), px)
         return {
             spp: plain_figures(level, reference) for spp, level in zip(spps, levels, strict=True)
         }

@@ -5,8 +5,13 @@ from pathlib import Path
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, percent
-from infra.bench.workloads import coarser_meshes
-from infra.bench.workloads.coarser_meshes import coarser, picture_db
+from infra.bench.workloads.coarser_meshes import (
+    METHODS,
+    REFERENCE,
+    make_coarser_meshes,
+    picture_db,
+    remesh,
+)
 from infra.bench.workloads.traced_pictures import fixed_samples
 from infra.bench_options import BenchOptions
 from pipeline.assets.settings import AssetSettings
@@ -32,7 +37,7 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
             group=METHOD_GROUP,
             kind="methods",
         )
-        for method in (coarser_meshes.REFERENCE, *coarser_meshes.METHODS)
+        for method in (REFERENCE, *METHODS)
     ]
     budgets = [
         Point(
@@ -47,7 +52,7 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
 
 
 def _simplify(method: str, budget: int, context: BenchContext, trial: str) -> Figures:
-    return context.mesh_child.call(coarser_meshes.remesh, _object(context, trial), method, budget)
+    return context.mesh_child.call(remesh, _object(context, trial), method, budget)
 
 
 def _simplify_and_render(budget: int, context: BenchContext, trial: str) -> Figures:
@@ -62,8 +67,8 @@ def _simplify_and_render(budget: int, context: BenchContext, trial: str) -> Figu
 
 
 def _picture_db(context: BenchContext, trial: str) -> list[float]:
-    method = coarser_meshes.METHODS["faithful"]
-    meshes = context.mesh_child.call(coarser, _object(context, trial), CURVE, method)
+    method = METHODS["faithful"]
+    meshes = context.mesh_child.call(make_coarser_meshes, _object(context, trial), CURVE, method)
     renders = fixed_samples(context.scale.picture_px, context.scale.max_spp // 4)
     return context.child.call(picture_db, meshes, renders)
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
-from infra.bench.workloads.judged_pictures import kept_reference
+from infra.bench.workloads.judged_pictures import load_or_render_reference
 from infra.bench_options import BenchOptions
 from infra.render.held_out_scenes import TRIANGLES, held_out_build, held_out_scene
 from infra.render.methods import (
@@ -67,7 +67,9 @@ def _measure(px: int, name: str, context: BenchContext, trial: str) -> Figures:
     renderers, child = context.get_or_make("methods", lambda: _set_up(context))
     index = int(trial.split()[-1])
     scene = context.get_or_make(("scene", trial), lambda: held_out_scene(child, index))
-    reference = kept_reference(child, scene, first_camera(scene, px), 2 * context.scale.max_spp)
+    reference = load_or_render_reference(
+        child, scene, first_camera(scene, px), 2 * context.scale.max_spp
+    )
     return judged_figures(renderers[px, name], scene, reference)
 
 

@@ -1,15 +1,13 @@
 """Description and throughput of a device: matrix products by type, and memory copies."""
 
-import shutil
-import subprocess
 import time
 from collections.abc import Callable
 
 import torch
 
 from model.precision import fast_float32_products
+from pipeline.renders.visible_gpus import query_gpus
 
-_ANSWER_S = 60
 REPEATS = 5
 
 
@@ -18,23 +16,11 @@ def device_facts(device: torch.device) -> str:
     if device.type != "cuda":
         return f"no GPU: torch {torch.__version__} with {torch.get_num_threads()} threads"
     properties = torch.cuda.get_device_properties(device)
+    driver = next(iter(query_gpus("driver_version")), "unknown")
     return (
         f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, torch {torch.__version__}, "
-        f"CUDA {torch.version.cuda}, driver {_driver(device.index or 0)}"
+        f"CUDA {torch.version.cuda}, driver {driver}"
     )
-
-
-def _driver(index: int) -> str:
-    smi = shutil.which("nvidia-smi")
-    if smi is None:
-        return "unknown"
-    command = [smi, f"--id={index}", "--query-gpu=driver_version", "--format=csv,noheader"]
-    try:
-        return subprocess.run(
-            command, capture_output=True, text=True, timeout=_ANSWER_S, check=True
-        ).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
 
 
 def product_figures(device: torch.device, kind: str, width: int) -> dict[str, float]:

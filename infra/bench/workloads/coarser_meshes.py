@@ -103,7 +103,7 @@ def _simplify_by_reference(raw: TriangleMesh, budget: int) -> TriangleMesh:
     )
 
 
-def coarser(path: Path, budgets: Sequence[int], method: str) -> list[TriangleMesh]:
+def make_coarser_meshes(path: Path, budgets: Sequence[int], method: str) -> list[TriangleMesh]:
     """Return the cleaned source of a file, and one mesh for each budget; raises Rejected."""
     source = clean_mesh(raw_mesh(path))
     meshes = [source, *(clean(decimate(source, budget, method)) for budget in budgets)]

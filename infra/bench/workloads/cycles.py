@@ -16,7 +16,7 @@ from storage.records.scene import Scene
 _SCRIPT = Path(__file__).with_name("blender_process.py")
 
 
-def cycles_pictures(
+def render_with_cycles(
     scene: Scene,
     resolution: int,
     spp: int,

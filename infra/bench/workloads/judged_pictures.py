@@ -23,7 +23,7 @@ from storage.records.scene_file import scene_digest
 _CURVES = {"log": log10_radiance, "linear": clamped_radiance, "object": log10_radiance}
 
 
-def kept_reference(
+def load_or_render_reference(
     child: IsolatedChild, scene: Scene, camera: PixelCamera, spp: int
 ) -> RawReference:
     """Return two halves of raw samples of a view, from the cache or rendered by a child.
@@ -86,7 +86,7 @@ def difference_db(ours: RawReference, theirs: RawReference, curve: Curve) -> flo
     return float(-10 * np.log10(max((weight * product).mean(), LEAST_ERROR)))
 
 
-def shrunk(reference: RawReference, resolution: int) -> RawReference:
+def shrink_reference(reference: RawReference, resolution: int) -> RawReference:
     """Return a reference of a smaller width, which divides the reference's."""
     halves = np.stack([reference.a_rgb, reference.b_rgb])
     size = halves.shape[1] // resolution

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from infra.bench.workloads.cost_scene import cost_scene
 from infra.bench.workloads.reading import write_copies
-from infra.bench.workloads.traced_pictures import fixed_samples, shot
+from infra.bench.workloads.traced_pictures import fixed_samples, render_shot
 from pipeline.renders.variant import activate, choose_variant
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
@@ -139,7 +139,7 @@ def _prepare(num_objects: int, folder: Path) -> None:
 
 def _trace(num_triangles: int, folder: Path) -> None:
     activate(choose_variant())
-    shot(cost_scene(num_triangles, _LIGHTS), fixed_samples(_PX, 64))
+    render_shot(cost_scene(num_triangles, _LIGHTS), fixed_samples(_PX, 64))
 
 
 def _show_by_network(num_triangles: int, folder: Path) -> None:

@@ -56,7 +56,7 @@ def fixed_samples(resolution: int, spp: int) -> RenderSettings:
     )
 
 
-def shot(scene: Scene, settings: RenderSettings) -> RenderedView:
+def render_shot(scene: Scene, settings: RenderSettings) -> RenderedView:
     """Return a scene's first view, always of one seed; runs in a render child."""
     small = dataclasses.replace(settings, resolution=_SMALL, max_spp=settings.min_spp)
     pose = scene.c2w[0]

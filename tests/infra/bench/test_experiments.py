@@ -24,7 +24,7 @@ from infra.bench.gpu.twin import NETWORKS, twin_figures
 from infra.bench.workloads import blender_environment as environment
 from infra.bench.workloads import sized_work
 from infra.bench.workloads.blender_environment import installed_python
-from infra.bench.workloads.judged_pictures import kept_reference
+from infra.bench.workloads.judged_pictures import load_or_render_reference
 from infra.bench.workloads.reading import LAYOUTS, unpacking_figures, write_copies
 from infra.bench.workloads.sized_work import WORK, measure_work, session_bytes, sizes_of
 from infra.bench_options import BenchOptions
@@ -325,8 +325,8 @@ def test_a_view_is_rendered_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path))
     counting = Counting()
     child, scene = cast(IsolatedChild, counting), toy_scene(0)
-    first = kept_reference(child, scene, first_camera(scene, 8), 128)
-    again = kept_reference(child, scene, first_camera(scene, 8), 128)
+    first = load_or_render_reference(child, scene, first_camera(scene, 8), 128)
+    again = load_or_render_reference(child, scene, first_camera(scene, 8), 128)
     assert counting.calls == 1
     np.testing.assert_array_equal(first.a_rgb, again.a_rgb)
     np.testing.assert_array_equal(first.b_rgb, again.b_rgb)
@@ -336,5 +336,5 @@ def test_a_view_is_rendered_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         (scene, first_camera(scene, 16), 128),
         (toy_scene(1), first_camera(scene, 8), 128),
     ):
-        kept_reference(child, *other)
+        load_or_render_reference(child, *other)
     assert counting.calls == 4, "other samples, width or scene is another reference"

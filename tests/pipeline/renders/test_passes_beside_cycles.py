@@ -17,7 +17,7 @@ import pytest
 from numpy.typing import NDArray
 
 from infra.bench.workloads.blender_environment import installed_python, run_blender
-from infra.bench.workloads.cycles import cycles_pictures
+from infra.bench.workloads.cycles import render_with_cycles
 from pipeline.exchange.convert import convert_scene
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.usd.write import write_usd
@@ -122,7 +122,7 @@ def blender() -> None:
 
 
 def _cycles(scene: Scene, resolution: int, spp: int, bounces: int = 8) -> NDArray[np.float32]:
-    (picture,), _ = cycles_pictures(scene, resolution, spp, bounces=bounces, threads=1)
+    (picture,), _ = render_with_cycles(scene, resolution, spp, bounces=bounces, threads=1)
     return picture
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from infra.bench.workloads import blender_environment as environment
-from infra.bench.workloads.traced_pictures import fixed_samples, shot
+from infra.bench.workloads.traced_pictures import fixed_samples, render_shot
 from pipeline.exchange.usd.read import UsdScene, read_usd
 from pipeline.exchange.usd.write import write_usd
 from pipeline.isolation import ChildLimits, IsolatedChild
@@ -52,7 +52,7 @@ def ours(scene: Scene, resolution: int, spp: int) -> NDArray[np.float32]:
     limits = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1)
     child = IsolatedChild(limits=limits, factory=activate, args=(choose_variant(),))
     try:
-        return child.call(shot, scene, fixed_samples(resolution, spp)).radiance_rgb
+        return child.call(render_shot, scene, fixed_samples(resolution, spp)).radiance_rgb
     finally:
         child.close()
 
