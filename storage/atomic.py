@@ -73,7 +73,7 @@ def append_line(path: Path, line: str, *, durable: bool = False) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("ab+") as stream:
+        with path.open("ab+" if durable else "ab") as stream:
             if durable and stream.seek(0, os.SEEK_END):
                 stream.seek(-1, os.SEEK_END)
                 if stream.read() != b"\n":
