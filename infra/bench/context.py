@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from infra.bench.experiment import BenchScale, Figures
+from infra.bench.workloads.coarser_meshes import count_faces
 from infra.bench.workloads.named_scenes import given_scenes, read_given, sampled_scene
 from infra.bench.workloads.reading import Members, render_scenes, write_copies
 from infra.bench_options import BenchOptions
@@ -22,6 +23,8 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
 from pipeline.generation.prepare_isolated import preload_mesh_libraries
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
+from pipeline.objects.sources import find_objects
+from storage.cache import cache_folder
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import Rejected
 from storage.records.scene import Scene
@@ -93,10 +96,6 @@ class BenchContext:
         Raises:
             TrilightError: as `find_objects`.
         """
-        from infra.bench.workloads.coarser_meshes import count_faces
-        from pipeline.objects.sources import find_objects
-        from storage.cache import cache_folder
-
         objects = find_objects(
             self.options.objects,
             work_dir=cache_folder("objects"),
