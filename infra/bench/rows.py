@@ -41,8 +41,8 @@ def rows_of(experiment: Experiment, run: Run) -> list[Row]:
             "expected one experiment a file. Name another one by --out."
         )
     points = [Point(**record) for record in run.plan["points"]]
-    found = {point.name: _values(experiment, run, point) for point in points}
-    values = {name: figures for name, (figures, _) in found.items()}
+    reduced = {point.name: _values(experiment, run, point) for point in points}
+    values = {name: figures for name, (figures, _) in reduced.items()}
     known = [point for point in points if values[point.name].get(experiment.cost.name, 0) > 0]
     if not known:
         raise TrilightError(f"bench {experiment.name}: no point was measured; run it again.")
@@ -51,7 +51,7 @@ def rows_of(experiment: Experiment, run: Run) -> list[Row]:
         Row(
             point=point,
             values=values[point.name],
-            intervals=found[point.name][1],
+            intervals=reduced[point.name][1],
             cost_range=_cost_range(experiment, run, point.name),
             on_front=front.get(point.name),
         )
@@ -120,14 +120,14 @@ def _values(
 
 def _figures(column: Column, run: Run, point: Point) -> dict[str, float]:
     """Return the figures of a column by trial; over `pair` minus those of the point's rival."""
-    mine = _known(column, run, point.name)
+    mine = _figures_by_trial(column, run, point.name)
     if column.over != "pair":
         return mine
-    theirs = _known(column, run, point.rival) if point.rival else {}
+    theirs = _figures_by_trial(column, run, point.rival) if point.rival else {}
     return {trial: mine[trial] - theirs[trial] for trial in mine if trial in theirs}
 
 
-def _known(column: Column, run: Run, point: str) -> dict[str, float]:
+def _figures_by_trial(column: Column, run: Run, point: str) -> dict[str, float]:
     trials = {trial: run.trials[trial][point] for trial in run.whole_trials()}
     name = column.figure
     return {trial: figures[name] for trial, figures in trials.items() if name in figures}
@@ -135,7 +135,7 @@ def _known(column: Column, run: Run, point: str) -> dict[str, float]:
 
 def _cost_range(experiment: Experiment, run: Run, point: str) -> tuple[float, float] | None:
     column = experiment.cost
-    costs = _known(column, run, point).values()
+    costs = _figures_by_trial(column, run, point).values()
     if len(costs) < 2:
         return None
     least, most = sorted(column.then(c) if column.then else c for c in (min(costs), max(costs)))

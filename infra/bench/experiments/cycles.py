@@ -80,7 +80,8 @@ def agreement_figures(ours: RawReference, theirs: RawReference) -> dict[str, flo
     """
     level = float(np.quantile((theirs.a_rgb + theirs.b_rgb).mean(axis=-1) / 2, 0.9))
     exposure = EXPOSED / level if level > 0 else 1.0
-    one, other = theirs.a_rgb * exposure, theirs.b_rgb * exposure
+    one = theirs.a_rgb * exposure
+    other = theirs.b_rgb * exposure
     ours = RawReference(a_rgb=ours.a_rgb * exposure, b_rgb=ours.b_rgb * exposure)
     theirs = RawReference(a_rgb=one, b_rgb=other)
     pixels_db = _linear_db(0.5 * (ours.a_rgb + ours.b_rgb), one)

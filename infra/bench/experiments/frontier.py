@@ -98,13 +98,13 @@ def _trials(scale: BenchScale, options: BenchOptions) -> list[str]:
 def _measure_ours(settings: RenderSettings, context: BenchContext, trial: str) -> Figures:
     view = context.child.call(render_shot, context.scene(trial), settings)
     judged = figures(view, shrink_reference(_reference(context, trial), settings.resolution))
-    found = {"core_s": view.core_s, "db": judged["log_true_db"], **judged}
+    costs_and_errors = {"core_s": view.core_s, "db": judged["log_true_db"], **judged}
     if settings.resolution == context.scale.resolution:
         levels = _plain_levels(context, trial).values()
         steps = [(each["spp"], each["core_s"], each["db"]) for each in levels]
-        core_s, is_reached = cost_at_error(steps, found["db"])
-        found |= {"times": core_s / view.core_s, "bound": float(not is_reached)}
-    return found
+        core_s, is_reached = cost_at_error(steps, costs_and_errors["db"])
+        costs_and_errors |= {"times": core_s / view.core_s, "bound": float(not is_reached)}
+    return costs_and_errors
 
 
 def _measure_plain(spp: int, context: BenchContext, trial: str) -> Figures:
