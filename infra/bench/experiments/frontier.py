@@ -26,7 +26,7 @@ from infra.bench.workloads.judged_pictures import (
     load_or_render_reference,
     shrink_reference,
 )
-from infra.bench.workloads.named_scenes import given_scenes, sampled_trials
+from infra.bench.workloads.named_scenes import given_scenes
 from infra.bench.workloads.traced_pictures import render_levels, render_shot
 from infra.bench_options import BenchOptions
 from infra.render.methods import SAMPLE_SEED
@@ -92,7 +92,8 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
 
 
 def _trials(scale: BenchScale, options: BenchOptions) -> list[str]:
-    return [*given_scenes(options.scenes), *sampled_trials(scale.scenes)]
+    sampled = [f"sampled {index}" for index in range(scale.scenes)]
+    return [*given_scenes(options.scenes), *sampled]
 
 
 def _measure_ours(settings: RenderSettings, context: BenchContext, trial: str) -> Figures:

@@ -52,7 +52,7 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
             for precision in precisions
         },
         **{f"step, {run}": partial(_step, run) for run in _runs(scale, options)},
-        "rendering a view": _rendering,
+        "rendering a view": lambda context, device: context.rendered[0],
         **{f"reading a sample, {count} threads": partial(_reading, count) for count in threads},
     }
     return [Point(name=name, measure=partial(_measure, name, part)) for name, part in named.items()]
@@ -115,10 +115,6 @@ def _step(run: str, context: BenchContext, device: "torch.device") -> Figures:
     if words:
         context.note(f"{run}: {', '.join(words)} of a step")
     return figures
-
-
-def _rendering(context: BenchContext, device: "torch.device") -> Figures:
-    return context.rendered[0]
 
 
 def _reading(threads: int, context: BenchContext, device: "torch.device") -> Figures:

@@ -34,11 +34,6 @@ _CALM = {
 """Changes that leave out mirrors, whose caustics would be too noisy for a comparison."""
 
 
-def sampled_trials(count: int) -> list[str]:
-    """Return the names of the first sampled scenes."""
-    return [f"sampled {index}" for index in range(count)]
-
-
 def given_scenes(folder: Path | None) -> Mapping[str, Path]:
     """Return the RenderFormer and glTF files of a folder by the name of their scene.
 
