@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all: temporary name, fsync, rename."""
+"""Files that appear whole or not at all (temporary name, fsync, rename), and logs of lines."""
 
 import contextlib
 import errno
@@ -57,6 +57,34 @@ def write_atomically(path: Path, data: bytes) -> None:
     """Write `data` so that `path` holds either all of it or what it held before."""
     with atomic_writer(path) as stream:
         stream.write(data)
+
+
+def append_line(path: Path, line: str, *, durable: bool = False) -> None:
+    """Append a line to a file, whose folder may be missing.
+
+    Args:
+        path: the file.
+        line: text without a line break.
+        durable: of a file with one writer, drop a last line that a kill has cut, and return only
+            when the new line is on the disk.
+
+    Raises:
+        TrilightError: the disk is full or the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab+" if durable else "ab") as stream:
+            if durable and stream.seek(0, os.SEEK_END):
+                stream.seek(-1, os.SEEK_END)
+                if stream.read() != b"\n":
+                    stream.seek(0)
+                    stream.truncate(stream.read().rfind(b"\n") + 1)
+            stream.write(line.encode() + b"\n")
+            if durable:
+                stream.flush()
+                os.fsync(stream.fileno())
+    except OSError as error:
+        raise write_error(path, error) from error
 
 
 def remove_leftovers(folder: Path, *, older_than_s: float = 0.0) -> None:

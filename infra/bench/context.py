@@ -12,8 +12,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from infra.bench.experiment import BenchScale
-from infra.bench.workloads.named_scenes import first_sample, given_scenes, sampled_scene
+from infra.bench.experiment import BenchScale, Figures
+from infra.bench.workloads.coarser_meshes import count_faces
+from infra.bench.workloads.named_scenes import given_scenes, read_given, sampled_scene
+from infra.bench.workloads.reading import Members, render_scenes, write_copies
 from infra.bench_options import BenchOptions
 from infra.render.held_out_scenes import composing_child
 from infra.render.path_tracer import RenderChild
@@ -21,16 +23,14 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
 from pipeline.generation.prepare_isolated import preload_mesh_libraries
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
+from pipeline.objects.sources import find_objects
+from storage.cache import cache_folder
+from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import Rejected
-from storage.records.sample import Sample, encode_sample
 from storage.records.scene import Scene
-from storage.settings.changes import changed
 
 Result = TypeVar("Result")
 Closable = TypeVar("Closable", IsolatedChild, RenderChild)
-
-_SAMPLES = 2
-"""Number of rendered scenes for experiments on packing and reading."""
 
 
 class BenchContext:
@@ -96,10 +96,6 @@ class BenchContext:
         Raises:
             TrilightError: as `find_objects`.
         """
-        from infra.bench.workloads.remeshing import count_faces
-        from pipeline.objects.sources import find_objects
-        from storage.cache import cache_folder
-
         objects = find_objects(
             self.options.objects,
             work_dir=cache_folder("objects"),
@@ -113,18 +109,25 @@ class BenchContext:
 
     def scene(self, trial: str) -> Scene:
         """Return the scene of the trial `sampled N`, or the user's scene of that name."""
-        user_scenes = given_scenes(self.options.scenes)
-        if trial in user_scenes:
-            return user_scenes[trial](self.child)
-        return sampled_scene(self.child, int(trial.split()[-1]))
+
+        def make() -> Scene:
+            path = given_scenes(self.options.scenes).get(trial)
+            if path is not None:
+                return self.child.call(read_given, path)
+            return sampled_scene(self.child, int(trial.split()[-1]))
+
+        return self.get_or_make(("scene", trial), make)
 
     @functools.cached_property
-    def samples(self) -> list[Sample]:
-        """Scenes of the preset `smoke` as a dataset has them, at the scale's width."""
-        build = changed(smoke(), {"renders.resolution": self.scale.picture_px})
-        child = self.render_child(build, "builtin:")
-        return [first_sample(child, index) for index in range(_SAMPLES)]
+    def rendered(self) -> tuple[Figures, list[Members]]:
+        """Costs and files of some scenes of the preset `smoke`, at the scale's width."""
+        return render_scenes(self.scale.picture_px, self.folder())
 
-    def members(self) -> list[dict[str, bytes]]:
-        """Return the files of those samples in a shard."""
-        return [dict(encode_sample(sample, "compact")) for sample in self.samples]
+    @functools.cached_property
+    def data(self) -> TrainingData:
+        """Data of the options, or a dataset with copies of the rendered scenes."""
+        if self.options.data:
+            return open_training_data([self.options.data])
+        root = self.folder()
+        write_copies(root, self.rendered[1])
+        return open_training_data([str(root)])

@@ -1,15 +1,18 @@
-"""Declarations of experiments: their points, their measure, and the columns of their table.
+"""Experiments: their points with what measures them, and the columns of their table.
 
 No heavy library is imported here: the list of experiments is made without measuring anything.
 """
 
 import dataclasses
+import importlib
 import importlib.util
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import pkgutil
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from infra.bench_options import BenchOptions
+from storage.errors import TrilightError
 
 if TYPE_CHECKING:
     from infra.bench.context import BenchContext
@@ -86,14 +89,19 @@ class Column:
     """Conversion of that number, such as `3600 / seconds`; None leaves it as it is."""
 
 
+Measure = Callable[["BenchContext", str], Figures]
+"""Function that measures a point in one trial. It raises `Rejected` or `ChildFailed` if the trial's
+scene or object is unusable; the trial then counts for no point."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """Measured setting, a row of the table; the results hold all fields but `settings`."""
+    """Measured setting, a row of the table; the results hold all fields but `measure`."""
 
     name: str
     """Name of its row in the table."""
-    settings: Any = None
-    """Value for the experiment's measure."""
+    measure: Measure | None = field(default=None, repr=False)
+    """Function that measures it; None of a point that was read from results."""
     default: bool = False
     """True for the default of the product."""
     judged: bool = True
@@ -109,12 +117,7 @@ class Point:
 
     def record(self) -> dict[str, Any]:
         """Return the fields for the results as JSON values."""
-        return {name: value for name, value in vars(self).items() if name != "settings"}
-
-
-Measure = Callable[["BenchContext", Sequence[Point], str], Iterable[tuple[str, Figures]]]
-"""Function that measures all points in one trial and yields their figures by name. It raises
-`Rejected` or `ChildFailed` if the trial's scene or object is unusable; it counts for no point."""
+        return {name: value for name, value in vars(self).items() if name != "measure"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,8 +136,6 @@ class Experiment:
     """Function that returns the points, in the order of the table."""
     trials: Callable[[BenchScale, BenchOptions], Sequence[str]]
     """Scenes, objects or repeats: in each trial every point is measured once."""
-    measure: Measure = field(repr=False)
-    """Function that measures all points in one trial."""
     error: Column | None = None
     """Second column of the table; None if only costs are compared."""
     better: Literal["higher", "lower"] = "lower"
@@ -190,3 +191,26 @@ def public_options(options: BenchOptions) -> dict[str, Any]:
         name = options.data.rstrip("/").rpartition("/")[2]
         values["data"] = f"{name} ({sha256_hex(options.data.encode())[:8]})"
     return values
+
+
+def every_experiment() -> dict[str, Experiment]:
+    """Return all experiments by name, in the order of the alphabet."""
+    from infra.bench import experiments
+
+    modules = sorted(module.name for module in pkgutil.iter_modules(experiments.__path__))
+    experiments_found = [
+        importlib.import_module(f"{experiments.__name__}.{name}").EXPERIMENT for name in modules
+    ]
+    return {one.name: one for one in experiments_found}
+
+
+def experiment_of(name: str) -> Experiment:
+    """Return the experiment of a name.
+
+    Raises:
+        TrilightError: the name is unknown; the message has all that exist.
+    """
+    known = every_experiment()
+    if name not in known:
+        raise TrilightError(f"experiment {name!r} is unknown; expected one of {', '.join(known)}.")
+    return known[name]

@@ -11,14 +11,7 @@ from infra.bench.experiment import Experiment
 from infra.bench.rows import Row, rows_of
 from infra.bench.store import Run
 from pipeline.documents.figures import drawing
-from train.evaluation.cost_charts import (
-    SeriesPoint,
-    colors_of,
-    draw_legend,
-    draw_points,
-    name_points,
-    plain_log,
-)
+from train.evaluation.cost_charts import SeriesPoint, draw_panels, plain_log
 
 _WIDE = 7.0
 _HIGH = 5.2
@@ -85,16 +78,11 @@ def _draw_errors(experiment: Experiment, rows: Sequence[Row]) -> Figure:
                 SeriesPoint(name=name, kind=kind, costs=values, error=row.values[error])
             )
     figure, panels = _panels(len(groups))
-    colors = colors_of([point for points in groups.values() for point in points])
-    for axes, (group, points) in zip(panels, groups.items(), strict=True):
+    for axes, group in zip(panels, groups, strict=True):
         axes.set_title(group, fontsize=_FONT + 1)
         axes.set_ylabel(f"{error}, {experiment.better} is better", fontsize=_FONT)
         axes.set_xlabel(costs[0] if len(costs) == 1 else "cost", fontsize=_FONT)
-        draw_points(axes, points, colors)
-    draw_legend(figure, costs, colors)
-    figure.canvas.draw()  # places are known from here on
-    for axes, points in zip(panels, groups.values(), strict=True):
-        name_points(axes, points)
+    draw_panels(figure, panels, list(groups.values()), costs)
     return figure
 
 

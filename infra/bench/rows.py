@@ -41,7 +41,8 @@ def rows_of(experiment: Experiment, run: Run) -> list[Row]:
             "expected one experiment a file. Name another one by --out."
         )
     points = [Point(**record) for record in run.plan["points"]]
-    values = {point.name: _values(experiment, run, point) for point in points}
+    reduced = {point.name: _values(experiment, run, point) for point in points}
+    values = {name: figures for name, (figures, _) in reduced.items()}
     known = [point for point in points if values[point.name].get(experiment.cost.name, 0) > 0]
     if not known:
         raise TrilightError(f"bench {experiment.name}: no point was measured; run it again.")
@@ -50,7 +51,7 @@ def rows_of(experiment: Experiment, run: Run) -> list[Row]:
         Row(
             point=point,
             values=values[point.name],
-            intervals=_intervals(experiment, run, point),
+            intervals=reduced[point.name][1],
             cost_range=_cost_range(experiment, run, point.name),
             on_front=front.get(point.name),
         )
@@ -95,55 +96,46 @@ _OVER: Mapping[str, Callable[[Sequence[float]], Any]] = {
 }
 
 
-def _values(experiment: Experiment, run: Run, point: Point) -> dict[str, float]:
-    whole_trials = run.whole_trials()
+def _values(
+    experiment: Experiment, run: Run, point: Point
+) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+    """Return the values of a point's columns, and the intervals of those over `pair`."""
     values = {}
-    for column in columns_of(experiment):
-        if column.over == "pair":
-            figures, trials = _differences(column, run, point)
-        else:
-            trials = [t for t in whole_trials if column.figure in run.trials[t][point.name]]
-            figures = [run.trials[t][point.name][column.figure] for t in trials]
-        if figures:
-            value = _over(column, figures, [experiment.cluster(trial) for trial in trials])
-            values[column.name] = column.then(value) if column.then else value
-    return values
-
-
-def _over(column: Column, figures: Sequence[float], clusters: Sequence[str]) -> float:
-    if column.over in ("low", "high"):
-        return mean_interval(figures, clusters)[column.over == "high"]
-    return float(_OVER[column.over](figures))
-
-
-def _differences(column: Column, run: Run, point: Point) -> tuple[list[float], list[str]]:
-    """Return a point's figures minus its rival's, and the trials that have both."""
-    if point.rival is None:
-        return [], []
-    name = column.figure
-    pairs = {
-        trial: (run.trials[trial][point.name], run.trials[trial][point.rival])
-        for trial in run.whole_trials()
-    }
-    both = {trial: pair for trial, pair in pairs.items() if all(name in one for one in pair)}
-    return [mine[name] - theirs[name] for mine, theirs in both.values()], list(both)
-
-
-def _intervals(experiment: Experiment, run: Run, point: Point) -> dict[str, tuple[float, float]]:
     intervals = {}
     for column in columns_of(experiment):
+        figures = _figures(column, run, point)
+        if not figures:
+            continue
+        taken = list(figures.values())
+        interval = mean_interval(taken, [experiment.cluster(trial) for trial in figures])
         if column.over == "pair":
-            differences, trials = _differences(column, run, point)
-            if differences:
-                clusters = [experiment.cluster(trial) for trial in trials]
-                intervals[column.name] = mean_interval(differences, clusters)
-    return intervals
+            intervals[column.name] = interval
+        if column.over in ("low", "high"):
+            value = interval[column.over == "high"]
+        else:
+            value = float(_OVER[column.over](taken))
+        values[column.name] = column.then(value) if column.then else value
+    return values, intervals
+
+
+def _figures(column: Column, run: Run, point: Point) -> dict[str, float]:
+    """Return the figures of a column by trial; over `pair` minus those of the point's rival."""
+    mine = _figures_by_trial(column, run, point.name)
+    if column.over != "pair":
+        return mine
+    theirs = _figures_by_trial(column, run, point.rival) if point.rival else {}
+    return {trial: mine[trial] - theirs[trial] for trial in mine if trial in theirs}
+
+
+def _figures_by_trial(column: Column, run: Run, point: str) -> dict[str, float]:
+    trials = {trial: run.trials[trial][point] for trial in run.whole_trials()}
+    name = column.figure
+    return {trial: figures[name] for trial, figures in trials.items() if name in figures}
 
 
 def _cost_range(experiment: Experiment, run: Run, point: str) -> tuple[float, float] | None:
     column = experiment.cost
-    trials = [run.trials[trial][point] for trial in run.whole_trials()]
-    costs = [trial[column.figure] for trial in trials if column.figure in trial]
+    costs = _figures_by_trial(column, run, point).values()
     if len(costs) < 2:
         return None
     least, most = sorted(column.then(c) if column.then else c for c in (min(costs), max(costs)))

@@ -72,7 +72,7 @@ def run(
     current = store.begin(plan)
     began = time.perf_counter()
     with contextlib.closing(BenchContext(scale, options)) as context:
-        _measure(experiment, points, current, store, context, trial_done)
+        _measure_missing(experiment, points, current, store, context, trial_done)
         notes = list(context.notes)
     if not current.whole_trials():
         reasons = "; ".join(sorted(set(current.left_out.values())))
@@ -94,7 +94,7 @@ def _points_of(experiment: Experiment, scale: BenchScale, options: BenchOptions)
     return points
 
 
-def _measure(
+def _measure_missing(
     experiment: Experiment,
     points: Sequence[Point],
     current: Run,
@@ -104,14 +104,15 @@ def _measure(
 ) -> None:
     """Measure the trials that a run lacks."""
     missing = current.missing_trials()
+    measures = [(point.name, point.measure) for point in points if point.measure]
     total = len(current.plan["trials"])
     if experiment.warm_up and missing:
-        for _ in experiment.measure(context, points, missing[0]):
-            pass
+        for _, measure in measures:
+            measure(context, missing[0])
     for number, trial in enumerate(missing, total - len(missing) + 1):
         try:
-            for point, figures in experiment.measure(context, points, trial):
-                store.add(current, trial, point, figures)
+            for name, measure in measures:
+                store.add(current, trial, name, measure(context, trial))
         except (Rejected, ChildFailed) as error:
             store.leave_out(current, trial, str(error))
         trial_done(number, total)

@@ -7,15 +7,15 @@ off.
 
 import datetime
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from infra.bench.experiment import Figures
+from storage.atomic import append_line
 from storage.errors import TrilightError
-from storage.typed_json import read_json
+from storage.typed_json import read_json_lines
 
 
 @dataclass(kw_only=True)
@@ -58,19 +58,19 @@ class Store:
         Raises:
             TrilightError: the file holds no runs.
         """
+        data = self.path.read_bytes() if self.path.is_file() else b""
         runs: list[Run] = []
-        for number, line in enumerate(self._whole_lines(), 1):
-            try:
-                record = read_json(line, dict[str, Any], str(self.path))
+        try:
+            for record in read_json_lines(data, dict[str, Any], str(self.path), torn_end=True):
                 if "plan" in record:
                     runs.append(Run(plan=record["plan"], date=record["date"]))
                 else:
                     _take(runs[-1], record)
-            except (ValueError, LookupError, TypeError) as error:
-                raise TrilightError(
-                    f"{self.path}: line {number} is no row of `trilight bench`; expected a file "
-                    "that it wrote. Name another one by --out."
-                ) from error
+        except (ValueError, LookupError, TypeError) as error:
+            raise TrilightError(
+                f"{self.path}: no rows of `trilight bench` ({error}); expected a file that it "
+                "wrote. Name another one by --out."
+            ) from error
         return runs
 
     def newest(self) -> Run | None:
@@ -103,18 +103,8 @@ class Store:
         self._append(record)
         _take(run, record)
 
-    def _whole_lines(self) -> list[bytes]:
-        data = self.path.read_bytes() if self.path.is_file() else b""
-        return data[: data.rfind(b"\n") + 1].splitlines()
-
     def _append(self, record: Mapping[str, Any]) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("ab+") as stream:
-            stream.seek(0)
-            stream.truncate(stream.read().rfind(b"\n") + 1)  # a torn line of a killed run
-            stream.write(json.dumps(record, sort_keys=True, allow_nan=False).encode() + b"\n")
-            stream.flush()
-            os.fsync(stream.fileno())
+        append_line(self.path, json.dumps(record, sort_keys=True, allow_nan=False), durable=True)
 
 
 def _take(run: Run, record: Mapping[str, Any]) -> None:

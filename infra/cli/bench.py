@@ -40,8 +40,7 @@ _COLUMNS = 8
 @command("names")
 def bench(run_options: BenchRunOptions, options: BenchOptions) -> None:
     try:
-        from infra.bench.catalogue import experiment_of
-        from infra.bench.experiment import FULL, QUICK
+        from infra.bench.experiment import FULL, QUICK, experiment_of
         from infra.bench.run import results_path, run
         from infra.bench.store import Store
     except ModuleNotFoundError as error:
@@ -108,7 +107,7 @@ def _print_run(experiment: "Experiment", run: "Run") -> None:
 
 
 def _list_experiments() -> None:
-    from infra.bench.catalogue import every_experiment
+    from infra.bench.experiment import every_experiment
 
     table = Table("experiment", "what it measures", box=None)
     for experiment in every_experiment().values():

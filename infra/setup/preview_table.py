@@ -92,7 +92,9 @@ def main() -> None:
                     raise
                 continue
             errors[index] = {px: _errors_of(renderers[px], child, scene, px) for px in WIDTHS}
-            costs[index] = {px: _costs_of(network, child, scene, px) for px in WIDTHS}
+            costs[index] = {
+                px: _costs_of(renderers[px][NETWORK], child, scene, px) for px in WIDTHS
+            }
     table = table_of(errors, costs, f"{processor()}, one thread")
     text = json.dumps(settings_record(table), indent=1, sort_keys=True)
     write_atomically(SHIPPED, f"{text}\n".encode())
@@ -169,19 +171,13 @@ def _renderers_at(
     return renderers
 
 
-def _costs_of(
-    network: "NeuralRenderer", child: IsolatedChild, scene: Scene, px: int
-) -> dict[str, float]:
+def _costs_of(network: Renderer, child: IsolatedChild, scene: Scene, px: int) -> dict[str, float]:
     core_s: dict[str, float] = child.call(timed_parts, scene, px, time.process_time)
-    pose = scene.c2w[0]
-    fov_deg = float(scene.fov_deg[0])
-    network.view(network.prepare(scene), pose, fov_deg, px)  # warms up
-    began = time.process_time()
-    prepared = network.prepare(scene)
-    encoded = time.process_time()
-    network.view(prepared, pose, fov_deg, px)
-    core_s[NETWORK_SCENE] = encoded - began
-    core_s[NETWORK_VIEW] = time.process_time() - encoded
+    for _ in range(2):  # the first warms up
+        loaded = network.load(scene, "scene")
+        view = loaded.render(Camera.of_scene(scene, 0))
+        core_s[NETWORK_SCENE] = loaded.cpu_seconds or 0.0
+        core_s[NETWORK_VIEW] = view.cpu_seconds or 0.0
     return core_s
 
 

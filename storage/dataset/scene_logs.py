@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from storage.atomic import write_error
+from storage.atomic import append_line
 from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError
 from storage.records.sample import sample_key
@@ -74,13 +74,7 @@ def log_scene(
         pid=os.getpid(),
         finished_unix_s=round(time.time(), 1),
     )
-    path = folder.root / log_name(shard)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a") as stream:
-            stream.write(json.dumps(dataclasses.asdict(row)) + "\n")
-    except OSError as error:
-        raise write_error(path, error) from error
+    append_line(folder.root / log_name(shard), json.dumps(dataclasses.asdict(row)))
 
 
 def log_name(shard: str) -> str:

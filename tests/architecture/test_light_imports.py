@@ -29,8 +29,7 @@ STEPS = (
 """Statements in the order in which a process runs them, and what is not loaded after each."""
 LISTED = (
     "sys.modules['torch'] = None",
-    "from infra.bench.catalogue import every_experiment",
-    "from infra.bench.experiment import QUICK",
+    "from infra.bench.experiment import QUICK, every_experiment",
     "from infra.bench_options import BenchOptions",
     "found = every_experiment().values()",
     "assert all(one.points(QUICK, BenchOptions()) for one in found)",

@@ -4,10 +4,12 @@ import re
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import pytest
 
+from storage.atomic import append_line
 from storage.errors import TrilightError
 from storage.settings.ranges import Within
 from storage.typed_json import FINITE, Sha256, read_json, read_json_lines
@@ -53,6 +55,21 @@ def test_what_a_file_is_not_is_one_sentence_within_a_second(text: str, message: 
     assert time.process_time() - began < 1
     assert re.search(message, str(caught.value)), str(caught.value)
     assert str(caught.value).startswith("file: ") and len(str(caught.value)) < 500
+
+
+def test_a_durable_line_takes_the_place_of_one_that_a_kill_has_cut(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "log"
+    append_line(path, "one", durable=True)
+    for torn in (b"", b"tw", b"\0"):
+        path.write_bytes(b"one\n" + torn)
+        append_line(path, "two", durable=True)
+        assert path.read_bytes() == b"one\ntwo\n"
+    path.write_bytes(b"tw")
+    append_line(path, "two", durable=True)
+    append_line(path, "three")
+    assert path.read_bytes() == b"two\nthree\n"
+    with pytest.raises(TrilightError, match="cannot write"):
+        append_line(tmp_path, "x")
 
 
 def test_lines_forgive_an_end_that_a_kill_has_cut_and_nothing_else() -> None:

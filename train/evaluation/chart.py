@@ -7,13 +7,7 @@ from typing import Any
 import numpy as np
 
 from train.evaluation.board import NOISE
-from train.evaluation.cost_charts import (
-    SeriesPoint,
-    colors_of,
-    draw_legend,
-    draw_points,
-    name_points,
-)
+from train.evaluation.cost_charts import SeriesPoint, draw_panels
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.pairs import METRIC
 from train.evaluation.standings import Standing, WidthStandings
@@ -45,20 +39,14 @@ def _plot(widths: Sequence[WidthStandings], title: str, path: Path) -> None:
         layout="constrained",
     )
     figure.suptitle(title, fontsize=12)
-    points_by_width = [_points(one) for one in widths]
-    colors = colors_of([point for points in points_by_width for point in points])
-    for axes, one, points in zip(panels.flat, widths, points_by_width, strict=True):
+    for axes, one in zip(panels.flat, widths, strict=True):
         axes.set_title(f"{one.width} x {one.width} pixels, {one.num_views} views", fontsize=11)
         axes.set_xlabel("core-seconds, one thread", fontsize=_FONT)
         axes.set_ylabel(f"median {METRIC}, higher is better", fontsize=_FONT)
-        draw_points(axes, points, colors)
         for standing in one.standings:
             if standing.first_s is None:
                 _line_across(axes, standing)
-    draw_legend(figure, _COSTS, colors)
-    figure.canvas.draw()  # places are known from here on
-    for axes, points in zip(panels.flat, points_by_width, strict=True):
-        name_points(axes, points)
+    draw_panels(figure, list(panels.flat), [_points(one) for one in widths], _COSTS)
     figure.savefig(path, metadata={"Software": None})
     plt.close(figure)
 

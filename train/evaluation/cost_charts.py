@@ -27,14 +27,30 @@ class SeriesPoint:
     """Error on the vertical axis."""
 
 
-def colors_of(points: Sequence[SeriesPoint]) -> dict[str, str]:
-    """Return the color of each kind: a way's own, or the next one."""
+def draw_panels(
+    figure: Any,
+    panels: Sequence[Any],
+    groups: Sequence[Sequence[SeriesPoint]],
+    costs: Sequence[str],
+) -> None:
+    """Draw each group of points in a panel, with their names and a legend of costs and kinds.
+
+    What else the panels show must be drawn before, since names avoid it.
+    """
     next_colors = itertools.cycle(OTHERS)
-    kinds = dict.fromkeys(one.kind for one in points)
-    return {name: WAYS.get(name.partition(",")[0]) or next(next_colors) for name in kinds}
+    kinds = dict.fromkeys(one.kind for points in groups for one in points)
+    colors = {name: WAYS.get(name.partition(",")[0]) or next(next_colors) for name in kinds}
+    for axes, points in zip(panels, groups, strict=True):
+        _draw_points(axes, points, colors)
+    _draw_legend(figure, costs, colors)
+    figure.canvas.draw()  # places are known from here on
+    for axes, points in zip(panels, groups, strict=True):
+        names = [(one.name, (one.costs[0], one.error)) for one in points]
+        further_costs = [(cost, one.error) for one in points for cost in one.costs[1:]]
+        _place_labels(axes, names, further_costs)
 
 
-def draw_points(axes: Any, points: Sequence[SeriesPoint], colors: Mapping[str, str]) -> None:
+def _draw_points(axes: Any, points: Sequence[SeriesPoint], colors: Mapping[str, str]) -> None:
     """Draw each point at each of its costs, on a logarithmic axis."""
     axes.grid(alpha=0.25)
     axes.set_xscale("log")
@@ -50,14 +66,7 @@ def draw_points(axes: Any, points: Sequence[SeriesPoint], colors: Mapping[str, s
     plain_log(axes.xaxis)
 
 
-def name_points(axes: Any, points: Sequence[SeriesPoint]) -> None:
-    """Write each name beside the point's first cost; the figure must have been drawn."""
-    names = [(one.name, (one.costs[0], one.error)) for one in points]
-    further_costs = [(cost, one.error) for one in points for cost in one.costs[1:]]
-    _place_labels(axes, names, further_costs)
-
-
-def draw_legend(figure: Any, costs: Sequence[str], colors: Mapping[str, str]) -> None:
+def _draw_legend(figure: Any, costs: Sequence[str], colors: Mapping[str, str]) -> None:
     """Draw the legend of markers (costs) and colors (kinds) below the axes."""
     from matplotlib.lines import Line2D
 

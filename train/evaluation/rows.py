@@ -4,16 +4,15 @@ The first line of the file names the dataset; each other one is a `Row`.
 """
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from storage.atomic import write_error
+from storage.atomic import append_line
 from storage.errors import TrilightError
 from storage.records.safe_read import read_plain
-from storage.typed_json import read_json
+from storage.typed_json import read_json_lines
 from train.evaluation.timing import Price
 
 UNKNOWN_MACHINE = "a machine that is not named"
@@ -63,14 +62,14 @@ class Rows:
         self.path = path
         self._rows: dict[RowKey, Row] = {}
         self._prices: dict[tuple[RowKey, str], Price] = {}
-        lines = self._whole_lines()
-        if not lines:
-            self._append({"set": set_digest})
-            return
+        data = read_plain(path) if path.is_file() else b""
         try:
-            stored_digest = read_json(lines[0], dict[str, str], str(path))["set"]
-            for line in lines[1:]:
-                record = read_json(line, dict[str, Any], str(path))
+            records = read_json_lines(data, dict[str, Any], str(path), torn_end=True)
+            if not records:
+                self._append({"set": set_digest})
+                return
+            stored_digest = str(records[0]["set"])
+            for record in records[1:]:
                 key = RowKey(*(record.pop(name) for name in RowKey._fields))
                 self._keep(key, Row(**record))
         except (ValueError, KeyError, TypeError) as error:
@@ -108,21 +107,5 @@ class Rows:
             price = Price(first_s=row.first_s, further_s=row.further_s)
             self._prices[key, row.machine or UNKNOWN_MACHINE] = price
 
-    def _whole_lines(self) -> list[bytes]:
-        """Return the whole lines, and truncate an incomplete one of a killed run."""
-        data = read_plain(self.path) if self.path.is_file() else b""
-        end = data.rfind(b"\n") + 1
-        if end < len(data):
-            os.truncate(self.path, end)
-        return data[:end].splitlines()
-
     def _append(self, record: Mapping[str, Any]) -> None:
-        line = json.dumps(record, sort_keys=True, allow_nan=False).encode() + b"\n"
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with self.path.open("ab") as stream:
-                stream.write(line)
-                stream.flush()
-                os.fsync(stream.fileno())
-        except OSError as error:
-            raise write_error(self.path, error) from error
+        append_line(self.path, json.dumps(record, sort_keys=True, allow_nan=False), durable=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from storage.atomic import write_atomically, write_error
+from storage.atomic import append_line, write_atomically
 from storage.settings.described import settings_record
 from train.evaluation.judge import Judge
 from train.evaluation.sheet import draw_validation_sheet
@@ -124,16 +124,9 @@ class MetricsLog:
         """
         self.path = path
         rows = [row for row in read_rows(path) if row["step"] <= first_step]
-        write_atomically(path, "".join(_line(row) for row in rows).encode())
+        lines = [f"{json.dumps(row, sort_keys=True)}\n" for row in rows]
+        write_atomically(path, "".join(lines).encode())
 
     def append(self, row: Mapping[str, Any]) -> None:
         """Append one row and close the file, so that readers can follow the run."""
-        try:
-            with self.path.open("a") as stream:
-                stream.write(_line(row))
-        except OSError as error:
-            raise write_error(self.path, error) from error
-
-
-def _line(row: Mapping[str, Any]) -> str:
-    return json.dumps(row, sort_keys=True) + "\n"
+        append_line(self.path, json.dumps(row, sort_keys=True))

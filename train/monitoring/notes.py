@@ -4,7 +4,7 @@ import json
 import time
 from pathlib import Path
 
-from storage.atomic import write_error
+from storage.atomic import append_line
 
 
 def add_note(path: Path, step: int, text: str) -> None:
@@ -19,9 +19,4 @@ def add_note(path: Path, step: int, text: str) -> None:
         TrilightError: the folder is full or cannot be written.
     """
     line = json.dumps({"step": step, "at_unix_s": round(time.time()), "text": text})
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a") as stream:
-            stream.write(line + "\n")
-    except OSError as error:
-        raise write_error(path, error) from error
+    append_line(path, line)

@@ -1,8 +1,6 @@
 """Experiment `cycles`: Trilight's pictures compared with raw ones of Blender's Cycles."""
 
-import os
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,14 +8,12 @@ from numpy.typing import NDArray
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
 from infra.bench.experiments.frontier import adaptive
-from infra.bench.workloads.cycles import CyclesOptions, CyclesSamples, cycles_of_usd, cycles_picture
-from infra.bench.workloads.judged_pictures import difference_db, shrunk
-from infra.bench.workloads.mapped_scenes import SKIES, mapped_scene
-from infra.bench.workloads.named_scenes import given_scenes
-from infra.bench.workloads.shots import shots
+from infra.bench.workloads.cycles import render_with_cycles
+from infra.bench.workloads.judged_pictures import difference_db, shrink_reference
+from infra.bench.workloads.named_scenes import SKIES, given_scenes, mapped_scene
+from infra.bench.workloads.traced_pictures import render_shot
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera, raw_reference, true_error_db
-from pipeline.exchange.usd.write import write_usd
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import USUAL_FLOOR_DB
@@ -45,7 +41,9 @@ _MOST_SCENES = 10
 
 def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     kinds = [PLAIN, TEXTURED, SKY, *([GIVEN] if options.scenes else [])]
-    return [Point(name=kind, kind=kind, judged=False) for kind in kinds]
+    return [
+        Point(name=kind, measure=partial(_measure, kind), kind=kind, judged=False) for kind in kinds
+    ]
 
 
 def _scene(context: BenchContext, kind: str, index: int) -> Scene:
@@ -55,70 +53,47 @@ def _scene(context: BenchContext, kind: str, index: int) -> Scene:
         names = list(given_scenes(context.options.scenes))
         return context.scene(names[index % len(names)])
     name = f"surfaces {index}" if kind == TEXTURED else f"sky {SKIES[index % len(SKIES)]}"
-    scene = mapped_scene(context.child, name)
-    return scene
+    return mapped_scene(context.child, name)
 
 
-def _measure(
-    context: BenchContext, points: Sequence[Point], trial: str
-) -> Iterator[tuple[str, Figures]]:
+def _measure(kind: str, context: BenchContext, trial: str) -> Figures:
     spp = context.scale.max_spp
-    for point in points:
-        scene = _scene(context, point.name, int(trial.split()[-1]))
-        camera = first_camera(scene, RESOLUTION)
-        ours = context.child.call(raw_reference, scene, camera, OUR_SHARE * spp)
-        settings = adaptive(USUAL_FLOOR_DB, RESOLUTION, spp)
-        view = context.child.call(shots, scene, {"stated": settings})["stated"]
-        theirs = _cycles_samples(scene, spp, context.folder(), is_plain=point.name == PLAIN)
-        yield (
-            point.name,
-            {
-                "core_s": theirs.core_s,
-                **agreement_figures(ours, theirs),
-                **_stated_figures(view, ours, theirs),
-            },
-        )
+    scene = _scene(context, kind, int(trial.split()[-1]))
+    camera = first_camera(scene, RESOLUTION)
+    ours = context.child.call(raw_reference, scene, camera, OUR_SHARE * spp)
+    view = context.child.call(render_shot, scene, adaptive(USUAL_FLOOR_DB, RESOLUTION, spp))
+    pictures, core_s = render_with_cycles(scene, RESOLUTION, spp, seeds=(0, 1))
+    a_rgb, b_rgb = (picture.astype(np.float64) for picture in pictures)
+    theirs = RawReference(a_rgb=a_rgb, b_rgb=b_rgb)
+    return {
+        "core_s": core_s,
+        **agreement_figures(ours, theirs),
+        **_stated_figures(view, ours, theirs),
+    }
 
 
-def _cycles_samples(scene: Scene, spp: int, folder: Path, *, is_plain: bool) -> CyclesSamples:
-    """Return two raw pictures of Cycles, from a plain scene's arrays, else from its USD."""
-    options = CyclesOptions(
-        resolution=RESOLUTION, spp=spp, denoise=False, threads=os.cpu_count() or 1
-    )
-    if not is_plain:
-        usd = folder / "scene.usdc"
-        write_usd(usd, scene)
-        return cycles_of_usd(usd, options, (0, 1))
-    pictures = [cycles_picture(scene, 0, options.with_seed(seed)) for seed in (0, 1)]
-    return CyclesSamples(
-        pictures_rgb=tuple(each.radiance_rgb for each in pictures),
-        core_s=sum(each.core_s for each in pictures),
-    )
-
-
-def agreement_figures(ours: RawReference, theirs: CyclesSamples) -> dict[str, float]:
+def agreement_figures(ours: RawReference, theirs: RawReference) -> dict[str, float]:
     """Return the agreement of Trilight with Cycles in dB, also without the noise of both.
 
     All pictures have one exposure, so that nine tenths of the pixels are below EXPOSED; values
     above 1 count as 1.
     """
-    one, other = (picture.astype(np.float64) for picture in theirs.pictures_rgb)
-    level = float(np.quantile((one + other).mean(axis=-1) / 2, 0.9))
+    level = float(np.quantile((theirs.a_rgb + theirs.b_rgb).mean(axis=-1) / 2, 0.9))
     exposure = EXPOSED / level if level > 0 else 1.0
-    one = one * exposure
-    other = other * exposure
+    one = theirs.a_rgb * exposure
+    other = theirs.b_rgb * exposure
     ours = RawReference(a_rgb=ours.a_rgb * exposure, b_rgb=ours.b_rgb * exposure)
-    their_halves = RawReference(a_rgb=one, b_rgb=other)
+    theirs = RawReference(a_rgb=one, b_rgb=other)
     pixels_db = _linear_db(0.5 * (ours.a_rgb + ours.b_rgb), one)
     seeds_db = _linear_db(one, other)
     blocks = len(ours.a_rgb) // _BLOCK_PX
-    coarse = shrunk(ours, blocks), shrunk(their_halves, blocks)
+    coarse = shrink_reference(ours, blocks), shrink_reference(theirs, blocks)
     return {
         "pixels_db": pixels_db,
         "seeds_db": seeds_db,
         "margin_db": pixels_db - min(AIM_DB, seeds_db - 1),
         "blocks_db": _linear_db(*(0.5 * (half.a_rgb + half.b_rgb) for half in coarse)),
-        "noiseless_db": difference_db(ours, their_halves, clamped_radiance),
+        "noiseless_db": difference_db(ours, theirs, clamped_radiance),
         "brightness": 100 * float((ours.a_rgb + ours.b_rgb).mean() / (one + other).mean() - 1),
     }
 
@@ -128,14 +103,12 @@ def _linear_db(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
 
 
 def _stated_figures(
-    view: RenderedView, ours: RawReference, theirs: CyclesSamples
+    view: RenderedView, ours: RawReference, theirs: RawReference
 ) -> dict[str, float]:
     """Return a picture's stated error, and its true errors to Trilight's and Cycles' samples."""
-    one, other = (picture.astype(np.float64) for picture in theirs.pictures_rgb)
-    references = {"ours": ours, "theirs": RawReference(a_rgb=one, b_rgb=other)}
     everywhere = np.ones_like(view.hits)
     figures = {"stated_db": view.noise_floor_db}
-    for name, reference in references.items():
+    for name, reference in (("ours", ours), ("theirs", theirs)):
         error_db, _ = true_error_db(view.radiance_rgb, reference, log10_radiance, everywhere)
         figures[f"to_{name}_db"] = error_db
     return figures
@@ -170,6 +143,5 @@ EXPERIMENT = Experiment(
     trials=lambda scale, options: [
         f"scene {index}" for index in range(min(_MOST_SCENES, scale.scenes))
     ],
-    measure=_measure,
     needs=("blender",),
 )

@@ -7,6 +7,7 @@ denoising, whose noise cancels. The renderers are measured alternately on every 
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -20,17 +21,21 @@ from infra.bench.experiment import (
     Point,
     percent,
 )
-from infra.bench.workloads.cached_references import kept_reference
-from infra.bench.workloads.judged_pictures import figures, shrunk
-from infra.bench.workloads.named_scenes import given_scenes, sampled_trials
-from infra.bench.workloads.plain_mitsuba import PlainPicture, render_levels
-from infra.bench.workloads.shots import SEED, shots
+from infra.bench.workloads.judged_pictures import (
+    figures,
+    load_or_render_reference,
+    shrink_reference,
+)
+from infra.bench.workloads.named_scenes import given_scenes
+from infra.bench.workloads.traced_pictures import render_levels, render_shot
 from infra.bench_options import BenchOptions
+from infra.render.methods import SAMPLE_SEED
 from infra.render.raw_references import RawReference, first_camera, true_error_db
 from pipeline.builds.training import pretrain_256
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.settings import USUAL_FLOOR_DB, RenderSettings
 from storage.conventions import log10_radiance
+from storage.renderer import Image
 
 TARGETS_DB = (38.0, 42.0, 46.0, 50.0)
 STATED_PX = (64, 256)
@@ -54,11 +59,16 @@ def adaptive(target_db: float, resolution: int, max_spp: int) -> RenderSettings:
     )
 
 
+def plain_spps(scale: BenchScale) -> tuple[int, ...]:
+    """Return the numbers of samples of plain Mitsuba, up to four times our cap."""
+    return tuple(64 << step for step in range((4 * scale.max_spp // 64).bit_length()))
+
+
 def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     ours = [
         Point(
             name=f"trilight {target_db:.0f} dB",
-            settings=adaptive(target_db, scale.resolution, scale.max_spp),
+            measure=partial(_measure_ours, adaptive(target_db, scale.resolution, scale.max_spp)),
             default=target_db == pretrain_256().renders.noise_floor_db,
             kind=OURS,
         )
@@ -67,61 +77,70 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     stated = [
         Point(
             name=f"trilight {USUAL_FLOOR_DB:.0f} dB, {px} px",
-            settings=adaptive(USUAL_FLOOR_DB, px, scale.max_spp),
+            measure=partial(_measure_ours, adaptive(USUAL_FLOOR_DB, px, scale.max_spp)),
             judged=False,
             kind=STATED,
         )
         for px in STATED_PX
         if px != scale.resolution
     ]
-    # fixed numbers of samples up to four times our cap
-    doublings = range((4 * scale.max_spp // 64).bit_length())
     plain = [
-        Point(name=f"mitsuba {64 << step}", settings=64 << step, kind=PLAIN) for step in doublings
+        Point(name=f"mitsuba {spp}", measure=partial(_measure_plain, spp), kind=PLAIN)
+        for spp in plain_spps(scale)
     ]
     return [*ours, *stated, *plain]
 
 
 def _trials(scale: BenchScale, options: BenchOptions) -> list[str]:
-    return [*given_scenes(options.scenes), *sampled_trials(scale.scenes)]
+    sampled = [f"sampled {index}" for index in range(scale.scenes)]
+    return [*given_scenes(options.scenes), *sampled]
 
 
-def _measure(
-    context: BenchContext, points: Sequence[Point], trial: str
-) -> list[tuple[str, Figures]]:
-    scale = context.scale
+def _measure_ours(settings: RenderSettings, context: BenchContext, trial: str) -> Figures:
+    view = context.child.call(render_shot, context.scene(trial), settings)
+    judged = figures(view, shrink_reference(_reference(context, trial), settings.resolution))
+    costs_and_errors = {"core_s": view.core_s, "db": judged["log_true_db"], **judged}
+    if settings.resolution == context.scale.resolution:
+        levels = _plain_levels(context, trial).values()
+        steps = [(each["spp"], each["core_s"], each["db"]) for each in levels]
+        core_s, is_reached = cost_at_error(steps, costs_and_errors["db"])
+        costs_and_errors |= {"times": core_s / view.core_s, "bound": float(not is_reached)}
+    return costs_and_errors
+
+
+def _measure_plain(spp: int, context: BenchContext, trial: str) -> Figures:
+    return _plain_levels(context, trial)[spp]
+
+
+def _reference(context: BenchContext, trial: str) -> RawReference:
     scene = context.scene(trial)
     camera = first_camera(scene, REFERENCE_PX)
-    full_reference = kept_reference(context.child, scene, camera, scale.reference_spp)
-    reference = shrunk(full_reference, scale.resolution)
-    ours = {p.name: p.settings for p in points if isinstance(p.settings, RenderSettings)}
-    plain = [point for point in points if point.name not in ours]
-    taken = context.child.call(shots, scene, ours)
-    spps = tuple(point.settings for point in plain)
-    levels = context.child.call(render_levels, scene, scale.resolution, spps, SEED)
-    errors = [plain_figures(level, reference) for level in levels]
-    by_point: dict[str, Figures] = {
-        point.name: each for point, each in zip(plain, errors, strict=True)
-    }
-    steps = [(each["spp"], each["core_s"], each["db"]) for each in errors]
-    for name, view in taken.items():
-        judged = figures(view, shrunk(full_reference, ours[name].resolution))
-        costs_and_errors = {"core_s": view.core_s, "db": judged["log_true_db"], **judged}
-        if ours[name].resolution == scale.resolution:
-            core_s, is_reached = cost_at_error(steps, costs_and_errors["db"])
-            costs_and_errors |= {"times": core_s / view.core_s, "bound": float(not is_reached)}
-        by_point[name] = costs_and_errors
-    return [(point.name, by_point[point.name]) for point in points]
+    return load_or_render_reference(context.child, scene, camera, context.scale.reference_spp)
 
 
-def plain_figures(level: PlainPicture, reference: RawReference) -> dict[str, float]:
+def _plain_levels(context: BenchContext, trial: str) -> dict[int, dict[str, float]]:
+    """Return the figures of plain Mitsuba by samples per pixel, ascending."""
+
+    def render() -> dict[int, dict[str, float]]:
+        px = context.scale.resolution
+        spps = plain_spps(context.scale)
+        levels = context.child.call(render_levels, context.scene(trial), px, spps, SAMPLE_SEED)
+        reference = shrink_reference(_reference(context, trial), px)
+        return {
+            spp: plain_figures(level, reference) for spp, level in zip(spps, levels, strict=True)
+        }
+
+    return context.get_or_make(("plain", trial), render)
+
+
+def plain_figures(level: Image, reference: RawReference) -> dict[str, float]:
     """Return cost and true errors of a picture of plain Mitsuba."""
     everywhere = np.ones(level.radiance_rgb.shape[:2], np.bool_)
     db, open_db = true_error_db(level.radiance_rgb, reference, log10_radiance, everywhere)
     linear_db, _ = true_error_db(level.radiance_rgb, reference, clamped_radiance, everywhere)
     return {
-        "core_s": level.core_s,
-        "spp": float(level.spp),
+        "core_s": level.cpu_seconds or 0.0,
+        "spp": float(level.samples or 0),
         "db": db,
         "linear_true_db": linear_db,
         "log_open_db": open_db,
@@ -192,5 +211,4 @@ EXPERIMENT = Experiment(
     "intervals are over scenes. Caution is by how much a picture is better than stated.",
     points=_points,
     trials=_trials,
-    measure=_measure,
 )

@@ -1,8 +1,9 @@
 """Experiment `gpu`: throughput, correct pictures, and steps of every training preset on a GPU."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import (
@@ -13,19 +14,26 @@ from infra.bench.experiment import (
     Point,
     device_of,
 )
+from infra.bench.workloads.reading import time_reading
 from infra.bench_options import BenchOptions
 from storage.errors import TrilightError
-from train.runs import RUNS
+from train.runs import RUNS, named_run
+
+if TYPE_CHECKING:
+    import torch
 
 NETWORKS = ("builtin:tokens", "builtin:hits")
 _QUICK_RUNS = ("pretrain", "hits")
 _STEPS = {"full": 10, "quick": 3}
+READ_AS = "pretrain"
+"""Training preset whose augmentation is applied to samples that are read."""
+_BATCH = 8
 _READ_S = {"full": 10.0, "quick": 2.0}
 _PRODUCT_WIDTH = {"cuda": 8192, "cpu": 512}
 _COPIED_BYTES = {"cuda": 1 << 30, "cpu": 1 << 26}
 _THREADS = (1, 2, 4, 8, 16)
 
-Measured = Callable[[BenchContext], Figures]
+Measured = Callable[[BenchContext, "torch.device"], Figures]
 
 
 def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
@@ -44,10 +52,10 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
             for precision in precisions
         },
         **{f"step, {run}": partial(_step, run) for run in _runs(scale, options)},
-        "rendering a view": _rendering,
+        "rendering a view": lambda context, device: context.rendered[0],
         **{f"reading a sample, {count} threads": partial(_reading, count) for count in threads},
     }
-    return [Point(name=name, settings=measure) for name, measure in named.items()]
+    return [Point(name=name, measure=partial(_measure, name, part)) for name, part in named.items()]
 
 
 def _runs(scale: BenchScale, options: BenchOptions) -> Sequence[str]:
@@ -61,56 +69,44 @@ def _runs(scale: BenchScale, options: BenchOptions) -> Sequence[str]:
     return _QUICK_RUNS if scale.name == "quick" else [name for name in RUNS if RUNS.is_ours(name)]
 
 
-def _measure(
-    context: BenchContext, points: Sequence[Point], trial: str
-) -> Iterator[tuple[str, Figures]]:
-    """Measure point by point; a failed point has no figures, and a note with the reason."""
+def _measure(name: str, part: Measured, context: BenchContext, trial: str) -> Figures:
+    """Measure a part; one that fails has no figures, and a note with the reason."""
     import torch
 
     from infra.bench.gpu.probe import device_facts
 
-    context.note(device_facts(torch.device(device_of(context.options))))
-    for point in points:
-        try:
-            figures = point.settings(context)
-        except (RuntimeError, TrilightError) as error:  # those of CUDA and of torch's compiler too
-            context.note(f"{point.name} was not measured: {type(error).__name__}")
-            figures = {}
-        yield point.name, figures
+    device = torch.device(device_of(context.options))
+    context.note(device_facts(device))
+    try:
+        return part(context, device)
+    except (RuntimeError, TrilightError) as error:  # those of CUDA and of torch's compiler too
+        context.note(f"{name} was not measured: {type(error).__name__}")
+        return {}
 
 
-def _product(kind: str, context: BenchContext) -> Figures:
-    import torch
-
+def _product(kind: str, context: BenchContext, device: "torch.device") -> Figures:
     from infra.bench.gpu.probe import product_figures
 
-    device = device_of(context.options)
-    return product_figures(torch.device(device), kind, _PRODUCT_WIDTH[device])
+    return product_figures(device, kind, _PRODUCT_WIDTH[device.type])
 
 
-def _copy(kind: str, context: BenchContext) -> Figures:
-    import torch
-
+def _copy(kind: str, context: BenchContext, device: "torch.device") -> Figures:
     from infra.bench.gpu.probe import copy_figures
 
-    device = device_of(context.options)
-    return copy_figures(torch.device(device), kind, _COPIED_BYTES[device])
+    return copy_figures(device, kind, _COPIED_BYTES[device.type])
 
 
-def _picture(network: str, precision: str, context: BenchContext) -> Figures:
-    import torch
-
+def _picture(
+    network: str, precision: str, context: BenchContext, device: "torch.device"
+) -> Figures:
     from infra.bench.gpu.twin import twin_figures
 
-    return twin_figures(network, precision, torch.device(device_of(context.options)))
+    return twin_figures(network, precision, device)
 
 
-def _step(run: str, context: BenchContext) -> Figures:
-    import torch
-
+def _step(run: str, context: BenchContext, device: "torch.device") -> Figures:
     from infra.bench.gpu.steps import step_figures
 
-    device = torch.device(device_of(context.options))
     figures, parts = step_figures(run, _STEPS[context.scale.name], device)
     if not figures:
         context.note(f"{run}: too little memory, even for one scene a pass")
@@ -121,27 +117,24 @@ def _step(run: str, context: BenchContext) -> Figures:
     return figures
 
 
-def _rendering(context: BenchContext) -> Figures:
-    return _render_data(context)[0]
+def _reading(threads: int, context: BenchContext, device: "torch.device") -> Figures:
+    """Decode and augment samples as a training preset does."""
+    from train.data.stream import StreamSettings
 
-
-def _reading(threads: int, context: BenchContext) -> Figures:
-    from infra.bench.gpu.supply import read_figures
-
-    data = context.options.data or _render_data(context)[1]
-    seconds = _READ_S[context.scale.name]
-    return read_figures(data, threads, context.scale.picture_px, seconds)
-
-
-def _render_data(context: BenchContext) -> tuple[Figures, str]:
-    """Return the figures of rendering here, and a dataset of the rendered scenes."""
-    from infra.bench.gpu.supply import rendered_figures
-
-    def render() -> tuple[Figures, str]:
-        figures, data = rendered_figures(context.scale.picture_px, context.folder())
-        return figures, str(data)
-
-    return context.get_or_make("rendered", render)
+    run = named_run(READ_AS)
+    settings = StreamSettings(
+        seed=0,
+        window=run.shuffle_shards,
+        batch_size=_BATCH,
+        resolution=context.scale.picture_px,
+        views_per_scene=run.views_per_scene,
+        augmentation=run.augmentation,
+    )
+    least_s = _READ_S[context.scale.name]
+    seconds, core_s = time_reading(context.data, settings, threads, least_s=least_s)
+    return {
+        "ms": 1e3 * seconds, "views_per_s": run.views_per_scene / seconds, "core_s": core_s
+    }  # fmt: skip
 
 
 EXPERIMENT = Experiment(
@@ -166,6 +159,5 @@ EXPERIMENT = Experiment(
     "names no host, user or folder; to send it, attach it to an issue.",
     points=_points,
     trials=lambda scale, options: ["round 1"],
-    measure=_measure,
     needs=("torch",),
 )

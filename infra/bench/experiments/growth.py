@@ -1,6 +1,7 @@
 """Experiment `growth`: time and memory against scenes, objects, triangles and shards."""
 
-from collections.abc import Iterator, Sequence
+import tempfile
+from functools import partial
 from pathlib import Path
 
 from infra.bench.context import BenchContext
@@ -13,7 +14,7 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     return [
         Point(
             name=f"{name}, {size:,} {work.unit}",
-            settings=(name, size),
+            measure=partial(_measure, name, size),
             kind=f"{name}, {work.unit}",
             size=float(size),
         )
@@ -22,23 +23,19 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     ]
 
 
-def _measure(
-    context: BenchContext, points: Sequence[Point], trial: str
-) -> Iterator[tuple[str, Figures]]:
+def _measure(name: str, size: int, context: BenchContext, trial: str) -> Figures:
+    root = context.get_or_make("root", lambda: _folder_with_sample(context))
+    return measure_work(name, size, Path(tempfile.mkdtemp(dir=root)))
+
+
+def _folder_with_sample(context: BenchContext) -> Path:
+    """Return a folder with the files of one rendered scene, which the shards repeat."""
     root = context.folder()
-    _keep_sample(context, root / "sample")
-    for row, point in enumerate(points):
-        folder = root / str(row)
-        folder.mkdir()
-        name, size = point.settings
-        yield point.name, measure_work(name, size, folder)
-
-
-def _keep_sample(context: BenchContext, folder: Path) -> None:
-    """Write the files of one rendered scene, which the shards repeat under many keys."""
-    folder.mkdir()
-    for name, data in context.members()[0].items():
-        (folder / name).write_bytes(data)
+    (root / "sample").mkdir()
+    _, members = context.rendered
+    for name, data in members[0].items():
+        (root / "sample" / name).write_bytes(data)
+    return root
 
 
 EXPERIMENT = Experiment(
@@ -52,6 +49,5 @@ EXPERIMENT = Experiment(
     because="Seconds are on the clock; memory is that of the process and its children.",
     points=_points,
     trials=rounds,
-    measure=_measure,
     needs=("torch",),
 )

@@ -4,18 +4,15 @@ It reads rendered scenes of `smoke`, each under many keys so that there are enou
 `--data`.
 """
 
-import itertools
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import closing
+from functools import partial
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, rounds
-from infra.bench.workloads.manifests import write_copies
-from infra.bench.workloads.packed_samples import LAYOUTS, unpacking_figures
+from infra.bench.workloads.reading import LAYOUTS, time_reading, unpacking_figures
 from infra.bench_options import BenchOptions
 from storage.dataset.settings import StorageSettings
-from storage.dataset.training_data import TrainingData, open_training_data
+from storage.dataset.training_data import TrainingData
+from storage.records.sample import decode_sample
 
 UNPACK = "unpacking, one thread"
 TRAIN = "batches as training reads them"
@@ -34,48 +31,35 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     unpacked = [
         Point(
             name=f"unpack, {layout}",
-            settings=layout,
+            measure=partial(_unpack, layout),
             default=layout == StorageSettings.profile,
             group=UNPACK,
         )
         for layout in LAYOUTS
     ]
     read = [
-        Point(name=f"batches, {threads} threads", settings=threads, group=TRAIN)
+        Point(name=f"batches, {threads} threads", measure=partial(_read, threads), group=TRAIN)
         for threads in THREADS
     ]
     return [*unpacked, *read]
 
 
-def _measure(
-    context: BenchContext, points: Sequence[Point], trial: str
-) -> Iterator[tuple[str, Figures]]:
-    data, count = context.get_or_make("data", lambda: _training_data(context))
-    for point in points:
-        if point.group == UNPACK:
-            figures = unpacking_figures(context.samples, point.settings, context.folder())
-        else:
-            figures = read_figures(data, count, point.settings)
-        yield point.name, figures
+def _unpack(layout: str, context: BenchContext, trial: str) -> Figures:
+    _, members = context.rendered
+    samples = [decode_sample(str(row), files) for row, files in enumerate(members)]
+    return unpacking_figures(samples, layout, context.folder())
 
 
-def _training_data(context: BenchContext) -> tuple[TrainingData, int]:
-    """Return the data to read, and the number of samples to read."""
-    if context.options.data:
-        data = open_training_data([context.options.data])
-        shards = data.split("train")
-        held = sum(shards.num_samples(number) for number in range(len(shards.names)))
-        return data, max(BATCH, min(_SAMPLES * context.scale.repeats, held))
-    root = context.folder()
-    count = write_copies(root, context.members())
-    return open_training_data([str(root)]), count
+def _read(threads: int, context: BenchContext, trial: str) -> Figures:
+    shards = context.data.split("train")
+    held = sum(shards.num_samples(number) for number in range(len(shards.names)))
+    count = max(BATCH, min(_SAMPLES * context.scale.repeats, held))
+    return read_figures(context.data, count, threads)
 
 
 def read_figures(data: TrainingData, count: int, threads: int) -> Figures:
     """Read samples as training does, without the network."""
-    from train.data.bad_samples import BadSampleCounter
-    from train.data.order import RankSlice
-    from train.data.stream import StreamSettings, stream_batches
+    from train.data.stream import StreamSettings
 
     settings = StreamSettings(
         seed=0,
@@ -84,23 +68,8 @@ def read_figures(data: TrainingData, count: int, threads: int) -> Figures:
         resolution=RESOLUTION,
         views_per_scene=min(_VIEWS, data.num_views or _VIEWS),
     )
-    began = time.perf_counter()
-    core_began = time.process_time()
-    stream = stream_batches(
-        data.split("train"),
-        settings,
-        0,
-        rank_slice=RankSlice(),
-        workers=threads,
-        unusable=BadSampleCounter(0),
-    )
-    with closing(stream) as batches:
-        for _ in itertools.islice(batches, count // BATCH):
-            pass
-    return {
-        "sample_ms": 1000 * (time.perf_counter() - began) / count,
-        "core_ms": 1000 * (time.process_time() - core_began) / count,
-    }
+    seconds, core_s = time_reading(data, settings, threads, least_count=count)
+    return {"sample_ms": 1000 * seconds, "core_ms": 1000 * core_s}
 
 
 EXPERIMENT = Experiment(
@@ -119,7 +88,6 @@ EXPERIMENT = Experiment(
     "those of our exporter, read without any check.",
     points=_points,
     trials=rounds,
-    measure=_measure,
     warm_up=True,
     needs=("torch",),
 )

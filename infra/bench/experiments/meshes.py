@@ -1,12 +1,18 @@
 """Experiment `meshes`: decimation methods, RenderFormer's recipe, and every budget of triangles."""
 
-from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, percent
-from infra.bench.workloads import remeshing
-from infra.bench.workloads.mesh_pictures import coarser, picture_db
-from infra.bench.workloads.shots import fixed_samples
+from infra.bench.workloads.coarser_meshes import (
+    METHODS,
+    REFERENCE,
+    make_coarser_meshes,
+    picture_db,
+    remesh,
+)
+from infra.bench.workloads.traced_pictures import fixed_samples
 from infra.bench_options import BenchOptions
 from pipeline.assets.settings import AssetSettings
 from storage.errors import Rejected
@@ -26,17 +32,17 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     methods = [
         Point(
             name=f"{METHOD_GROUP}, {method}",
-            settings=(method, BUDGET),
+            measure=partial(_simplify, method, BUDGET),
             default=method == AssetSettings.profile,
             group=METHOD_GROUP,
             kind="methods",
         )
-        for method in (remeshing.REFERENCE, *remeshing.METHODS)
+        for method in (REFERENCE, *METHODS)
     ]
     budgets = [
         Point(
             name=f"{BUDGET_GROUP}, {budget}",
-            settings=("faithful", budget),
+            measure=partial(_simplify_and_render, budget),
             group=BUDGET_GROUP,
             kind="budgets",
         )
@@ -45,28 +51,37 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     return [*methods, *budgets]
 
 
-def _measure(
-    context: BenchContext, points: Sequence[Point], trial: str
-) -> Iterator[tuple[str, Figures]]:
-    """Measure one object with every method, and its pictures if it is path traced."""
-    number = int(trial.split()[-1])
-    scale = context.scale
+def _simplify(method: str, budget: int, context: BenchContext, trial: str) -> Figures:
+    return context.mesh_child.call(remesh, _object(context, trial), method, budget)
+
+
+def _simplify_and_render(budget: int, context: BenchContext, trial: str) -> Figures:
+    """Measure `faithful` at a budget, with pictures if the object is path traced."""
+    figures = _simplify("faithful", budget, context, trial)
+    if _number(trial) > PICTURED:
+        return figures
+    pictures = context.get_or_make(("pictures", trial), lambda: _picture_db(context, trial))
+    return {
+        **figures, "picture_db": pictures[CURVE.index(budget)], "again_db": pictures[-1]
+    }  # fmt: skip
+
+
+def _picture_db(context: BenchContext, trial: str) -> list[float]:
+    method = METHODS["faithful"]
+    meshes = context.mesh_child.call(make_coarser_meshes, _object(context, trial), CURVE, method)
+    renders = fixed_samples(context.scale.picture_px, context.scale.max_spp // 4)
+    return context.child.call(picture_db, meshes, renders)
+
+
+def _object(context: BenchContext, trial: str) -> Path:
     large = [path for path, faces in context.mesh_files if faces >= LARGE]
-    if number > len(large):
+    if _number(trial) > len(large):
         raise Rejected("no_object", f"only {len(large)} objects have {LARGE} triangles")
-    path = large[number - 1]
-    pictures = list[float]()
-    if number <= PICTURED:
-        method = remeshing.METHODS["faithful"]
-        meshes = context.mesh_child.call(coarser, path, CURVE, method)
-        renders = fixed_samples(scale.picture_px, scale.max_spp // 4)
-        pictures = context.child.call(picture_db, meshes, renders)
-    for point in points:
-        figures = dict(context.mesh_child.call(remeshing.remesh, path, *point.settings))
-        if pictures and point.group == BUDGET_GROUP:
-            figures["picture_db"] = pictures[CURVE.index(point.settings[1])]
-            figures["again_db"] = pictures[-1]
-        yield point.name, figures
+    return large[_number(trial) - 1]
+
+
+def _number(trial: str) -> int:
+    return int(trial.split()[-1])
 
 
 EXPERIMENT = Experiment(
@@ -92,5 +107,4 @@ EXPERIMENT = Experiment(
     "for uses that need even triangles, at more error and more time.",
     points=_points,
     trials=lambda scale, options: [f"object {number}" for number in range(1, scale.objects + 1)],
-    measure=_measure,
 )

@@ -1,12 +1,13 @@
 """Experiment `methods`: cost against true error, from pure networks to the path tracer."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
-from infra.bench.workloads.cached_references import kept_reference
+from infra.bench.workloads.judged_pictures import load_or_render_reference
 from infra.bench_options import BenchOptions
 from infra.render.held_out_scenes import TRIANGLES, held_out_build, held_out_scene
 from infra.render.methods import (
@@ -52,6 +53,7 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     return [
         Point(
             name=row_name(px, name),
+            measure=partial(_measure, px, name),
             group=f"{px} px",
             kind=kind_of(name),
             rival=None if name == first else row_name(px, first),
@@ -61,35 +63,34 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     ]
 
 
-def _measure(
-    context: BenchContext, points: Sequence[Point], trial: str
-) -> Iterator[tuple[str, Figures]]:
+def _measure(px: int, name: str, context: BenchContext, trial: str) -> Figures:
     renderers, child = context.get_or_make("methods", lambda: _set_up(context))
-    scene = held_out_scene(child, int(trial.split()[-1]))
-    for px in WIDTHS:
-        camera = first_camera(scene, px)
-        reference = kept_reference(child, scene, camera, 2 * context.scale.max_spp)
-        for renderer in renderers[px]:
-            figures = judged_figures(renderer, scene, reference)
-            yield row_name(px, renderer.name), figures
+    index = int(trial.split()[-1])
+    scene = context.get_or_make(("scene", trial), lambda: held_out_scene(child, index))
+    reference = load_or_render_reference(
+        child, scene, first_camera(scene, px), 2 * context.scale.max_spp
+    )
+    return judged_figures(renderers[px, name], scene, reference)
 
 
-def _set_up(context: BenchContext) -> tuple[Mapping[int, Sequence[Renderer]], IsolatedChild]:
-    """Return the renderers at each width, and a child that composes scenes and references."""
+def _set_up(
+    context: BenchContext,
+) -> tuple[Mapping[tuple[int, str], Renderer], IsolatedChild]:
+    """Return the renderers by width and name, and a child that composes scenes and references."""
     from model.neural_renderer import NeuralRenderer
 
     paths = context.options.checkpoint
     paths_by_label = dict(zip(network_labels(paths), paths, strict=True))
     networks = {}
-    for label, path in (
-        dict(zip(BUILTIN_NETWORKS, BUILTIN_NETWORKS, strict=True)) | paths_by_label
-    ).items():
+    for label, path in ({each: each for each in BUILTIN_NETWORKS} | paths_by_label).items():
         network = NeuralRenderer.load(path, device="cpu")
         networks[network_name(label)] = network
         context.note(f"{network_name(label)} is {network.digest[:8]}")
     context.note(f"differences are to {network_name(network_labels(paths)[0])}")
     child = context.until_closed(RenderChild(choose_variant(), threads=1))
-    renderers = {px: compared_renderers(px, networks, child) for px in WIDTHS}
+    renderers = {
+        (px, each.name): each for px in WIDTHS for each in compared_renderers(px, networks, child)
+    }
     return renderers, context.render_child(held_out_build(), BENCHMARK, threads=1)
 
 
@@ -136,6 +137,5 @@ EXPERIMENT = Experiment(
     "them. Differences are view by view, with the 95 % interval of their mean over scenes.",
     points=_points,
     trials=lambda scale, options: [f"held-out {index}" for index in range(scale.scenes)],
-    measure=_measure,
     needs=("torch",),
 )

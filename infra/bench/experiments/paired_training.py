@@ -1,6 +1,7 @@
 """Experiment `paired-training`: two trainings with different settings and equal seeds."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 from infra.bench.context import BenchContext
@@ -16,7 +17,6 @@ from infra.bench_options import BenchOptions
 from storage.errors import Rejected, TrilightError
 
 if TYPE_CHECKING:
-    from infra.bench.workloads.trainings import TrainingScenes
     from train.settings import TrainSettings
 
 SIDE_A = "a"
@@ -45,8 +45,8 @@ def settings_of(side: str, seed: int, scale: BenchScale, options: BenchOptions) 
 
 def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     return [
-        Point(name=SIDE_A, kind=SIDE_A, default=True),
-        Point(name=SIDE_B, kind=SIDE_B, rival=SIDE_A),
+        Point(name=SIDE_A, measure=partial(_measure, SIDE_A), kind=SIDE_A, default=True),
+        Point(name=SIDE_B, measure=partial(_measure, SIDE_B), kind=SIDE_B, rival=SIDE_A),
     ]
 
 
@@ -63,28 +63,26 @@ def scene_of(trial: str) -> str:
     return trial.partition(", ")[2]
 
 
-def _measure(
-    context: BenchContext, points: Sequence[Point], trial: str
-) -> Iterator[tuple[str, Figures]]:
+def _measure(side: str, context: BenchContext, trial: str) -> Figures:
     seed, scene = (int(part.split()[1]) for part in trial.split(", "))
-    for point in points:
-        key = (point.name, seed)
-        scenes = context.get_or_make(key, lambda key=key: _train(context, *key))  # type: ignore[misc]
-        if scene >= len(scenes):
-            raise Rejected("no_scene", f"the validation split has {len(scenes)} scenes")
-        yield point.name, scenes[scene]
+    scenes = context.get_or_make((side, seed), lambda: _train(context, side, seed))
+    if scene >= len(scenes):
+        raise Rejected("no_scene", f"the validation split has {len(scenes)} scenes")
+    return scenes[scene]
 
 
-def _train(context: BenchContext, side: str, seed: int) -> Sequence[Mapping[str, float]]:
+def _train(context: BenchContext, side: str, seed: int) -> Sequence[Figures]:
+    """Train one side, and return the figures of each judged scene."""
     import torch
 
-    from infra.bench.workloads.trainings import training_figures
+    from infra.bench.workloads.trainings import scenes_of, training_figures
     from train.loop.distributed import choose_device
 
     options = context.options
     settings = settings_of(side, seed, context.scale, options)
+    px = settings.resolution
     scenes = context.get_or_make(
-        ("scenes", settings.resolution), lambda: _scenes(context, settings)
+        ("scenes", px), lambda: scenes_of(options.data or "", context.scale.held_out, px)
     )
     context.note(scenes.about)
     side_changes = options.set_a if side == SIDE_A else options.set_b
@@ -93,12 +91,6 @@ def _train(context: BenchContext, side: str, seed: int) -> Sequence[Mapping[str,
     if device_of(options) == "cpu":
         torch.set_num_threads(context.cores)
     return training_figures(scenes, settings, choose_device(device_of(options)))
-
-
-def _scenes(context: BenchContext, settings: "TrainSettings") -> "TrainingScenes":
-    from infra.bench.workloads.trainings import scenes_of
-
-    return scenes_of(context.options.data or "", context.scale.held_out, settings.resolution)
 
 
 EXPERIMENT = Experiment(
@@ -120,7 +112,6 @@ EXPERIMENT = Experiment(
     "bootstrapped over scenes: it says nothing of other seeds where there are few.",
     points=_points,
     trials=_trials,
-    measure=_measure,
     cluster=scene_of,
     needs=("torch", "data"),
 )

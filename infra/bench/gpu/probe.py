@@ -1,15 +1,13 @@
 """Description and throughput of a device: matrix products by type, and memory copies."""
 
-import shutil
-import subprocess
 import time
 from collections.abc import Callable
 
 import torch
 
 from model.precision import fast_float32_products
+from pipeline.renders.visible_gpus import query_gpus
 
-_ANSWER_S = 60
 REPEATS = 5
 
 
@@ -18,23 +16,11 @@ def device_facts(device: torch.device) -> str:
     if device.type != "cuda":
         return f"no GPU: torch {torch.__version__} with {torch.get_num_threads()} threads"
     properties = torch.cuda.get_device_properties(device)
+    driver = next(iter(query_gpus("driver_version")), "unknown")
     return (
         f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, torch {torch.__version__}, "
-        f"CUDA {torch.version.cuda}, driver {_driver(device.index or 0)}"
+        f"CUDA {torch.version.cuda}, driver {driver}"
     )
-
-
-def _driver(index: int) -> str:
-    smi = shutil.which("nvidia-smi")
-    if smi is None:
-        return "unknown"
-    command = [smi, f"--id={index}", "--query-gpu=driver_version", "--format=csv,noheader"]
-    try:
-        return subprocess.run(
-            command, capture_output=True, text=True, timeout=_ANSWER_S, check=True
-        ).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
 
 
 def product_figures(device: torch.device, kind: str, width: int) -> dict[str, float]:
@@ -48,7 +34,7 @@ def product_figures(device: torch.device, kind: str, width: int) -> dict[str, fl
     dtype = torch.float32 if kind == "tf32" else getattr(torch, kind)
     matrix = torch.randn(width, width, device=device).to(dtype)
     with fast_float32_products(device, enabled=kind == "tf32"):
-        seconds = best_s(lambda: matrix @ matrix, device)
+        seconds = min(time_calls(lambda: matrix @ matrix, device))
     return {"ms": 1e3 * seconds, "teraflop_per_s": 2 * width**3 / seconds / 1e12}
 
 
@@ -66,25 +52,21 @@ def copy_figures(device: torch.device, kind: str, size: int) -> dict[str, float]
     else:
         source = torch.zeros(size, dtype=torch.uint8)
         source = source.pin_memory() if kind == "to_pinned" else source
-    seconds = best_s(lambda: target.copy_(source, non_blocking=kind == "to_pinned"), device)
+    non_blocking = kind == "to_pinned"
+    seconds = min(time_calls(lambda: target.copy_(source, non_blocking=non_blocking), device))
     moved = 2 * size if kind == "within" else size
     return {"ms": 1e3 * seconds, "gigabyte_per_s": moved / seconds / 1e9}
 
 
-def best_s(work: Callable[[], object], device: torch.device, repeats: int = REPEATS) -> float:
-    """Return the seconds of the fastest of several calls, after a warm-up call."""
-    work()
-    wait_for(device)
+def time_calls(
+    work: Callable[[], object], device: torch.device, repeats: int = REPEATS, *, warm_up: int = 1
+) -> list[float]:
+    """Return the seconds of several calls until the device is done, after some that warm it up."""
     times = []
-    for _ in range(repeats):
+    for _ in range(warm_up + repeats):
         began = time.perf_counter()
         work()
-        wait_for(device)
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
         times.append(time.perf_counter() - began)
-    return min(times)
-
-
-def wait_for(device: torch.device) -> None:
-    """Wait until a device has finished its queue."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+    return times[warm_up:]

@@ -5,7 +5,6 @@ to certain weights, named by their digest: after another training of a built-in 
 infra.bench.gpu.twin` renders them again.
 """
 
-import time
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from infra.bench.gpu.probe import time_calls
 from infra.bench.workloads.cost_scene import cost_scene
 from model.neural_renderer import NeuralRenderer
 from model.open import BUILTIN_NETWORKS
@@ -74,11 +74,9 @@ def _render(
     pose = scene.c2w[0]
     fov = float(scene.fov_deg[0])
     picture = renderer.view(prepared, pose, fov, PX)
-    times = []
-    for _ in range(MORE_VIEWS):
-        began = time.perf_counter()
-        renderer.view(prepared, pose, fov, PX)  # its picture is on the host when it returns
-        times.append(time.perf_counter() - began)
+    times = time_calls(
+        lambda: renderer.view(prepared, pose, fov, PX), device, MORE_VIEWS, warm_up=0
+    )
     return np.asarray(picture, np.float64), float(np.median(times))
 
 

@@ -5,6 +5,7 @@ a comparison installs it from the package index into the user's cache, and only 
 imports it (infra.bench.workloads.blender_process).
 """
 
+import os
 import shutil
 import subprocess
 import sys
@@ -23,6 +24,7 @@ PYTHON = "3.11"
 """Only version of Python that the wheel supports."""
 
 _INSTALL_S = 1800
+_RENDER_S = 4 * 3600
 _PROBE = f"import bpy; assert bpy.app.version_string.startswith({BLENDER!r})"
 _READY = "ready"
 
@@ -52,6 +54,19 @@ def blender_python() -> Path:
     return python
 
 
+def run_blender(script: Path, folder: Path) -> None:
+    """Run a script with a folder as its argument in the Python of Blender.
+
+    Files that Blender writes by itself stay in the folder.
+
+    Raises:
+        TrilightError: as `blender_python`, or the script failed.
+    """
+    command = [str(blender_python()), "-I", str(script), str(folder)]
+    homes = {"HOME": str(folder), "BLENDER_USER_RESOURCES": str(folder)}
+    _run(f"run {script.name}", command, timeout_s=_RENDER_S, **homes)
+
+
 def _folder() -> Path:
     return cache_folder("cycles") / f"bpy-{BLENDER}"
 
@@ -70,10 +85,16 @@ def _base_python() -> str:
     return python
 
 
-def _run(step: str, command: list[str]) -> None:
+def _run(step: str, command: list[str], *, timeout_s: int = _INSTALL_S, **more: str) -> None:
+    """Run a command, with more variables of the environment; raises TrilightError if it fails."""
     try:
         result = subprocess.run(
-            command, capture_output=True, text=True, timeout=_INSTALL_S, check=False
+            command,
+            env={**os.environ, **more},
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise _unavailable(f"could not {step} ({type(error).__name__})") from error

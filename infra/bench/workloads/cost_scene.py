@@ -6,6 +6,8 @@ ones on a ring, and share one power. So surfaces, materials and camera always ag
 """
 
 import math
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,44 +46,61 @@ def cost_scene(num_triangles: int, num_lights: int) -> Scene:
     """
     rng = rng_for(0, "cost scene")
     shell = [
-        shell_piece(_wall(name, corners), rng, _SMOOTH_ANGLE_DEG) for name, corners in _ROOM.items()
+        shell_piece(quad(name, corners, plain_surface(0.5, 0.3, 0.5)), rng, _SMOOTH_ANGLE_DEG)
+        for name, corners in _ROOM.items()
     ]
     for_objects = num_triangles - 2 * len(_ROOM) - num_lights
     objects = [
-        _object("box", 0.3, for_objects // 2, (0.35, 0.1, 0.36), _surface(0.05, 0.9, 0.05), rng),
-        _object("egg", 1.0, for_objects // 2, (-0.4, 0.0, 0.36), _surface(0.6, 0.3, 0.6), rng),
+        _object(
+            "box", 0.3, for_objects // 2, (0.35, 0.1, 0.36), plain_surface(0.05, 0.9, 0.05), rng
+        ),
+        _object("egg", 1.0, for_objects // 2, (-0.4, 0.0, 0.36), plain_surface(0.6, 0.3, 0.6), rng),
     ]
     emitters = [emitter_piece(_light(row, num_lights), row) for row in range(num_lights)]
-    pieces = [*shell, *objects, *emitters]
     pose = look_at_c2w(eye=(1.4, -2.2, 1.3), target=(0, 0, 0.35), up=(0, 0, 1))
+    provenance = {"template": "cost", "scene_index": 0, "attempt": 0, "seed": 0}
+    return scene_of_pieces([*shell, *objects, *emitters], pose, 40.0, provenance)
+
+
+def scene_of_pieces(
+    pieces: Sequence[ScenePiece],
+    pose: NDArray[np.float64],
+    fov_deg: float,
+    provenance: Mapping[str, Any],
+) -> Scene:
+    """Return a checked scene of pieces with one camera."""
     scene = Scene(
         **concatenate_pieces(pieces),
         c2w=pose[None].astype(np.float32),
-        fov_deg=np.array([40.0], np.float32),
+        fov_deg=np.array([fov_deg], np.float32),
         objects=tuple(piece.entry for piece in pieces),
-        provenance={"template": "cost", "scene_index": 0, "attempt": 0, "seed": 0},
+        provenance=provenance,
     )
     scene.check()
     return scene
 
 
-def _surface(diffuse: float, specular: float, roughness: float) -> SurfaceLook:
+def plain_surface(
+    diffuse: float, specular: float, roughness: float, *, smooth: bool = True
+) -> SurfaceLook:
+    """Return a gray surface of one color."""
     return SurfaceLook(
         diffuse_scale=diffuse,
         diffuse_rgb=(diffuse, diffuse, diffuse),
         specular_rgb=(specular, specular, specular),
         roughness=roughness,
-        smooth=True,
+        smooth=smooth,
         colours="one",
     )
 
 
-def _wall(name: str, corners: ArrayLike) -> ShellPart:
+def quad(name: str, corners: ArrayLike, surface: SurfaceLook) -> ShellPart:
+    """Return a part of the shell of two triangles; `corners` [4, 3] go around it."""
     return ShellPart(
         name=name,
         positions=np.asarray(corners, np.float64),
         faces=np.array([[0, 1, 2], [0, 2, 3]], np.uint32),
-        surface=_surface(0.5, 0.3, 0.5),
+        surface=surface,
     )
 
 

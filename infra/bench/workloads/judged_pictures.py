@@ -1,14 +1,49 @@
-"""Stated errors of pictures, compared with true errors to raw references (infra.render)."""
+"""Raw references (infra.render), and stated errors of pictures compared with true ones.
+
+References cost a hundred times the pictures that they judge, and are cached. The cache holds
+float32 numbers, and a new reference is rounded to them, too, so that a figure does not depend on
+whether its reference was cached.
+"""
 
 import numpy as np
-from numpy.typing import NDArray
+from safetensors.numpy import load, save
 
-from infra.render.raw_references import LEAST_ERROR, RawReference, true_error_db
+from infra.render.raw_references import LEAST_ERROR, RawReference, raw_reference, true_error_db
+from pipeline.isolation import IsolatedChild
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.noise_floor import Curve, clamped_radiance, secant_slope
 from pipeline.renders.results import RenderedView
+from storage.atomic import write_atomically
+from storage.cache import cache_folder
 from storage.conventions import log10_radiance
+from storage.digests import canonical_json, sha256_hex
+from storage.records.scene import Scene
+from storage.records.scene_file import scene_digest
 
 _CURVES = {"log": log10_radiance, "linear": clamped_radiance, "object": log10_radiance}
+
+
+def load_or_render_reference(
+    child: IsolatedChild, scene: Scene, camera: PixelCamera, spp: int
+) -> RawReference:
+    """Return two halves of raw samples of a view, from the cache or rendered by a child.
+
+    Args:
+        child: render child.
+        scene: scene that passes `Scene.check`.
+        camera: camera of the view.
+        spp: samples per pixel of both halves together, a multiple of 128.
+    """
+    view = [camera.c2w.tolist(), camera.fov_deg, camera.resolution, spp]
+    name = sha256_hex(canonical_json([scene_digest(scene), *view]))
+    path = cache_folder("raw-references") / f"{name}.safetensors"
+    if not path.is_file():
+        made = child.call(raw_reference, scene, camera, spp)
+        halves = {"a": made.a_rgb.astype(np.float32), "b": made.b_rgb.astype(np.float32)}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, save(halves))
+    stored = load(path.read_bytes())
+    return RawReference(a_rgb=stored["a"].astype(np.float64), b_rgb=stored["b"].astype(np.float64))
 
 
 def figures(view: RenderedView, reference: RawReference) -> dict[str, float]:
@@ -51,16 +86,9 @@ def difference_db(ours: RawReference, theirs: RawReference, curve: Curve) -> flo
     return float(-10 * np.log10(max((weight * product).mean(), LEAST_ERROR)))
 
 
-def shrunk(reference: RawReference, resolution: int) -> RawReference:
+def shrink_reference(reference: RawReference, resolution: int) -> RawReference:
     """Return a reference of a smaller width, which divides the reference's."""
-    return RawReference(
-        a_rgb=_block_means(reference.a_rgb, resolution),
-        b_rgb=_block_means(reference.b_rgb, resolution),
-    )
-
-
-def _block_means(picture: NDArray[np.float64], resolution: int) -> NDArray[np.float64]:
-    size = len(picture) // resolution
-    blocks = picture.reshape(resolution, size, resolution, size, 3)
-    means: NDArray[np.float64] = blocks.mean(axis=(1, 3))
-    return means
+    halves = np.stack([reference.a_rgb, reference.b_rgb])
+    size = halves.shape[1] // resolution
+    blocks = halves.reshape(2, resolution, size, resolution, size, 3).mean(axis=(2, 4))
+    return RawReference(a_rgb=blocks[0], b_rgb=blocks[1])

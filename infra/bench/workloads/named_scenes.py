@@ -1,35 +1,41 @@
-"""Scenes of the experiments on pictures: fixed sampled ones, and those of the user."""
+"""Scenes of the experiments on pictures: fixed ones, plain or mapped, and those of the user."""
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 
 from infra.render.held_out_scenes import first_composed
-from pipeline.assets.settings import AssetSettings
-from pipeline.builds.training import smoke
+from pipeline.builds.training import smoke, textured_256
 from pipeline.exchange.gltf.read import SUFFIXES as GLTF_SUFFIXES
-from pipeline.exchange.gltf.read import read_gltf
-from pipeline.exchange.scene_files import build_scene
-from pipeline.generation.scene_worker import MAX_ATTEMPTS, SceneWorker
+from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.isolation import IsolatedChild
-from pipeline.objects.licences import USER_PROVIDED
+from scene_templates.settings import SceneSettings
 from storage.errors import TrilightError
-from storage.records.sample import Sample
 from storage.records.scene import Scene
+from storage.settings.changes import changed
 
-MakeScene = Callable[[IsolatedChild], Scene]
-"""Function that makes a scene in a render child."""
+SKIES = ("sun_and_sky", "clouds", "softboxes", "night")
+"""Families of skies; the first has a sharp sun."""
+
+_SEEN = ("sun_and_sky", "softboxes")
+"""Families of skies that are visible to cameras."""
+
+_MAPPED_SEED = 20_261_125
+_SKY_ROWS = 128
+
+_ROUGH = (0.4, 1.0)
+_CALM = {
+    "num_views": 1,
+    "textures.share": 0.8,
+    "textures.surfaces.roughness_clip": _ROUGH,
+    "materials.roughness_clip": _ROUGH,
+}
+"""Changes that leave out mirrors, whose caustics would be too noisy for a comparison."""
 
 
-def sampled_trials(count: int) -> list[str]:
-    """Return the names of the first sampled scenes."""
-    return [f"sampled {index}" for index in range(count)]
-
-
-def given_scenes(folder: Path | None) -> Mapping[str, MakeScene]:
-    """Return the scenes of a folder of RenderFormer and glTF files by name; empty for no folder.
+def given_scenes(folder: Path | None) -> Mapping[str, Path]:
+    """Return the RenderFormer and glTF files of a folder by the name of their scene.
 
     Raises:
         TrilightError: the folder holds neither a glTF file nor a JSON file of a scene.
@@ -37,16 +43,18 @@ def given_scenes(folder: Path | None) -> Mapping[str, MakeScene]:
     if folder is None:
         return {}
     root = folder.resolve()
-    names = [path.name for path in sorted(root.glob("*.json")) if _holds_a_scene(path)]
     trees = [path for suffix in GLTF_SUFFIXES for path in sorted(root.glob(f"*{suffix}"))]
-    if not names and not trees:
+    described = [path for path in sorted(root.glob("*.json")) if _holds_a_scene(path)]
+    if not described and not trees:
         raise TrilightError(
             f"--scenes {folder}: it holds no scene; expected RenderFormer scenes (*.json) or glTF."
         )
-    scenes: dict[str, MakeScene] = {path.name: partial(_call, _gltf_scene, path) for path in trees}
-    return scenes | {
-        Path(name).stem: partial(_call, _described_scene, root, name) for name in names
-    }
+    return {path.name: path for path in trees} | {path.stem: path for path in described}
+
+
+def read_given(path: Path) -> Scene:
+    """Return the scene of a file, as `trilight render` reads it; runs in a render child."""
+    return load_source(scene_source(str(path))).scene
 
 
 def sampled_scene(child: IsolatedChild, scene_index: int) -> Scene:
@@ -59,36 +67,29 @@ def sampled_scene(child: IsolatedChild, scene_index: int) -> Scene:
     return first_composed(child, settings, scene_index)
 
 
-def first_sample(child: IsolatedChild, scene_index: int) -> Sample:
-    """Return the sample of a training scene's first accepted attempt, made in a render child.
+def mapped_scene(child: IsolatedChild, name: str) -> Scene:
+    """Return the scene of a name, with one camera.
+
+    Args:
+        child: render child with objects.
+        name: `surfaces N`, a scene of `textured-256`, or `sky` and one of SKIES.
 
     Raises:
-        TrilightError: every attempt was rejected.
+        Rejected: none can be composed.
     """
-    for attempt in range(MAX_ATTEMPTS):
-        made = child.call_method(SceneWorker.attempt, "train", scene_index, attempt)
-        if made.sample is not None:
-            return made.sample
-    raise TrilightError(f"scene {scene_index}: rejected {MAX_ATTEMPTS} times; choose others.")
-
-
-def _call(function: Callable[..., Scene], *arguments: object) -> Scene:
-    """Call a function in the render child, which is the last argument."""
-    *known, child = arguments
-    assert isinstance(child, IsolatedChild)
-    return child.call(function, *known)
-
-
-def _gltf_scene(path: Path) -> Scene:
-    return read_gltf(path, USER_PROVIDED).scene
-
-
-def _described_scene(root: Path, name: str) -> Scene:
-    """Return the scene of a RenderFormer file with its first camera."""
-    scene, _ = build_scene(
-        root, name, AssetSettings(), licence=USER_PROVIDED, num_views=1, scene_index=0, seed=0
-    )
-    return scene
+    kind, _, which = name.partition(" ")
+    number = int(which) if kind == "surfaces" else 10 + SKIES.index(which)
+    settings: SceneSettings = changed(textured_256().scenes, _CALM)
+    if kind == "sky":
+        sky = {
+            "skies.share": 1.0,
+            "skies.over_lamps_log": (2.0, 2.0),
+            "skies.seen_share": float(which in _SEEN),
+            "skies.maps.families": (which,),
+            "skies.maps.height": _SKY_ROWS,
+        }
+        settings = changed(settings, sky)
+    return first_composed(child, settings, number, seed=_MAPPED_SEED)
 
 
 def _holds_a_scene(path: Path) -> bool:

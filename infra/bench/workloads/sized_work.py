@@ -11,11 +11,15 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
 from infra.bench.workloads.cost_scene import cost_scene
-from infra.bench.workloads.manifests import write_copies
+from infra.bench.workloads.reading import write_copies
+from infra.bench.workloads.traced_pictures import fixed_samples, render_shot
+from pipeline.renders.variant import activate, choose_variant
+from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from storage.installation import IMPORT_ROOT, child_environment
 
@@ -134,11 +138,8 @@ def _prepare(num_objects: int, folder: Path) -> None:
 
 
 def _trace(num_triangles: int, folder: Path) -> None:
-    from infra.bench.workloads.shots import fixed_samples, shots
-    from pipeline.renders.variant import activate, choose_variant
-
     activate(choose_variant())
-    shots(cost_scene(num_triangles, _LIGHTS), {"view": fixed_samples(_PX, 64)})
+    render_shot(cost_scene(num_triangles, _LIGHTS), fixed_samples(_PX, 64))
 
 
 def _show_by_network(num_triangles: int, folder: Path) -> None:
@@ -149,21 +150,15 @@ def _show_by_network(num_triangles: int, folder: Path) -> None:
     renderer.view(renderer.prepare(scene), scene.c2w[0], float(scene.fov_deg[0]), _PX)
 
 
-def _write_shards(num_shards: int, folder: Path) -> Path:
-    """Write shards of one sample each, copies of the file next to the folders of all sizes."""
+def _read(num_shards: int, folder: Path) -> None:
+    """Write shards of one sample each, open them for training, and read every sample once.
+
+    The samples are copies of the one next to the folders of all sizes.
+    """
     stored = folder.parents[1] / "sample"
     members = {path.name: path.read_bytes() for path in sorted(stored.iterdir())}
     write_copies(folder / "set", [members], copies=num_shards, per_shard=1)
-    return folder / "set"
-
-
-def _read(num_shards: int, folder: Path) -> None:
-    """Write the shards, open them for training, and read every sample once."""
-    from contextlib import closing
-
-    from storage.dataset.training_data import open_training_data
-
-    shards = open_training_data([str(_write_shards(num_shards, folder))]).split("train")
+    shards = open_training_data([str(folder / "set")]).split("train")
     for number in range(len(shards.names)):
         with closing(shards.open(number)) as shard:
             shard.members(0)

@@ -4,11 +4,11 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
 
-from model.costs import Workload, training_flops
 from model.renderformer import RenderFormer
 from storage.dataset.shard_set import ShardSet
 from storage.dataset.training_data import open_training_data
@@ -22,6 +22,7 @@ from train.loop.muon import choose_muon_precision
 from train.loop.schedule import learning_rate
 from train.loop.state import new_state
 from train.loop.step import Stepper
+from train.loop.trainer import scene_flops
 from train.loss.objective import TrainingLoss
 from train.run import stream_settings
 from train.settings import TrainSettings
@@ -88,13 +89,7 @@ def _trained_network(
     crew = DistributedContext(device=device)
     state = new_state(settings, device, muon_precision=choose_muon_precision(crew))
     stepper = Stepper(state, settings, TrainingLoss(settings.loss, None), crew)
-
-    def flops(triangles: int) -> int:
-        views = settings.views_per_scene
-        resolution = settings.resolution
-        workload = Workload(triangles=triangles, views=views, resolution=resolution)
-        return training_flops(settings.model, workload)
-
+    cost = partial(scene_flops, settings)
     stream = stream_batches(
         shards,
         stream_settings(settings),
@@ -105,7 +100,7 @@ def _trained_network(
     )
     with closing(stream) as batches:
         for step in range(settings.num_steps):
-            buckets = bucket_scenes(next(batches), flops, settings.scenes_per_pass)
+            buckets = bucket_scenes(next(batches), cost, settings.scenes_per_pass)
             stepper.launch(buckets, learning_rate(step, settings))  # no step waits for its figures
             state.step += 1
     return state.model.eval()

@@ -19,16 +19,13 @@ from infra.bench.experiments.loader import read_figures
 from infra.bench.experiments.meshes import BUDGET_GROUP, CURVE, METHOD_GROUP
 from infra.bench.experiments.paired_training import SIDE_A, SIDE_B, scene_of, settings_of
 from infra.bench.gpu import steps
-from infra.bench.gpu.step_profile import REST, parts_ms
-from infra.bench.gpu.steps import step_figures, step_settings
+from infra.bench.gpu.steps import REST, parts_ms, step_figures, step_settings
 from infra.bench.gpu.twin import NETWORKS, twin_figures
 from infra.bench.workloads import blender_environment as environment
 from infra.bench.workloads import sized_work
 from infra.bench.workloads.blender_environment import installed_python
-from infra.bench.workloads.cached_references import kept_reference
-from infra.bench.workloads.cycles import CyclesSamples
-from infra.bench.workloads.manifests import write_copies
-from infra.bench.workloads.packed_samples import LAYOUTS, unpacking_figures
+from infra.bench.workloads.judged_pictures import load_or_render_reference
+from infra.bench.workloads.reading import LAYOUTS, unpacking_figures, write_copies
 from infra.bench.workloads.sized_work import WORK, measure_work, session_bytes, sizes_of
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera
@@ -54,8 +51,7 @@ def test_noise_is_no_difference_and_another_picture_is() -> None:
     ours = RawReference(a_rgb=noisy(truth), b_rgb=noisy(truth))
 
     def figures(theirs: np.ndarray) -> dict[str, float]:
-        pictures = tuple(noisy(theirs).astype(np.float32) for _ in range(2))
-        return agreement_figures(ours, CyclesSamples(pictures_rgb=pictures, core_s=1.0))
+        return agreement_figures(ours, RawReference(a_rgb=noisy(theirs), b_rgb=noisy(theirs)))
 
     same, mirrored = figures(truth), figures(truth[::-1])
     assert same["pixels_db"] > same["seeds_db"], "our mean of two is less noisy than one of theirs"
@@ -329,8 +325,8 @@ def test_a_view_is_rendered_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path))
     counting = Counting()
     child, scene = cast(IsolatedChild, counting), toy_scene(0)
-    first = kept_reference(child, scene, first_camera(scene, 8), 128)
-    again = kept_reference(child, scene, first_camera(scene, 8), 128)
+    first = load_or_render_reference(child, scene, first_camera(scene, 8), 128)
+    again = load_or_render_reference(child, scene, first_camera(scene, 8), 128)
     assert counting.calls == 1
     np.testing.assert_array_equal(first.a_rgb, again.a_rgb)
     np.testing.assert_array_equal(first.b_rgb, again.b_rgb)
@@ -340,5 +336,5 @@ def test_a_view_is_rendered_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         (scene, first_camera(scene, 16), 128),
         (toy_scene(1), first_camera(scene, 8), 128),
     ):
-        kept_reference(child, *other)
+        load_or_render_reference(child, *other)
     assert counting.calls == 4, "other samples, width or scene is another reference"

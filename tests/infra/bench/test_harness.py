@@ -5,7 +5,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -14,9 +14,18 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from infra.bench import run as running
-from infra.bench.catalogue import every_experiment, experiment_of
 from infra.bench.context import BenchContext
-from infra.bench.experiment import FULL, QUICK, Column, Experiment, Figures, Point, columns_of
+from infra.bench.experiment import (
+    FULL,
+    QUICK,
+    Column,
+    Experiment,
+    Figures,
+    Point,
+    columns_of,
+    every_experiment,
+    experiment_of,
+)
 from infra.bench.machine import commit_text, machine_record
 from infra.bench.plot import plot
 from infra.bench.rows import Row, rows_of, table_of
@@ -40,19 +49,16 @@ FIGURES = {"cheap": (1.0, 30.0), "default": (2.0, 40.0), "waste": (3.0, 35.0)}
 """Cost and error in decibels by point."""
 
 
-def measure(
-    context: BenchContext, points: Sequence[Point], trial: str
-) -> Iterable[tuple[str, Figures]]:
+def measure(point: str, context: BenchContext, trial: str) -> Figures:
     """Return made-up figures; the trial `bad` cannot be used, and `killed` ends the run."""
-    for point in points:
-        if trial == "bad" and point.name == "default":
-            raise Rejected("no_scene", "it has no light")
-        calls.append((trial, point.name))
-        if trial == "killed" and point.name == "waste" and not context.options.data:
-            raise KeyboardInterrupt
-        cost, db = FIGURES[point.name]
-        late = 0.5 * (trial == "c")
-        yield point.name, {"core_s": cost + late, "db": db}
+    if trial == "bad" and point == "default":
+        raise Rejected("no_scene", "it has no light")
+    calls.append((trial, point))
+    if trial == "killed" and point == "waste" and not context.options.data:
+        raise KeyboardInterrupt
+    cost, db = FIGURES[point]
+    late = 0.5 * (trial == "c")
+    return {"core_s": cost + late, "db": db}
 
 
 def experiment(*trials: str, warm_up: bool = False) -> Experiment:
@@ -71,6 +77,7 @@ def experiment(*trials: str, warm_up: bool = False) -> Experiment:
         points=lambda scale, options: [
             Point(
                 name=name,
+                measure=partial(measure, name),
                 default=name == "default",
                 kind="cheap ones" if name == "cheap" else "others",
                 rival=None if name == "default" else "default",
@@ -78,7 +85,6 @@ def experiment(*trials: str, warm_up: bool = False) -> Experiment:
             for name in FIGURES
         ],
         trials=lambda scale, options: trials,
-        measure=measure,
         warm_up=warm_up,
     )
 
@@ -211,7 +217,9 @@ def test_another_file_is_refused(tmp_path: Path) -> None:
         with case(text):
             path = tmp_path / "other.jsonl"
             path.write_text(text)
-            with pytest.raises(TrilightError, match="line 1 is no row of `trilight bench`"):
+            with pytest.raises(
+                TrilightError, match="no rows of `trilight bench`.*expected a file that it wrote"
+            ):
                 Store(path).runs()
 
 
@@ -260,7 +268,7 @@ def test_an_unknown_name_is_answered_with_those_that_exist() -> None:
 
 
 def test_an_installed_trilight_says_where_the_bench_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "infra.bench.catalogue")
+    monkeypatch.delitem(sys.modules, "infra.bench.experiment")
     monkeypatch.setitem(sys.modules, "infra.bench", None)
     done = trilight(["bench", "frontier"])
     assert done.mistake.startswith("bench: an installed Trilight has no experiments; expected a")

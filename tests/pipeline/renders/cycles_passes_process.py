@@ -2,10 +2,10 @@
 
     python -I cycles_passes_process.py FOLDER
 
-FOLDER holds `scene.npz` and `request.json`, as infra.bench.workloads.blender_process takes them.
-Receives `passes.exr`: depth, position, normal, row of the material, diffuse and specular colour, as
-Blender names them. FOLDER/ours.exr, where it is there, is opened as people open passes in Blender,
-and what Blender finds in it is written to `layers.json`.
+FOLDER/request.json holds what infra.bench.workloads.blender_process takes. Receives `passes.exr`:
+depth, position, normal, row of the material, diffuse and specular colour, as Blender names them.
+FOLDER/ours.exr, where it is there, is opened as people open passes in Blender, and what Blender
+finds in it is written to `layers.json`.
 """
 
 import importlib.util
@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-import numpy as np
 
 _ROOT = Path(__file__).parents[3]
 _PASSES = (
@@ -36,13 +35,9 @@ def main(folder: Path) -> None:
     blender: Any = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(blender)
     request = json.loads((folder / "request.json").read_text())
-    with np.load(folder / "scene.npz", allow_pickle=False) as arrays:
-        scene = {name: arrays[name] for name in arrays.files}
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    blender.add_meshes(scene)
-    for row, material in enumerate(bpy.data.objects["surfaces"].data.materials):
-        material.pass_index = row
-    blender.add_camera(np.array(request["c2w"]), request["fov_deg"])
+    blender.open_usd(request["usd"])
+    for material in bpy.data.materials:
+        material.pass_index = int(material.name.rpartition("_")[2])
     target = folder / "passes.exr"
     blender.set_up_cycles(request, target)
     # the ray through the middle of each pixel, to a hundredth of its width

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from infra.bench.workloads.judged_pictures import shrunk
-from infra.bench.workloads.mesh_pictures import picture_db
-from infra.bench.workloads.plain_mitsuba import render_levels
-from infra.bench.workloads.shots import fixed_samples, shots
+from infra.bench.workloads.coarser_meshes import picture_db
+from infra.bench.workloads.judged_pictures import shrink_reference
+from infra.bench.workloads.traced_pictures import fixed_samples, render_levels, render_shot
 from infra.render.raw_references import raw_reference
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.renders.load_tracer import load_tracer
@@ -23,7 +22,7 @@ def test_a_small_reference_is_that_of_its_own_width() -> None:
     scene = sampled_like_scene(np.random.default_rng(5), num_views=1)
     large = raw_reference(scene, camera_of(scene, 64), 128, 1)
     assert not np.array_equal(large.a_rgb, large.b_rgb)
-    small = shrunk(large, 32)
+    small = shrink_reference(large, 32)
     tracer = load_tracer(scene, max_depth=10, rr_depth=2)
     direct = tracer.radiance(camera_of(scene, 32), seed=4, spp=256)
     # Both have 256 samples a pixel, of which single ones are bright: compare calm pixels.
@@ -38,10 +37,10 @@ def test_a_small_reference_is_that_of_its_own_width() -> None:
 def test_plain_mitsuba_comes_to_the_same_picture() -> None:
     """With other samples of another sampler: its error falls with samples, towards our picture."""
     scene = tiny_scene()
-    ours = shots(scene, {"ours": fixed_samples(32, 2048)})["ours"].radiance_rgb
+    ours = render_shot(scene, fixed_samples(32, 2048)).radiance_rgb
     levels = render_levels(scene, 32, (16, 64, 1024), 5)
-    assert [level.spp for level in levels] == [16, 64, 1024]
-    assert levels[0].core_s > 0
+    assert [level.samples for level in levels] == [16, 64, 1024]
+    assert levels[0].cpu_seconds
     errors = [psnr_log_db(level.radiance_rgb, ours) for level in levels]
     # With three seeds 57 to 59, 60 to 62, and 68 to 69 dB; light off by half a percent is at 60.
     assert errors[0] < errors[2]

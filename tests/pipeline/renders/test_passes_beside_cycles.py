@@ -9,8 +9,6 @@ in cbox, nothing elsewhere).
 
 import dataclasses
 import json
-import os
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -18,17 +16,18 @@ import OpenEXR
 import pytest
 from numpy.typing import NDArray
 
-from infra.bench.workloads.blender_environment import installed_python
-from infra.bench.workloads.cycles import CyclesOptions, cycles_picture
+from infra.bench.workloads.blender_environment import installed_python, run_blender
+from infra.bench.workloads.cycles import render_with_cycles
 from pipeline.exchange.convert import convert_scene
 from pipeline.exchange.open_scene import load_source, scene_source
+from pipeline.exchange.usd.write import write_usd
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.settings import RenderSettings
 from storage.metrics import psnr_linear_db
 from storage.records.exr import decode_exr
 from storage.records.passes.pictures import view_passes
 from storage.records.passes.stored import passes_exr
-from storage.records.scene import ARRAY_FIELDS, Scene
+from storage.records.scene import Scene
 from tests.pipeline.renders.sampling import block_means, camera_of, render_view
 from tests.pipeline.renders.scene_kit import box, furnace, join, light, material, quad, sphere
 from tests.pipeline.scenes.example_scenes import example_scene
@@ -41,31 +40,17 @@ RESOLUTION = 128
 
 def _blender(scene: Scene, folder: Path) -> dict[str, NDArray[np.float32]]:
     """Return Cycles' passes [R, R, K] by Blender's names, from one ray a pixel."""
-    np.savez(folder / "scene.npz", **{field: getattr(scene, field) for field in ARRAY_FIELDS})
+    write_usd(folder / "scene.usdc", scene)
     request = {
+        "usd": str(folder / "scene.usdc"),
         "resolution": RESOLUTION,
-        "spp": 1,
         "denoise": False,
         "bounces": 0,
         "seed": 0,
         "threads": 2,
-        "c2w": scene.c2w[0].tolist(),
-        "fov_deg": float(scene.fov_deg[0]),
     }
     (folder / "request.json").write_text(json.dumps(request))
-    done = subprocess.run(
-        [
-            str(installed_python()),
-            "-I",
-            str(Path(__file__).with_name("cycles_passes_process.py")),
-            str(folder),
-        ],
-        env={**os.environ, "HOME": str(folder), "BLENDER_USER_RESOURCES": str(folder)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
+    run_blender(Path(__file__).with_name("cycles_passes_process.py"), folder)
     with OpenEXR.File(str(folder / "passes.exr"), separate_channels=True) as file:
         channels = {name: each.pixels for name, each in file.channels().items()}
     found: dict[str, list[str]] = {}
@@ -137,8 +122,8 @@ def blender() -> None:
 
 
 def _cycles(scene: Scene, resolution: int, spp: int, bounces: int = 8) -> NDArray[np.float32]:
-    request = CyclesOptions(resolution=resolution, spp=spp, denoise=False, bounces=bounces)
-    return cycles_picture(scene, 0, request).radiance_rgb
+    (picture,), _ = render_with_cycles(scene, resolution, spp, bounces=bounces, threads=1)
+    return picture
 
 
 @pytest.mark.usefixtures("blender")

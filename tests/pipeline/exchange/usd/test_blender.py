@@ -2,8 +2,6 @@
 
 import dataclasses
 import json
-import os
-import subprocess
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -13,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from infra.bench.workloads.blender_environment import installed_python
-from infra.bench.workloads.shots import fixed_samples, shots
+from infra.bench.workloads import blender_environment as environment
+from infra.bench.workloads.traced_pictures import fixed_samples, render_shot
 from pipeline.exchange.usd.read import UsdScene, read_usd
 from pipeline.exchange.usd.write import write_usd
 from pipeline.isolation import ChildLimits, IsolatedChild
@@ -39,20 +37,12 @@ def run_blender(process: str, folder: Path, request: dict[str, Any]) -> NDArray[
 
     Skips where Blender has not been installed: that is 380 MB, which tests do not download.
     """
-    python = installed_python()
-    if python is None:
+    if environment.installed_python() is None:
         pytest.skip("Blender is not installed: run `trilight bench cycles` once")
     folder.mkdir(exist_ok=True)
     asked = {"bounces": 8, "denoise": True, "seed": 0, "threads": 2, **request}
     (folder / "request.json").write_text(json.dumps(asked))
-    result = subprocess.run(
-        [str(python), "-I", str(Path(__file__).with_name(process)), str(folder)],
-        env={**os.environ, "HOME": str(folder), "BLENDER_USER_RESOURCES": str(folder)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr[-2000:]
+    environment.run_blender(Path(__file__).with_name(process), folder)
     picture: NDArray[np.float32] = np.load(folder / "picture.npy")
     return picture
 
@@ -62,8 +52,7 @@ def ours(scene: Scene, resolution: int, spp: int) -> NDArray[np.float32]:
     limits = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1)
     child = IsolatedChild(limits=limits, factory=activate, args=(choose_variant(),))
     try:
-        settings = {"ours": fixed_samples(resolution, spp)}
-        return child.call(shots, scene, settings)["ours"].radiance_rgb
+        return child.call(render_shot, scene, fixed_samples(resolution, spp)).radiance_rgb
     finally:
         child.close()
 

@@ -1,45 +1,70 @@
-"""Pictures of plain Mitsuba at rising numbers of samples, with their cost.
+"""Pictures of one view by Trilight's path tracer and by plain Mitsuba, with their cost.
 
-The setup is that of a user of plain Mitsuba: the stock `path` integrator with its defaults, the
-`independent` sampler, and Open Image Denoise once. Material and emitters are those of
+CPU seconds of ours are those of sampling, guide pictures, measuring the stated error, and one
+denoise. Loading the scene is not counted; kernels are warm.
+
+The other setup is that of a user of plain Mitsuba: the stock `path` integrator with its defaults,
+the `independent` sampler, and Open Image Denoise once. Material and emitters are those of
 tests/oracle/plugin_scene.py, which only a checkout has: without its one texture rough metals would
 lose light, and no number of samples would give the right picture. Emitters are sampled by their
 power, which is not Mitsuba's default, and the denoiser reads Trilight's guide pictures: both favor
 plain Mitsuba.
 """
 
+import dataclasses
 import importlib
 import sys
 import time
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.render.methods import warm_up_denoiser
+from infra.render.methods import SAMPLE_SEED, warm_up_denoiser
 from infra.render.raw_references import first_camera
 from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import Features
 from storage.errors import TrilightError
 from storage.installation import IMPORT_ROOT
+from storage.metrics import MAX_DB
 from storage.records.scene import Scene
+from storage.renderer import Image
 from storage.seeds import seed_for
 
+_SMALL = 32
+"""Width in pixels of the picture that compiles the kernels."""
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PlainPicture:
-    """View with a fixed number of samples."""
 
-    spp: int
-    """Number of samples per pixel."""
-    radiance_rgb: NDArray[np.float32]
-    """[R, R, 3] linear radiance."""
-    core_s: float
-    """CPU seconds of the picture, with warm kernels and a loaded scene."""
+def fixed_samples(resolution: int, spp: int) -> RenderSettings:
+    """Return settings of a fixed number of samples, which no stated error stops early.
+
+    Args:
+        resolution: width in pixels.
+        spp: samples per pixel; a multiple of 128 for the best sampling.
+    """
+    return RenderSettings(
+        resolution=resolution,
+        noise_floor_db=MAX_DB - 1,
+        min_spp=spp,
+        max_spp=spp,
+        min_mean_radiance=0.0,
+    )
+
+
+def render_shot(scene: Scene, settings: RenderSettings) -> RenderedView:
+    """Return a scene's first view, always of one seed; runs in a render child."""
+    small = dataclasses.replace(settings, resolution=_SMALL, max_spp=settings.min_spp)
+    pose = scene.c2w[0]
+    fov_deg = float(scene.fov_deg[0])
+    SceneRenderer(scene, small).render_view(pose, fov_deg, seed=0)  # compiles
+    if settings.denoiser != "off":
+        warm_up_denoiser(settings.resolution, settings.denoiser)
+    return SceneRenderer(scene, settings).render_view(pose, fov_deg, SAMPLE_SEED)
 
 
 _RR_DEPTH = 5
@@ -48,7 +73,7 @@ _RR_DEPTH = 5
 
 def render_levels(
     scene: Scene, resolution: int, levels_spp: tuple[int, ...], seed: int
-) -> list[PlainPicture]:
+) -> list[Image]:
     """Render a scene's first view with each number of samples; no sample is traced twice.
 
     CPU seconds are those of the samples, the guide pictures, and one denoise.
@@ -75,7 +100,7 @@ def render_levels(
         started = time.process_time()
         picture = denoise((total / spp).astype(np.float32), features, "high")
         finished_core_s = core_s + time.process_time() - started
-        levels.append(PlainPicture(spp=spp, radiance_rgb=picture, core_s=finished_core_s))
+        levels.append(Image(radiance_rgb=picture, samples=spp, cpu_seconds=finished_core_s))
         before = spp
     return levels
 

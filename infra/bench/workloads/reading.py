@@ -1,0 +1,172 @@
+"""Rendered scenes packed in several layouts, and reading of many copies as training does."""
+
+import io
+import itertools
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import h5py
+import numpy as np
+
+from infra.planning import measure_scenes
+from pipeline.builds.named import named_build
+from pipeline.exchange.renderformer_h5 import TextureType, write_renderformer_h5
+from pipeline.generation.dataset_order import DatasetOrder
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import Manifest, index_shard, write_manifest
+from storage.dataset.shard import write_shard
+from storage.dataset.splits import shard_name
+from storage.dataset.staging import read_staged_scene
+from storage.dataset.training_data import TrainingData
+from storage.records.profiles import PROFILES, Profile
+from storage.records.sample import Sample, decode_sample, encode_sample, sample_key
+from storage.records.scene import ARRAY_FIELDS
+
+if TYPE_CHECKING:
+    from train.data.stream import StreamSettings
+
+BUILD = "smoke"
+SCENES = 3
+"""Number of rendered scenes, fewer than a shard of the preset; the first compiles kernels."""
+_DECODED_AHEAD = 16
+"""Number of samples that are read before any is timed: what is decoded ahead would count twice."""
+
+Members = Mapping[str, bytes]
+"""Files of a sample by name."""
+
+
+def render_scenes(px: int, place: Path) -> tuple[dict[str, float], list[Members]]:
+    """Render scenes of BUILD one after the other on all cores.
+
+    Returns:
+        Wall-clock milliseconds and CPU seconds of a view; and the files of each scene.
+    """
+    splits = named_build(BUILD).splits
+    order = DatasetOrder(build=BUILD, resolution=px, scenes=splits.scenes_per_shard)
+    marks: list[float] = []
+    measured = measure_scenes(order, SCENES, place, lambda: marks.append(time.monotonic()))
+    staged = DatasetFolder(place).staged_shard(shard_name(0, splits))
+    members: list[Members] = [read_staged_scene(staged, row).members for row in range(SCENES)]
+    view_s = (marks[-1] - marks[0]) / (len(marks) - 1) / measured.num_views
+    core_s = sum(measured.core_s[1:]) / (SCENES - 1) / measured.num_views
+    return {"ms": 1e3 * view_s, "views_per_s": 1 / view_s, "core_s": core_s}, members
+
+
+def write_copies(
+    root: Path, members: Sequence[Members], *, copies: int = 16, per_shard: int = 16
+) -> int:
+    """Write a dataset that holds each sample under many keys; return the number of samples.
+
+    Args:
+        root: folder of the dataset; it may be missing.
+        members: files of each sample by name.
+        copies: number of keys of each sample.
+        per_shard: number of samples of a shard.
+    """
+    folder = DatasetFolder(root)
+    every = [(sample_key(k), members[k % len(members)]) for k in range(copies * len(members))]
+    names = []
+    for number, start in enumerate(range(0, len(every), per_shard)):
+        names.append(f"train-{number:06d}.tar")
+        write_shard(folder.shard(names[-1]), every[start : start + per_shard])
+    manifest = Manifest(
+        build="bench", settings={}, environment={}, num_scenes=len(every), num_views=4,
+        objects_lock_sha256="", shards=tuple(index_shard(folder.shard(name)) for name in names),
+    )  # fmt: skip
+    write_manifest(folder.manifest, manifest)
+    return len(every)
+
+
+def time_reading(
+    data: TrainingData,
+    settings: "StreamSettings",
+    threads: int,
+    *,
+    least_count: int = 1,
+    least_s: float = 0.0,
+) -> tuple[float, float]:
+    """Return wall-clock and CPU seconds of reading a sample as training does, without a network.
+
+    Args:
+        data: data to read, again from its start when it ends.
+        settings: settings of the stream.
+        threads: number of decoding threads; with 0 the main thread decodes.
+        least_count: minimum number of samples.
+        least_s: minimum number of seconds.
+
+    Raises:
+        TrilightError: the data cannot be read at this width.
+    """
+    from train.data.bad_samples import BadSampleCounter
+    from train.data.order import RankSlice
+    from train.data.stream import stream_batches
+
+    stream = stream_batches(
+        data.split("train"), settings, 0, rank_slice=RankSlice(),
+        workers=threads, unusable=BadSampleCounter(0),
+    )  # fmt: skip
+    with closing(stream) as batches:
+        for _ in itertools.islice(batches, 1 + _DECODED_AHEAD // settings.batch_size):
+            pass
+        began = time.perf_counter()
+        core_began = time.process_time()
+        count = 0
+        while count < least_count or time.perf_counter() - began < least_s:
+            next(batches)
+            count += settings.batch_size
+        seconds = time.perf_counter() - began
+        return seconds / count, (time.process_time() - core_began) / count
+
+
+TEXTURES: Mapping[str, TextureType] = {"HDF5 float16": "float16", "HDF5 float32": "float32"}
+LAYOUTS = (*PROFILES, *TEXTURES)
+
+Packed = TypeVar("Packed")
+
+
+def unpacking_figures(samples: Sequence[Sample], layout: str, work: Path) -> Mapping[str, float]:
+    """Unpack samples of one of LAYOUTS in memory, in one thread.
+
+    Returns:
+        Mean bytes of a sample before and after, and mean CPU milliseconds.
+    """
+    if layout in TEXTURES:
+        files = [_h5_bytes(sample, work, TEXTURES[layout]) for sample in samples]
+        return _time_unpacking(files, _unpacked_h5, len)
+    profile: Profile = "lossless" if layout == "lossless" else "compact"
+    members = [encode_sample(sample, profile) for sample in samples]
+    return _time_unpacking(members, _unpacked_sample, lambda packed: sum(map(len, packed.values())))
+
+
+def _unpacked_sample(members: Mapping[str, bytes]) -> int:
+    sample = decode_sample("0", members)
+    arrays = sum(getattr(sample.scene, name).nbytes for name in ARRAY_FIELDS)
+    return int(arrays + sample.radiance_rgb.nbytes)
+
+
+def _h5_bytes(sample: Sample, work: Path, texture_type: TextureType) -> bytes:
+    path = work / "scene.h5"
+    write_renderformer_h5(path, sample.scene, sample.radiance_rgb, texture_type=texture_type)
+    return path.read_bytes()
+
+
+def _unpacked_h5(data: bytes) -> int:
+    """Read every array without checks, as a loader that trusts its files does."""
+    with h5py.File(io.BytesIO(data)) as file:
+        return sum(file[name][()].nbytes for name in file)
+
+
+def _time_unpacking(
+    packed: Sequence[Packed], unpack: Callable[[Packed], int], size: Callable[[Packed], int]
+) -> Mapping[str, float]:
+    began = time.process_time()
+    memory = sum(map(unpack, packed))
+    spent_s = time.process_time() - began
+    return {
+        "bytes": float(np.mean([size(one) for one in packed])),
+        "memory_bytes": memory / len(packed),
+        "sample_ms": 1000 * spent_s / len(packed),
+    }
