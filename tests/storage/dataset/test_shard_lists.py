@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from infra.cli.words import value_of
+from infra.cli.options import value_of
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import dataset_folder
 from storage.dataset.mixed_data import open_mixture
