@@ -224,7 +224,7 @@ def test_evaluate_is_a_leaderboard_without_a_network_and_beside_others(
     data = ["--data", short.source, "--split", "validation", "--most-scenes", "1"]
     words = [*data, "--resolution", str(PX), "--json"]
     without_effect = trilight(["evaluate", *words, "--tracer-views", "0"]).exception
-    assert "--tracer-views is 0; expected it with a network alone" in str(without_effect)
+    assert "--tracer-views is 0 and no network is named" in str(without_effect)
     alone = json.loads(trilight(["evaluate", *words, "--out", str(tmp_path / "alone")]).stdout)
     (one,) = alone["widths"]
     assert (one["width"], one["scenes"], alone["rival"]) == (PX, 1, "network builtin:tokens")

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from storage.palette import OTHERS, WAYS
+from storage.palette import METHOD_COLORS, OTHERS
 
 _FONT = 9
 
@@ -39,7 +39,9 @@ def draw_panels(
     """
     next_colors = itertools.cycle(OTHERS)
     kinds = dict.fromkeys(one.kind for points in groups for one in points)
-    colors = {name: WAYS.get(name.partition(",")[0]) or next(next_colors) for name in kinds}
+    colors = {
+        name: METHOD_COLORS.get(name.partition(",")[0]) or next(next_colors) for name in kinds
+    }
     for axes, points in zip(panels, groups, strict=True):
         _draw_points(axes, points, colors)
     _draw_legend(figure, costs, colors)

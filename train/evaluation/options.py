@@ -109,8 +109,8 @@ class EvaluationOptions:
         for option, value in (("device", self.device), ("tracer_views", self.tracer_views)):
             if not self.checkpoint and value != getattr(EvaluationOptions, option):
                 raise TrilightError(
-                    f"{option_of(option)} is {value!r}; expected it with a network alone. All "
-                    "methods are compared on the processor."
+                    f"{option_of(option)} is {value!r} and no network is named; expected both or "
+                    "neither. Without one, all methods are compared on the processor."
                 )
         if len(self.data) > 1:
             raise TrilightError(
