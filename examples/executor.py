@@ -28,7 +28,7 @@ TRILIGHT = (sys.executable, "-m", "trilight")
 
 def by_commands(order: DatasetOrder, address: str | None) -> Outcome:
     """Make every missing shard in a process of its own, then finish what is left here."""
-    missing = prepare_dataset(order).publication.missing_shards()
+    missing = prepare_dataset(order).publication.unfinished_shards()
     words = (*TRILIGHT, *generate_words(order), "--out", order.place)
 
     def make(shard: int) -> None:

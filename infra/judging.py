@@ -26,6 +26,16 @@ from storage.errors import TrilightError
 from storage.renderer import Renderer
 from storage.typed_json import read_json
 from train.evaluation.chart import plot_excursions
+from train.evaluation.equal_time import (
+    TIMED_SCENES,
+    EqualTimeResult,
+    Filter,
+    Level,
+    equal_time,
+    spread_text,
+    spread_views,
+    time_both,
+)
 from train.evaluation.evaluate import (
     EvalConfig,
     judge_views,
@@ -38,16 +48,6 @@ from train.evaluation.evaluate import (
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.pages import evaluation_page
 from train.evaluation.report import record
-from train.evaluation.same_time import (
-    TIMED_SCENES,
-    Filter,
-    Level,
-    SameTimeResult,
-    same_time,
-    spread_text,
-    spread_views,
-    time_both,
-)
 from train.evaluation.sheet import draw_sheet, write_picture
 from train.loop.distributed import choose_device
 from train.loss.lpips import load_lpips
@@ -94,7 +94,7 @@ def judge_network(
         resolution: width in pixels; by default the network's training width, else the data's.
         most_scenes: maximum number of scenes, from the start of the split.
         tracer_views: maximum number of views on which the path tracer is evaluated in the network's
-            time (train.evaluation.same_time); 0 for none. Where it fails, the record says why.
+            time (train.evaluation.equal_time); 0 for none. Where it fails, the record says why.
         lpips: folder of LPIPS' weights, or `hub`; without them LPIPS is n/a.
         device: cpu or cuda; by default cuda if there is a GPU.
         done: called with (finished, all) scenes.
@@ -134,17 +134,17 @@ def judge_network(
 
 
 def _beside_tracer(
-    contest: EvalConfig, views: Sequence[JudgedView], times: SameTimeResult
+    contest: EvalConfig, views: Sequence[JudgedView], times: EqualTimeResult
 ) -> dict[str, Any]:
     """Return the comparison with the path tracer as JSON values."""
     every, first = spread_views(contest.tracer_views, contest.num_scenes)
     most_views = 1 + max(view.view for view in views)
-    return same_time(views, times, spread_text(every, first, most_views))
+    return equal_time(views, times, spread_text(every, first, most_views))
 
 
 def _time_tracer(
     contest: EvalConfig, stack: contextlib.ExitStack
-) -> tuple[SameTimeResult, Renderer | None]:
+) -> tuple[EqualTimeResult, Renderer | None]:
     """Time the network and the path tracer; return the latter, too, if it can trace the scenes."""
     network = NetworkRenderer(
         name=NETWORK,

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import elu
 
 from model.published.config import decode_published
-from model.published.convert import NORMAL, from_published
+from model.published.convert import NORMAL, load_published
 from model.renderformer import ELU_ALPHA, RenderFormer
 from model.scene_tensors import SceneBatch
 from model.weights import read_tensors
@@ -81,7 +81,7 @@ def read_reference(path: Path) -> Reference:
         if name.startswith(_PARAMETER)
     }
     return Reference(
-        model=from_published(parameters, decode_published(json.loads(metadata["config"]))),
+        model=load_published(parameters, decode_published(json.loads(metadata["config"]))),
         batch=_batch(*(tensors[name] for name in inputs)),
         resolution=int(metadata["resolution"]),
         expected_BVRR3=tensors[_OUTPUT].float().movedim(2, -1),

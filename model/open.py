@@ -17,7 +17,7 @@ from safetensors.torch import save
 
 from model.checkpoint_format import find_checkpoint, read_checkpoint
 from model.published.config import PublishedConfig, decode_published, encode_published
-from model.published.convert import from_published, to_published
+from model.published.convert import load_published, to_published
 from model.renderformer import RenderFormer
 from model.weights import (
     CONFIG_KEY,
@@ -170,7 +170,7 @@ def _weights_file(source: str, path: Path) -> Path:
 
 def _open_published(weights: Path) -> RenderFormer:
     tensors, _ = read_tensors(weights)
-    return from_published(tensors, _read_config(weights.parent / CONFIG_NAME))
+    return load_published(tensors, _read_config(weights.parent / CONFIG_NAME))
 
 
 def _has_pickles(folder: Path) -> bool:

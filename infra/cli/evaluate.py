@@ -63,8 +63,8 @@ def _judge_network(
 
 
 def _report(record: dict[str, Any], out: Path) -> None:
+    from train.evaluation.equal_time import sentences
     from train.evaluation.metrics import METRICS
-    from train.evaluation.same_time import sentences
 
     contestants = record["contestants"]
     table = Table(box=None, title_justify="left", header_style="dim")

@@ -23,9 +23,9 @@ from storage.dataset.dataset import Dataset, open_dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.objects import read_objects_lock
+from train.evaluation.equal_time import sentences
 from train.evaluation.judged_view import NETWORK
 from train.evaluation.pages import scores_table, swapped_text
-from train.evaluation.same_time import sentences
 from train.folder import RunFolder
 
 MOST_BYTES = 10_000_000

@@ -15,7 +15,7 @@ from model.hits.device_textures import DeviceTextures
 from model.hits.textures import SurfaceTextures
 from model.hits.vectors import Floats, as_rows, brightest, dot, unit
 from model.sky.sampler import SkySampler
-from storage.optics.lobes import lobes_of
+from storage.optics.bsdf import bsdf_lobes
 from storage.optics.multiscatter import scattered_again
 from storage.raycast.caster import RayCaster, RayHits
 from storage.raycast.embree import Triangles
@@ -49,7 +49,7 @@ class Reflectance:
 
 def reflectance_of(materials: NDArray[np.float32]) -> Reflectance:
     """Return the reflectance of material rows [N, 10]."""
-    lobes = lobes_of(materials)
+    lobes = bsdf_lobes(materials)
     multiscatter = scattered_again(lobes.specular, lobes.alpha, "correlated")
     return Reflectance(
         diffuse=lobes.diffuse.T.astype(np.float32),

@@ -22,7 +22,7 @@ FREQUENCY_TOLERANCE = 1e-6
 """Maximum relative difference of stored frequencies from the formula: float32's rounding."""
 
 
-def from_published(tensors: Mapping[str, Tensor], config: PublishedConfig) -> RenderFormer:
+def load_published(tensors: Mapping[str, Tensor], config: PublishedConfig) -> RenderFormer:
     """Return the network of published tensors, float32, in evaluation mode on the CPU.
 
     Args:

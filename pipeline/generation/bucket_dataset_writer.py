@@ -79,11 +79,11 @@ class BucketDatasetWriter(DatasetWriter):
         if sent := self._mirror.upload_shard(note.shard.name):
             self._count(sent)
 
-    def missing_shards(self, requested: range | None = None) -> list[int]:
+    def unfinished_shards(self, requested: range | None = None) -> list[int]:
         for name in shard_names_in(self.folder.root):  # left by a killed or another local worker
             self._mirror.upload_shard(name)
         self.refresh_plan()
-        return super().missing_shards(requested)
+        return super().unfinished_shards(requested)
 
     def _finished_shards(self, shards: range) -> set[str]:
         for part in parts_of(shards):

@@ -153,7 +153,7 @@ class DatasetWriter:
             given_up=self.progress.given_up + num_scenes - note.shard.num_samples,
         )
 
-    def missing_shards(self, requested: range | None = None) -> list[int]:
+    def unfinished_shards(self, requested: range | None = None) -> list[int]:
         """Return the unfinished or growing shards among the requested ones; by default of all.
 
         The cost depends on the number of requested shards alone.

@@ -44,9 +44,9 @@ class Run:
     device: Device = "cpu"
     """Device that renders, `cpu` or `gpu`."""
 
-    def missing_shards(self) -> list[int]:
+    def unfinished_shards(self) -> list[int]:
         """Return the numbers of the requested shards that are not finished."""
-        return self.publication.missing_shards(self.order.shard_range())
+        return self.publication.unfinished_shards(self.order.shard_range())
 
     def num_workers(self) -> int:
         """Return the number of parallel tasks of one process; an executor may set another."""

@@ -165,7 +165,7 @@ def iter_rounds_until_done(run: Run, at_once: int) -> Iterator[Round]:
     sizes = TaskSizes()
     tasks = TaskBudget()
     pause_s = _FIRST_PAUSE_S
-    while missing := run.missing_shards():
+    while missing := run.unfinished_shards():
         this = Round(
             tasks.take_tasks(missing, run.publication.splits, sizes, at_once=at_once), sizes
         )
@@ -188,7 +188,7 @@ def _wait_for_others(run: Run, pause_s: float) -> float:
     while True:
         time.sleep(pause_s)
         pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-        missing = run.missing_shards()
+        missing = run.unfinished_shards()
         splits = run.settings.splits
         shards = [UnfinishedShard(writer.folder, splits, index) for index in missing]
         if not missing or any(shard.is_free() for shard in shards):

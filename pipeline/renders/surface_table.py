@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import own_floats
 from pipeline.renders.ggx import KernelLobes
-from storage.optics.lobes import lobes_of
+from storage.optics.bsdf import bsdf_lobes
 from storage.optics.multiscatter import scattered_again
 from storage.records.scene import Scene
 
@@ -40,7 +40,7 @@ class SurfaceTable:
     def __init__(self, scene: Scene, order: NDArray[np.intp]) -> None:
         corners = scene.vertex_positions[scene.faces[order]]
         normals = scene.vertex_normals[scene.faces[order]]
-        lobes = lobes_of(scene.materials[scene.material_index[order]])
+        lobes = bsdf_lobes(scene.materials[scene.material_index[order]])
         rows = np.concatenate(
             [
                 np.concatenate([corners[:, 0], normals[:, 0, 0:1]], axis=1),

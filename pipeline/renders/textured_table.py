@@ -16,7 +16,7 @@ from pipeline.renders.device_memory import own_floats
 from pipeline.renders.ggx import KernelLobes
 from pipeline.renders.kernel_textures import KernelTextures
 from pipeline.renders.surface_table import SurfaceTable
-from storage.optics.lobes import MIN_ALPHA
+from storage.optics.bsdf import MIN_ALPHA
 from storage.optics.multiscatter import ROUGHNESS_STEPS, mean_albedo
 from storage.records.scene import Scene
 

@@ -192,7 +192,7 @@ def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
     return listed
 
 
-def missing_shards(url: str, num_scenes: int = 0) -> list[int]:
+def unfinished_shards(url: str, num_scenes: int = 0) -> list[int]:
     """Return the indices of the shards that are not there, of a dataset that is begun.
 
     Of more scenes than were planned so far, also what those need.

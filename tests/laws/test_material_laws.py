@@ -11,7 +11,7 @@ from pipeline.renders import surface_table
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.tracer import Tracer
 from storage.conventions import alpha_ggx
-from storage.optics.lobes import MIN_ALPHA, lobes_of
+from storage.optics.bsdf import MIN_ALPHA, bsdf_lobes
 from storage.optics.multiscatter import scattered_again
 from storage.records.scene import Scene
 from tests.oracle import plugin_scene
@@ -144,7 +144,7 @@ def test_lobes_add_up_to_the_material_and_never_exceed_one() -> None:
     rows[:, 0:3], rows[:, 3:6] = split * 0.97, (1 - split) * 0.97
     rows[:, 6] = rng.uniform(size=500)
     rows[0, 0:6], rows[1, 0:3], rows[2, 3:6] = 0, 0, 0
-    lobes = lobes_of(rows)
+    lobes = bsdf_lobes(rows)
     diffuse, specular = scaled_albedos(lobes)
     weight = lobes.weight[:, None]
     # float64 arithmetic on float32 rows: exact to 1e-12.

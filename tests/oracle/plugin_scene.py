@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pipeline.renders.sky_share import lamp_power, shining_sky, sky_share
 from pipeline.renders.tracer import split_triangles
 from storage.errors import Rejected
-from storage.optics.lobes import Lobes, lobes_of
+from storage.optics.bsdf import Lobes, bsdf_lobes
 from storage.optics.multiscatter import Smith, scattered_again
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
@@ -41,7 +41,7 @@ _SMITH: Smith = "separable"
 
 
 def _blend(textures: dict[str, Any]) -> dict[str, Any]:
-    """Return diffuse and specular lobe as the blend of storage.optics.lobes."""
+    """Return diffuse and specular lobe as the blend of storage.optics.bsdf."""
     specular = {name: textures[name] for name in ("specular", "again", "alpha")}
     return {
         "type": "blendbsdf",
@@ -139,7 +139,7 @@ def _surfaces(scene: Scene, triangles: NDArray[np.intp], row: int) -> Any:
 def _feature_surfaces(scene: Scene, triangles: NDArray[np.intp], row: int) -> Any:
     if scene.textures:
         return _mesh(scene, triangles, _two_sided(textured_albedo(scene, row)))
-    lobes = lobes_of(scene.materials[scene.material_index[triangles]])
+    lobes = bsdf_lobes(scene.materials[scene.material_index[triangles]])
     mesh = _mesh(scene, triangles, _two_sided({"type": "diffuse", "reflectance": _face("albedo")}))
     _add_attribute(mesh, "albedo", lobes.diffuse + lobes.specular)
     return mesh
@@ -149,7 +149,7 @@ def _add_material(mesh: Any, scene: Scene, triangles: NDArray[np.intp]) -> None:
     """Give the faces of a mesh what `_material` reads from them: textured ones read no face."""
     if scene.textures:
         return
-    lobes = lobes_of(scene.materials[scene.material_index[triangles]])
+    lobes = bsdf_lobes(scene.materials[scene.material_index[triangles]])
     diffuse, specular = scaled_albedos(lobes)
     _add_attribute(mesh, "weight", lobes.weight[:, None])
     _add_attribute(mesh, "alpha", lobes.alpha[:, None])

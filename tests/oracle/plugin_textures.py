@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.optics.lobes import MIN_ALPHA
+from storage.optics.bsdf import MIN_ALPHA
 from storage.optics.multiscatter import ROUGHNESS_STEPS, X_STEPS, Smith, albedo_table, mean_albedo
 from storage.records.environment import Environment
 from storage.records.material import laid_out

@@ -26,11 +26,11 @@ from storage.settings.described import checked
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.baselines import Baselines
+from train.evaluation.equal_time import CAPTION, TRACER, spread_views
 from train.evaluation.judge import ValidationScene, predict, validation_scene
 from train.evaluation.judged_view import GROUPED, NETWORK, JudgedView, scene_facts
 from train.evaluation.metrics import noise_floors, picture_scores
 from train.evaluation.options import SceneCount, Width
-from train.evaluation.same_time import CAPTION, TRACER, spread_views
 from train.evaluation.sheet import SheetView
 from train.loss.lpips import Lpips
 

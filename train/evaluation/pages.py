@@ -8,11 +8,11 @@ from typing import Any
 from storage.markdown import inert, table, text
 from train.evaluation.board import NOISE
 from train.evaluation.cost_tables import number_text
+from train.evaluation.equal_time import TRACER, sentences
 from train.evaluation.judged_view import NEAR_DB, NETWORK
 from train.evaluation.metrics import METRICS
 from train.evaluation.pairs import METRIC, PairedLead, interval_text
 from train.evaluation.published import PUBLISHED, PUBLISHED_ROWS, PUBLISHED_WHERE
-from train.evaluation.same_time import TRACER, sentences
 from train.evaluation.standings import WidthStandings
 
 _NONE = "n/a"
@@ -31,7 +31,7 @@ def evaluation_page(report: Mapping[str, Any]) -> str:
         "",
         scores_table(contestants),
     ]
-    lines += ["", *_noise_lines(network), *_same_time_lines(report["path tracer"])]
+    lines += ["", *_noise_lines(network), *_equal_time_lines(report["path tracer"])]
     if loss := report["swapped scenes"]:
         lines += ["", swapped_text(loss)]
     if report["published"]:
@@ -125,7 +125,7 @@ def _noise_lines(network: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _same_time_lines(traced: Mapping[str, Any] | None) -> list[str]:
+def _equal_time_lines(traced: Mapping[str, Any] | None) -> list[str]:
     if traced is None:
         return []
     lines = ["", "## Beside the path tracer, in the network's own time", ""]

@@ -27,7 +27,7 @@ def record(
     Args:
         views: rows of the evaluation.
         about: network, data, split and resolution, as the report shows them.
-        traced: comparison at equal time (evaluation.same_time); None if it was not measured.
+        traced: comparison at equal time (evaluation.equal_time); None if it was not measured.
     """
     ours = summarize_views(views)
     published = {

@@ -18,7 +18,7 @@ from model.published.convert import (
     TEXTURE_CHANNELS,
     _require_frequencies,
     fold,
-    from_published,
+    load_published,
     to_published,
     unfold,
 )
@@ -62,7 +62,7 @@ def test_export_and_import_give_the_same_network(family: str, patch: int) -> Non
     config = PublishedConfig(model=publishable(family), texture_patch=patch)
     assert decode_published(json.loads(json.dumps(encode_published(config)))) == config
     model = awake(config.model, torch.float32)
-    again = from_published(to_published(model, patch), config)
+    again = load_published(to_published(model, patch), config)
     assert again.state_dict().keys() == model.state_dict().keys()
     for name, tensor in again.state_dict().items():
         assert torch.equal(tensor, model.state_dict()[name]), name
@@ -81,7 +81,7 @@ def test_export_gives_back_what_was_published(shared: Path, name: str) -> None:
         for key, tensor in load_file(path).items()
         if key.startswith("param.")
     }
-    exported = to_published(from_published(published, config), config.texture_patch)
+    exported = to_published(load_published(published, config), config.texture_patch)
     assert exported.keys() == published.keys()
     for key, tensor in exported.items():
         assert tensor.shape == published[key].shape, key
@@ -146,7 +146,7 @@ def test_wrong_tensors_are_listed(name: str, tensor: Tensor | None, message: str
     if tensor is not None:
         tensors[name] = tensor
     with pytest.raises(TrilightError, match=message):
-        from_published(tensors, config)
+        load_published(tensors, config)
 
 
 WIDTH = 5

@@ -34,7 +34,7 @@ def make(writer: DatasetWriter, *shards: int) -> None:
     """Freeze the objects where nobody has, make shards that are missing, and list all, if so."""
     if not writer.manifest.objects_lock_sha256:
         writer.lock_objects([_locked()])
-    for index in set(shards) & set(writer.missing_shards()):
+    for index in set(shards) & set(writer.unfinished_shards()):
         make_tiny_shard(writer, index)
     writer.finish()
 
@@ -139,7 +139,7 @@ def test_a_shard_that_was_deleted_is_made_again(bucket: Any, machines: Machines)
         digest = writer.manifest.dataset_digest
     bucket.rm_file(f"shards/set/{FIRST}")
     with machines.maker("b") as writer:
-        assert writer.missing_shards() == [0]
+        assert writer.unfinished_shards() == [0]
         make(writer, 0)
     assert open_dataset(OUT).digest == digest
     assert verify_dataset(OUT).problems == []
@@ -156,7 +156,7 @@ def test_a_shard_is_listed_only_when_it_is_in_the_bucket(bucket: Any, machines: 
         writer.finish()
         assert [entry.name for entry in open_dataset(OUT).manifest.shards] == [FIRST]
         assert verify_dataset(OUT).problems == []
-        assert writer.missing_shards() == []
+        assert writer.unfinished_shards() == []
     assert [entry.name for entry in open_dataset(OUT).manifest.shards] == [FIRST, SECOND]
 
 
@@ -165,7 +165,7 @@ def test_a_larger_wish_of_one_maker_is_known_to_all(bucket: Any, machines: Machi
         make(first, 0)
         with machines.maker("b", 8):
             machines.use("a")
-            assert first.missing_shards() == [1]
+            assert first.unfinished_shards() == [1]
             assert first.manifest.num_scenes == 8
     with machines.maker("c", 4) as third:
         assert third.num_shards == 2
@@ -203,7 +203,7 @@ def test_access_that_is_lost_in_the_middle_loses_nothing(
     assert text.startswith(f"out '{OUT}': cannot be written") and "\n" not in text
     assert "access that lets you list, read and write" in text and "s3cret" not in text
     with machines.maker("a") as writer:
-        assert writer.missing_shards() == []
+        assert writer.unfinished_shards() == []
         writer.finish()
     assert open_dataset(OUT).digest == expected
 

@@ -76,7 +76,7 @@ def _dataset(root: Path, scenes: int = 8) -> DatasetWriter:
     build = _build()
     writer = _begin(root, build, scenes)
     writer.lock_objects([_locked()])
-    for index in writer.missing_shards():
+    for index in writer.unfinished_shards():
         make_tiny_shard(writer, index)
     writer.finish()
     return writer
@@ -97,7 +97,7 @@ def test_the_digest_knows_nothing_of_place_or_order(tmp_path: Path) -> None:
 def test_as_many_scenes_are_planned_as_are_asked_for(tmp_path: Path) -> None:
     writer = _begin(tmp_path, _build(), 5)
     assert writer.manifest.num_scenes == 5
-    assert writer.missing_shards() == [0, 1]
+    assert writer.unfinished_shards() == [0, 1]
     done = writer.progress
     assert (done.shards, done.shards_requested, done.scenes_requested) == (0, 2, 5)
 
@@ -176,7 +176,7 @@ def test_a_shard_that_missed_the_manifest_is_found(tmp_path: Path) -> None:
     note_of(writer.folder, whole.shards[0].name).unlink()
     assert open_dataset(str(tmp_path / "b")).manifest.shards == whole.shards[1:]
     later = _begin(tmp_path / "b", _build(), 8)
-    assert later.missing_shards() == []
+    assert later.unfinished_shards() == []
     assert later.finish() == whole == open_dataset(str(tmp_path / "b")).manifest
 
 
@@ -271,7 +271,7 @@ def test_a_shard_in_the_folder_of_a_worker_alone_is_no_shard(
     with pytest.raises(TrilightError, match="a worker has packed .* folder is not this one"):
         writer.add_shard(elsewhere)
     assert sum(pauses) > 60  # a network file system may keep a listing for a minute
-    assert writer.missing_shards() == [0]
+    assert writer.unfinished_shards() == [0]
 
     def appear(seconds: float) -> None:
         name = elsewhere.name
@@ -318,12 +318,12 @@ def test_a_dataset_in_parts_is_whole(tmp_path: Path) -> None:
     keys = [s.key for shard in dataset.manifest.shards for s in dataset.read_shard(shard)]
     assert keys == [sample_key(index) for index in range(20)]
     assert _most_entries(tmp_path) == 2
-    assert writer.missing_shards() == []
+    assert writer.unfinished_shards() == []
     assert read_progress(writer.folder).scenes_done == 20
     path = tmp_path / names[3]
     moved = path.rename(tmp_path / "away")
     assert verify_dataset(tmp_path).problems == ["part-0001/train-000003.tar: missing"]
-    assert writer.missing_shards() == [3]
+    assert writer.unfinished_shards() == [3]
     moved.rename(path)
     assert index_shard(path) == shards[3]
     path.with_name("train-000009.tar").write_bytes(b"")

@@ -128,7 +128,7 @@ def test_who_waits_for_others_says_for_whom(
     writer = SimpleNamespace(folder=folder)
     settings = SimpleNamespace(splits=_build().splits)
     run: Any = SimpleNamespace(
-        publication=writer, settings=settings, missing_shards=lambda: missing.pop(0)
+        publication=writer, settings=settings, unfinished_shards=lambda: missing.pop(0)
     )
     _make(tmp_path, 1, 4, Counter())
     with hold_claim(folder.staged_shard(NAME) / f"{sample_key(0)}.claim"):
@@ -280,8 +280,8 @@ def test_a_range_leaves_to_others_what_they_are_at(
     ranged = dataclasses.replace(run, order=dataclasses.replace(run.order, shards="0:1"))
     pipeline.make_shards(ranged, runner, lambda run, outcome: None)
     assert runner.rounds == [1]
-    assert ranged.missing_shards() == [0]
-    assert run.missing_shards() == [0, 1]
+    assert ranged.unfinished_shards() == [0]
+    assert run.unfinished_shards() == [0, 1]
 
 
 def test_what_is_free_is_what_nobody_is_at(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders import ggx
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
-from storage.optics.lobes import lobes_of
+from storage.optics.bsdf import bsdf_lobes
 from storage.optics.multiscatter import directional_albedo, scattered_again
 from tests.pipeline.renders.scene_kit import material
 from tests.storage.optics.test_multiscatter import stretched
@@ -26,7 +26,7 @@ UP = (0.0, 0.0, 1.0)
 def kernel_lobes(*, diffuse: Any = 0.0, specular: Any = 0.0, roughness: float) -> KernelLobes:
     """Return one material as the kernel has it."""
     row = material(diffuse=diffuse, specular=specular, roughness=roughness)
-    lobes = lobes_of(row[None].astype(np.float32))
+    lobes = bsdf_lobes(row[None].astype(np.float32))
     again = scattered_again(lobes.specular, lobes.alpha, "correlated")
     return KernelLobes(
         diffuse=mi.Color3f(*lobes.diffuse[0].tolist()),

@@ -26,7 +26,7 @@ from storage.dataset.manifest import (
     read_manifest,
     write_manifest,
 )
-from storage.dataset.progress import missing_shards
+from storage.dataset.progress import unfinished_shards
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import (
     named_shard,
@@ -202,7 +202,7 @@ def test_a_billion_planned_shards_cost_nothing(tmp_path: Path) -> None:
     settings = {"splits": {"scenes_per_shard": 1}}
     edit_manifest(dataset, settings=settings, num_scenes=10**9)
     with pytest.raises(TrilightError, match="1000000000 shards; expected at most 1000000"):
-        missing_shards(str(tmp_path))
+        unfinished_shards(str(tmp_path))
 
 
 SETTINGS = SplitSettings(scenes_per_shard=4)

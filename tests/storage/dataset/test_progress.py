@@ -18,10 +18,10 @@ from storage.dataset.progress import (
     announce_objects,
     count_object,
     forget_views,
-    missing_shards,
     read_progress,
     read_status,
     tell_views,
+    unfinished_shards,
 )
 from storage.dataset.scene_logs import SceneLog, log_scene, sample_logs
 from storage.dataset.shard_notes import note_of
@@ -127,7 +127,7 @@ def test_only_a_bucket_is_asked_what_it_holds(
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     begin_tiny(tmp_path, 8)
     with serve(tmp_path) as site:
-        assert missing_shards(site.url) == [0, 1]
+        assert unfinished_shards(site.url) == [0, 1]
     assert not asked
 
 

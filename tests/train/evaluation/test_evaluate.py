@@ -29,6 +29,7 @@ from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
 from train.evaluation.baselines import MEDIAN, NEAREST, Baselines, median_picture
 from train.evaluation.chart import plot_excursions
+from train.evaluation.equal_time import TRACER
 from train.evaluation.evaluate import (
     GROUPED,
     EvalConfig,
@@ -45,7 +46,6 @@ from train.evaluation.options import EvaluationOptions
 from train.evaluation.pages import evaluation_page
 from train.evaluation.published import BENCHMARK
 from train.evaluation.report import record
-from train.evaluation.same_time import TRACER
 from train.loop.state import new_state
 from train.loss.lpips import Lpips
 

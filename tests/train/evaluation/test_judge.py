@@ -26,6 +26,14 @@ from tests.train.loss.test_objective import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
 from train.evaluation.baselines import median_picture
+from train.evaluation.equal_time import (
+    CAPTION,
+    TRACER,
+    EqualTimeResult,
+    TracerTimes,
+    equal_time,
+    sentences,
+)
 from train.evaluation.error_colors import ERROR_WHITE, error_picture
 from train.evaluation.evaluate import EvalConfig, judge_views, sheet_views
 from train.evaluation.judge import hit_masks
@@ -33,14 +41,6 @@ from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.metrics import METRICS, noise_floors, picture_scores
 from train.evaluation.pages import evaluation_page
 from train.evaluation.report import record
-from train.evaluation.same_time import (
-    CAPTION,
-    TRACER,
-    SameTimeResult,
-    TracerTimes,
-    same_time,
-    sentences,
-)
 from train.evaluation.scores import ViewScore, fraction_better, lead, score_view, summarize_scores
 from train.evaluation.sheet import (
     NOISE_WHITE,
@@ -205,7 +205,7 @@ def test_floors_of_metrics_without_a_measurement_are_of_drawn_noise() -> None:
     assert set(METRICS) - set(without) == {"lpips"}
 
 
-TIMES = SameTimeResult(
+TIMES = EqualTimeResult(
     network_first_s=0.12,
     network_further_s=0.06,
     scenes=4,
@@ -257,7 +257,7 @@ def judging(tmp_path_factory: pytest.TempPathFactory) -> tuple[EvalConfig, list[
 def test_both_are_judged_on_the_same_views(judging: tuple[EvalConfig, list[JudgedView]]) -> None:
     _, views = judging
     assert [TRACER in view.scores for view in views] == [True, False] * 3
-    found = same_time(views, TIMES, "the first view of each scene")
+    found = equal_time(views, TIMES, "the first view of each scene")
     assert found["views"] == 3
     assert found["tracer"]["psnr_log_db"]["median"] == 100.0, "it shows the target itself"
     leads = [view.scores[NETWORK]["psnr_log_db"] - 100.0 for view in views[::2]]  # type: ignore[operator]
@@ -277,13 +277,13 @@ def test_what_takes_longer_and_what_is_missing_is_said(
     _, views = judging
     dearest = TracerTimes(samples=1, denoiser="fast", first_s=0.1, further_s=0.07, note="slow")
     dear = dataclasses.replace(TIMES, preview=dearest)
-    told = " ".join(sentences(same_time(views, dear, "all")))
+    told = " ".join(sentences(equal_time(views, dear, "all")))
     assert "1 sample a pixel" in told and "longer than the network" in told and "slow." in told
     untraced = [dataclasses.replace(view, scores={NETWORK: view.scores[NETWORK]}) for view in views]
-    own, line = sentences(same_time(untraced, TIMES, "all"))
+    own, line = sentences(equal_time(untraced, TIMES, "all"))
     assert line.endswith("is not shown: none of the judged views could be traced.")
     lacking = dataclasses.replace(TIMES, preview=None, missing="no tracer here")
-    page = evaluation_page(record(views, {}, same_time(views, lacking, "all")))
+    page = evaluation_page(record(views, {}, equal_time(views, lacking, "all")))
     assert own in page and "is not shown: no tracer here." in page
     assert "own time" not in evaluation_page(record(views, {}))
 

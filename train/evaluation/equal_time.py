@@ -55,7 +55,7 @@ class TracerTimes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SameTimeResult:
+class EqualTimeResult:
     """Median times on one CPU thread after a warm-up."""
 
     network_first_s: float
@@ -90,7 +90,7 @@ def time_both(
     *,
     missing: str = "",
     note: str = "",
-) -> SameTimeResult:
+) -> EqualTimeResult:
     """Time both on some scenes, and choose the samples that fit.
 
     The network is timed first, then the path tracer, then the network once more.
@@ -132,7 +132,7 @@ def time_both(
             note=note,
             **dataclasses.asdict(theirs[level]),
         )
-    return SameTimeResult(
+    return EqualTimeResult(
         network_first_s=middle.first_s,
         network_further_s=middle.further_s,
         scenes=len(timed),
@@ -162,7 +162,7 @@ def _preview_prices(
     return prices
 
 
-def same_time(views: Sequence[JudgedView], times: SameTimeResult, which: str) -> dict[str, Any]:
+def equal_time(views: Sequence[JudgedView], times: EqualTimeResult, which: str) -> dict[str, Any]:
     """Compare network and path tracer over the views that have both, as JSON values.
 
     Args:

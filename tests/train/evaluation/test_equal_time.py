@@ -11,7 +11,7 @@ from storage.records.scene import Scene
 from storage.renderer import Camera, Image, OnProgress, Renderer, ignore_progress
 from tests.for_each import case
 from tests.train.toy import toy_sample
-from train.evaluation.same_time import Filter, Level, spread_text, spread_views, time_both
+from train.evaluation.equal_time import Filter, Level, spread_text, spread_views, time_both
 from train.evaluation.timing import Price, time_scene
 
 FILTERS: tuple[Filter, ...] = ("fast", "high")

@@ -34,7 +34,7 @@ class Lobes:
     """[T] share of the specular lobe, in [0, 1]; 0 for black."""
 
 
-def lobes_of(materials: NDArray[np.float32]) -> Lobes:
+def bsdf_lobes(materials: NDArray[np.float32]) -> Lobes:
     """Return the lobes of material rows [T, 10 or more]; other columns are not read."""
     rows = materials.astype(np.float64)
     diffuse = rows[:, DIFFUSE]
