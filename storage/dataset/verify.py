@@ -112,7 +112,11 @@ def verify_dataset(
         )
         try:
             for shard, findings in checks:
-                faults = [*findings.faults, *_twice(findings.keys, shard, where)]
+                faults = findings.faults + [
+                    f"sample {key} occurs twice in the dataset, first in {first}"
+                    for key in findings.keys
+                    if (first := where.setdefault(key, shard.name)) != shard.name
+                ]
                 bad += [shard.name] if faults else []
                 problems += [
                     f"{shard.name}: {fault.removeprefix(f'{shard.name}: ')}"
@@ -205,12 +209,6 @@ def _check_manifest(dataset: Dataset) -> Iterator[str]:
             yield f"{document}: edited since it was written (sha256 differs from the manifest)"
 
 
-def _twice(keys: Sequence[str], shard: ShardEntry, where: dict[str, str]) -> Iterator[str]:
-    for key in keys:
-        if (other := where.setdefault(key, shard.name)) != shard.name:
-            yield f"sample {key} occurs twice in the dataset, first in {other}"
-
-
 def _check_shard(
     dataset: Dataset, shard: ShardEntry, locked: Mapping[str, LockedObject] | None, *, fast: bool
 ) -> _ShardFindings:
@@ -224,7 +222,11 @@ def _check_shard(
             return findings
         with _open_shard(dataset, shard) as stream:
             if fast:
-                _check_members(stream, shard, findings)
+                findings.keys += contents_of(stream, shard.name).samples
+                if len(findings.keys) != shard.num_samples:
+                    findings.faults.append(
+                        f"{len(findings.keys)} samples; expected {shard.num_samples}"
+                    )
             else:
                 _check_content(stream, shard, dataset.manifest, locked, findings)
     except EnvironmentFailure:
@@ -251,12 +253,6 @@ def _open_shard(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
         stream.close()
         raise
     return stream
-
-
-def _check_members(stream: BinaryIO, shard: ShardEntry, findings: _ShardFindings) -> None:
-    findings.keys += contents_of(stream, shard.name).samples
-    if len(findings.keys) != shard.num_samples:
-        findings.faults.append(f"{len(findings.keys)} samples; expected {shard.num_samples}")
 
 
 def _check_content(

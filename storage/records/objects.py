@@ -108,8 +108,7 @@ class Failure:
 
 def encode_objects_lock(objects: Iterable[LockedObject]) -> bytes:
     """Return the file of a lock: one line per object, sorted by uid."""
-    rows = sorted(objects, key=lambda entry: entry.uid)
-    return _lines(rows)
+    return _lines(sorted(objects, key=lambda entry: entry.uid))
 
 
 def write_objects_lock(path: Path, objects: Iterable[LockedObject]) -> None:
