@@ -72,8 +72,9 @@ class StoredSample(SceneRecord):
         with name_errors(self.key):
             size = (resolution, resolution)
             lights_rgb = decode_lights(self.scene, views, size, self.members)
-        for view, lights in zip(views, () if lights_rgb is None else lights_rgb, strict=False):
-            check_lights(self.key, lights[None], first_view=view)
+        if lights_rgb is not None:
+            for view, lights in zip(views, lights_rgb, strict=True):
+                check_lights(self.key, lights[None], first_view=view)
         return lights_rgb
 
 
