@@ -108,7 +108,8 @@ class Failure:
 
 def encode_objects_lock(objects: Iterable[LockedObject]) -> bytes:
     """Return the file of a lock: one line per object, sorted by uid."""
-    return _lines(sorted(objects, key=lambda entry: entry.uid))
+    rows = sorted(objects, key=lambda entry: entry.uid)
+    return _lines(rows)
 
 
 def write_objects_lock(path: Path, objects: Iterable[LockedObject]) -> None:
