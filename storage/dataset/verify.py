@@ -112,11 +112,7 @@ def verify_dataset(
         )
         try:
             for shard, findings in checks:
-                faults = findings.faults + [
-                    f"sample {key} occurs twice in the dataset, first in {first}"
-                    for key in findings.keys
-                    if (first := where.setdefault(key, shard.name)) != shard.name
-                ]
+                faults = [*findings.faults, *_twice(findings.keys, shard, where)]
                 bad += [shard.name] if faults else []
                 problems += [
                     f"{shard.name}: {fault.removeprefix(f'{shard.name}: ')}"
@@ -207,6 +203,12 @@ def _check_manifest(dataset: Dataset) -> Iterator[str]:
             yield f"{document}: missing"
         elif sha256_hex(content) != sha256:
             yield f"{document}: edited since it was written (sha256 differs from the manifest)"
+
+
+def _twice(keys: Sequence[str], shard: ShardEntry, where: dict[str, str]) -> Iterator[str]:
+    for key in keys:
+        if (other := where.setdefault(key, shard.name)) != shard.name:
+            yield f"sample {key} occurs twice in the dataset, first in {other}"
 
 
 def _check_shard(

@@ -183,7 +183,7 @@ class _Header:
     levels: tuple[LevelRecord, ...]
     materials: OwnMaterials | None = None
     skins: Mapping[str, SkinQuality] = dataclasses.field(default_factory=dict)
-    """By the budget of their level."""
+    """Quality of the skin of each level that has one, by its budget."""
 
 
 def _level(
