@@ -17,7 +17,6 @@ from pipeline.exchange import formats
 from pipeline.exchange.convert import convert_scene, write_scene
 from pipeline.exchange.formats import list_lost_members
 from pipeline.exchange.open_scene import SceneSource, load_source, scene_source
-from pipeline.exchange.renderformer_json import describe_scene
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.sample_layout import scene_plan
@@ -174,12 +173,6 @@ def test_any_names_become_names_of_files(tmp_path: Path) -> None:
         assert_usable(written(scene, folder), scene, folder)
 
 
-def test_light_beyond_half_floats_is_said_to_be_cut_off() -> None:
-    scene = tiny_scene()
-    scene.materials[LIGHT, 7:] = 65505
-    assert any("cuts off" in text for text in describe_scene(scene, "a").lost)
-
-
 WARM, SCENES = 50, 200
 PAGE = 4096
 
@@ -204,10 +197,6 @@ def grown_bytes(folder: Path, form: str) -> int:
         if index == WARM:
             before = resident_bytes()
     return resident_bytes() - before
-
-
-def nothing() -> None:
-    """A child needs no preparation."""
 
 
 @pytest.mark.slow("memory")

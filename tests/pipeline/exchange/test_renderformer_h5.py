@@ -203,18 +203,6 @@ def test_albedos_that_rounding_took_over_one_are_mended(tmp_path: Path) -> None:
         read_renderformer_h5(path)
 
 
-def test_flat_and_smooth_shading_stay(tmp_path: Path) -> None:
-    """The two triangles of the floor share vertices; turned normals part them."""
-    path = tmp_path / "a.h5"
-    write_renderformer_h5(path, tiny_scene())
-    assert len(read_renderformer_h5(path).scene.vertex_positions) == 7
-    with h5py.File(path, "r+") as file:
-        file["vn"][1] = np.array([[0, 0.6, 0.8]] * 3)
-    scene = read_renderformer_h5(path).scene
-    assert len(scene.vertex_positions) == 9
-    assert np.allclose(scene.vertex_normals[scene.faces[1]], [0, 0.6, 0.8])
-
-
 @pytest.mark.parametrize("packing", [{}, {"compression": "gzip", "shuffle": True, "chunks": True}])
 def test_other_packings_are_read(tmp_path: Path, packing: dict[str, object]) -> None:
     plain, other = tmp_path / "a.h5", tmp_path / "b.h5"

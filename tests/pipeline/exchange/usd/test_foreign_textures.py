@@ -10,14 +10,12 @@ from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
 from pipeline.exchange.usd.read import UsdScene, read_usd
-from pipeline.exchange.usd.write import write_usd
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
 from storage.records.exr import encode_channels
 from tests.for_each import for_each
 from tests.pipeline.exchange.exchange_kit import row_at
 from tests.pipeline.exchange.strangers_stage import write_stage
-from tests.textured_by_hand import textured_scene
 
 RED, GREEN, BLUE, GREY = (200, 0, 0), (0, 200, 0), (0, 0, 200), (100, 100, 100)
 PICTURE = np.array([[RED, GREEN], [BLUE, GREY]], np.uint8)
@@ -67,18 +65,6 @@ def test_every_texel_lies_where_usd_puts_it(tmp_path: Path) -> None:
         assert row[:3] == pytest.approx(linear(colour), abs=CODED), colour
         assert row[3:7] == pytest.approx([F, F, F, 0.3])
     assert not any("texture" in text for text in found.lost)
-
-
-def test_an_edit_of_our_own_file_keeps_its_textures(tmp_path: Path) -> None:
-    """Whatever is moved, bytes and floats of textures come back as they were."""
-    write_usd(tmp_path / "a.usda", textured_scene())
-    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
-    UsdGeom.Xformable(stage.GetPrimAtPath("/Scene/Objects/floor")).AddTranslateOp().Set((0, 0, 1))
-    stage.GetRootLayer().Save()
-    found = read_usd(tmp_path / "a.usda", None, None, "CC0-1.0")
-    assert not found.exact
-    assert [t.sha256 for t in found.scene.textures] == [t.sha256 for t in textured_scene().textures]
-    assert np.array_equal(found.scene.uv[:6], textured_scene().uv[:6])  # type: ignore[index]
 
 
 def test_scale_and_bias_are_applied_in_linear_light_and_bounded(tmp_path: Path) -> None:
@@ -139,12 +125,6 @@ def test_a_mesh_without_coordinates_takes_the_mean(tmp_path: Path, is_there: boo
     assert any("no coordinates 'st'" in text for text in found.lost)
     mean = (1 - F) * linear_from_srgb8()[PICTURE].mean(axis=(0, 1))
     assert row_at(found.scene, 0, 0.1)[:3] == pytest.approx(mean, abs=1e-5)
-
-
-def test_one_texel_is_a_constant(tmp_path: Path) -> None:
-    found = changed(tmp_path, None, PICTURE[:1, :1])
-    assert not found.scene.textures
-    assert row_at(found.scene, 0, 0.1)[:3] == pytest.approx(linear(RED), abs=1e-6)
 
 
 def test_metals_take_their_colour_where_a_texture_says_metal(tmp_path: Path) -> None:

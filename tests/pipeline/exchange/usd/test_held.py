@@ -183,6 +183,7 @@ def test_objects_turn_about_their_centers(tmp_path: Path) -> None:
 
     scene = tiny_scene()
     found = edited(tmp_path, scene, turn)
+    assert any("changed since Trilight wrote it: read as any other" in text for text in found.lost)
     was, now = (s.vertex_positions[s.faces[2]] for s in (scene, found.scene))
     assert now.mean(axis=0)[2] == 2
     assert np.array_equal(rows(found.scene)[2], scene.materials[LIGHT])

@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
-from pipeline.exchange.usd.read_exact_scene import read_exact, scene_keys
+from pipeline.exchange.usd.read import read_usd, usd_keys
+from pipeline.exchange.usd.read_exact_scene import read_exact
 from pipeline.exchange.usd.write import SUFFIXES, write_usd, write_usd_shard
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
@@ -219,14 +220,15 @@ def test_a_shard_shows_one_scene_at_a_time(tmp_path: Path, suffix: str) -> None:
     write_usd_shard(tmp_path / f"s{suffix}", kept.items())
     stage = Usd.Stage.Open(str(tmp_path / f"s{suffix}"))
     assert errors_of(stage) == []
-    layer = stage.GetRootLayer()
-    assert scene_keys(layer) == list(kept)
     for key, scene in kept.items():
         stage.GetPrimAtPath("/Scenes").GetVariantSet("scene").SetVariantSelection(key)
         meshes = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
         assert len(meshes) == len(set(scene.object_index))
-        back = read_exact(layer, key)
-        assert back is not None and encode_scene(back) == encode_scene(scene)
+        found = read_usd(tmp_path / f"s{suffix}", key, None, "")
+        assert encode_scene(found.scene) == encode_scene(scene)
+    assert usd_keys(tmp_path / f"s{suffix}") == list(kept)
+    with pytest.raises(TrilightError, match="no scene 000000003; expected one of 000000001"):
+        read_usd(tmp_path / f"s{suffix}", "000000003", None, "")
 
 
 def edits() -> Iterable[tuple[str, str, Any]]:
