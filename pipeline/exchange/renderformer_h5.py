@@ -27,13 +27,13 @@ or shared vertices. The reader does not trust the file (pipeline.exchange.safe_h
 """
 
 import io
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.renderformer_cells import (
     CELLS,
     compute_cells,
@@ -44,12 +44,15 @@ from pipeline.exchange.renderformer_stored import (
     CHANNELS,
     FLAT_NORMAL,
     MAX_TRIANGLES,
+    SECOND_VERSION,
     TEXTURE_EMISSION,
     TEXTURE_NORMAL,
+    is_second_version,
+    read_grey_textures,
+    read_sky,
     read_textures,
     with_cells,
 )
-from pipeline.exchange.renderformer_v2 import KNOWN, is_second_version, read_grey_textures, read_sky
 from pipeline.exchange.safe_h5 import (
     list_names,
     open_h5,
@@ -211,19 +214,7 @@ _ROUNDING = 2.0**-10
 _PUBLISHED_EMITTER = np.array([1, 1, 1, 0, 0, 0, 1], np.float32)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RenderFormerFile:
-    """A scene that was read, with its pictures and losses."""
-
-    scene: Scene
-    """A checked scene: one object of everything that reflects, one for each emitting triangle."""
-    radiance_rgb: NDArray[np.float32] | None
-    """[V, H, W, 3] linear radiance; None where the file has no pictures."""
-    lost: tuple[str, ...]
-    """Sentences about parts of the file that were lost."""
-
-
-def read_renderformer_h5(path: Path) -> RenderFormerFile:
+def read_renderformer_h5(path: Path) -> LoadedScene:
     """Read a file of the published layout.
 
     Corners with equal position and normal become one vertex, so that flat and smooth shading stay
@@ -258,11 +249,11 @@ def read_renderformer_h5(path: Path) -> RenderFormerFile:
         )
         scene = with_cells(scene, stored, UNKNOWN_LICENCE)
         scene.check()
-    return RenderFormerFile(scene=scene, radiance_rgb=pictures, lost=tuple(lost))
+    return LoadedScene(scene=scene, radiance_rgb=pictures, notes=tuple(lost))
 
 
 def _list_unknown(file: Any) -> list[str]:
-    known = (*_KNOWN, *KNOWN) if is_second_version(file) else _KNOWN
+    known = (*_KNOWN, *SECOND_VERSION) if is_second_version(file) else _KNOWN
     names = [f"array or group {name!r:.60}" for name in list_names(file) if name not in known]
     names += [f"attribute {name!r:.60}" for name in sorted(file.attrs)]
     return names if len(names) <= 10 else [*names[:10], f"and {len(names) - 10} more"]

@@ -18,6 +18,7 @@ from pipeline.exchange.gltf.cameras_and_lights import (
     light_triangles,
     read_camera,
 )
+from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.part_materials import PartConverter
 from pipeline.exchange.pictures import decode_values
 from pipeline.exchange.textured_triangles import SceneParts, TexturedTriangles
@@ -30,24 +31,14 @@ from pipeline.foreign.material import SourceMaterial
 from pipeline.foreign.part import Part, drop_empty, unit_normals
 from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected, TrilightError
-from storage.records.scene import Scene, SceneObject
+from storage.records.scene import SceneObject
 from storage.records.texture import MapSource
 
 SUFFIXES = (".glb", ".gltf")
 _LIMITS = ReadLimits(max_bytes=1 << 30, with_materials=True)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class GltfScene:
-    """A scene that was read, with its losses."""
-
-    scene: Scene
-    """The scene, which passes `Scene.check`."""
-    lost: tuple[str, ...]
-    """Sentences about parts of the file that were lost."""
-
-
-def read_gltf(path: Path, licence: str) -> GltfScene:
+def read_gltf(path: Path, licence: str) -> LoadedScene:
     """Read the default scene of a file.
 
     Args:
@@ -75,7 +66,7 @@ class _GltfReader:
     licence: str
     lost: list[str] = field(default_factory=list)
 
-    def scene(self) -> GltfScene:
+    def scene(self) -> LoadedScene:
         """Build the scene of the file."""
         tree = self.document.tree
         nodes = list(placed_nodes(tree))
@@ -102,8 +93,8 @@ class _GltfReader:
             sky = even_sky()
         usable = [camera for camera in cameras if camera is not None]
         scene = parts.build(usable, sky, {"template": "gltf", "file": self.name}, self.lost)
-        lost = dict.fromkeys([*self.document.unread, *self.lost])
-        return GltfScene(scene=scene, lost=tuple(lost))
+        notes = dict.fromkeys([*self.document.unread, *self.lost])
+        return LoadedScene(scene=scene, notes=tuple(notes))
 
     def _add_mesh(self, placed: PlacedNode, parts: SceneParts) -> None:
         if "mesh" not in placed.node:

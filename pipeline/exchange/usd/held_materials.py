@@ -40,7 +40,6 @@ from pipeline.foreign.usd.shaders import (
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import (
     TextureNode,
-    UvChart,
     asset_bytes,
     find_sources,
     is_output,
@@ -188,7 +187,8 @@ def _read_exact_texture(
     """Return the texture of a column; None where its file or its use differs."""
     is_used_alike = all(
         each.wrap == ("repeat", "repeat")
-        and each.chart == UvChart(primvar=node.chart.primvar, transforms=())
+        and each.chart.primvar == node.chart.primvar
+        and not each.chart.is_moved
         and (each.scale == 1).all()
         and not each.bias.any()
         for each in nodes

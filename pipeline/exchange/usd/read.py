@@ -4,30 +4,19 @@ Only child processes with limits import this (pipeline.isolation): native code p
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.usd.foreign_scene import build_stage_scene
 from pipeline.exchange.usd.read_exact_scene import is_marked, read_exact, scene_keys
 from pipeline.foreign.usd.stage import OpenedStage, read_quietly
 from storage.errors import Rejected, TrilightError
-from storage.records.scene import Scene
 
 MAX_FRAMES = 10_000
 """Maximum number of scenes in a stage with time samples."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class UsdScene:
-    """A scene that was read, with its losses."""
-
-    key: str  # key in a shard, or time code of a frame; empty for a single scene
-    scene: Scene  # passes `Scene.check`
-    lost: tuple[str, ...]  # sentences about parts of the file that were lost
-    exact: bool  # True where Trilight wrote the file and it is unchanged
 
 
 def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
@@ -39,7 +28,7 @@ def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
     return read_quietly(path, lambda: _keys(OpenedStage(path, folder)))
 
 
-def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> UsdScene:
+def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> LoadedScene:
     """Return one scene of a file.
 
     Args:
@@ -54,7 +43,7 @@ def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> 
     return read_quietly(path, lambda: _read(path, key, folder, licence))
 
 
-def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> UsdScene:
+def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> LoadedScene:
     opened = OpenedStage(path, folder)
     shard = scene_keys(opened.root)
     if shard is not None:
@@ -62,7 +51,7 @@ def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> Usd
     if key is None:
         scene = read_exact(opened.root, opened=opened)
         if scene is not None:
-            return UsdScene(key="", scene=scene, lost=(), exact=True)
+            return LoadedScene(scene=scene, notes=())
     stage = opened.compose()
     frames = list(_frames(stage))
     if is_marked(opened.root):
@@ -79,10 +68,10 @@ def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> Usd
         message = error.message if isinstance(error, Rejected) else str(error)
         text = message.removeprefix(f"{path.name}: ")
         raise TrilightError(f"{path.name}: {text}") from error
-    return UsdScene(key=chosen, scene=scene, lost=opened.notes, exact=False)
+    return LoadedScene(scene=scene, notes=opened.notes)
 
 
-def _read_shard_scene(opened: OpenedStage, keys: list[str], key: str) -> UsdScene:
+def _read_shard_scene(opened: OpenedStage, keys: list[str], key: str) -> LoadedScene:
     name = opened.path.name
     if key not in keys:
         raise TrilightError(f"{name}: no scene {key}; expected one of {keys[0]} to {keys[-1]}.")
@@ -92,7 +81,7 @@ def _read_shard_scene(opened: OpenedStage, keys: list[str], key: str) -> UsdScen
             f"{name}: scene {key} has been changed since Trilight wrote it; save it as a file of "
             "its own and read that."
         )
-    return UsdScene(key=key, scene=scene, lost=(), exact=True)
+    return LoadedScene(scene=scene, notes=())
 
 
 def _keys(opened: OpenedStage) -> list[str]:

@@ -24,7 +24,7 @@ from pipeline.foreign.usd.shaders import (
     reflect_head_on,
 )
 from pipeline.foreign.usd.stage_materials import StageMaterials, name_unsupported
-from pipeline.foreign.usd.texture_nodes import TextureNode, UvChart
+from pipeline.foreign.usd.texture_nodes import TextureNode
 from storage.errors import Rejected
 
 _CHANNELS = {"rgb": 0, "r": 0, "g": 1, "b": 2, "a": 3}
@@ -281,12 +281,11 @@ class _Reader:
             picture = _scale_picture(picture, scale, bias)
             if self._notes is not None and picture.values[..., :3].max() > 1:
                 self._notes.append(f"{where}: texels above 1 are clamped, but for emission")
-        uv_matrix, uv_offset = _chart_transform(node.chart)
         return Slot(
             picture=picture,
             uv_set=self._primvars.index(node.chart.primvar),
-            uv_matrix=uv_matrix,
-            uv_offset=uv_offset,
+            uv_matrix=node.chart.matrix,
+            uv_offset=node.chart.offset,
             channel=channel,
         )
 
@@ -311,17 +310,6 @@ def _scale_picture(
         strip = slice(row, row + _STRIP)
         values[strip] = np.maximum(picture.linear(picture.values[strip]) * scale + bias, 0)
     return Picture(values=values, is_srgb=False, wrap=picture.wrap)
-
-
-def _chart_transform(chart: UvChart) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    matrix = np.eye(2)
-    offset = np.zeros(2)
-    for transform in chart.transforms:
-        matrix = transform.matrix @ matrix
-        offset = transform.matrix @ offset + transform.translation
-    if not (np.isfinite(matrix).all() and np.isfinite(offset).all()):
-        raise Rejected("materials_unreadable", "coordinates are moved by what is no number")
-    return matrix, offset
 
 
 def _rgb(stated: StatedMaterial, name: str) -> RGB:

@@ -13,8 +13,9 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.exchange.convert import convert_scene, write_scene
-from pipeline.exchange.gltf.read import GltfScene, read_gltf
+from pipeline.exchange.gltf.read import read_gltf
 from pipeline.exchange.gltf.write import encode_mesh_glb, encode_scene_glb
+from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.open_scene import load_source, scene_source
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
@@ -65,11 +66,11 @@ def quad(
     return {**tree, **changes}, buffer
 
 
-def saved(folder: Path, tree: dict[str, Any], buffer: bytes) -> GltfScene:
+def saved(folder: Path, tree: dict[str, Any], buffer: bytes) -> LoadedScene:
     return read_gltf(write_glb(folder / "a.glb", tree, buffer), "CC0-1.0")
 
 
-def read(folder: Path, *pictures: bytes | str, **changes: Any) -> GltfScene:
+def read(folder: Path, *pictures: bytes | str, **changes: Any) -> LoadedScene:
     return saved(folder, *quad(*pictures, **changes))
 
 
@@ -177,7 +178,7 @@ def test_what_is_lost_is_said_once(tmp_path: Path) -> None:
         "clearcoat",
         "animations",
     ):
-        assert sum(words in text for text in found.lost) == 1, words
+        assert sum(words in text for text in found.notes) == 1, words
     files = convert_scene(
         scene_source(str(tmp_path / "a.glb")), tmp_path / "a.usda", budget=None,
         done=lambda finished, total: None,
@@ -190,7 +191,7 @@ def test_what_is_lost_is_said_once(tmp_path: Path) -> None:
 
 def test_a_missing_picture_leaves_the_factor(tmp_path: Path) -> None:
     found = read(tmp_path, "gone.png")
-    assert any("left out: 'gone.png'" in text for text in found.lost)
+    assert any("left out: 'gone.png'" in text for text in found.notes)
     assert row_at(found.scene, 0.5, 0.5)[:3] == pytest.approx([1 - F] * 3, abs=1e-6)
 
 
@@ -204,7 +205,7 @@ def test_a_mesh_without_coordinates_takes_the_mean_and_one_texel_is_a_constant(
     tmp_path: Path,
 ) -> None:
     found = read(tmp_path, uv=None)
-    assert any("without texture coordinates" in text for text in found.lost)
+    assert any("without texture coordinates" in text for text in found.notes)
     assert not found.scene.textures
     mean = linear_from_srgb8()[PICTURE].mean(axis=(0, 1)) * (1 - F)
     assert found.scene.materials[0, :3] == pytest.approx(mean, abs=1e-5)
@@ -217,7 +218,7 @@ def test_a_mesh_without_coordinates_takes_the_mean_and_one_texel_is_a_constant(
 def test_factors_that_are_no_albedo(tmp_path: Path, value: Any) -> None:
     surface = {"metallicFactor": value, "baseColorFactor": [0.5, 0.5, 0.5, 1]}
     found = read(tmp_path, material={"pbrMetallicRoughness": surface})
-    assert any("metallicFactor" in text for text in found.lost)
+    assert any("metallicFactor" in text for text in found.notes)
 
 
 def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path) -> None:

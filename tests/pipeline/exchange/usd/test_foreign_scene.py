@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdUtils
 
-from pipeline.exchange.usd.read import UsdScene, read_usd, usd_keys
+from pipeline.exchange.loaded_scene import LoadedScene
+from pipeline.exchange.usd.read import read_usd, usd_keys
 from pipeline.exchange.usd.write import SUFFIXES, write_usd
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from storage.errors import TrilightError
@@ -20,12 +21,12 @@ from tests.pipeline.exchange.strangers_stage import L_SHAPE, mesh, write_stage
 from tests.scenes_by_hand import tiny_scene
 
 
-def read(path: Path, key: str | None = None) -> UsdScene:
+def read(path: Path, key: str | None = None) -> LoadedScene:
     return read_usd(path, key, None, "LicenseRef-user-provided")
 
 
 @pytest.fixture
-def stage(tmp_path: Path) -> UsdScene:
+def stage(tmp_path: Path) -> LoadedScene:
     return read(write_stage(tmp_path))
 
 
@@ -43,11 +44,11 @@ def facing(corners: np.ndarray) -> np.ndarray:
     return np.asarray(cross.sum(axis=0) / 2)
 
 
-def test_units_axes_and_losses(stage: UsdScene) -> None:
+def test_units_axes_and_losses(stage: LoadedScene) -> None:
     """Centimetres with Y up become metres with Z up; to single precision."""
     assert stage.scene.environment is not None, "its DomeLight is kept"
     for words in ("/W/rect: emits to one side", "its material emits nothing"):
-        assert any(words in text for text in stage.lost), words
+        assert any(words in text for text in stage.notes), words
     corners, _ = object_of(stage.scene, "Grid")
     assert facing(corners) == pytest.approx([0, 0, 4], abs=1e-6)
     assert stage.scene.c2w[0, :3, 3] == pytest.approx([0, -3, 0.5], abs=1e-6)
@@ -64,7 +65,7 @@ def test_units_axes_and_losses(stage: UsdScene) -> None:
     ],
 )
 def test_lights_have_their_area_and_radiance(
-    stage: UsdScene, name: str, area_vector: list[float], radiance: list[float]
+    stage: LoadedScene, name: str, area_vector: list[float], radiance: list[float]
 ) -> None:
     corners, rows = object_of(stage.scene, name)
     # sums of up to 128 areas in single precision
@@ -111,7 +112,7 @@ def test_our_own_files_read_as_a_stranger_does_hold_the_same_light(tmp_path: Pat
     text = (tmp_path / "a.usda").read_text()
     (tmp_path / "b.usda").write_text(text.replace("trilight:", "other:"))
     found, scene = read(tmp_path / "b.usda"), tiny_scene()
-    assert not found.exact
+    assert found.notes
     back = found.scene
     assert np.array_equal(back.vertex_positions[back.faces], scene.vertex_positions[scene.faces])
     assert np.array_equal(back.vertex_normals[back.faces], scene.vertex_normals[scene.faces])
@@ -156,7 +157,7 @@ def test_a_stage_without_light_or_camera(tmp_path: Path) -> None:
     lamps[0].CreateRadiusAttr(1.0)
     stage.GetRootLayer().Export(str(tmp_path / "a.usda"))
     assert any(
-        "binding of a material that is not there" in t for t in read(tmp_path / "a.usda").lost
+        "binding of a material that is not there" in t for t in read(tmp_path / "a.usda").notes
     )
     path = write_stage(tmp_path)
     whole = Usd.Stage.Open(str(path))
@@ -164,7 +165,7 @@ def test_a_stage_without_light_or_camera(tmp_path: Path) -> None:
     whole.GetRootLayer().Save()
     found = read(path)
     assert found.scene.num_views == 1
-    assert any("no camera" in text for text in found.lost)
+    assert any("no camera" in text for text in found.notes)
 
 
 COPIES = 60

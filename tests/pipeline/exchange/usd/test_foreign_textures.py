@@ -9,7 +9,8 @@ import pytest
 from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
-from pipeline.exchange.usd.read import UsdScene, read_usd
+from pipeline.exchange.loaded_scene import LoadedScene
+from pipeline.exchange.usd.read import read_usd
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
 from storage.records.exr import encode_channels
@@ -39,7 +40,7 @@ def linear(srgb: tuple[int, int, int]) -> np.ndarray:
 Edit = Callable[[Any, UsdShade.Shader, UsdShade.Shader], None]
 
 
-def changed(folder: Path, edit: Edit | None = None, pixels: Any = PICTURE) -> UsdScene:
+def changed(folder: Path, edit: Edit | None = None, pixels: Any = PICTURE) -> LoadedScene:
     """Return the stage of a stranger with another picture, edited (stage, preview, texture)."""
     path = write_stage(folder)
     if pixels is not None:
@@ -64,7 +65,7 @@ def test_every_texel_lies_where_usd_puts_it(tmp_path: Path) -> None:
         row = row_at(found.scene, x, y)
         assert row[:3] == pytest.approx(linear(colour), abs=CODED), colour
         assert row[3:7] == pytest.approx([F, F, F, 0.3])
-    assert not any("texture" in text for text in found.lost)
+    assert not any("texture" in text for text in found.notes)
 
 
 def test_scale_and_bias_are_applied_in_linear_light_and_bounded(tmp_path: Path) -> None:
@@ -76,7 +77,7 @@ def test_scale_and_bias_are_applied_in_linear_light_and_bounded(tmp_path: Path) 
     grey = linear_from_srgb8()[GREY[0]]
     expected = (1 - F) * np.array([2 * grey, 0.5 * grey + 0.25, 0])
     assert row_at(found.scene, 0.5, 0.5)[:3] == pytest.approx(expected, abs=CODED)
-    assert any("clamped" in text for text in found.lost)
+    assert any("clamped" in text for text in found.notes)
 
 
 def test_numbers_that_are_none_become_black(tmp_path: Path) -> None:
@@ -88,7 +89,7 @@ def test_numbers_that_are_none_become_black(tmp_path: Path) -> None:
         texture.GetInput("file").Set("./tex.exr")
 
     found = changed(tmp_path, edit)
-    assert any("NaN replaced by 0" in text for text in found.lost)
+    assert any("NaN replaced by 0" in text for text in found.notes)
     rows = [row_at(found.scene, x, y)[0] for x, y in CORNERS]
     assert rows == pytest.approx([0, 1 - F, 0, 0.5 * (1 - F)], abs=CODED)
 
@@ -100,7 +101,7 @@ def test_a_missing_file_takes_its_fallback(tmp_path: Path) -> None:
 
     found = changed(tmp_path, edit)
     assert row_at(found.scene, 0, 0.1)[:3] == pytest.approx((1 - F) * np.array([0.1, 0.2, 0.3]))
-    assert any("left out: './gone.png' is not" in text for text in found.lost)
+    assert any("left out: './gone.png' is not" in text for text in found.notes)
 
 
 def test_a_huge_picture_is_refused(tmp_path: Path) -> None:
@@ -122,7 +123,7 @@ def test_a_mesh_without_coordinates_takes_the_mean(tmp_path: Path, is_there: boo
             grid.RemoveProperty("primvars:st")
 
     found = changed(tmp_path, edit)
-    assert any("no coordinates 'st'" in text for text in found.lost)
+    assert any("no coordinates 'st'" in text for text in found.notes)
     mean = (1 - F) * linear_from_srgb8()[PICTURE].mean(axis=(0, 1))
     assert row_at(found.scene, 0, 0.1)[:3] == pytest.approx(mean, abs=1e-5)
 

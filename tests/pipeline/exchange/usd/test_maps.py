@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
-from pipeline.exchange.usd.read import UsdScene, read_usd
+from pipeline.exchange.loaded_scene import LoadedScene
+from pipeline.exchange.usd.read import read_usd
 from pipeline.exchange.usd.write import SUFFIXES, write_usd, write_usd_shard
 from scene_templates.rotations import uniform_rotation
 from storage.conventions import linear_from_srgb8
@@ -28,7 +29,7 @@ from tests.sky_maps import COLOURS, POLES, one_sun, six_poles, smooth
 from tests.textured_by_hand import number_texture, sky, textured_scene
 
 
-def _read(path: Path) -> UsdScene:
+def _read(path: Path) -> LoadedScene:
     return read_usd(path, None, None, "CC0-1.0")
 
 
@@ -109,7 +110,7 @@ def test_a_foreign_dome_stands_by_the_axes_of_usd(tmp_path: Path, up: str) -> No
     light.CreateExposureAttr(1.0)
     stage.Save()
     found = _read(path)
-    assert not found.exact
+    assert found.notes
     of_picture = {"top": "+Z", "middle": "+X", "quarter": "+Y"}  # its colours, by our own axes
     world = {"Z": {"top": (0, 1, 0), "middle": (0, 0, 1), "quarter": (1, 0, 0)},
              "Y": {"top": (0, 0, 1), "middle": (0, -1, 0), "quarter": (1, 0, 0)}}[up]  # fmt: skip
@@ -146,7 +147,7 @@ def test_a_map_that_cannot_be_read_is_said(tmp_path: Path, asset: str, said: str
     stage.Save()
     found = _read(path)
     assert found.scene.environment is None
-    assert any(said in text for text in found.lost)
+    assert any(said in text for text in found.notes)
 
 
 def test_a_dome_shows_pictures_of_radiance_and_of_8_bits(tmp_path: Path) -> None:
@@ -169,7 +170,7 @@ def test_a_map_that_was_changed_is_read_as_it_is_now(tmp_path: Path) -> None:
     (file,) = tmp_path.glob("sky-*.exr")
     file.write_bytes(encode_channels({"RGB": np.full((2, 4, 3), 7, np.float32)}))
     found = _read(path)
-    assert not found.exact
+    assert found.notes
     assert (_sky(found.scene).radiance_rgb == 7).all()
 
 
@@ -252,11 +253,11 @@ def test_a_texture_that_was_changed_is_read_as_it_is_now(tmp_path: Path) -> None
     shader = layer.GetPrimAtPath("/Scene/Materials/material_0/Preview")
     shader.attributes["inputs:diffuseColor"].connectionPathList.ClearEdits()
     layer.Export(str(tmp_path / "b.usda"))
-    assert not _read(tmp_path / "b.usda").exact, "a connection was edited"
+    assert _read(tmp_path / "b.usda").notes, "a connection was edited"
     (file,) = tmp_path.glob("texture-*.png")
     Image.fromarray(np.full((4, 6, 3), 255, np.uint8)).save(file)
     found = _read(path)
-    assert not found.exact and any("changed since" in text for text in found.lost)
+    assert any("changed since" in text for text in found.notes)
 
 
 def test_a_texture_too_large_for_usd_is_refused(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.assets.source_materials.skin import _parts
-from pipeline.exchange.gltf.read import GltfScene, read_gltf
+from pipeline.exchange.gltf.read import read_gltf
+from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.material import MaterialSamples, SourceMaterial, source_columns
@@ -55,7 +56,7 @@ def surface(path: Path) -> NDArray[np.float64]:
     return ordered(corners, colors)
 
 
-def scene_surface(found: GltfScene) -> NDArray[np.float64]:
+def scene_surface(found: LoadedScene) -> NDArray[np.float64]:
     """Return the same of a scene."""
     scene = found.scene
     corners = scene.vertex_positions[scene.faces].astype(np.float64)
@@ -380,7 +381,7 @@ def test_what_no_code_reads_is_named_once(tmp_path: Path, sentence: str) -> None
     path = plain(UNREAD[sentence]).save(tmp_path, "glb")
     source = read_source(path, KEPT)
     assert source.unread == ((sentence,) if sentence else ())
-    assert set(source.unread) <= set(read_gltf(path, "CC0-1.0").lost)
+    assert set(source.unread) <= set(read_gltf(path, "CC0-1.0").notes)
     assert len(load_mesh(source).faces) == (12 if "instancing" in sentence else 2)
 
 

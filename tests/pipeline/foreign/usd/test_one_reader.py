@@ -10,7 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
-from pipeline.exchange.usd.read import UsdScene, read_usd
+from pipeline.exchange.loaded_scene import LoadedScene
+from pipeline.exchange.usd.read import read_usd
 from pipeline.foreign.material import MaterialSamples, source_columns
 from pipeline.foreign.source_file import read_source
 from pipeline.foreign.usd.materials import usd_textured_mesh
@@ -81,7 +82,7 @@ def diffuse_of(rgb: Any) -> tuple[float, ...]:
     return tuple(rounded(np.array(rgb) * (1 - F)).tolist())
 
 
-def read(path: Path) -> UsdScene:
+def read(path: Path) -> LoadedScene:
     return read_usd(path, None, None, "CC0-1.0")
 
 
@@ -422,4 +423,4 @@ def test_a_dome_turns_with_its_pole_and_what_is_not_read_is_named(tmp_path: Path
     for word in (*words, "1 x RectLight"):
         assert any(word in note for note in usd.unread), word
     for word in (*words, "inputs:diffuse", "cone:angle"):
-        assert any(word in note for note in read(path).lost), word
+        assert any(word in note for note in read(path).notes), word
