@@ -137,7 +137,7 @@ class _GltfReader:
                 raise Rejected("texture_coordinates_not_finite", f"TEXCOORD_{number} is not finite")
             return uv
 
-        number = primitive.primitive.material
+        number = primitive.material
         row = {} if number is None else entry(self.document.tree, "materials", number)
         part = Part(
             where="",
