@@ -30,6 +30,7 @@ from pipeline.exchange.description import (
     SceneDescription,
 )
 from pipeline.exchange.from_description import SHELL_FOLDER, SMOOTH_ANGLE_DEG
+from pipeline.exchange.textured_triangles import group_triangles
 from pipeline.foreign.numbers import Malformed
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import face_normals, smooth_shaded
@@ -308,7 +309,7 @@ def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
     meshes: dict[str, bytes] = {}
     objects: dict[str, Any] = {}
     taken: set[str] = set()
-    for row, material, faces in _group_triangles(scene):
+    for row, material, faces in group_triangles(scene):
         if len(without_slivers(scene.vertex_positions, scene.faces[faces])) == 0:
             continue  # readers refuse a mesh without an area
         name = _unique(_name(scene, row, material), taken)
@@ -332,17 +333,6 @@ def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
     _require_size(scene, data, len(objects))
     read_description(data, f"{stem}.json")  # raises for anything that readers would refuse
     return DescribedFiles(json=data, meshes=meshes, lost=(*_losses(scene), *lost))
-
-
-def _group_triangles(scene: Scene) -> list[tuple[int, int, NDArray[np.intp]]]:
-    """Return (object, material, triangles), sorted by object and then by material."""
-    keys = scene.object_index.astype(np.int64) * len(scene.materials) + scene.material_index
-    order = np.argsort(keys, kind="stable")
-    distinct, starts = np.unique(keys[order], return_index=True)
-    return [
-        (*divmod(int(key), len(scene.materials)), faces)
-        for key, faces in zip(distinct, np.split(order, starts[1:]), strict=True)
-    ]
 
 
 def _name(scene: Scene, row: int, material: int) -> str:
@@ -435,7 +425,7 @@ def _is_reproduced(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.fl
 
 def _losses(scene: Scene) -> list[str]:
     losses: list[str] = []
-    parts = np.bincount([row for row, _, _ in _group_triangles(scene)])
+    parts = np.bincount([row for row, _, _ in group_triangles(scene)])
     num_objects = int((parts > 1).sum())
     num_parts = int(parts[parts > 1].sum())
     if num_objects:

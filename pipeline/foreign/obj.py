@@ -206,7 +206,7 @@ def _read_materials(
     named = [
         (row, name)
         for row in np.flatnonzero(kinds == _OTHER).tolist()
-        if (name := _read_value(lines.line(row), b"usemtl")) is not None
+        if (name := _read_material(lines.line(row))) is not None
     ]
     rows: dict[str, int] = {}
     known = [-1, *(rows.setdefault(name, len(rows)) if name else -1 for _, name in named)]
@@ -249,10 +249,10 @@ def _read_polypaint(text: bytes, count: int) -> NDArray[np.float64] | None:
     )
 
 
-def _read_value(line: bytes, key: bytes) -> str | None:
-    """Return the value of a statement, or None for another key word."""
+def _read_material(line: bytes) -> str | None:
+    """Return the name of a material, or None for another statement."""
     word = line.split(maxsplit=1)[0]
-    if word.lower() != key:
+    if word.lower() != b"usemtl":
         return None
     return unquote_name(decode_name(line[len(word) :]))
 

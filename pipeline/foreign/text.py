@@ -18,6 +18,7 @@ T = TypeVar("T", bound=np.generic)
 
 _SPACE = 32
 """Bytes up to this value separate words."""
+_MOST_LISTED = 12
 
 
 def plain_text(data: bytes) -> bytes:
@@ -130,8 +131,8 @@ def _is_number(word: bytes, kind: type) -> bool:
     return b"_" not in word
 
 
-def list_some(sentences: dict[str, int], most: int = 12) -> tuple[str, ...]:
+def list_some(sentences: dict[str, int]) -> tuple[str, ...]:
     """Return the first sentences of a file, and the number of further ones."""
     listed = [text if count == 1 else f"{count} x {text}" for text, count in sentences.items()]
-    more = len(listed) - most
-    return (*listed[:most], *([f"{more} other things"] if more > 0 else []))
+    more = len(listed) - _MOST_LISTED
+    return (*listed[:_MOST_LISTED], *([f"{more} other things"] if more > 0 else []))

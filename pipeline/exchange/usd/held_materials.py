@@ -28,8 +28,7 @@ from pipeline.exchange.usd.names import (
     column_attribute,
     texture_attribute,
 )
-from pipeline.exchange.usd.texture_files import decode_texture
-from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS
+from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, decode_texture
 from pipeline.foreign.picture import decode_image
 from pipeline.foreign.usd.shaders import (
     DEFAULTS,

@@ -49,7 +49,7 @@ def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> Loa
     if shard is not None:
         return _read_shard_scene(opened, shard, key or shard[0])
     if key is None:
-        scene = read_exact(opened.root, opened=opened)
+        scene = read_exact(opened)
         if scene is not None:
             return LoadedScene(scene=scene, notes=())
     stage = opened.compose()
@@ -75,7 +75,7 @@ def _read_shard_scene(opened: OpenedStage, keys: list[str], key: str) -> LoadedS
     name = opened.path.name
     if key not in keys:
         raise TrilightError(f"{name}: no scene {key}; expected one of {keys[0]} to {keys[-1]}.")
-    scene = read_exact(opened.root, key, opened)
+    scene = read_exact(opened, key)
     if scene is None:
         raise TrilightError(
             f"{name}: scene {key} has been changed since Trilight wrote it; save it as a file of "
@@ -88,7 +88,7 @@ def _keys(opened: OpenedStage) -> list[str]:
     shard = scene_keys(opened.root)
     if shard is not None:
         return shard
-    if read_exact(opened.root, opened=opened) is not None:
+    if read_exact(opened) is not None:
         return [""]
     return list(_frames(opened.compose())) or [""]
 

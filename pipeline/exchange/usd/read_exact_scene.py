@@ -19,10 +19,9 @@ from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import MAX_ROWS
 from pipeline.exchange.usd import names
 from pipeline.exchange.usd.dome import read_exact_dome
-from pipeline.exchange.usd.texture_files import decode_texture
 from pipeline.exchange.usd.write import ENVIRONMENT, author_scene, new_layer
 from pipeline.exchange.usd.write_meshes import CENTER, sum_positions
-from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, SHADERS, ST
+from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, SHADERS, ST, decode_texture
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.conventions import require_readable
@@ -51,25 +50,23 @@ def scene_keys(layer: Any) -> list[str] | None:
     return keys if all_marked and keys else None
 
 
-def is_marked(layer: Any, key: str | None = None) -> bool:
+def is_marked(layer: Any) -> bool:
     """Return whether a layer has the marks of a scene that Trilight wrote."""
-    return _find_root(layer, key) is not None
+    return _find_root(layer, None) is not None
 
 
-def read_exact(
-    layer: Any, key: str | None = None, opened: OpenedStage | None = None
-) -> Scene | None:
-    """Read the scene of a layer or of a shard's key; return None where it was changed.
+def read_exact(opened: OpenedStage, key: str | None = None) -> Scene | None:
+    """Read the scene of a file or of a shard's key; return None where it was changed.
 
     Args:
-        layer: the layer of one scene or of a shard.
+        opened: the open file of one scene or of a shard.
         key: key of the scene in a shard.
-        opened: the open file, which resolves map files; None refuses scenes with maps.
 
     Raises:
         TrilightError: the file has an unsupported version or an undeclared material column, or the
             scene breaks a law (`Scene.check`).
     """
+    layer = opened.root
     root = _find_root(layer, key)
     if root is None or len(layer.subLayerPaths) or len(layer.rootPrims) != 1:
         return None
@@ -105,12 +102,10 @@ def _find_root(layer: Any, key: str | None) -> Any:
     return root if root and all(mark in root.attributes for mark in marks) else None
 
 
-def _read_scene(root: Any, opened: OpenedStage | None) -> Scene:
+def _read_scene(root: Any, opened: OpenedStage) -> Scene:
     folders = root.nameChildren
     sky = None
     if ENVIRONMENT in folders:
-        _require(opened is not None)
-        assert opened is not None
         sky = read_exact_dome(folders[ENVIRONMENT], root.layer, opened)
     materials = _read_materials(folders["Materials"], opened)
     prims = sorted(folders["Objects"].nameChildren, key=lambda p: p.attributes[names.INDEX].default)
@@ -223,7 +218,7 @@ class _Materials:
     """[M, 3] the value of `Scene.material_textures`; None without textures."""
 
 
-def _read_materials(folder: Any, opened: OpenedStage | None) -> _Materials:
+def _read_materials(folder: Any, opened: OpenedStage) -> _Materials:
     """Read the materials below a prim; raises UndeclaredColumn."""
     prims = _list_by_row(folder, names.material_name)
     rows = default_rows(len(prims))
@@ -244,16 +239,12 @@ def _read_materials(folder: Any, opened: OpenedStage | None) -> _Materials:
     )
 
 
-def _read_textures(
-    prim: Any, textures: dict[int, Texture], opened: OpenedStage | None
-) -> dict[str, int]:
+def _read_textures(prim: Any, textures: dict[int, Texture], opened: OpenedStage) -> dict[str, int]:
     """Return the texture rows of a material's columns, and add new ones to `textures`."""
     used = {}
     for name, shader in SHADERS.items():
         if shader not in prim.nameChildren:
             continue
-        _require(opened is not None)
-        assert opened is not None
         attributes = prim.nameChildren[shader].attributes
         row = attributes[names.TEXTURE_ROW].default
         if row not in textures:

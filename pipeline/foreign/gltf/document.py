@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.gltf.check import check_tree
+from pipeline.foreign.gltf.check import check_tree, list_unread_parts
 from pipeline.foreign.gltf.container import (
     data_uri_bytes,
     is_data_uri,
@@ -17,7 +17,6 @@ from pipeline.foreign.gltf.container import (
     read_container,
 )
 from pipeline.foreign.gltf.nodes import INSTANCING, PlacedNode, entry, extension, transforms
-from pipeline.foreign.gltf.unread import list_unread_parts
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material_files import MaterialFiles, ReadFile, SourceFolder, gltf_files
 from pipeline.foreign.numbers import Malformed, read_count

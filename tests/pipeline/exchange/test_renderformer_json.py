@@ -161,7 +161,10 @@ def test_normals_that_no_reader_makes_are_said_to_be_lost(tmp_path: Path) -> Non
     assert "floor: shading normals, which readers compute again" in lost
 
 
-def test_too_many_objects(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_much_light_and_too_many_objects(monkeypatch: pytest.MonkeyPatch) -> None:
+    bright = tiny_scene()
+    bright.materials[LIGHT, 7:] = 65505
+    assert any("cuts off" in text for text in describe_scene(bright, "a").lost)
     monkeypatch.setattr("pipeline.exchange.renderformer_json.MAX_OBJECTS", 1)
     with pytest.raises(TrilightError, match="2 objects of one material; a scene file holds at"):
         describe_scene(tiny_scene(), "a")
