@@ -13,8 +13,7 @@ import pytest
 
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
-from pipeline.exchange.scene_files import SceneFiles, build_scene
-from pipeline.exchange.scene_folder import find_scene_files
+from pipeline.exchange.scene_files import SceneFiles, find_scene_files
 from pipeline.generation import render_children
 from pipeline.generation.accept_scene_files import (
     accept_scene_files,
@@ -28,6 +27,7 @@ from storage.dataset.manifest import read_manifest
 from storage.errors import Rejected, TrilightError
 from storage.records.objects import read_objects_lock
 from storage.records.scene import Scene
+from tests.pipeline.exchange.exchange_kit import build_json
 from tests.pipeline.generation.tiny_scenes_kit import NO_OBJECTS
 
 CAMERA = {"position": [0, -2, 0], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 40}
@@ -67,16 +67,7 @@ def _change(folder: Path, name: str, **change: Any) -> None:
 
 
 def _build(folder: Path, name: str = "a.json") -> Scene:
-    scene, _ = build_scene(
-        folder.resolve(),
-        name,
-        named_build("smoke").assets,
-        licence="MIT",
-        num_views=1,
-        scene_index=3,
-        seed=9,
-    )
-    return scene
+    return build_json(folder, name, licence="MIT", num_views=1, scene_index=3, seed=9)
 
 
 def _digests(folder: Path, name: str) -> dict[str, str]:

@@ -1,22 +1,27 @@
-"""What other programs write in USD, as a scene: places, areas, colours, losses, and damage."""
+"""What other programs write in USD, as a scene: places, lights, textures, losses, and damage."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdUtils
+from PIL import Image
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
 
 from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.usd.read import read_usd, usd_keys
 from pipeline.exchange.usd.write import SUFFIXES, write_usd
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
+from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
+from storage.records.exr import encode_channels
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from tests.for_each import for_each
+from tests.pipeline.assets.source_materials.textured_kit import F
+from tests.pipeline.exchange.exchange_kit import row_at
 from tests.pipeline.exchange.strangers_stage import L_SHAPE, mesh, write_stage
 from tests.scenes_by_hand import tiny_scene
 
@@ -25,9 +30,18 @@ def read(path: Path, key: str | None = None) -> LoadedScene:
     return read_usd(path, key, None, "LicenseRef-user-provided")
 
 
+def edited(folder: Path, edit: Callable[[Any], object] = lambda stage: None) -> LoadedScene:
+    """Return the stage of a stranger after an edit."""
+    path = write_stage(folder)
+    stage = Usd.Stage.Open(str(path))
+    edit(stage)
+    stage.GetRootLayer().Save()
+    return read(path)
+
+
 @pytest.fixture
 def stage(tmp_path: Path) -> LoadedScene:
-    return read(write_stage(tmp_path))
+    return edited(tmp_path)
 
 
 def object_of(scene: Scene, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -83,14 +97,14 @@ def test_a_stated_temperature_tints_a_light(
     tmp_path: Path, kelvin: float | None, redder: float
 ) -> None:
     """USD's own table for 3000 K, red over blue; Blender switches it on and states none."""
-    path = write_stage(tmp_path)
-    opened = Usd.Stage.Open(str(path))
-    light = UsdLux.RectLight.Get(opened, "/W/rect")
-    light.CreateEnableColorTemperatureAttr(True)
-    if kelvin is not None:
-        light.CreateColorTemperatureAttr(kelvin)
-    opened.GetRootLayer().Save()
-    red, _, blue = object_of(read(path).scene, "rect")[1][0, EMISSION]
+
+    def edit(stage: Any) -> None:
+        light = UsdLux.RectLight.Get(stage, "/W/rect")
+        light.CreateEnableColorTemperatureAttr(True)
+        if kelvin is not None:
+            light.CreateColorTemperatureAttr(kelvin)
+
+    red, _, blue = object_of(edited(tmp_path, edit).scene, "rect")[1][0, EMISSION]
     assert red / blue == pytest.approx(redder, rel=0.01)  # 6.51 in the table
     assert (red == blue == 20) == (kelvin is None)
 
@@ -124,14 +138,15 @@ def test_our_own_files_read_as_a_stranger_does_hold_the_same_light(tmp_path: Pat
 
 
 def test_time_samples_are_a_sequence(tmp_path: Path) -> None:
-    path = write_stage(tmp_path)
-    stage = Usd.Stage.Open(str(path))
-    move = UsdGeom.Xformable(stage.GetPrimAtPath("/W/Grid")).AddTranslateOp()
-    for frame, height in ((1, 0), (3, 100)):
-        move.Set((0, height, 0), frame)
-    stage.SetStartTimeCode(1)
-    stage.SetEndTimeCode(3)
-    stage.GetRootLayer().Save()
+    def edit(stage: Any) -> None:
+        move = UsdGeom.Xformable(stage.GetPrimAtPath("/W/Grid")).AddTranslateOp()
+        for frame, height in ((1, 0), (3, 100)):
+            move.Set((0, height, 0), frame)
+        stage.SetStartTimeCode(1)
+        stage.SetEndTimeCode(3)
+
+    edited(tmp_path, edit)
+    path = tmp_path / "stage.usda"
     assert usd_keys(path) == ["1", "2", "3"]
     heights = [object_of(read(path, key).scene, "Grid")[0][..., 2].max() for key in ("1", "2", "3")]
     assert heights == pytest.approx([0, 0.5, 1], abs=1e-6)
@@ -159,13 +174,127 @@ def test_a_stage_without_light_or_camera(tmp_path: Path) -> None:
     assert any(
         "binding of a material that is not there" in t for t in read(tmp_path / "a.usda").notes
     )
-    path = write_stage(tmp_path)
-    whole = Usd.Stage.Open(str(path))
-    whole.RemovePrim("/W/cam")
-    whole.GetRootLayer().Save()
-    found = read(path)
+    found = edited(tmp_path, lambda stage: stage.RemovePrim("/W/cam"))
     assert found.scene.num_views == 1
     assert any("no camera" in text for text in found.notes)
+
+
+RED, GREEN, BLUE, GREY = (200, 0, 0), (0, 200, 0), (0, 0, 200), (100, 100, 100)
+PICTURE = np.array([[RED, GREEN], [BLUE, GREY]], np.uint8)
+"""The top row first; the stage's floor has u along +X and v along -Y."""
+
+CORNERS = {(-0.5, -0.5): RED, (0.5, -0.5): GREEN, (-0.5, 0.5): BLUE, (0.5, 0.5): GREY}
+
+
+CODED = 0.005
+"""Half a step of 8 sRGB-encoded bits is at most 0.0045 in linear light."""
+
+
+def linear(srgb: tuple[int, int, int]) -> np.ndarray:
+    """Return the diffuse albedo of such a surface by its encoded color."""
+    return np.asarray(linear_from_srgb8()[list(srgb)] * (1 - F))
+
+
+Edit = Callable[[Any, UsdShade.Shader, UsdShade.Shader], None]
+
+
+def changed(folder: Path, edit: Edit | None = None) -> LoadedScene:
+    """Return the stage of a stranger with another picture, edited (stage, preview, texture)."""
+
+    def change(stage: Any) -> None:
+        Image.fromarray(PICTURE).save(folder / "tex.png")
+        shaders = (UsdShade.Shader.Get(stage, f"/W/mat/{name}") for name in ("preview", "texture"))
+        if edit is not None:
+            edit(stage, *shaders)
+
+    return edited(folder, change)
+
+
+def test_every_texel_lies_where_usd_puts_it(tmp_path: Path) -> None:
+    found = changed(tmp_path)
+    for (x, y), colour in CORNERS.items():
+        row = row_at(found.scene, x, y)
+        assert row[:3] == pytest.approx(linear(colour), abs=CODED), colour
+        assert row[3:7] == pytest.approx([F, F, F, 0.3])
+    assert not any("texture" in text for text in found.notes)
+
+
+def test_scale_and_bias_are_applied_in_linear_light_and_bounded(tmp_path: Path) -> None:
+    def edit(stage: Any, preview: Any, texture: UsdShade.Shader) -> None:
+        for name, value in (("scale", (2, 0.5, 0.5, 1)), ("bias", (0, 0.25, -1, 0))):
+            texture.CreateInput(name, Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(*value))
+
+    found = changed(tmp_path, edit)
+    grey = linear_from_srgb8()[GREY[0]]
+    expected = (1 - F) * np.array([2 * grey, 0.5 * grey + 0.25, 0])
+    assert row_at(found.scene, 0.5, 0.5)[:3] == pytest.approx(expected, abs=CODED)
+    assert any("clamped" in text for text in found.notes)
+
+
+def test_numbers_that_are_none_become_black(tmp_path: Path) -> None:
+    """NaN, infinity and negative values in an OpenEXR file."""
+    values = np.array([[[np.nan] * 3, [np.inf] * 3], [[-1] * 3, [0.5] * 3]], np.float32)
+
+    def edit(stage: Any, preview: Any, texture: UsdShade.Shader) -> None:
+        (tmp_path / "tex.exr").write_bytes(encode_channels({"RGB": values}))
+        texture.GetInput("file").Set("./tex.exr")
+
+    found = changed(tmp_path, edit)
+    assert any("NaN replaced by 0" in text for text in found.notes)
+    rows = [row_at(found.scene, x, y)[0] for x, y in CORNERS]
+    assert rows == pytest.approx([0, 1 - F, 0, 0.5 * (1 - F)], abs=CODED)
+
+
+def test_a_missing_file_takes_its_fallback(tmp_path: Path) -> None:
+    def edit(stage: Any, preview: Any, texture: UsdShade.Shader) -> None:
+        texture.CreateInput("fallback", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(0.1, 0.2, 0.3, 1))
+        texture.GetInput("file").Set("./gone.png")
+
+    found = changed(tmp_path, edit)
+    assert row_at(found.scene, 0, 0.1)[:3] == pytest.approx((1 - F) * np.array([0.1, 0.2, 0.3]))
+    assert any("left out: './gone.png' is not" in text for text in found.notes)
+
+
+def test_a_huge_picture_is_refused(tmp_path: Path) -> None:
+    path = write_stage(tmp_path)
+    Image.new("L", (9000, 9000)).save(tmp_path / "tex.png")
+    with pytest.raises(TrilightError, match=r"tex.png': 9000 x 9000 pixels; expected at most"):
+        read_usd(path, None, None, "CC0-1.0")
+
+
+@for_each("is_there", [False, True])
+def test_a_mesh_without_coordinates_takes_the_mean(tmp_path: Path, is_there: bool) -> None:
+    """None, or some that are no numbers."""
+
+    def edit(stage: Any, preview: Any, texture: Any) -> None:
+        grid = stage.GetPrimAtPath("/W/Grid")
+        coordinates = [(float("nan"), 0), (1, 0), (1, 1), (0, 1)]
+        UsdGeom.PrimvarsAPI(grid).GetPrimvar("st").Set(coordinates)
+        if not is_there:
+            grid.RemoveProperty("primvars:st")
+
+    found = changed(tmp_path, edit)
+    assert any("no coordinates 'st'" in text for text in found.notes)
+    mean = (1 - F) * linear_from_srgb8()[PICTURE].mean(axis=(0, 1))
+    assert row_at(found.scene, 0, 0.1)[:3] == pytest.approx(mean, abs=1e-5)
+
+
+def test_metals_take_their_colour_where_a_texture_says_metal(tmp_path: Path) -> None:
+    """One picture for the colour, and its green channel for the metal."""
+
+    def edit(stage: Any, preview: UsdShade.Shader, texture: UsdShade.Shader) -> None:
+        texture.CreateOutput("g", Sdf.ValueTypeNames.Float)
+        metal = preview.CreateInput("metallic", Sdf.ValueTypeNames.Float)
+        metal.ConnectToSource(texture.ConnectableAPI(), "g")
+
+    found = changed(tmp_path, edit)
+    share = linear_from_srgb8()[GREEN[1]]  # decoded too: the shader states no space
+    plain, metal = row_at(found.scene, -0.5, -0.5), row_at(found.scene, 0.5, -0.5)
+    assert plain[:6] == pytest.approx([*linear(RED), F, F, F], abs=CODED)
+    head_on = 0.04 * (1 - share) + share * share
+    specular = head_on + (1 - head_on) / 21
+    assert metal[1] == pytest.approx(share * (1 - share) * (1 - specular), abs=CODED)
+    assert metal[4] == pytest.approx(specular, abs=CODED)
 
 
 COPIES = 60

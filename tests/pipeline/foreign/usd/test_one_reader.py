@@ -18,7 +18,7 @@ from pipeline.foreign.usd.materials import usd_textured_mesh
 from storage.errors import Rejected, TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
 from tests.for_each import for_each
-from tests.pipeline.assets.source_materials.textured_kit import KEEP
+from tests.pipeline.assets.source_materials.textured_kit import KEEP, F
 from tests.pipeline.assets.source_materials.usd_kit import new_stage
 
 POINTS = ((0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3))
@@ -71,10 +71,6 @@ def tinted(rgb: np.ndarray) -> MaterialSamples:
         specular_strength=None,
         glossiness=None,
     )
-
-
-F = 0.04 + 0.96 / 21
-"""What a dielectric of index 1.5 reflects: F0, and the mean of Schlick's rise to 1."""
 
 
 def diffuse_of(rgb: Any) -> tuple[float, ...]:
