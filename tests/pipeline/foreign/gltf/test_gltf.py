@@ -50,9 +50,7 @@ def surface(path: Path) -> NDArray[np.float64]:
             base = slot.picture.sample(uv, np.zeros(len(chosen), np.int64))
         if parts.color is not None:
             base[:, :3] *= parts.color[chosen].mean(axis=1)
-        seen = MaterialSamples(base=base, metallic=None, roughness=None, specular_colour=None,
-                    specular_strength=None, glossiness=None)  # fmt: skip
-        colors[chosen] = source_columns(material, seen, len(chosen))[:, :3]
+        colors[chosen] = source_columns(material, MaterialSamples(base=base), len(chosen))[:, :3]
     return ordered(corners, colors)
 
 

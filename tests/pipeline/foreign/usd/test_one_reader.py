@@ -58,19 +58,9 @@ def of_object(path: Path) -> Looks:
     columns = np.zeros((len(tint), 7))
     for row in np.unique(parts.material):
         own = parts.material == row
-        columns[own] = source_columns(parts.materials[row], tinted(tint[own]), int(own.sum()))
+        samples = MaterialSamples(base=tint[own].astype(np.float32))
+        columns[own] = source_columns(parts.materials[row], samples, int(own.sum()))
     return looks_of(parts.mesh.positions[parts.mesh.faces], columns[:, :3], columns[:, 6])
-
-
-def tinted(rgb: np.ndarray) -> MaterialSamples:
-    return MaterialSamples(
-        base=rgb.astype(np.float32),
-        metallic=None,
-        roughness=None,
-        specular_colour=None,
-        specular_strength=None,
-        glossiness=None,
-    )
 
 
 def diffuse_of(rgb: Any) -> tuple[float, ...]:
