@@ -72,7 +72,13 @@ from storage.records.material import (
     default_rows,
     distinct_rows,
 )
-from storage.records.scene import ALBEDO_SUM_TOLERANCE, UNIT_NORMAL_TOLERANCE, Scene, SceneObject
+from storage.records.scene import (
+    ALBEDO_SUM_TOLERANCE,
+    UNIT_NORMAL_TOLERANCE,
+    ObjectKind,
+    Scene,
+    SceneObject,
+)
 
 CARRIED = frozenset(
     {"vertex_positions", "vertex_normals", "faces", "material_index", "c2w", "fov_deg", "textures"}
@@ -115,7 +121,8 @@ def write_renderformer_h5(
         _write(file, "c2w", scene.c2w)
         _write(file, "fov", scene.fov_deg)
         if radiance_rgb is not None:
-            _write(file, "img", _rgba(radiance_rgb))
+            opaque = np.ones((*radiance_rgb.shape[:3], 1), np.float16)
+            _write(file, "img", np.concatenate([to_half(radiance_rgb), opaque], axis=3))
             _write(file, "mvp", _mvp(scene))
     write_atomically(path, stream.getvalue())
 
@@ -181,11 +188,6 @@ def _write_texture(file: Any, rows: NDArray[np.floating], scene: Scene) -> None:
             for part, values in compute_cells(scene, int(triangle)):
                 cells[triangle - start, part] = values
         texture[start : start + step] = cells
-
-
-def _rgba(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float16]:
-    opaque = np.ones((*radiance_rgb.shape[:3], 1), np.float16)
-    return np.concatenate([to_half(radiance_rgb), opaque], axis=3)
 
 
 def _mvp(scene: Scene) -> NDArray[np.float32]:
@@ -316,19 +318,18 @@ def _palette(
             f"texture: {len(first)} materials and {emits.sum()} emitters; expected at most "
             f"{MAX_PALETTE} of each."
         )
-    surface = () if emits.all() else (SceneObject(name="surfaces", kind="object"),)
-    emitters = tuple(SceneObject(name=f"emitter{i}", kind="emitter") for i in range(emits.sum()))
-    entries = [_with_unknown_licence(entry) for entry in (*surface, *emitters)]
+    kinds: dict[str, ObjectKind] = {} if emits.all() else {"surfaces": "object"}
+    first_emitter = len(kinds)
+    kinds |= {f"emitter{row}": "emitter" for row in range(emits.sum())}
     return {
         "materials": materials[first],
         "material_index": index.astype(np.uint16),
-        "object_index": (np.where(emits, order - 1 + len(surface), 0)).astype(np.uint16),
-        "objects": tuple(entries),
+        "object_index": (np.where(emits, order - 1 + first_emitter, 0)).astype(np.uint16),
+        "objects": tuple(
+            SceneObject(name=name, kind=kind, licence=UNKNOWN_LICENCE)
+            for name, kind in kinds.items()
+        ),
     }
-
-
-def _with_unknown_licence(entry: SceneObject) -> SceneObject:
-    return SceneObject(name=entry.name, kind=entry.kind, licence=UNKNOWN_LICENCE)
 
 
 def _limit_rounded_albedos(materials: NDArray[np.float32], lost: list[str]) -> None:

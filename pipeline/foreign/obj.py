@@ -70,12 +70,15 @@ def read_obj(data: bytes) -> FileMesh:
     if (used >= len(coordinates)).any() or (used < -1).any():
         unread["texture coordinates that the file does not hold"] = 1
         used = np.where((used < 0) | (used >= len(coordinates)), -1, used)
+    uv = coordinates[used, :2] if len(coordinates) else None
+    if uv is not None:
+        uv[used < 0] = np.nan
     colors = _decode_colors(text, points, width, unread)
     return FileMesh(
         mesh=TriangleMesh(positions=points[chosen[first, 0], :3], faces=vertex.reshape(-1, 3)),
         material=material[polygon],
         material_names=names,
-        uv=_pick(coordinates[:, :2], used).reshape(-1, 3, 2) if len(coordinates) else None,
+        uv=None if uv is None else uv.reshape(-1, 3, 2),
         color=None if colors is None else colors[chosen[:, 0]].reshape(-1, 3, 3),
         unread=list_some(unread),
     )
@@ -300,12 +303,6 @@ def _unique_rows(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
     else:
         _, first, number = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     return first, number.ravel()
-
-
-def _pick(values: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    picked = values[rows]
-    picked[rows < 0] = np.nan
-    return picked
 
 
 def list_libraries(data: bytes) -> list[Sequence[str]]:

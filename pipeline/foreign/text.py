@@ -25,13 +25,9 @@ def plain_text(data: bytes) -> bytes:
     """Return a text without byte order mark, with line feeds as line ends."""
     for mark, encoding in _MARKS.items():
         if data.startswith(mark):
-            data = data[len(mark) :] if not encoding else _from_utf16(data)
+            data = data.decode("utf-16", "replace").encode() if encoding else data[len(mark) :]
             break
     return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in data else data
-
-
-def _from_utf16(data: bytes) -> bytes:
-    return data.decode("utf-16", "replace").encode()
 
 
 def decode_name(data: bytes) -> str:

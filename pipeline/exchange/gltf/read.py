@@ -3,8 +3,6 @@
 Only child processes with limits import this (pipeline.isolation), since the file is untrusted.
 """
 
-from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -52,19 +50,26 @@ def read_gltf(path: Path, licence: str) -> LoadedScene:
         with refuse_malformed("load_error", "the glTF tree is"):
             document = read_source(path, _LIMITS).gltf
             assert document is not None
-            return _GltfReader(document=document, name=path.name, licence=licence).scene()
+            return _GltfReader(document, path.name, licence).scene()
     except Rejected as error:
         raise TrilightError(f"{path.name}: {error}") from error
 
 
-@dataclass(kw_only=True, eq=False)
 class _GltfReader:
-    """State of reading one file: the document and losses."""
+    """Reads the scene of one file."""
 
-    document: GltfDocument
-    name: str
-    licence: str
-    lost: list[str] = field(default_factory=list)
+    def __init__(self, document: GltfDocument, name: str, licence: str) -> None:
+        self.document = document
+        self.name = name
+        self.licence = licence
+        self.lost: list[str] = []
+        self._converter = PartConverter(self.lost)
+        self._materials = GltfMaterials(
+            document,
+            lambda data, name: decode_values(data, name, self.lost),
+            emission=True,
+            notes=self.lost,
+        )
 
     def scene(self) -> LoadedScene:
         """Build the scene of the file."""
@@ -103,17 +108,6 @@ class _GltfReader:
         name = placed.node.get("name") or mesh.get("name") or "object"
         for primitive in placed_primitives(self.document, placed):
             parts.add(self._entry(name), self._triangles(primitive))
-
-    @cached_property
-    def _materials(self) -> GltfMaterials:
-        def decode(data: bytes, name: str) -> NDArray:
-            return decode_values(data, name, self.lost)
-
-        return GltfMaterials(self.document, decode, emission=True, notes=self.lost)
-
-    @cached_property
-    def _converter(self) -> PartConverter:
-        return PartConverter(self.lost)
 
     def _material(self, number: int | None) -> SourceMaterial:
         material = DEFAULT if number is None else self._materials.material(number)

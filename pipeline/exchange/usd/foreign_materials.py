@@ -240,7 +240,9 @@ class StageSurfaces:
         if stated is None:
             self._lost.append(f"{held.where}: no shader; the values that Trilight wrote are used")
             stated = as_stated(held)
-        elif stated.is_specular or not _is_metal(stated):
+        elif stated.is_specular or not (
+            "metallic" in stated.textures or stated.constants["metallic"].any()
+        ):
             stated = restore_stated(held, stated, material, self._time, self._opened)
         else:
             self._lost.append(
@@ -248,10 +250,6 @@ class StageSurfaces:
             )
             return stated, None
         return stated, find_exact(held, stated, self._lost)
-
-
-def _is_metal(stated: StatedMaterial) -> bool:
-    return "metallic" in stated.textures or bool(stated.constants["metallic"].any())
 
 
 def _read_added_columns(

@@ -44,6 +44,8 @@ def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> 
 
 
 def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> LoadedScene:
+    from pxr import Usd
+
     opened = OpenedStage(path, folder)
     shard = scene_keys(opened.root)
     if shard is not None:
@@ -62,8 +64,9 @@ def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> Loa
     chosen = key or (frames[0] if frames else "")
     if frames and key is None:
         opened.lost.append(f"time codes other than {chosen} of {len(frames)}")
+    time = Usd.TimeCode(float(chosen)) if chosen else Usd.TimeCode.EarliestTime()
     try:
-        scene = build_stage_scene(stage, _time(chosen), opened, licence)
+        scene = build_stage_scene(stage, time, opened, licence)
     except (TrilightError, Rejected) as error:
         message = error.message if isinstance(error, Rejected) else str(error)
         text = message.removeprefix(f"{path.name}: ")
@@ -98,7 +101,7 @@ def _frames(stage: Any) -> Iterator[str]:
     if len({t for layer in stage.GetUsedLayers() for t in layer.ListAllTimeSamples()}) < 2:
         return
     if not stage.HasAuthoredTimeCodeRange():
-        times = np.unique([code for prim in _list_prims(stage) for code in _list_samples(prim)])
+        times = np.unique(list(_list_samples(stage)))
     else:
         first = stage.GetStartTimeCode()
         last = stage.GetEndTimeCode()
@@ -113,20 +116,11 @@ def _frames(stage: Any) -> Iterator[str]:
         yield f"{time:g}"
 
 
-def _list_prims(stage: Any) -> Iterator[Any]:
+def _list_samples(stage: Any) -> Iterator[float]:
+    """Yield the time codes of all samples, in the time of the stage."""
     from pxr import Usd
 
     for root in (stage.GetPseudoRoot(), *stage.GetPrototypes()):
-        yield from Usd.PrimRange.AllPrims(root)
-
-
-def _list_samples(prim: Any) -> Iterator[float]:
-    """Yield the time codes of a prim's samples, in the time of the stage."""
-    for attribute in prim.GetAuthoredAttributes():
-        yield from attribute.GetTimeSamples()
-
-
-def _time(code: str) -> Any:
-    from pxr import Usd
-
-    return Usd.TimeCode(float(code)) if code else Usd.TimeCode.EarliestTime()
+        for prim in Usd.PrimRange.AllPrims(root):
+            for attribute in prim.GetAuthoredAttributes():
+                yield from attribute.GetTimeSamples()

@@ -266,7 +266,9 @@ class _Reader:
 
     def _read_slot(self, node: TextureNode, where: str, *, is_grey: bool) -> Slot:
         values = self._picture(node)
-        is_srgb = self._is_srgb(node)
+        is_srgb = node.color_space == "sRGB"
+        if node.color_space not in ("sRGB", "raw"):
+            is_srgb = has_colors(self._files.require(node.resolved or node.named))
         channel = _CHANNELS[node.output]
         if is_grey:
             values = np.ascontiguousarray(values[..., [channel] * 3 + [3]])
@@ -294,11 +296,6 @@ class _Reader:
         if path not in self._values:
             self._values[path] = self._decode(self._files.require(path), node.named)
         return self._values[path]
-
-    def _is_srgb(self, node: TextureNode) -> bool:
-        if node.color_space in ("sRGB", "raw"):
-            return node.color_space == "sRGB"
-        return has_colors(self._files.require(node.resolved or node.named))
 
 
 def _scale_picture(
