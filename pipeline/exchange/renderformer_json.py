@@ -18,7 +18,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, NoReturn, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, NoReturn, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +38,6 @@ from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, ROUGHNESS, SPECULAR
 from storage.records.scene import ARRAY_FIELDS, Scene
-
-Record = TypeVar("Record")
 
 MAX_BYTES = 4 << 20
 """Maximum size of a file; an object takes about 1 KiB."""
@@ -140,7 +138,7 @@ class _Reader:
         where = f"objects.{key}"
         if not key or len(key) > _MAX_TEXT or not key.isprintable():
             self.refuse(where, key, f"a printable name of 1 to {_MAX_TEXT} letters")
-        described = self._record(DescribedObject, entry, where, name=key)
+        described: DescribedObject = self._record(DescribedObject, entry, where, name=key)
         self.text(described.mesh_path, f"{where}.mesh_path")
         return described
 
@@ -149,7 +147,7 @@ class _Reader:
             self.refuse(where, value, f"printable text of up to {_MAX_TEXT} letters")
         return value
 
-    def _record(self, kind: type[Record], value: Any, where: str, **more: str) -> Record:
+    def _record(self, kind: Any, value: Any, where: str, **more: str) -> Any:
         """Return a JSON object as a record; `more` are fields that the file states elsewhere."""
         from pydantic import ValidationError  # takes time to import
 
@@ -157,8 +155,7 @@ class _Reader:
             self.refuse(where, value, "a JSON object")
         known = json.dumps(self._take_known(kind, value, where, more))
         try:
-            record: Record = _adapter(kind).validate_json(known)
-            return record
+            return _adapter(kind).validate_json(known)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
         theirs = {ours: name for name, ours in _OUR_NAMES.items()}
@@ -173,7 +170,8 @@ class _Reader:
 
     def _take_known(self, kind: Any, value: Any, where: str, more: dict[str, str]) -> Any:
         """Return the fields of a record, renamed, and those of records in it; note the others."""
-        if not dataclasses.is_dataclass(kind) or not isinstance(value, dict):
+        is_record = dataclasses.is_dataclass(kind) and isinstance(value, dict)
+        if not is_record:
             return value
         hints = {name: hint for name, hint in _field_types(kind).items() if name not in more}
         known: dict[str, Any] = dict(more)
@@ -225,7 +223,7 @@ def _expected_number(hint: Any, steps: Sequence[str | int]) -> str:
     """Return the number that a record expects at a place, with its range."""
     for step in steps:
         hints = _field_types(hint) if isinstance(step, str) else {}
-        hint = hints.get(step) or get_args(hint)[0]
+        hint = hints.get(str(step)) or get_args(hint)[0]
     if get_origin(hint) is not Annotated:  # a number or None
         hint = get_args(hint)[0]
     number, within = get_args(hint)

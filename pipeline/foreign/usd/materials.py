@@ -5,13 +5,12 @@ defines, and metadata of the picture are ignored.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.material import MOST_UV_SETS, RGB, WHITE, Slot, SourceMaterial
-from pipeline.foreign.material_files import MaterialFiles
 from pipeline.foreign.picture import Decode, Picture, has_colors
 from pipeline.foreign.textured_mesh import TexturedMesh
 from pipeline.foreign.usd.object_source import UsdSource
@@ -90,14 +89,15 @@ class MeshMaterials:
         self._bindings = stage_materials.bindings
         self._time = time
         self._emission = emission
+        self._files = stage_materials.pictures
+        self._decode = decode
+        self._notes = notes
+        self._values: dict[str, NDArray] = {}
         self._known: dict[tuple[int, bytes], int] = {}
         nodes = [node for stated in self._stated for node in stated.textures.values()]
         self.primvars = list(dict.fromkeys(node.chart.primvar for node in nodes))
         """Names of the sets of texture coordinates, by the numbers in slots."""
-        reader = _Reader(
-            stage_materials.pictures, self.primvars, decode, emission=emission, notes=notes
-        )
-        self.materials = [reader.material(stated) for stated in self._stated]
+        self.materials = [self._convert(stated) for stated in self._stated]
         """Materials by row; those of primvars are added when they are met."""
         self.plain = len(self.materials)
         """Row of triangles without a material."""
@@ -169,48 +169,7 @@ class MeshMaterials:
             rows.append(self._known[key])
         return np.array(rows, np.int64)[index.reshape(-1)]
 
-
-def _replace_values(
-    material: SourceMaterial, values: Mapping[str, NDArray[np.float64]]
-) -> SourceMaterial:
-    """Return a material with some inputs replaced by values [3]."""
-
-    def number(name: str, old: float) -> float:
-        return float(values[name][0]) if name in values else old
-
-    specular = values.get("specularColor")
-    glow = values.get("emissiveColor")
-    f0 = float(reflect_head_on(values["ior"])[0]) if "ior" in values else material.f0
-    return dataclasses.replace(
-        material,
-        metallic=number("metallic", material.metallic),
-        roughness=number("roughness", material.roughness),
-        f0=f0,
-        specular_rgb=material.specular_rgb if specular is None else _drop_negative(specular),
-        emission_rgb=material.emission_rgb if glow is None else _drop_negative(glow),
-    )
-
-
-class _Reader:
-    """Converts the materials of one stage, decoding each picture once."""
-
-    def __init__(
-        self,
-        files: MaterialFiles,
-        primvars: Sequence[str],
-        decode: Decode,
-        *,
-        emission: bool,
-        notes: list[str] | None,
-    ) -> None:
-        self._files = files
-        self._primvars = primvars
-        self._decode = decode
-        self._emission = emission
-        self._notes = notes
-        self._values: dict[str, NDArray] = {}
-
-    def material(self, stated: StatedMaterial) -> SourceMaterial:
+    def _convert(self, stated: StatedMaterial) -> SourceMaterial:
         base = self._color_slot(stated, "diffuseColor")
         is_tint = base is not None or "diffuseColor" in stated.primvars
         roughness = self._slot(stated, "roughness")
@@ -285,7 +244,7 @@ class _Reader:
                 self._notes.append(f"{where}: texels above 1 are clamped, but for emission")
         return Slot(
             picture=picture,
-            uv_set=self._primvars.index(node.chart.primvar),
+            uv_set=self.primvars.index(node.chart.primvar),
             uv_matrix=node.chart.matrix,
             uv_offset=node.chart.offset,
             channel=channel,
@@ -296,6 +255,27 @@ class _Reader:
         if path not in self._values:
             self._values[path] = self._decode(self._files.require(path), node.named)
         return self._values[path]
+
+
+def _replace_values(
+    material: SourceMaterial, values: Mapping[str, NDArray[np.float64]]
+) -> SourceMaterial:
+    """Return a material with some inputs replaced by values [3]."""
+
+    def number(name: str, old: float) -> float:
+        return float(values[name][0]) if name in values else old
+
+    specular = values.get("specularColor")
+    glow = values.get("emissiveColor")
+    f0 = float(reflect_head_on(values["ior"])[0]) if "ior" in values else material.f0
+    return dataclasses.replace(
+        material,
+        metallic=number("metallic", material.metallic),
+        roughness=number("roughness", material.roughness),
+        f0=f0,
+        specular_rgb=material.specular_rgb if specular is None else _drop_negative(specular),
+        emission_rgb=material.emission_rgb if glow is None else _drop_negative(glow),
+    )
 
 
 def _scale_picture(

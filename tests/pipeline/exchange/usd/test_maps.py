@@ -1,11 +1,12 @@
 """Textures and environments through USD: ours bit for bit, and others by the words of USD."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
@@ -21,7 +22,7 @@ from storage.records.lookup import environment_values
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene, scene_digest
 from storage.records.texture import MapSource, Texture
-from tests.for_each import with_folders
+from tests.for_each import for_each, with_folders
 from tests.pipeline.exchange.exchange_kit import assert_usd_keeps_all
 from tests.pipeline.foreign.test_light_pictures import radiance_hdr
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
@@ -73,27 +74,26 @@ def test_other_programs_find_each_pole_where_we_have_it(tmp_path: Path) -> None:
         assert environment_values(turned, world) == pytest.approx(radiance[row, column])
 
 
-def _foreign(path: Path, edit: NDArray[np.float64] | None = None) -> Usd.Stage:
+def edited(path: Path, edit: Callable[[Usd.Stage, UsdLux.DomeLight], object]) -> LoadedScene:
+    """Return our six poles, with their dome edited."""
     write_usd(path, tiny_scene(environment=six_poles()))
     stage = Usd.Stage.Open(str(path))
-    if edit is not None:
-        stage.GetPrimAtPath("/Scene/Environment").GetAttribute("xformOp:transform").Set(
-            Gf.Matrix4d(edit.T.tolist())
-        )
-    return stage
+    edit(stage, UsdLux.DomeLight(stage.GetPrimAtPath("/Scene/Environment")))
+    stage.Save()
+    return _read(path)
 
 
 @pytest.mark.parametrize("up", ["Y", "Z"])
 def test_a_foreign_dome_stands_by_the_axes_of_usd(tmp_path: Path, up: str) -> None:
     """Unturned: the top of the picture is +Y of the stage, whichever axis is up there."""
-    path = tmp_path / "a.usda"
-    stage = _foreign(path, np.eye(4))
-    stage.SetMetadata("upAxis", up)
-    light = UsdLux.DomeLight(stage.GetPrimAtPath("/Scene/Environment"))
-    light.GetIntensityAttr().Set(2.0)
-    light.CreateExposureAttr(1.0)
-    stage.Save()
-    found = _read(path)
+
+    def turn(stage: Usd.Stage, light: UsdLux.DomeLight) -> None:
+        light.GetPrim().GetAttribute("xformOp:transform").Set(Gf.Matrix4d(1))
+        stage.SetMetadata("upAxis", up)
+        light.GetIntensityAttr().Set(2.0)
+        light.CreateExposureAttr(1.0)
+
+    found = edited(tmp_path / "a.usda", turn)
     assert found.notes
     of_picture = {"top": "+Z", "middle": "+X", "quarter": "+Y"}  # its colours, by our own axes
     world = {"Z": {"top": (0, 1, 0), "middle": (0, 0, 1), "quarter": (1, 0, 0)},
@@ -104,56 +104,51 @@ def test_a_foreign_dome_stands_by_the_axes_of_usd(tmp_path: Path, up: str) -> No
 
 
 def test_a_dome_without_a_file_is_even_and_may_be_the_only_light(tmp_path: Path) -> None:
-    path = tmp_path / "a.usda"
-    stage = _foreign(path)
-    light = UsdLux.DomeLight(stage.GetPrimAtPath("/Scene/Environment"))
-    light.GetTextureFileAttr().Clear()
-    light.CreateColorAttr(Gf.Vec3f(1.0, 0.5, 0.25))
-    stage.GetPrimAtPath("/Scene/Objects/light").SetActive(False)
-    stage.Save()
-    found = _read(path).scene
+    def clear(stage: Usd.Stage, light: UsdLux.DomeLight) -> None:
+        light.GetTextureFileAttr().Clear()
+        light.CreateColorAttr(Gf.Vec3f(1.0, 0.5, 0.25))
+        stage.GetPrimAtPath("/Scene/Objects/light").SetActive(False)
+
+    found = edited(tmp_path / "a.usda", clear).scene
     assert not found.triangle_emits.any()
     np.testing.assert_allclose(_sky(found).radiance_rgb, [[[1, 0.5, 0.25]] * 2])
 
 
-@pytest.mark.parametrize(
-    ("asset", "said"),
-    [("./missing.exr", "is missing"), ("./text.exr", "is not read"), ("./wide.exr", "shape")],
+@for_each(
+    "asset, expected",
+    [
+        ("./missing.exr", "is missing"),
+        ("./text.exr", "is not read"),
+        ("./wide.exr", "shape"),
+        ("./a.hdr", [0.5, 1, 0.25]),
+        ("./a.png", linear_from_srgb8()[[188] * 3]),
+    ],
 )
-def test_a_map_that_cannot_be_read_is_said(tmp_path: Path, asset: str, said: str) -> None:
-    path = tmp_path / "a.usda"
-    stage = _foreign(path)
-    (tmp_path / "text.exr").write_bytes(b"no picture")
-    wide = encode_channels({"RGB": np.ones((4, 4, 3), np.float32)})
-    (tmp_path / "wide.exr").write_bytes(wide)
-    light = UsdLux.DomeLight(stage.GetPrimAtPath("/Scene/Environment"))
-    light.GetTextureFileAttr().Set(Sdf.AssetPath(asset))
-    stage.Save()
-    found = _read(path)
-    assert found.scene.environment is None
-    assert any(said in text for text in found.notes)
-
-
-def test_a_dome_shows_pictures_of_radiance_and_of_8_bits(tmp_path: Path) -> None:
+def test_a_map_is_read_or_named(tmp_path: Path, asset: str, expected: Any) -> None:
     texels = np.full((2, 4, 4), (64, 128, 32, 130), np.uint8)
     (tmp_path / "a.hdr").write_bytes(radiance_hdr(texels, header="EXPOSURE=2\n"))
     Image.fromarray(np.full((2, 4, 3), 188, np.uint8)).save(tmp_path / "a.png")
-    for name, value in (("a.hdr", [0.5, 1, 0.25]), ("a.png", linear_from_srgb8()[[188] * 3])):
-        stage = _foreign(tmp_path / "a.usda")
-        light = UsdLux.DomeLight(stage.GetPrimAtPath("/Scene/Environment"))
-        light.GetTextureFileAttr().Set(Sdf.AssetPath(f"./{name}"))
-        stage.Save()
-        radiance = _sky(_read(tmp_path / "a.usda").scene).radiance_rgb
-        np.testing.assert_allclose(radiance, np.broadcast_to(value, (2, 4, 3)), rtol=1e-6)
+    (tmp_path / "text.exr").write_bytes(b"no picture")
+    wide = encode_channels({"RGB": np.ones((4, 4, 3), np.float32)})
+    (tmp_path / "wide.exr").write_bytes(wide)
+    found = edited(
+        tmp_path / "a.usda",
+        lambda stage, light: light.GetTextureFileAttr().Set(Sdf.AssetPath(asset)),
+    )
+    if isinstance(expected, str):
+        assert found.scene.environment is None
+        assert any(expected in text for text in found.notes)
+    else:
+        radiance = _sky(found.scene).radiance_rgb
+        np.testing.assert_allclose(radiance, np.broadcast_to(expected, (2, 4, 3)), rtol=1e-6)
 
 
 def test_a_map_that_was_changed_is_read_as_it_is_now(tmp_path: Path) -> None:
     """The scene is no longer the one that was written, and the digest says so."""
-    path = tmp_path / "a.usda"
-    _foreign(path)
+    write_usd(tmp_path / "a.usda", tiny_scene(environment=six_poles()))
     (file,) = tmp_path.glob("sky-*.exr")
     file.write_bytes(encode_channels({"RGB": np.full((2, 4, 3), 7, np.float32)}))
-    found = _read(path)
+    found = _read(tmp_path / "a.usda")
     assert found.notes
     assert (_sky(found.scene).radiance_rgb == 7).all()
 
