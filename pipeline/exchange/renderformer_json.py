@@ -153,11 +153,18 @@ class _Reader:
 
         if not isinstance(value, dict):
             self.refuse(where, value, "a JSON object")
-        known = json.dumps(self._take_known(kind, value, where, more))
+        known = self._take_known(kind, value, where, more)
         try:
-            return _adapter(kind).validate_json(known)
+            return _adapter(kind).validate_json(json.dumps(known))
+        except RecursionError:
+            first = {"type": "json_invalid"}
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
+            first = dict(error.errors(include_url=False)[0])
+        if first["type"] == "json_invalid":
+            raise TrilightError(
+                f"{self._file}: {_to_text(where)} is nested too deeply, or holds half a character; "
+                "expected the fields of a scene."
+            )
         theirs = {ours: name for name, ours in _OUR_NAMES.items()}
         steps = [step for step in first["loc"] if step != kind.__name__]
         is_short = first["type"] == "missing" and isinstance(steps[-1], int)

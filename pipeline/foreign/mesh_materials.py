@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.material import RGB, WHITE, Slot, SourceMaterial
 from pipeline.foreign.material_files import READ_MAPS, MaterialFiles
+from pipeline.foreign.mesh import FileMesh
 from pipeline.foreign.mtl import Fields, read_mtl, split_map
 from pipeline.foreign.numbers import Malformed, parse_number
 from pipeline.foreign.picture import Decode, Picture
 from pipeline.foreign.source_file import SourceFile
-from pipeline.foreign.textured_mesh import TexturedMesh, build_textured_mesh
+from pipeline.foreign.textured_mesh import TexturedMesh
 from storage.errors import Rejected
 
 
@@ -49,16 +50,25 @@ def read_textured_mesh(source: SourceFile, decode: Decode, *, emission: bool) ->
     elif contents.color is not None:
         why = "without texture coordinates" if contents.uv is None else "it is not there"
         source.notes.extend(f"picture {name[:60]!r}: {why}" for name in names)
-        return build_textured_mesh(
-            dataclasses.replace(contents, material=None), [], SourceMaterial()
-        )
+        return _build_textured_mesh(dataclasses.replace(contents, material=None), [])
     else:
         of_ply = " and no picture with texture coordinates" if source.kind == "ply" else ""
         raise Rejected("no_materials", f"the {source.kind.upper()} has no colors{of_ply}")
     if contents.color is not None:
         source.notes.append("colors, where materials or pictures are read")
-    return build_textured_mesh(
-        dataclasses.replace(contents, color=None), materials, SourceMaterial()
+    return _build_textured_mesh(dataclasses.replace(contents, color=None), materials)
+
+
+def _build_textured_mesh(contents: FileMesh, materials: Sequence[SourceMaterial]) -> TexturedMesh:
+    count = len(contents.mesh.faces)
+    rows = np.full(count, -1) if contents.material is None else contents.material
+    uv = np.full((count, 3, 2), np.nan) if contents.uv is None else contents.uv
+    return TexturedMesh(
+        mesh=contents.mesh,
+        material=np.where(rows < 0, len(materials), rows),
+        materials=(*materials, SourceMaterial()),
+        uv=uv[:, None],
+        color=contents.color,
     )
 
 

@@ -138,7 +138,7 @@ def read_source(path: Path, limits: ReadLimits, root: Path | None = None) -> Sou
     keep = limits.with_materials
     folder = SourceFolder(path.parent, root or path.parent, _read_regular)
     if suffix in (".glb", ".gltf"):
-        gltf = open_gltf(data, suffix, path.parent, folder, limits, _read_regular)
+        gltf = open_gltf(data, suffix, folder, limits)
         materials = gltf.pictures
     elif suffix in (".obj", ".ply") and keep:
         list_files = obj_files if suffix == ".obj" else ply_files

@@ -68,6 +68,12 @@ REFUSED = [
     (changed(cameras=[]), "cameras is []; expected a list of 1 to 1000"),
     (changed(scene_name=...), "scene_name is missing"),
     (changed(*BOX, mesh_path="a\0b"), "objects.box.mesh_path is 'a\\x00b'; expected printable"),
+    (changed(*BOX, mesh_path="\ud800"), "objects.box is nested too deeply, or holds half a char"),
+    (
+        changed(*BOX, mesh_path=...)[:-1] + b"," + b'"a":' + b"[" * 300 + b"]" * 300 + b"}",
+        "missing",
+    ),
+    (changed().replace(b'"box.obj"', b"[" * 900 + b"]" * 900), "objects.box is nested too deeply"),
     (changed(*BOX, remesh_target_face_num=2), "is 2; expected a whole number from 4"),
     (changed(*TRANSFORM, normalize="yes"), "transform.normalize is yes; expected true or false"),
     (changed(*TRANSFORM, scale=2), "objects.box.transform.scale is 2; expected a list of three"),
