@@ -143,16 +143,7 @@ def is_second_version(file: Any) -> bool:
 
 
 def read_grey_textures(file: Any, count: int, lost: list[str]) -> StoredTextures:
-    """Return grey surfaces with the emission of a file.
-
-    Args:
-        file: its root group.
-        count: number of its triangles.
-        lost: receives a sentence for each loss.
-
-    Raises:
-        TrilightError: the array is unusable (`plain_array`), or a value is not finite.
-    """
+    """Return grey surfaces with the emission of a successor's file, as `read_textures`."""
     light = read_whole(plain_array(file, "light_strength", (count, 3), MAX_TRIANGLES))
     rows = np.zeros((count, CHANNELS), np.float32)
     rows[:, DIFFUSE] = _GREY
