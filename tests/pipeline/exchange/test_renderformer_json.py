@@ -64,6 +64,8 @@ def test_unknown_fields_are_named_and_harmless() -> None:
 REFUSED = [
     (changed(version="2.0"), "version is '2.0'; expected '1.0'"),
     (changed(objects={str(i): 1 for i in range(8193)}), "8193 objects; expected 1 to 8192"),
+    (changed(objects=[]), "objects is []; expected a JSON object"),
+    (changed(objects={"a": 1}), "objects.a is 1; expected a JSON object"),
     (changed(objects={"a\nb": OBJECT}), "expected a printable name"),
     (changed(cameras=[]), "cameras is []; expected a list of 1 to 1000"),
     (changed(scene_name=...), "scene_name is missing"),

@@ -152,6 +152,8 @@ REFUSED = {
     "stl without end": ("stl", "cut_off", "solid a\n"),
     "off binary": ("off", "load_error", "OFF BINARY\n3 1 0\n"),
     "off of four dimensions": ("off", "load_error", "nOFF 4\n3 1 0\n"),
+    "ply of uncounted faces": ("ply", "header_size_mismatch: the PLY header counts b'-5'",
+                               "ply\nformat ascii 1.0\nelement face -5\nend_header\n"),
     "ply of another format": ("ply", "load_error", "ply\nformat xml 1.0\nend_header\n"),
 }  # fmt: skip
 

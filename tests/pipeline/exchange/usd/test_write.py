@@ -78,6 +78,7 @@ def test_there_and_back_is_exact_and_valid(tmp_path: Path, suffix: str) -> None:
     assert errors_of(written(tmp_path, scene, path.name)) == []
     back = read_usd(path, None, None, "")
     assert back.notes == () and encode_scene(back.scene) == encode_scene(scene)
+    assert usd_keys(path) == [""]
     write_usd(tmp_path / f"b{suffix}", back.scene)
     assert (tmp_path / f"b{suffix}").read_bytes() == path.read_bytes()
 
