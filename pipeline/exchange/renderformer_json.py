@@ -154,12 +154,13 @@ class _Reader:
         if not isinstance(value, dict):
             self.refuse(where, value, "a JSON object")
         known = self._take_known(kind, value, where, more)
+        first: Any = {"type": "json_invalid"}
         try:
             return _adapter(kind).validate_json(json.dumps(known))
         except RecursionError:
-            first = {"type": "json_invalid"}
+            pass
         except ValidationError as error:
-            first = dict(error.errors(include_url=False)[0])
+            first = error.errors(include_url=False)[0]
         if first["type"] == "json_invalid":
             raise TrilightError(
                 f"{self._file}: {_to_text(where)} is nested too deeply, or holds half a character; "
