@@ -26,9 +26,9 @@ class UvChart:
     primvar: str
     """Name of the mesh's primvar of coordinates."""
     matrix: NDArray[np.float64]
-    """[2, 2] for column vectors."""
+    """[2, 2] factors for column vectors: scales and rotations."""
     offset: NDArray[np.float64]
-    """[2]"""
+    """[2] offset that is added after the matrix."""
 
     @property
     def is_moved(self) -> bool:
