@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pipeline.assets.settings import Profile
 from storage.errors import TrilightError
 
-_LIBRARIES = ("embreex", "libigl", "meshoptimizer", "numpy", "pymeshlab", "trimesh")
+_LIBRARIES = ("embreex", "libigl", "numpy", "pymeshlab", "trimesh", "wasmtime")
 
 
 def library_versions() -> dict[str, str]:
