@@ -197,7 +197,7 @@ def _mesh_filters() -> Finding:
             name="mesh filters",
             state="slower",
             found="no pymeshlab (GPL)",
-            consequence="decimated meshes have twice the error, and the profile uniform is missing",
+            consequence="libigl decimates: other meshes, other digests, and no profile uniform",
             mend="make setup",
         )
     code = (
@@ -209,7 +209,7 @@ def _mesh_filters() -> Finding:
         "mesh filters",
         code,
         summary=f"pymeshlab {metadata.version('pymeshlab')}",
-        consequence="every object is rejected, or decimated by meshoptimizer with twice the error",
+        consequence="no mesh can be made by pymeshlab",
         mend=f"{_APT} libgl1 libopengl0",
     )
 
