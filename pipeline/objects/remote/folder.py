@@ -7,7 +7,7 @@ from urllib.parse import quote, unquote
 
 from storage.errors import TrilightError
 from storage.remote.tries import TransferFailed, is_absent, with_tries
-from storage.remote.url import RemoteUrl, open_driver
+from storage.remote.url import RemoteUrl, shared_driver
 
 _MAX_FOLDERS = 10_000
 _MAX_DEPTH = 32
@@ -20,7 +20,7 @@ class RemoteFolder:
     def __init__(self, url: RemoteUrl) -> None:
         """Open the driver; raises TrilightError where its package is missing."""
         self.url = url
-        self.driver = open_driver(url)
+        self.driver = shared_driver(url)
         self._addresses: dict[str, str] = {}
         self._facts: dict[str, dict[str, Any]] = {}
 
