@@ -16,7 +16,7 @@ from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.assets.quality.triangles import count_edges
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
-from pipeline.assets.source_materials.levels import add_source_materials
+from pipeline.assets.source_materials.skin import add_source_materials
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source

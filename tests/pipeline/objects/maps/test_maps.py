@@ -10,10 +10,14 @@ from PIL import Image
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.maps.listing import FoundMaps, find_maps
 from pipeline.objects.maps.names import _parse_name, group_textures
-from pipeline.objects.maps.prepared import MapFiles, decode_prepared, prepare_map
+from pipeline.objects.maps.prepared import (
+    MapFiles,
+    decode_prepared,
+    prepare_map,
+    texture_set,
+)
 from pipeline.objects.maps.radiance import usable_map
 from pipeline.objects.maps.resample import area_means, flux, solid_angle_means
-from pipeline.objects.maps.texture_set import texture_set
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected, TrilightError
 from storage.records.exr import encode_channels
@@ -283,15 +287,15 @@ def test_a_base_colour_is_a_dielectric_or_a_metal_or_leaves_no_room_for_gloss() 
     made = texture_set({"base": _flat(128 / 255, 3)}, 8)
     linear = linear_from_srgb8()[128]
     specular = 0.04 + 0.96 / 21
-    np.testing.assert_allclose(made.specular_rgb, specular, rtol=1e-6)  # float32
-    np.testing.assert_allclose(made.diffuse_rgb, linear * (1 - specular), rtol=1e-6)
-    assert made.roughness is None
+    np.testing.assert_allclose(made.arrays["specular"], specular, rtol=1e-6)  # float32
+    np.testing.assert_allclose(made.arrays["diffuse"], linear * (1 - specular), rtol=1e-6)
+    assert "roughness" not in made.arrays
     metal = texture_set({"base": _flat(1.0, 3), "metallic": _flat(1.0)}, 8)
-    assert metal.diffuse_rgb.max() == 0
-    np.testing.assert_allclose(metal.specular_rgb, 1.0, rtol=1e-6)
+    assert metal.arrays["diffuse"].max() == 0
+    np.testing.assert_allclose(metal.arrays["specular"], 1.0, rtol=1e-6)
     white = texture_set({"base": _flat(1.0, 3), "specular": _flat(0.5)}, 8)
-    assert white.diffuse_rgb.min() == 1 and white.specular_rgb.max() == 0
-    assert white.specular_rgb.shape == (4, 4, 3)
+    assert white.arrays["diffuse"].min() == 1 and white.arrays["specular"].max() == 0
+    assert white.arrays["specular"].shape == (4, 4, 3)
 
 
 def test_means_are_of_linear_values_and_of_widths() -> None:
@@ -299,16 +303,15 @@ def test_means_are_of_linear_values_and_of_widths() -> None:
     squares: NDArray[np.float32] = np.zeros((8, 8, 1), np.float32)
     squares[::2, 1::2] = squares[1::2, ::2] = 1
     made = texture_set({"base": squares, "specular": _flat(0.0), "roughness": squares}, 2)
-    assert made.roughness is not None
-    np.testing.assert_allclose(made.diffuse_rgb, 0.5, rtol=1e-6)
-    np.testing.assert_allclose(made.roughness, np.sqrt(0.5), rtol=1e-6)
+    np.testing.assert_allclose(made.arrays["diffuse"], 0.5, rtol=1e-6)
+    np.testing.assert_allclose(made.arrays["roughness"], np.sqrt(0.5), rtol=1e-6)
 
 
 def test_proportions_stay_parts_of_other_sizes_fit_and_the_content_is_the_base_colour() -> None:
     for shape, fitted in (((8, 4), (4, 2)), ((3, 9), (1, 4)), ((2, 2), (2, 2))):
         base = np.full((*shape, 3), 0.5, np.float32)
         made = texture_set({"base": base, "roughness": _flat(0.3)}, 4)
-        assert made.diffuse_rgb.shape[:2] == fitted
-        assert made.roughness is not None and made.roughness.shape == (*fitted, 1)
+        assert made.arrays["diffuse"].shape[:2] == fitted
+        assert made.arrays["roughness"].shape == (*fitted, 1)
         assert texture_set({"base": base}, 8).content_sha256 == made.content_sha256
         assert texture_set({"base": base * 0.9}, 4).content_sha256 != made.content_sha256
