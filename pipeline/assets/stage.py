@@ -56,9 +56,7 @@ def prepare_assets(
     """Prepare every object in isolated children; returns both lists in the order of `records`.
 
     Args:
-        records: the objects.
-        settings: profile, budgets and limits.
-        store: the cache of outcomes.
+        records: the objects; outcomes of earlier runs come from `store`.
         borrow_child: lends a child with the limits of this stage.
         workers: objects that are prepared at a time.
         done: called after each object, from any thread.

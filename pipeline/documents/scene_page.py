@@ -9,9 +9,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.documents.pages import Figure, png_uri, render_page
-from pipeline.documents.pass_colors import id_colors
 from pipeline.documents.scene_maps import shown_maps
-from pipeline.documents.scene_passes import PREVIEW_PX, pass_figures, passes_command
+from pipeline.documents.scene_passes import (
+    PREVIEW_PX,
+    id_colors,
+    pass_figures,
+    passes_command,
+)
 from storage.conventions import preview_gain, preview_srgb8, srgb8
 from storage.records.material import DIFFUSE
 from storage.records.objects import Failure
@@ -38,14 +42,7 @@ class Neighbours:
 def encode_scene_page(
     sample: Sample, split: str, rejected: Sequence[Failure], links: Neighbours
 ) -> bytes:
-    """Return the page of one scene.
-
-    Args:
-        sample: a valid scene with its pictures.
-        split: split of the scene.
-        rejected: rejected attempts at the scene and its views.
-        links: relative links to the other pages.
-    """
+    """Return the page of one scene, with the rejected attempts at it and its views."""
     scene = sample.scene
     reflecting = surfaces(scene)
     shading = {surface.row: "smooth" if surface.smooth else "flat" for surface in reflecting}

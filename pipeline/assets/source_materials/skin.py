@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
-from pipeline.assets.source_materials.bake import bake
-from pipeline.assets.source_materials.emission import level_emission
+from pipeline.assets.source_materials.bake import bake, level_emission
 from pipeline.assets.source_materials.measure import skin_quality
 from pipeline.assets.source_materials.nearest import SurfaceLookup
 from pipeline.assets.source_materials.source_surface import SourceSurface, match_source_surface
@@ -44,8 +43,7 @@ def add_source_materials(
     Args:
         levels: levels without skins.
         missed: reason and message by budget.
-        source: the object's file.
-        mesh: the clean, oriented mesh of that file.
+        source: the object's file; `mesh` is its clean, oriented mesh.
         settings: `own_materials` keeps materials, and says what happens where they are lost.
 
     Raises:
@@ -132,12 +130,7 @@ def _require_lawful(textures: Sequence[Texture], emission: NDArray[np.float32] |
 def open_skin_baker(
     source: SourceFile, mesh: TriangleMesh, settings: OwnMaterialSettings
 ) -> tuple[SkinBaker, OwnMaterials]:
-    """Return the skin baker of a source, and the lost parts of its materials.
-
-    Args:
-        source: the file, with the pictures next to it.
-        mesh: the clean, oriented mesh of that file.
-        settings: sizes and limits.
+    """Return the skin baker of a source with its clean, oriented mesh, and the lost materials.
 
     Raises:
         Rejected: no_materials, materials_unreadable, texture_missing, texture_outside,

@@ -142,11 +142,7 @@ def _halvings(
 
 
 def match_source_surface(mesh: TriangleMesh, parts: TexturedMesh) -> SourceSurface:
-    """Match the faces of a clean mesh to those of its file.
-
-    Args:
-        mesh: the cleaned and oriented mesh.
-        parts: the faces of the same file.
+    """Match the faces of a clean, oriented mesh to those of its file.
 
     Raises:
         Rejected: materials_unreadable where many faces do not match, no_texture_coordinates or

@@ -22,7 +22,7 @@ def list_folder(folder: Path, licence: str | None) -> Listing:
     """Return the objects of a folder; nothing is loaded.
 
     Args:
-        folder: a folder with a catalogue, or with object files.
+        folder: with a catalogue or object files.
         licence: the user's licence for files without a statement.
 
     Raises:

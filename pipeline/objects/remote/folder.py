@@ -58,8 +58,7 @@ class RemoteFolder:
         except TransferFailed as error:
             raise TrilightError(
                 f"objects {self.url.display_url!r}: cannot be read ({error.message}); expected a "
-                "folder "
-                "that can be reached. Check the URL and your access to it."
+                "folder that can be reached. Check the URL and your access to it."
             ) from error
 
     def names(self) -> list[str]:
