@@ -71,7 +71,8 @@ def prepare_assets(
         try:
             return _prepare_once(record, settings, store, methods, borrow_child)
         except Rejected as rejection:
-            return _failure(record, rejection.reason, rejection.message)
+            reason, message = rejection.reason, rejection.message
+            return Failure(stage="assets", item=record.uid, reason=reason, message=message)
         finally:
             done()
 
@@ -264,7 +265,3 @@ def attempt_in_child(
         raise
     except TrilightError as error:  # of its data: that ends no run
         raise Rejected("law_broken", str(error)) from error
-
-
-def _failure(record: ObjectRecord, reason: str, message: str) -> Failure:
-    return Failure(stage="assets", item=record.uid, reason=reason, message=message)

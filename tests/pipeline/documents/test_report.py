@@ -26,8 +26,7 @@ from pipeline.documents.gallery import write_gallery
 from pipeline.documents.report import write_report
 from pipeline.documents.report_sections import _rejections
 from pipeline.documents.rights import rights_of
-from pipeline.documents.scene_maps import shown_maps
-from pipeline.documents.scene_page import Neighbours, encode_scene_page
+from pipeline.documents.scene_page import Neighbours, encode_scene_page, shown_maps
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError
