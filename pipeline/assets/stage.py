@@ -71,8 +71,12 @@ def prepare_assets(
         try:
             return _prepare_once(record, settings, store, methods, borrow_child)
         except Rejected as rejection:
-            reason, message = rejection.reason, rejection.message
-            return Failure(stage="assets", item=record.uid, reason=reason, message=message)
+            return Failure(
+                stage="assets",
+                item=record.uid,
+                reason=rejection.reason,
+                message=rejection.message,
+            )
         finally:
             done()
 

@@ -21,6 +21,7 @@ class RemoteFolder:
         """Open the driver; raises TrilightError where its package is missing."""
         self.url = url
         self.driver = shared_driver(url)
+        self.driver.invalidate_cache()  # one driver keeps listings although that is turned off
         self._addresses: dict[str, str] = {}
         self._facts: dict[str, dict[str, Any]] = {}
 

@@ -52,7 +52,8 @@ def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
         records, failures = _list_object_files(folder, files, stated_licence(licence))
     else:
         require_unstated(licence, catalogue)
-        records, failures = _list_catalogue(folder, files, catalogue), []
+        records = _list_catalogue(folder, files, catalogue)
+        failures = []
     return Listing(records=records, failures=failures, fetch=partial(_fetch, folder, files))
 
 

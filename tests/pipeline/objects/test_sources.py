@@ -100,10 +100,11 @@ def test_a_link_out_costs_itself_only(tmp_path: Path) -> None:
     folder = tmp_path / "objects"
     touch(folder, "a.obj", "d.obj")
     touch(tmp_path, "outside.obj", "more/x.obj")
-    for name, target in {
+    targets: dict[str, str | Path] = {
         "b.obj": folder / "a.obj", "c.obj": tmp_path / "outside.obj", "e.obj": "../outside.obj",
         "more": tmp_path / "more", "round.obj": "round.obj", "gone.obj": "nowhere.obj",
-    }.items():  # fmt: skip
+    }  # fmt: skip
+    for name, target in targets.items():
         (folder / name).symlink_to(target)
     found = find(folder)
     assert [record.uid for record in found.records] == ["a", "b", "d", "gone", "round"]

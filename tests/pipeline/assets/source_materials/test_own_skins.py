@@ -102,7 +102,7 @@ def _plain_skin(path: Path, extensions: dict[str, Any] | None = None, **metal: A
 
 def test_constants_are_exact_and_metals_have_no_diffuse_part(tmp_path: Path) -> None:
     base, path = np.array([0.3, 0.62, 0.011]), tmp_path / "a.glb"
-    factor = {"baseColorFactor": [*base, 1.0]}
+    factor: dict[str, Any] = {"baseColorFactor": [*base, 1.0]}
     skin = _plain_skin(path, **factor, metallicFactor=0.0, roughnessFactor=0.37)
     diffuse, specular, roughness = skin.textures
     assert [texture.texels.shape[:2] for texture in skin.textures] == [(1, 1)] * 3
