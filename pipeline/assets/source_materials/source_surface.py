@@ -57,10 +57,9 @@ class SourceSurface:
         """Return the radiance [N, 3] at points on faces; arguments as in `columns`."""
         result = np.zeros((len(faces), 3))
         for material, chosen, in_file in self._by_material(faces, weights):
-            if not material.emits:
-                continue
-            result[chosen] = material.emission_rgb
-            if material.emission is not None:
+            if material.emits:
+                result[chosen] = material.emission_rgb
+            if material.emits and material.emission is not None:
                 result[chosen] *= self._sample_picture(material.emission, *in_file, cell)[:, :3]
         return result
 
