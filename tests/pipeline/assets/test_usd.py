@@ -246,6 +246,8 @@ def test_a_gltf_and_its_twin_in_usd_are_the_same_to_the_last_bit(tmp_path: Path)
         numbers = "/W/mat/numbers"
         connect_texture(stage, "./tex.png", {"roughness": "g", "metallic": "b"}, numbers)
         set_inputs(stage, numbers, {"sourceColorSpace": "raw"})
+        # a picture that names no coordinates has those of the mesh
+        UsdShade.Shader(stage.GetPrimAtPath(numbers)).GetInput("st").ClearSources()
 
     asset = made(tmp_path, linear, noise, uv=uv, mesh=ball)
     assert geometry(asset) == geometry(twin)
