@@ -1,5 +1,6 @@
 """Prepares one object: from a file to an `Asset`, in a child process that may crash."""
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.assets.quality.triangles import count_edges
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
-from pipeline.assets.source_materials.levels import add_source_materials
+from pipeline.assets.source_materials.skin import add_source_materials
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
@@ -98,63 +99,48 @@ def _levels(
 
     A budget that the level before it meets as well gets no level.
     """
-    builder = _LevelBuilder(source, settings, method)
     levels: list[Level] = []
     missed: dict[int, tuple[str, str]] = {}
     for budget in settings.budgets:
         if levels and len(levels[-1].faces) <= budget:
             continue
+        epsilon = settings.epsilon if budget == settings.budgets[0] else None
         try:
-            finest = budget == settings.budgets[0]
-            levels.append(builder.smallest(budget) if finest else builder.level(budget))
+            levels.append(_level(source, settings, method, budget, epsilon))
         except Rejected as failure:
             missed[budget] = (failure.reason, failure.message)
     return tuple(levels), missed
 
 
-class _LevelBuilder:
-    """Builds the levels of one source by one method."""
+def _level(
+    source: MeasuredSource,
+    settings: AssetSettings,
+    method: str,
+    budget: int,
+    epsilon: float | None,
+) -> Level:
+    """Return the smallest level within the mesh tolerance `epsilon`, or else that of `budget`.
 
-    def __init__(self, source: MeasuredSource, settings: AssetSettings, method: str) -> None:
-        self._mesh = source.mesh
-        self._source = source
-        self._settings = settings
-        self._method = method
+    Raises Rejected where that one fails the quality checks.
+    """
+    num_faces = len(source.mesh.faces)
+    # A source within budget is used unchanged where its triangles need not be even.
+    keeps_source = settings.profile == "faithful"
 
-    def smallest(self, budget: int) -> Level:
-        """Return the smallest level within the mesh tolerance, or else that of `budget`."""
-        epsilon = self._settings.epsilon
-        if epsilon is None:
-            return self.level(budget)
-        largest = min(budget, len(self._mesh.faces)) if self._keeps_source else budget
-        try:
-            best = smallest_passing(lambda faces: self._make(faces, epsilon), largest)
-        except Rejected:
-            return self.level(budget)
-        return _level(budget, *best)
+    def make(faces: int, max_error_p99: float) -> tuple[str, TriangleMesh, LevelQuality]:
+        if keeps_source and num_faces <= faces:
+            return "source", source.mesh, source.source_quality()
+        result = decimate(source.mesh, faces, method)
+        return method, *check_level(result, source, faces, settings.gate, max_error_p99)
 
-    def level(self, budget: int) -> Level:
-        """Return the level of a budget; raises Rejected where it fails the quality checks."""
-        return _level(budget, *self._make(budget, self._settings.gate.max_error_p99))
-
-    @property
-    def _keeps_source(self) -> bool:
-        """True where a source within budget is used unchanged: its triangles need not be even."""
-        return self._settings.profile == "faithful"
-
-    def _make(self, faces: int, max_error_p99: float) -> tuple[str, TriangleMesh, LevelQuality]:
-        if self._keeps_source and len(self._mesh.faces) <= faces:
-            return "source", self._mesh, self._source.source_quality()
-        result = decimate(self._mesh, faces, self._method)
-        gate = self._settings.gate
-        mesh, quality = check_level(result, self._source, faces, gate, max_error_p99)
-        return self._method, mesh, quality
-
-
-def _level(budget: int, method: str, mesh: TriangleMesh, quality: LevelQuality) -> Level:
-    """Return a level; clean positions lie on a grid that float32 holds exactly."""
+    made = None
+    if epsilon is not None:
+        largest = min(budget, num_faces) if keeps_source else budget
+        with contextlib.suppress(Rejected):
+            made = smallest_passing(lambda faces: make(faces, epsilon), largest)
+    used_method, mesh, quality = made or make(budget, settings.gate.max_error_p99)
     return Level(
-        record=LevelRecord(budget=budget, method=method, quality=quality),
-        positions=mesh.positions.astype(np.float32),
+        record=LevelRecord(budget=budget, method=used_method, quality=quality),
+        positions=mesh.positions.astype(np.float32),  # which holds the grid of clean ones exactly
         faces=mesh.faces.astype(np.uint32),
     )

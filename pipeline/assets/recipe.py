@@ -28,7 +28,7 @@ _WITH_PYMESHLAB = (
 """Number 2, and the library versions at its start: a constant, since asset files hold it.
 
 Raise the number (`assets-3`, without versions) when a change here or in a library gives a source
-another result. `tests/pipeline/assets/test_recipe.py` fails until it does.
+another result. `tests/pipeline/assets/test_prepare.py` fails until it does.
 """
 
 RECIPE = _WITH_PYMESHLAB if _installed_version("pymeshlab") != "absent" else "assets-3 libigl"

@@ -56,9 +56,7 @@ def prepare_assets(
     """Prepare every object in isolated children; returns both lists in the order of `records`.
 
     Args:
-        records: the objects.
-        settings: profile, budgets and limits.
-        store: the cache of outcomes.
+        records: the objects; outcomes of earlier runs come from `store`.
         borrow_child: lends a child with the limits of this stage.
         workers: objects that are prepared at a time.
         done: called after each object, from any thread.
@@ -73,7 +71,12 @@ def prepare_assets(
         try:
             return _prepare_once(record, settings, store, methods, borrow_child)
         except Rejected as rejection:
-            return _failure(record, rejection.reason, rejection.message)
+            return Failure(
+                stage="assets",
+                item=record.uid,
+                reason=rejection.reason,
+                message=rejection.message,
+            )
         finally:
             done()
 
@@ -266,7 +269,3 @@ def attempt_in_child(
         raise
     except TrilightError as error:  # of its data: that ends no run
         raise Rejected("law_broken", str(error)) from error
-
-
-def _failure(record: ObjectRecord, reason: str, message: str) -> Failure:
-    return Failure(stage="assets", item=record.uid, reason=reason, message=message)

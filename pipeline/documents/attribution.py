@@ -3,11 +3,12 @@
 import csv
 import io
 from collections.abc import Iterable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 from storage.dataset.derived import derivation_of
 from storage.markdown import inert
-from storage.records.objects import OBJECT, SKY, TEXTURE
+from storage.records.asset import AssetRow
+from storage.records.objects import OBJECT, SKY, TEXTURE, LockedObject
 
 _COLUMNS = ("uid", "title", "licence", "licence_source", "attribution", "source_url", "changes")
 _REMESHED = "cleaned, remeshed and given new materials"
@@ -20,24 +21,9 @@ AS_IN_FILE = "rendered as its scene file says"
 """Changes to the meshes of scene files."""
 
 
-class HasRights(Protocol):
-    """An object with its rights."""
-
-    @property
-    def uid(self) -> str: ...
-    @property
-    def title(self) -> str: ...
-    @property
-    def licence(self) -> str: ...
-    @property
-    def licence_source(self) -> str: ...
-    @property
-    def attribution(self) -> str: ...
-    @property
-    def source_url(self) -> str: ...
-
-
-def encode_attribution(objects: Iterable[HasRights], *, changes: str = _REMESHED) -> bytes:
+def encode_attribution(
+    objects: Iterable[LockedObject | AssetRow], *, changes: str = _REMESHED
+) -> bytes:
     """Return the file: one row per object, sorted by uid, with the changes made to it."""
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
@@ -50,7 +36,7 @@ def encode_attribution(objects: Iterable[HasRights], *, changes: str = _REMESHED
     return stream.getvalue().encode(errors="replace")
 
 
-def attribution_of(objects: Iterable[HasRights], settings: Mapping[str, Any]) -> bytes:
+def attribution_of(objects: Iterable[LockedObject], settings: Mapping[str, Any]) -> bytes:
     """Return the file of a dataset; its settings decide the changes made to objects."""
     return encode_attribution(objects, changes=" or ".join(sorted(_changes(settings))))
 

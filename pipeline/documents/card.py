@@ -45,14 +45,7 @@ _ENVIRONMENT = (("Mitsuba variant", "mitsuba_variant"), ("processor", "processor
 def encode_card(
     folder: DatasetFolder, manifest: Manifest, distributions: Distributions, rights: Rights
 ) -> bytes:
-    """Return the card.
-
-    Args:
-        folder: folder of the dataset; only the names of its documents are used.
-        manifest: manifest of the dataset.
-        distributions: distributions of the dataset.
-        rights: rights to its objects.
-    """
+    """Return the card; of `folder` only the names of the dataset's documents are used."""
     title = f"Trilight dataset {manifest.build}"
     layouts = Counter[str]()
     for (template, _), count in sorted(distributions.scenes.items()):

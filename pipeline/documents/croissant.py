@@ -48,9 +48,7 @@ _RECORDS = "scene-records"
 def encode_croissant(manifest: Manifest, rights: Rights) -> bytes:
     """Return the file of a dataset: every shard with its sha256, and a record for each scene.
 
-    Args:
-        manifest: manifest of the dataset.
-        rights: rights to its objects; a licence without a known URL is stated by its name.
+    A licence without a known URL is stated by its name.
     """
     digest = manifest.dataset_digest
     shards = list(manifest.shards)
@@ -81,27 +79,29 @@ MOST_LISTED = 10_000
 def _distribution(shards: list[ShardEntry]) -> list[dict[str, Any]]:
     if len(shards) <= MOST_LISTED:
         return [*map(_shard, shards), *_file_sets([shard.name for shard in shards])]
-    every = {
-        "@type": "cr:FileSet",
-        "@id": "shards",
-        "name": "shards",
-        "description": "manifest.json has the size and sha256 of each",
-        "encodingFormat": "application/x-tar",
-        "includes": "**/*.tar",
-    }
+    every = _node(
+        "cr:FileSet",
+        "shards",
+        description="manifest.json has the size and sha256 of each",
+        encodingFormat="application/x-tar",
+        includes="**/*.tar",
+    )
     return [every, *_file_sets(["shards"])]
 
 
+def _node(kind: str, name: str, **fields: Any) -> dict[str, Any]:
+    return {"@type": kind, "@id": name, "name": name, **fields}
+
+
 def _shard(shard: ShardEntry) -> dict[str, Any]:
-    return {
-        "@type": "cr:FileObject",
-        "@id": shard.name,
-        "name": shard.name,
-        "contentUrl": shard.name,
-        "contentSize": f"{shard.num_bytes} B",
-        "encodingFormat": "application/x-tar",
-        "sha256": shard.sha256,
-    }
+    return _node(
+        "cr:FileObject",
+        shard.name,
+        contentUrl=shard.name,
+        contentSize=f"{shard.num_bytes} B",
+        encodingFormat="application/x-tar",
+        sha256=shard.sha256,
+    )
 
 
 def _file_sets(archives: Sequence[str]) -> list[dict[str, Any]]:
@@ -117,15 +117,14 @@ def _file_sets(archives: Sequence[str]) -> list[dict[str, Any]]:
         ("pictures", "linear radiance of each view, half floats", "image/x-exr", "*.exr"),
     )
     return [
-        {
-            "@type": "cr:FileSet",
-            "@id": name,
-            "name": name,
-            "description": description,
-            "containedIn": [{"@id": name} for name in archives],
-            "encodingFormat": encoding,
-            "includes": pattern,
-        }
+        _node(
+            "cr:FileSet",
+            name,
+            description=description,
+            containedIn=[{"@id": archive} for archive in archives],
+            encodingFormat=encoding,
+            includes=pattern,
+        )
         for name, description, encoding, pattern in kinds
         if archives
     ]
@@ -133,32 +132,30 @@ def _file_sets(archives: Sequence[str]) -> list[dict[str, Any]]:
 
 def _splits(shards: list[ShardEntry]) -> dict[str, Any]:
     used = [split for split in SPLITS if any(shard.split == split for shard in shards)]
-    return {
-        "@type": "cr:RecordSet",
-        "@id": "splits",
-        "name": "splits",
-        "description": "a shard holds one split; its name begins with it",
-        "dataType": "cr:Split",
-        "key": {"@id": "splits/name"},
-        "field": [_field("splits/name", "sc:Text"), _field("splits/url", "sc:URL")],
-        "data": [{"splits/name": split, "splits/url": _SPLIT_URLS[split]} for split in used],
-    }
+    return _node(
+        "cr:RecordSet",
+        "splits",
+        description="a shard holds one split; its name begins with it",
+        dataType="cr:Split",
+        key={"@id": "splits/name"},
+        field=[_field("splits/name", "sc:Text"), _field("splits/url", "sc:URL")],
+        data=[{"splits/name": split, "splits/url": _SPLIT_URLS[split]} for split in used],
+    )
 
 
 def _scenes() -> dict[str, Any]:
     """Return the records of scenes: key and JSON, which is all mlcroissant reads of many tars."""
     key = {"extract": {"fileProperty": "filename"}, "transform": {"regex": r"^([^.]+)\."}}
     content = {"extract": {"fileProperty": "content"}}
-    return {
-        "@type": "cr:RecordSet",
-        "@id": "scenes",
-        "name": "scenes",
-        "description": "one record per scene; its arrays and pictures have the same key",
-        "key": {"@id": "scenes/key"},
-        "field": [_field("scenes/key", "sc:Text", key), _field("scenes/json", "sc:Text", content)],
-    }
+    return _node(
+        "cr:RecordSet",
+        "scenes",
+        description="one record per scene; its arrays and pictures have the same key",
+        key={"@id": "scenes/key"},
+        field=[_field("scenes/key", "sc:Text", key), _field("scenes/json", "sc:Text", content)],
+    )
 
 
 def _field(name: str, data_type: str, source: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    field: dict[str, Any] = {"@type": "cr:Field", "@id": name, "name": name, "dataType": data_type}
+    field = _node("cr:Field", name, dataType=data_type)
     return field | ({"source": {"fileSet": {"@id": _RECORDS}, **source}} if source else {})

@@ -24,9 +24,7 @@ def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Stati
     Each file is written atomically. They depend on the dataset alone, so equal datasets have equal
     documents.
 
-    Args:
-        dataset: a dataset in a folder, or on a server.
-        out: folder to write into; None for the dataset's folder.
+    They go into `out`, by default the dataset's folder; the dataset may be on a server.
 
     Raises:
         TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.

@@ -181,9 +181,7 @@ def dataset_distributions(
     Memory grows by about 200 bytes per read scene (storage.dataset.sampled chooses the sample). The
     digests of the shards are not checked.
 
-    Args:
-        dataset: the dataset.
-        shard_done: called with the name of each shard that was read.
+    `shard_done` is called with the name of each shard that was read.
 
     Raises:
         TrilightError: a shard is missing, or a sample is unreadable or breaks a law.

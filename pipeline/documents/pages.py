@@ -34,13 +34,7 @@ _SCRIPT = (_TEMPLATES / "page.js").read_text()
 
 
 def render_page(template: str, title: str, **values: object) -> bytes:
-    """Return a page.
-
-    Args:
-        template: name of a file of `templates/`.
-        title: title of the page.
-        values: what the template shows.
-    """
+    """Return a page by a file of `templates/`, which shows the values."""
     page = _PAGES.get_template(template).render(title=title, **values)
     # a lone surrogate, which untrusted JSON may hold, has no UTF-8
     return page.encode(errors="replace")

@@ -41,8 +41,7 @@ def encode_quality_page(
     """Return the page.
 
     Args:
-        rows: the accepted objects.
-        failures: the rejected objects.
+        rows: the accepted objects; `failures` are the rejected ones.
         pairs: pictures by the name of their group.
         unread: unread parts of accepted objects, by uid.
         budget: most triangles of an object.

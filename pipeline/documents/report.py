@@ -31,8 +31,6 @@ def write_report(
     """Write `report.html` and the pages of its gallery, and return the path of the former.
 
     Args:
-        dataset: the dataset.
-        distributions: distributions of the dataset.
         max_scenes: most scenes in the gallery, up to 1000; they are spread over splits and shards.
         out: folder to write into; None for the dataset's folder.
 

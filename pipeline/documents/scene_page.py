@@ -1,26 +1,36 @@
-"""The HTML page of one scene: its pictures, and tables of its contents."""
+"""The HTML page of one scene: its pictures and maps, and tables of its contents."""
 
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.documents.pages import Figure, png_uri, render_page
-from pipeline.documents.pass_colors import id_colors
-from pipeline.documents.scene_maps import shown_maps
-from pipeline.documents.scene_passes import PREVIEW_PX, pass_figures, passes_command
+from pipeline.documents.scene_passes import (
+    PREVIEW_PX,
+    id_colors,
+    pass_figures,
+    passes_command,
+)
 from storage.conventions import preview_gain, preview_srgb8, srgb8
+from storage.records.environment import Environment
+from storage.records.map_facts import sky_facts
 from storage.records.material import DIFFUSE
 from storage.records.objects import Failure
 from storage.records.sample import PartFloor, Sample
 from storage.records.scene import Scene
 from storage.records.scene_facts import cameras, lights, surfaces
+from storage.records.texture import TEXTURED, MapSource, Texture
 
 _PICTURE_PX = 384
 _MOST_SWATCHES = 128
+_MAP_PX = 112
+_MOST_MAPS = 48
+"""Most textures shown as pictures; the table has all."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,14 +48,7 @@ class Neighbours:
 def encode_scene_page(
     sample: Sample, split: str, rejected: Sequence[Failure], links: Neighbours
 ) -> bytes:
-    """Return the page of one scene.
-
-    Args:
-        sample: a valid scene with its pictures.
-        split: split of the scene.
-        rejected: rejected attempts at the scene and its views.
-        links: relative links to the other pages.
-    """
+    """Return the page of one scene, with the rejected attempts at it and its views."""
     scene = sample.scene
     reflecting = surfaces(scene)
     shading = {surface.row: "smooth" if surface.smooth else "flat" for surface in reflecting}
@@ -116,3 +119,61 @@ def _colors(scene: Scene, row: int) -> NDArray[np.uint8]:
     """Return the first diffuse colors of an object, as [N, 3] sRGB."""
     used = np.unique(scene.material_index[scene.object_index == row])
     return srgb8(scene.materials[used[:_MOST_SWATCHES], DIFFUSE])
+
+
+class ShownMap(NamedTuple):
+    """A texture or a sky, as a page shows it."""
+
+    source: MapSource
+    what: str
+    """Columns of the material that it gives, or whether cameras see the sky."""
+    size: str
+    """Width and height in texels."""
+    caption: str
+    picture: str | None
+    """Address of the picture; None beyond the most that are shown."""
+
+
+def shown_maps(scene: Scene) -> list[ShownMap]:
+    """Return the textures and the sky of a scene, if there are any."""
+    maps = []
+    for row, texture in enumerate(scene.textures):
+        assert scene.material_textures is not None
+        used = (scene.material_textures == row).any(axis=0)
+        role = " and ".join(name for name, uses in zip(TEXTURED, used, strict=True) if uses)
+        name = texture.source.name
+        caption = name if name.endswith(role) else f"{name} ({role})"
+        picture = png_uri(_texture_pixels(texture)) if row < _MOST_MAPS else None
+        size = _size(texture.texels)
+        maps.append(ShownMap(texture.source, f"texture: {role}", size, caption, picture))
+    if (sky := scene.environment) is not None:
+        seen = "environment, seen" if sky.is_seen else "environment, hidden from cameras"
+        facts = sky_facts(sky)
+        caption = (
+            f"{sky.source.name} ({seen}): mean radiance {facts.mean_radiance:.3g}, brightest texel "
+            f"{facts.peak:.3g} times that, half of the light from {facts.half_light_deg:.1f} "
+            "degrees"
+        )
+        picture = png_uri(_sky_pixels(sky, facts.mean_radiance))
+        maps.append(ShownMap(sky.source, seen, _size(sky.radiance_rgb), caption, picture))
+    return maps
+
+
+def _size(values: NDArray) -> str:
+    return f"{values.shape[1]} x {values.shape[0]}"
+
+
+def _texture_pixels(texture: Texture) -> NDArray[np.uint8]:
+    """Return the pixels of a texture, top row first; linear values are converted to sRGB."""
+    height, width = texture.texels.shape[:2]
+    step = max(1, height // _MAP_PX, width // (4 * _MAP_PX))
+    linear = texture.linear(texture.texels[::-1][::step, ::step])
+    return srgb8(linear if texture.channels == 3 else linear[..., 0])
+
+
+def _sky_pixels(sky: Environment, mean_radiance: float) -> NDArray[np.uint8]:
+    """Return the pixels of a sky, exposed by its mean: a sun is white, the rest visible."""
+    scale = 0.5 / mean_radiance if mean_radiance else 1.0
+    pixels = preview_srgb8((sky.radiance_rgb * np.float32(scale)).astype(np.float32))
+    size = (2 * _MAP_PX, _MAP_PX)
+    return np.asarray(Image.fromarray(pixels).resize(size, Image.Resampling.BOX))

@@ -38,11 +38,7 @@ def write_contact_sheet(
 ) -> None:
     """Write `contact_sheet.png`: every view of up to `max_scenes` scenes, over splits and shards.
 
-    Args:
-        dataset: the dataset.
-        statistics: statistics of the dataset.
-        max_scenes: most scenes that are shown.
-        out: the folder to write into; the folder of the dataset by default.
+    It is written into `out`, by default the folder of the dataset.
 
     Raises:
         TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.
@@ -62,14 +58,7 @@ def write_contact_sheet(
 def write_first_pictures(folder: DatasetFolder, sample: Sample, *, build: str, split: str) -> None:
     """Write `contact_sheet.png` of one scene, as a preview before the dataset is finished.
 
-    Args:
-        folder: folder of the unfinished dataset.
-        sample: its first finished scene.
-        build: name of the build.
-        split: split of the scene.
-
-    Raises:
-        TrilightError: the folder cannot be written.
+    Raises TrilightError where the folder cannot be written.
     """
     title = f"{build}: the first scene"
     state = "the dataset is still being made"

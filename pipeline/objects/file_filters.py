@@ -76,10 +76,7 @@ def warn_once(message: str) -> None:
 def drop_outputs(names: Iterable[str]) -> list[str]:
     """Return the files outside output folders of Trilight; one note names those folders.
 
-    The folder itself may be an output: its user named it.
-
-    Args:
-        names: paths of all files, with / between their parts.
+    Paths have / between their parts. The folder itself may be an output: its user named it.
     """
     names = list(names)
     inside: dict[str, set[str]] = defaultdict(set)
@@ -146,11 +143,7 @@ def _is_scene(path: Path) -> bool:
 
 
 def drop_duplicates(names: Sequence[str]) -> list[str]:
-    """Return object files without copies of other objects; one note counts the copies.
-
-    Args:
-        names: paths of object files, with / between their parts.
-    """
+    """Return object files without copies of other objects; one note counts the copies."""
     rules: dict[str, Callable[[Sequence[str]], Iterator[str]]] = {
         "shapes for collisions": _collisions,
         "lower levels of detail": _levels,

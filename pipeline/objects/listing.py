@@ -96,7 +96,7 @@ def fetch_all(
     """Fetch every object; a TransferFailed of `fetch` is a failure of that object alone.
 
     Args:
-        records: objects to fetch.
+        records: what to fetch.
         fetch: returns the record with its path; called in threads, at most `threads` at a time.
         downloaded: called in this thread with the number of finished objects, failed ones
             included, and the total.

@@ -65,15 +65,6 @@ class ObjectSource:
     is_place: bool = False
     """True where the name is the scheme of a URL, which may hold a secret."""
 
-    def run_query(self, query: SourceQuery, *, check_only: bool) -> Listing | None:
-        """Return the listing, or check the source only; raises TrilightError as `list`."""
-        if self.states_licences:
-            require_unstated(query.licence, f"{query.source.partition(':')[0]}:")
-        if check_only and self.look:
-            self.look(query)
-            return None
-        return self.list(query)
-
 
 def _list_folder(query: SourceQuery) -> Listing:
     location = parse_url(query.source, what="objects")
@@ -142,10 +133,6 @@ def _ignore_progress(done: int, total: int) -> None:
     """Show no progress."""
 
 
-def _select_all(uid: str) -> bool:
-    return True
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ListedObjects:
     """The listing of a source, split by licence; files are downloaded on demand."""
@@ -161,8 +148,8 @@ class ListedObjects:
 
     def fetch_selected(
         self,
-        is_selected: Callable[[str], bool] = _select_all,
-        downloaded: Callable[[int, int], None] = _ignore_progress,
+        is_selected: Callable[[str], bool] = lambda uid: True,
+        downloaded: CountDone = _ignore_progress,
     ) -> FoundObjects:
         """Download the selected objects and return them with the failures.
 
@@ -249,7 +236,7 @@ def find_objects(
     work_dir: Path,
     allowed_licences: Sequence[str],
     licence: str | None = None,
-    downloaded: Callable[[int, int], None] = _ignore_progress,
+    downloaded: CountDone = _ignore_progress,
 ) -> FoundObjects:
     """List a source and download all its usable objects; raises as `list_objects`."""
     listed = list_objects(
@@ -332,8 +319,14 @@ def _query_source(
     query = SourceQuery(
         source=source, work_dir=work_dir, licence=licence, allowed_licences=allowed_licences
     )
-    listing = source_of(source).run_query(query, check_only=check_only)
-    if listing and not listing.records and not listing.failures:
+    kind = source_of(source)
+    if kind.states_licences:
+        require_unstated(licence, f"{source.partition(':')[0]}:")
+    if check_only and kind.look:
+        kind.look(query)
+        return None
+    listing = kind.list(query)
+    if not listing.records and not listing.failures:
         raise TrilightError(
             f"objects {printable(safe_url(source))!r} holds no object; expected "
             f"{' '.join(SUFFIXES)} files, or a catalogue (objects.jsonl or objects.csv) that lists "

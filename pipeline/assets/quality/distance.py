@@ -11,6 +11,7 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.assets.quality.triangles import unit_normals
 from pipeline.foreign.mesh import TriangleMesh
 
 
@@ -39,12 +40,8 @@ class Deviation:
 
     def two_way(self, percentile: float) -> float:
         """Return the larger of the two directions' percentiles."""
-        return float(
-            max(
-                np.percentile(distances, percentile)
-                for distances in (self.to_other, self.from_other)
-            )
-        )
+        both = (self.to_other, self.from_other)
+        return max(float(np.percentile(distances, percentile)) for distances in both)
 
 
 def sample_surface(mesh: TriangleMesh, uniform: NDArray[np.float64]) -> SurfacePoints:
@@ -70,7 +67,7 @@ class Surface:
         self.mesh = mesh
         self.points = sample_surface(mesh, uniform)
         self._uniform = uniform
-        self._normals = _unit_normals(mesh)
+        self._normals = unit_normals(mesh)
         self._tree = igl.AABB()
         self._tree.init(mesh.positions, mesh.faces)
 
@@ -79,7 +76,7 @@ class Surface:
         points = self.points.positions
         squared, nearest, _ = igl.point_mesh_squared_distance(points, other.positions, other.faces)
         cosine = np.einsum(
-            "ij,ij->i", self._normals[self.points.faces], _unit_normals(other)[nearest]
+            "ij,ij->i", self._normals[self.points.faces], unit_normals(other)[nearest]
         )
         back = self._tree.squared_distance(
             self.mesh.positions, self.mesh.faces, sample_surface(other, self._uniform).positions
@@ -89,8 +86,3 @@ class Surface:
             from_other=np.sqrt(back) / self.mesh.diagonal,
             angle_deg=np.degrees(np.arccos(np.minimum(np.abs(cosine), 1.0))),
         )
-
-
-def _unit_normals(mesh: TriangleMesh) -> NDArray[np.float64]:
-    vectors = mesh.double_area_vectors
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

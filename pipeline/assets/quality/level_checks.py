@@ -20,10 +20,9 @@ def check_level(
     """Return the cleaned result of a decimation with its measures.
 
     Args:
-        result: the unchecked result of a decimation.
+        result: the unchecked result.
         source: the cleaned source.
-        budget: most faces.
-        gate: the other limits.
+        budget: most faces; `gate` has the other limits.
         max_error_p99: limit on the error, at most that of `gate`.
 
     Raises:

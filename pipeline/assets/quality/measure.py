@@ -8,6 +8,7 @@ from pipeline.assets.quality.silhouette import intersection_over_union, silhouet
 from pipeline.assets.quality.triangles import (
     area_variation,
     count_edges,
+    round_digits,
     smallest_angles_deg,
 )
 from pipeline.foreign.mesh import TriangleMesh
@@ -46,23 +47,18 @@ class MeasuredSource:
         """Return all measures of a clean result; a known `deviation` saves its computation."""
         measured = deviation or self.surface.hausdorff_deviation(result)
         return LevelQuality(
-            error_mean=_round_digits(max(measured.to_other.mean(), measured.from_other.mean())),
-            error_p99=_round_digits(measured.two_way(99)),
-            error_max=_round_digits(measured.two_way(100)),
-            normal_error_deg=_round_digits(measured.angle_deg.mean()),
-            area_ratio=_round_digits(self.area_ratio(result)),
-            silhouette_iou=_round_digits(self.silhouette_iou(result)),
-            lost_area=_round_digits(self.components.lost_area(measured.to_other)),
-            area_variation=_round_digits(area_variation(result)),
-            min_angle_p5_deg=_round_digits(np.percentile(smallest_angles_deg(result), 5)),
+            error_mean=round_digits(max(measured.to_other.mean(), measured.from_other.mean())),
+            error_p99=round_digits(measured.two_way(99)),
+            error_max=round_digits(measured.two_way(100)),
+            normal_error_deg=round_digits(measured.angle_deg.mean()),
+            area_ratio=round_digits(self.area_ratio(result)),
+            silhouette_iou=round_digits(self.silhouette_iou(result)),
+            lost_area=round_digits(self.components.lost_area(measured.to_other)),
+            area_variation=round_digits(area_variation(result)),
+            min_angle_p5_deg=round_digits(np.percentile(smallest_angles_deg(result), 5)),
             open_edges=count_edges(result).open,
         )
 
 
 def _area(mesh: TriangleMesh) -> float:
     return 0.5 * float(np.linalg.norm(mesh.double_area_vectors, axis=1).sum())
-
-
-def _round_digits(value: float) -> float:
-    """Round to six digits: more than these measures have, and short in a file."""
-    return float(f"{value:.6g}")

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.foreign.mesh import TriangleMesh
 
@@ -19,13 +20,24 @@ class EdgeCounts:
     """Largest number of faces that share one edge."""
 
 
+def unit_normals(mesh: TriangleMesh) -> NDArray[np.float64]:
+    """Return the unit normal [F, 3] of each face; each must have an area."""
+    vectors = mesh.double_area_vectors
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def round_digits(value: float) -> float:
+    """Round a measure to six digits: more than it has, and short in a file."""
+    return float(f"{value:.6g}")
+
+
 def area_variation(mesh: TriangleMesh) -> float:
     """Return the standard deviation of the areas over their mean; 0 where all are equal."""
     areas = np.linalg.norm(mesh.double_area_vectors, axis=1)
     return float(areas.std() / areas.mean())
 
 
-def smallest_angles_deg(mesh: TriangleMesh) -> np.ndarray:
+def smallest_angles_deg(mesh: TriangleMesh) -> NDArray[np.float64]:
     """Return the smallest angle [F] of each face; 60 where it is equilateral."""
     edges = np.roll(mesh.corners, -1, axis=1) - mesh.corners
     lengths = np.sort(np.linalg.norm(edges, axis=2), axis=1)

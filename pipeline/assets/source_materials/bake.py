@@ -1,4 +1,7 @@
-"""Bakes a level's textures: an atlas of its triangles, colored from the nearest source points."""
+"""Bakes a level's textures and emission from the nearest source points.
+
+Textures are an atlas of the level's triangles; a triangle emits the mean of the source over it.
+"""
 
 from dataclasses import dataclass
 
@@ -17,7 +20,9 @@ from pipeline.assets.source_materials.tiles import (
     tile_weights,
 )
 from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.picture import spread_points
 from storage.conventions import linear_from_srgb8, srgb8
+from storage.errors import Rejected
 from storage.records.texture import Texture
 
 _INSET = 0.02
@@ -28,6 +33,11 @@ _SHRINK = 0.9
 """Factor on the texel density per attempt, until the atlas fits its largest size."""
 _BLOCK = 1 << 18
 """Texels per lookup; it bounds memory."""
+
+_LEAST = 0.05
+"""Fraction of the brightest triangle's radiance below which a triangle emits nothing."""
+_MOST = 1e30
+"""Radiance from which on a number is refused."""
 
 DIFFUSE = slice(0, 3)
 SPECULAR = slice(3, 6)
@@ -70,8 +80,7 @@ def bake(
 
     Args:
         level: mesh in the unit box.
-        source: surface of the source.
-        nearest: lookup of points on that surface.
+        source: surface that `nearest` looks up.
         settings: texels and greatest size.
         reach: largest distance to the source, in the unit box.
     """
@@ -222,3 +231,32 @@ def _limit_diffuse(diffuse: NDArray[np.uint8], specular: NDArray[np.floating]) -
     room = 1 + 1e-6 - np.broadcast_to(specular, diffuse.shape)
     highest = np.maximum(np.searchsorted(table, room, side="right") - 1, 0)
     return np.minimum(diffuse, highest).astype(np.uint8)
+
+
+def level_emission(
+    level: TriangleMesh, source: SourceSurface, nearest: SurfaceLookup, reach: float
+) -> NDArray[np.float32] | None:
+    """Return the radiance [F, 3] of a level's triangles; None where nothing emits.
+
+    Arguments as those of `bake`.
+
+    Raises:
+        Rejected: materials_unreadable where the radiance is not a number, or too large for float32.
+    """
+    if not source.emits:
+        return None
+    weights = spread_points()
+    corners = level.corners
+    points = np.einsum("pc,fcd->fpd", weights, corners)
+    normal = level.double_area_vectors
+    areas = 0.5 * np.linalg.norm(normal, axis=1)
+    normals = np.repeat(normal / (2 * areas[:, None]), len(weights), axis=0)
+    locations = nearest.find(points.reshape(-1, 3), normals, reach)
+    cell = float(np.sqrt(np.median(areas) / len(weights)))
+    seen = source.emission(locations.faces, locations.weights, cell).reshape(len(corners), -1, 3)
+    mean = seen.mean(axis=1)
+    if not mean.max() < _MOST:  # or not a number
+        raise Rejected("materials_unreadable", f"a surface emits {mean.max():.3g}; < {_MOST:g}")
+    brightness = mean.mean(axis=1)
+    mean[brightness < _LEAST * brightness.max()] = 0
+    return mean.astype(np.float32) if mean.any() else None

@@ -5,6 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.quality.distance import sample_surface
+from pipeline.assets.quality.triangles import round_digits, unit_normals
 from pipeline.assets.source_materials.bake import DIFFUSE, BakedTextures
 from pipeline.assets.source_materials.nearest import SurfaceLookup, barycentric
 from pipeline.assets.source_materials.source_surface import SourceSurface
@@ -31,11 +32,11 @@ def skin_quality(
     """Return the measures of a baked level; arguments as those of `bake`."""
     error = _color_errors(level, baked, source)
     return SkinQuality(
-        colour_error=_round_digits(error.mean()),
-        colour_error_p95=_round_digits(np.percentile(error, 95)),
-        missed_cells=_round_digits(baked.missed),
-        torn_seams=_round_digits(_torn_seams(level, nearest, source, reach, 1 / baked.density)),
-        texels_per_length=_round_digits(baked.density),
+        colour_error=round_digits(error.mean()),
+        colour_error_p95=round_digits(np.percentile(error, 95)),
+        missed_cells=round_digits(baked.missed),
+        torn_seams=round_digits(_torn_seams(level, nearest, source, reach, 1 / baked.density)),
+        texels_per_length=round_digits(baked.density),
     )
 
 
@@ -73,8 +74,7 @@ def _torn_seams(
     if not len(sides):
         return 0.0
     inner = level.positions[edges[count == 2]]
-    normal = level.double_area_vectors
-    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = unit_normals(level)
     along = np.array(_ALONG)[:, None, None]
     points = ((1 - along) * inner[:, 0] + along * inner[:, 1]).reshape(-1, 3)
     side_positions = []
@@ -86,7 +86,3 @@ def _torn_seams(
     length = np.linalg.norm(inner[:, 1] - inner[:, 0], axis=1)
     torn = (gap > _TORN_TEXELS * texel).mean(axis=0)
     return float((torn * length).sum() / length.sum())
-
-
-def _round_digits(value: float) -> float:
-    return float(f"{value:.6g}")

@@ -12,6 +12,7 @@ from embreex.mesh_construction import TriangleMesh as EmbreeMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
+from pipeline.assets.quality.triangles import unit_normals
 from pipeline.foreign.mesh import TriangleMesh
 
 _BEHIND = 1e-4
@@ -37,8 +38,7 @@ class SurfaceLookup:
     def __init__(self, mesh: TriangleMesh) -> None:
         """Build the trees of a clean, outward oriented mesh of the unit box."""
         self._mesh = mesh
-        vectors = mesh.double_area_vectors
-        self._normals = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+        self._normals = unit_normals(mesh)
         self._tree = igl.AABB()
         self._tree.init(mesh.positions, mesh.faces)
         self._embree = EmbreeScene(robust=True)

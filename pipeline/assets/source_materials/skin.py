@@ -1,14 +1,13 @@
-"""`SkinBaker`: source materials of one object, from its file to the skins of its levels."""
+"""Source materials of one object, from its file to the skins of its levels."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.settings import OwnMaterialSettings
-from pipeline.assets.source_materials.bake import bake
-from pipeline.assets.source_materials.emission import level_emission
+from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
+from pipeline.assets.source_materials.bake import bake, level_emission
 from pipeline.assets.source_materials.measure import skin_quality
 from pipeline.assets.source_materials.nearest import SurfaceLookup
 from pipeline.assets.source_materials.source_surface import SourceSurface, match_source_surface
@@ -30,6 +29,47 @@ from storage.records.texture import TEXTURED, Texture
 _LEAST_REACH = 1e-3
 """Least distance within which rays search the source, in the unit box; beyond it, 1.5 times the
 level's largest error."""
+
+
+def add_source_materials(
+    levels: tuple[Level, ...],
+    missed: Mapping[int, tuple[str, str]],
+    source: SourceFile,
+    mesh: TriangleMesh,
+    settings: AssetSettings,
+) -> tuple[tuple[Level, ...], dict[int, tuple[str, str]], OwnMaterials | None]:
+    """Return levels with skins, reasons of missing levels, and the state of the materials.
+
+    Args:
+        levels: levels without skins.
+        missed: reason and message by budget.
+        source: the object's file; `mesh` is its clean, oriented mesh.
+        settings: `own_materials` keeps materials, and says what happens where they are lost.
+
+    Raises:
+        Rejected: as `open_skin_baker`, where `if_lost` is `reject`.
+    """
+    reasons = dict(missed)
+    if not settings.own_materials.keep:
+        return levels, reasons, None
+    refuse = settings.own_materials.if_lost == "reject"
+    try:
+        baker, materials = open_skin_baker(source, mesh, settings.own_materials)
+    except Rejected as lost:
+        if refuse:
+            raise
+        return levels, reasons, OwnMaterials(reason=lost.reason, message=lost.message)
+    with_skins = list[Level]()
+    for level in levels:
+        try:
+            with_skins.append(baker.add_skin(level))
+        except Rejected as lost:
+            if refuse:
+                reasons[level.record.budget] = (lost.reason, lost.message)
+                continue
+            with_skins.append(level)
+            materials = OwnMaterials(reason=lost.reason, message=lost.message, lost=materials.lost)
+    return tuple(with_skins), reasons, materials
 
 
 class SkinBaker:
@@ -90,12 +130,7 @@ def _require_lawful(textures: Sequence[Texture], emission: NDArray[np.float32] |
 def open_skin_baker(
     source: SourceFile, mesh: TriangleMesh, settings: OwnMaterialSettings
 ) -> tuple[SkinBaker, OwnMaterials]:
-    """Return the skin baker of a source, and the lost parts of its materials.
-
-    Args:
-        source: the file, with the pictures next to it.
-        mesh: the clean, oriented mesh of that file.
-        settings: sizes and limits.
+    """Return the skin baker of a source with its clean, oriented mesh, and the lost materials.
 
     Raises:
         Rejected: no_materials, materials_unreadable, texture_missing, texture_outside,

@@ -1,5 +1,6 @@
 """The cleaned source with its materials: each clean face is matched to a face of the file."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -40,16 +41,9 @@ class SourceSurface:
             weights: [N, 3] barycentric coordinates in them.
             cell: width in the unit box over which pictures are averaged.
         """
-        source_face = self.source_face[faces]
-        source_weights = np.zeros((len(faces), 3))  # weights of the corners in the file's order
-        np.put_along_axis(source_weights, self.source_corner[faces], weights, axis=1)
         result = np.zeros((len(faces), 7))
-        material = self.parts.material[source_face]
-        for row in np.unique(material):
-            chosen = np.flatnonzero(material == row)
-            result[chosen] = self._material_columns(
-                self.parts.materials[row], source_face[chosen], source_weights[chosen], cell
-            )
+        for material, chosen, in_file in self._by_material(faces, weights):
+            result[chosen] = self._material_columns(material, *in_file, cell)
         return result
 
     @property
@@ -61,20 +55,27 @@ class SourceSurface:
         self, faces: NDArray[np.int64], weights: NDArray[np.float64], cell: float
     ) -> NDArray[np.float64]:
         """Return the radiance [N, 3] at points on faces; arguments as in `columns`."""
-        source_face = self.source_face[faces]
-        source_weights = np.zeros((len(faces), 3))
-        np.put_along_axis(source_weights, self.source_corner[faces], weights, axis=1)
         result = np.zeros((len(faces), 3))
-        for row, material in enumerate(self.parts.materials):
-            chosen = np.flatnonzero(self.parts.material[source_face] == row)
-            if not material.emits or not len(chosen):
-                continue
-            result[chosen] = material.emission_rgb
-            if material.emission is not None:
-                result[chosen] *= self._sample_picture(
-                    material.emission, source_face[chosen], source_weights[chosen], cell
-                )[:, :3]
+        for material, chosen, in_file in self._by_material(faces, weights):
+            if material.emits:
+                result[chosen] = material.emission_rgb
+            if material.emits and material.emission is not None:
+                result[chosen] *= self._sample_picture(material.emission, *in_file, cell)[:, :3]
         return result
+
+    def _by_material(
+        self, faces: NDArray[np.int64], weights: NDArray[np.float64]
+    ) -> Iterator[
+        tuple[SourceMaterial, NDArray[np.int64], tuple[NDArray[np.int64], NDArray[np.float64]]]
+    ]:
+        """Yield each material, the rows of its points, and their faces and weights in the file."""
+        source_face = self.source_face[faces]
+        source_weights = np.zeros((len(faces), 3))  # weights of the corners in the file's order
+        np.put_along_axis(source_weights, self.source_corner[faces], weights, axis=1)
+        material = self.parts.material[source_face]
+        for row in np.unique(material):
+            chosen = np.flatnonzero(material == row)
+            yield self.parts.materials[row], chosen, (source_face[chosen], source_weights[chosen])
 
     def _material_columns(
         self,
@@ -88,12 +89,8 @@ class SourceSurface:
         def sample(slot: Slot | None) -> NDArray[np.float32] | None:
             if slot is None:
                 return None
-            key = (
-                id(slot.picture),
-                slot.uv_set,
-                slot.uv_matrix.tobytes(),
-                slot.uv_offset.tobytes(),
-            )
+            place = slot.uv_matrix.tobytes(), slot.uv_offset.tobytes()
+            key = id(slot.picture), slot.uv_set, place
             if key not in known:  # one picture often holds several numbers
                 known[key] = self._sample_picture(slot, source_face, source_weights, cell)
             return known[key]
@@ -144,11 +141,7 @@ def _halvings(
 
 
 def match_source_surface(mesh: TriangleMesh, parts: TexturedMesh) -> SourceSurface:
-    """Match the faces of a clean mesh to those of its file.
-
-    Args:
-        mesh: the cleaned and oriented mesh.
-        parts: the faces of the same file.
+    """Match the faces of a clean, oriented mesh to those of its file.
 
     Raises:
         Rejected: materials_unreadable where many faces do not match, no_texture_coordinates or

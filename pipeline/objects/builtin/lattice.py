@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.objects.builtin.grids import Mesh
+from pipeline.objects.builtin.solids import taper_and_twist
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,12 +127,7 @@ def _warp(unit: NDArray[np.float64], params: LatticeParams) -> NDArray[np.float6
     length = np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
     ball = unit * largest / length
     points = (unit + params.roundness * (ball - unit)) * np.array(params.half_sizes)
-    points[:, :2] *= 1 + params.taper * unit[:, 2:]
-    angle = params.twist_rad * unit[:, 2]
-    x = points[:, 0].copy()
-    y = points[:, 1].copy()
-    points[:, 0] = np.cos(angle) * x - np.sin(angle) * y
-    points[:, 1] = np.sin(angle) * x + np.cos(angle) * y
+    taper_and_twist(points, unit[:, 2], params.taper, params.twist_rad)
     if params.bend_rad:
         radius = 2 * params.half_sizes[0] / params.bend_rad
         arc_angle = points[:, 0] / radius

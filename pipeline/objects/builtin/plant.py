@@ -28,41 +28,6 @@ class LeafParams:
     rows: int  # rows of vertices from base to tip; at least twice the teeth
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlantParams:
-    """Shape of one plant; the rim of its pot has a radius of about 0.3."""
-
-    leaf: LeafParams  # the largest leaf
-    leaves: int  # their number
-    stem: float  # height of the stem above the pot; 0 is a rosette
-    stalk: float  # length of each leaf's own stalk; 0 is none
-    steepest_rad: float  # rise of the uppermost leaf
-    flattest_rad: float  # rise of the lowest leaf
-    smallest: float  # size of the uppermost leaf, as a share of the largest
-    pot_height: float  # height of the pot
-    pot_foot: float  # radius of its foot over that of its rim
-
-
-def plant(params: PlantParams) -> Mesh:
-    """Return a closed pot, closed stems, and one open sheet per leaf."""
-    parts = [_pot(params)]
-    top = params.pot_height - 0.03
-    if params.stem:
-        bend = np.linspace(0, 1, 10)
-        path = np.stack([0.1 * params.stem * bend**2, 0 * bend, params.stem * bend], axis=1)
-        path[:, 2] += top - 0.02
-        parts.append(tube(path, 0.045 - 0.02 * bend, 8))
-    for number in range(params.leaves):
-        fraction = (number + 0.5) / params.leaves
-        azimuth = number * np.pi * (3 - np.sqrt(5))
-        rise = params.flattest_rad + fraction * (params.steepest_rad - params.flattest_rad)
-        level = (0.35 + 0.65 * fraction) * params.stem
-        foot = np.array([0.1 * level**2 / params.stem if params.stem else 0.0, 0.0, top + level])
-        size = 1 - fraction * (1 - params.smallest)
-        parts += _leaf_on_stalk(params, foot, azimuth, rise, size)
-    return join(parts)
-
-
 def leaf_sheet(leaf: LeafParams, rise_rad: float) -> Mesh:
     """Return one leaf: an open sheet of 8 (rows - 1) + 4 triangles from the origin towards x.
 
@@ -86,9 +51,12 @@ def leaf_sheet(leaf: LeafParams, rise_rad: float) -> Mesh:
 
 
 def sample_plant(rng: np.random.Generator) -> Mesh:
-    """Return a random plant."""
+    """Return a random plant: a closed pot, closed stems, and one open sheet per leaf.
+
+    The rim of its pot has a radius of about 0.3.
+    """
     kind = str(rng.choice(["agave", "grass", "palm", "broad", "herb"]))
-    leaf, numbers, stem, stalk, rises = {
+    leaf, numbers, stems, stalks, rises = {
         "agave": ((0.75, 0.24, 0.4, 0.7), (14, 27), (0.0, 0.0), (0.0, 0.0), (1.4, 0.3)),
         "grass": ((1.1, 0.07, 0.4, 0.7), (28, 45), (0.0, 0.0), (0.0, 0.0), (1.5, 0.8)),
         "palm": ((1.0, 0.34, 0.45, 0.2), (9, 15), (0.7, 1.5), (0.0, 0.0), (1.2, 0.2)),
@@ -108,19 +76,30 @@ def sample_plant(rng: np.random.Generator) -> Mesh:
         tooth_depth=0.75 if kind == "palm" else 0.4,
         rows=max(2 * teeth, int(rng.integers(9, 13))),
     )
-    return plant(
-        PlantParams(
-            leaf=shape,
-            leaves=int(rng.integers(*numbers)),
-            stem=float(rng.uniform(*stem)),
-            stalk=float(rng.uniform(*stalk)),
-            steepest_rad=float(rises[0] + rng.uniform(-0.1, 0.1)),
-            flattest_rad=float(rises[1] + rng.uniform(-0.2, 0.2)),
-            smallest=float(rng.uniform(0.4, 0.8)),
-            pot_height=float(rng.uniform(0.22, 0.42)),
-            pot_foot=float(rng.uniform(0.55, 1.0)),
-        )
-    )
+    leaves = int(rng.integers(*numbers))
+    stem = rng.uniform(*stems)  # height of the stem above the pot; 0 is a rosette
+    stalk = rng.uniform(*stalks)  # length of each leaf's own stalk; 0 is none
+    steepest_rad = rises[0] + rng.uniform(-0.1, 0.1)  # rise of the uppermost leaf
+    flattest_rad = rises[1] + rng.uniform(-0.2, 0.2)  # rise of the lowest leaf
+    smallest = rng.uniform(0.4, 0.8)  # size of the uppermost leaf, as a share of the largest
+    pot_height = rng.uniform(0.22, 0.42)
+    parts = [_pot(pot_height, pot_foot=rng.uniform(0.55, 1.0))]
+    top = pot_height - 0.03
+    if stem:
+        bend = np.linspace(0, 1, 10)
+        path = np.stack([0.1 * stem * bend**2, 0 * bend, stem * bend], axis=1)
+        path[:, 2] += top - 0.02
+        parts.append(tube(path, 0.045 - 0.02 * bend, 8))
+    for number in range(leaves):
+        fraction = (number + 0.5) / leaves
+        azimuth = number * np.pi * (3 - np.sqrt(5))
+        rise = flattest_rad + fraction * (steepest_rad - flattest_rad)
+        level = (0.35 + 0.65 * fraction) * stem
+        foot = np.array([0.1 * level**2 / stem if stem else 0.0, 0.0, top + level])
+        size = 1 - fraction * (1 - smallest)
+        scaled = replace(shape, length=shape.length * size)
+        parts += _leaf_on_stalk(scaled, stalk * size, foot, azimuth, rise)
+    return join(parts)
 
 
 def _width(along: NDArray[np.float64], leaf: LeafParams) -> NDArray[np.float64]:
@@ -134,17 +113,15 @@ def _width(along: NDArray[np.float64], leaf: LeafParams) -> NDArray[np.float64]:
 
 
 def _leaf_on_stalk(
-    params: PlantParams, foot: NDArray[np.float64], azimuth: float, rise: float, size: float
+    leaf: LeafParams, stalk: float, foot: NDArray[np.float64], azimuth: float, rise: float
 ) -> list[Mesh]:
     """Return a leaf that starts at `foot` or at the end of its stalk, and the stalk if any."""
     ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     direction = np.cos(rise) * ahead + np.array([0.0, 0.0, np.sin(rise)])
-    stalk = params.stalk * size
     # Without a stalk it begins just inside the stem or the earth.
     start = foot + (direction * stalk if stalk else 0.025 * ahead - [0.0, 0.0, 0.01])
-    scaled = replace(params.leaf, length=params.leaf.length * size)
     # A leaf at the end of a stalk hangs from it, the others go on in their own direction.
-    positions, faces = leaf_sheet(scaled, rise - 0.5 if stalk > 0.2 else rise)
+    positions, faces = leaf_sheet(leaf, rise - 0.5 if stalk > 0.2 else rise)
     aside = np.array([-ahead[1], ahead[0], 0.0])
     turned = positions @ np.stack([ahead, aside, [0.0, 0.0, 1.0]])
     parts: list[Mesh] = [(turned + start, faces)]
@@ -154,10 +131,12 @@ def _leaf_on_stalk(
     return parts
 
 
-def _pot(params: PlantParams) -> Mesh:
-    """Return a pot with a rim, filled with earth to just below it."""
-    height = params.pot_height
-    foot = 0.28 * params.pot_foot
+def _pot(height: float, pot_foot: float) -> Mesh:
+    """Return a pot with a rim, filled with earth to just below it.
+
+    `pot_foot` is the radius of its foot over that of its rim.
+    """
+    foot = 0.28 * pot_foot
     outline = [(0.9 * foot, 0.0), (foot, 0.02), (0.28, height - 0.1), (0.31, height - 0.09)]
     outline += [(0.31, height), (0.28, height), (0.27, height - 0.03), (0.14, height - 0.025)]
     return lathe(outline, 20)

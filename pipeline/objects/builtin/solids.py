@@ -24,6 +24,23 @@ def scale_and_move(mesh: Mesh, offset: ArrayLike, scale: ArrayLike = 1.0) -> Mes
     return mesh[0] * np.asarray(scale) + np.asarray(offset), mesh[1]
 
 
+def taper_and_twist(
+    points: NDArray[np.float64], level: NDArray[np.float64], taper: float, twist_rad: float
+) -> None:
+    """Widen points [V, 3] and turn them about z, in place.
+
+    Args:
+        points: to be changed.
+        level: [V] height of each point, from -1 to 1.
+        taper: relative growth of width from the middle to the top, in (-1, 1).
+        twist_rad: turn from the middle to the top.
+    """
+    x, y = (points[:, :2] * (1 + taper * level[:, None])).T
+    angle = twist_rad * level
+    points[:, 0] = np.cos(angle) * x - np.sin(angle) * y
+    points[:, 1] = np.sin(angle) * x + np.cos(angle) * y
+
+
 def lathe(outline: Sequence[tuple[float, float]], columns: int) -> Mesh:
     """Return a solid of revolution about z, of 2 len(outline) columns triangles.
 

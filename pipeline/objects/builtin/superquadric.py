@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.objects.builtin.grids import Mesh, sphere_faces
+from pipeline.objects.builtin.solids import taper_and_twist
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,12 +37,7 @@ def superquadric(params: SuperquadricParams) -> Mesh:
     rings = (profile[:, None, :1] * plan[None, :, :]).reshape(-1, 2)
     unit = np.concatenate([np.column_stack([rings, height]), [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]])
     positions = unit * np.array(params.half_sizes)
-    positions[:, :2] *= 1 + params.taper * unit[:, 2:]
-    angle = params.twist_rad * unit[:, 2]
-    x = positions[:, 0].copy()
-    y = positions[:, 1].copy()
-    positions[:, 0] = np.cos(angle) * x - np.sin(angle) * y
-    positions[:, 1] = np.sin(angle) * x + np.cos(angle) * y
+    taper_and_twist(positions, unit[:, 2], params.taper, params.twist_rad)
     return positions, sphere_faces(params.rings, params.columns)
 
 

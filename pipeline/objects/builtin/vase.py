@@ -3,65 +3,37 @@
 Unlike closed bodies, open vessels let light in, and their inside shades itself.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.objects.builtin.grids import Mesh, sphere_faces
 
 
-@dataclass(frozen=True, kw_only=True)
-class VaseParams:
-    """Shape of one vase."""
-
-    height: float  # from foot to lip
-    radii: tuple[float, ...]
-    """Outer radii at equal heights from foot to lip, joined by a smooth curve; all positive."""
-    wall: float  # thickness of wall and bottom; smaller than every radius
-    flutes: int  # folds around the vase; 0 is plain
-    flute_depth: float  # depth of the folds as a share of the radius, in [0, 1)
-    swirl_rad: float  # turn of the folds from foot to lip
-    rings: int  # rings from foot to lip
-    columns: int  # vertices of a ring; a multiple of the flutes makes them all alike
-
-
-def vase(params: VaseParams) -> Mesh:
-    """Return the closed surface (outside, lip, inside) of 4 rings columns triangles."""
-    level = np.linspace(0, 1, params.rings)
-    outer = _smooth(np.array(params.radii), level)
-    inner_height = params.wall + (params.height - params.wall) * level
-    inner = _smooth(np.array(params.radii), inner_height / params.height) - params.wall
-    radius = np.concatenate([outer, inner[::-1]])
-    height = np.concatenate([params.height * level, inner_height[::-1]])
-    azimuth = 2 * np.pi * np.arange(params.columns) / params.columns
-    phase = params.flutes * (azimuth[None] + params.swirl_rad * height[:, None] / params.height)
-    fold = 1 - params.flute_depth * (0.5 - 0.5 * np.cos(phase)) * bool(params.flutes)
-    rings = radius[:, None] * fold
-    upright = np.broadcast_to(height[:, None], rings.shape)
-    grid = np.stack([rings * np.cos(azimuth), rings * np.sin(azimuth), upright], axis=-1)
-    poles = [[0.0, 0.0, 0.0], [0.0, 0.0, params.wall]]
-    positions = np.concatenate([grid.reshape(-1, 3), poles])
-    return positions, sphere_faces(2 * params.rings, params.columns)
-
-
 def sample_vase(rng: np.random.Generator) -> Mesh:
-    """Return a random vase."""
+    """Return a random vase: a closed surface (outside, lip, inside)."""
+    # Outer radii at equal heights from foot to lip, joined by a smooth curve.
     radii = rng.uniform(0.16, 0.55, int(rng.integers(4, 7)))
-    flutes = int(rng.choice([0, 0, 5, 6, 8, 10]))
+    flutes = int(rng.choice([0, 0, 5, 6, 8, 10]))  # folds around the vase; 0 is plain
     columns = int(rng.integers(28, 45))
-    return vase(
-        VaseParams(
-            height=float(rng.uniform(0.7, 1.6)),
-            radii=tuple(radii.tolist()),
-            wall=float(rng.uniform(0.025, 0.06)),
-            flutes=flutes,
-            flute_depth=float(rng.uniform(0.1, 0.35)),
-            swirl_rad=float(rng.uniform(-0.8, 0.8)),
-            rings=int(rng.integers(14, 21)),
-            columns=columns - columns % max(flutes, 1),
-        )
-    )
+    columns -= columns % max(flutes, 1)  # so that all flutes are alike
+    height = rng.uniform(0.7, 1.6)
+    wall = rng.uniform(0.025, 0.06)  # thickness of wall and bottom
+    flute_depth = rng.uniform(0.1, 0.35)  # as a share of the radius
+    swirl_rad = rng.uniform(-0.8, 0.8)  # turn of the folds from foot to lip
+    rings = int(rng.integers(14, 21))  # from foot to lip
+    level = np.linspace(0, 1, rings)
+    inner_height = wall + (height - wall) * level
+    inner = _smooth(radii, inner_height / height) - wall
+    radius = np.concatenate([_smooth(radii, level), inner[::-1]])
+    heights = np.concatenate([height * level, inner_height[::-1]])
+    azimuth = 2 * np.pi * np.arange(columns) / columns
+    phase = flutes * (azimuth[None] + swirl_rad * heights[:, None] / height)
+    fold = 1 - flute_depth * (0.5 - 0.5 * np.cos(phase)) * bool(flutes)
+    folded = radius[:, None] * fold
+    upright = np.broadcast_to(heights[:, None], folded.shape)
+    grid = np.stack([folded * np.cos(azimuth), folded * np.sin(azimuth), upright], axis=-1)
+    poles = [[0.0, 0.0, 0.0], [0.0, 0.0, wall]]
+    return np.concatenate([grid.reshape(-1, 3), poles]), sphere_faces(2 * rings, columns)
 
 
 def _smooth(values: NDArray[np.float64], where: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -21,19 +21,20 @@ from storage.remote.safe_url import printable, public_text
 CATALOGUE_NAMES = ("objects.jsonl", "objects.csv")
 
 
-def only_catalogue(exists: Callable[[str], bool]) -> str | None:
+def only_catalogue(exists: Callable[[str], bool], kind: str = "objects") -> str | None:
     """Return the name of a folder's catalogue, or None where it has none.
 
     Args:
         exists: returns True where the folder has a file of this name.
+        kind: name of the catalogue: objects, textures or skies.
 
     Raises:
         TrilightError: the folder has both.
     """
-    present = [name for name in CATALOGUE_NAMES if exists(name)]
+    present = [name for end in ("jsonl", "csv") if exists(name := f"{kind}.{end}")]
     if len(present) > 1:
         raise TrilightError(
-            f"objects: the folder has {' and '.join(present)}; expected one catalogue. Remove one."
+            f"{kind}: the folder has {' and '.join(present)}; expected one catalogue. Remove one."
         )
     return present[0] if present else None
 

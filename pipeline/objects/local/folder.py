@@ -22,7 +22,7 @@ def list_folder(folder: Path, licence: str | None) -> Listing:
     """Return the objects of a folder; nothing is loaded.
 
     Args:
-        folder: a folder with a catalogue, or with object files.
+        folder: with a catalogue or object files.
         licence: the user's licence for files without a statement.
 
     Raises:
@@ -59,8 +59,7 @@ def scan_folder(folder: Path, licence: StatedLicence) -> Listing:
     uids, failures = assign_uids(drop_duplicates(drop_scenes(root, files)))
     records = []
     for name, uid in uids.items():
-        # Not Path.resolve: links that go round in a circle make it raise.
-        if not Path(os.path.realpath(root / name)).is_relative_to(root):
+        if not is_below(root, root / name):
             message = (
                 f"{printable(name)} is a link out of the folder; copy the file into it, or name "
                 "the folder that holds it"
@@ -69,6 +68,12 @@ def scan_folder(folder: Path, licence: StatedLicence) -> Listing:
             continue
         records.append(replace(file_record(uid, str(root / name), licence), root=str(root)))
     return Listing(records=records, failures=failures)
+
+
+def is_below(root: Path, path: Path) -> bool:
+    """Return True where a file is inside a folder after following links."""
+    # Not Path.resolve: links that go round in a circle make it raise.
+    return Path(os.path.realpath(path)).is_relative_to(root)
 
 
 def file_record(

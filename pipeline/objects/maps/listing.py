@@ -19,8 +19,8 @@ from pipeline.objects.licences import (
     stated_licence,
 )
 from pipeline.objects.listing import failure
-from pipeline.objects.local.catalogue import read_catalogue
-from pipeline.objects.local.folder import walk_files
+from pipeline.objects.local.catalogue import only_catalogue, read_catalogue
+from pipeline.objects.local.folder import file_record, is_below, walk_files
 from pipeline.objects.maps.names import PICTURES, group_textures
 from storage.errors import TrilightError
 from storage.records.objects import SKY, TEXTURE, Failure, ObjectRecord
@@ -86,13 +86,14 @@ def find_maps(
             f"{suffixes} files. Download them first where they are on a server."
         )
     stated = stated_licence(licence)
-    catalogue = _only_catalogue(root, plural)
+    catalogue = only_catalogue(lambda name: (root / name).exists(), plural)
     failures: list[Failure] = []
     if catalogue is None:
         records = _scan_pictures(kind, root, stated, failures)
     else:
-        require_unstated(licence, catalogue.name)
-        records = [replace(row, uid=f"{kind}:{row.uid}") for row in read_catalogue(catalogue)]
+        require_unstated(licence, catalogue)
+        rows = read_catalogue(root / catalogue)
+        records = [replace(row, uid=f"{kind}:{row.uid}") for row in rows]
     if not records and not failures:
         raise TrilightError(
             f"{plural} {display_path!r} holds none; expected {suffixes} files, or a catalogue "
@@ -103,16 +104,6 @@ def find_maps(
         maps=tuple(_with_files(kind, root, sorted(allowed, key=attrgetter("uid")))),
         failures=tuple(sorted([*failures, *refused], key=attrgetter("item"))),
     )
-
-
-def _only_catalogue(root: Path, plural: str) -> Path | None:
-    present = [path for end in ("jsonl", "csv") if (path := root / f"{plural}.{end}").exists()]
-    if len(present) > 1:
-        raise TrilightError(
-            f"{plural}: the folder has {present[0].name} and {present[1].name}; expected one "
-            "catalogue. Remove one."
-        )
-    return present[0] if present else None
 
 
 def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[FoundMap]:
@@ -134,7 +125,7 @@ def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[
         base = Path(row.path)
         files = textures.get(base.relative_to(root).as_posix(), {})
         companions = {
-            part: root / name for part, name in files.items() if _is_below(root, root / name)
+            part: root / name for part, name in files.items() if is_below(root, root / name)
         }
         maps.append(FoundMap(record=row, files={**companions, "base": base}))
     return maps
@@ -146,7 +137,7 @@ def _scan_pictures(
     """Return a record of each texture or map, and add a failure for each other picture."""
     every = [name for name in drop_outputs(walk_files(root)) if not _is_hidden(name)]
     names = sorted(name for name in every if name.lower().endswith(SUFFIXES[kind]))
-    outside = {name for name in names if not _is_below(root, root / name)}
+    outside = {name for name in names if not is_below(root, root / name)}
     names = [name for name in names if name not in outside]
     unused = {
         name: ("unread_format", f"expected {' '.join(SUFFIXES[kind])}; convert or unpack it")
@@ -175,7 +166,8 @@ def _scan_pictures(
             message = "another file of the same name is taken; rename one of them"
             failures.append(failure(f"{kind}:{printable(name)}", "name_clash", message))
         else:
-            records[uid] = _record(uid, root / name, stated)
+            title = printable(stem).rpartition("/")[2]
+            records[uid] = replace(file_record(uid, str(root / name), stated), title=title)
     return list(records.values())
 
 
@@ -185,20 +177,3 @@ def _pictures(names: Sequence[str]) -> list[str]:
 
 def _is_hidden(name: str) -> bool:
     return name.rpartition("/")[2].startswith(".")
-
-
-def _is_below(root: Path, path: Path) -> bool:
-    """Return True where a file is inside a folder after following links, circular ones too."""
-    return Path(os.path.realpath(path)).is_relative_to(root)
-
-
-def _record(uid: str, path: Path, stated: StatedLicence) -> ObjectRecord:
-    return ObjectRecord(
-        uid=uid,
-        path=str(path),
-        title=uid.partition(":")[2].rpartition("/")[2],
-        licence=stated.licence,
-        licence_source=stated.licence_source,
-        attribution="",
-        source_url="",
-    )

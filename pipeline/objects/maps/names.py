@@ -157,12 +157,12 @@ def group_textures(
     stems = {name: name.rpartition(".")[0] for name in names}
     named = {name: entry for name in names if (entry := _parse_name(stems[name])) is not None}
     _add_letters(stems, named)
-    bare = _UnlabeledFiles(stems, named)
+    colors, unknown = _classify_unlabeled(stems, named)
     parts: dict[tuple[str, str], dict[str, str]] = defaultdict(dict)
     bases: dict[tuple[str, str], tuple[str, str]] = {}
     unused: dict[str, tuple[str, str]] = {}
-    for name in (*named, *bare.colors):
-        entry = named.get(name) or _ParsedName(bare.colors[name], bare.colors[name], "base")
+    for name in (*named, *colors):
+        entry = named.get(name) or _ParsedName(colors[name], colors[name], "base")
         at = entry.key, entry.kind
         if entry.part not in _READ:
             message = f"it is a map of {entry.part}; expected colors, metallic and roughness"
@@ -173,7 +173,7 @@ def group_textures(
             bases[at] = entry.stem, name
         else:
             parts[at][entry.part] = name
-    for name in bare.unknown:
+    for name in unknown:
         message = "its name says no part that is known; end it in _color, or move it away"
         unused[name] = ("unknown_map", message)
     _drop_packed(parts.values(), unused)
@@ -191,28 +191,30 @@ def group_textures(
     return textures, unused
 
 
-class _UnlabeledFiles:
-    """Files whose names state no component: colors by their context, and unknown ones."""
+def _classify_unlabeled(
+    stems: Mapping[str, str], named: Mapping[str, _ParsedName]
+) -> tuple[dict[str, str], list[str]]:
+    """Classify files whose names state no component by the files next to them.
 
-    def __init__(self, stems: Mapping[str, str], named: Mapping[str, _ParsedName]) -> None:
-        """Classify each file by the files next to it."""
-        with_color = {entry.key for entry in named.values() if entry.part == "base"}
-        keys = {entry.key for entry in named.values()}
-        folders = {stems[name].rpartition("/")[0] for name in named}
-        self.colors: dict[str, str] = {}
-        """Stems by file name."""
-        self.unknown: list[str] = []
-        repeated = _find_repeated(stem for name, stem in stems.items() if name not in named)
-        for name, stem in stems.items():
-            if name in named:
-                continue
-            is_alone = stem.rpartition("/")[0] not in folders and not name.lower().endswith(".exr")
-            is_alone &= stem not in repeated
-            is_alone &= not _NO_COLOR.fullmatch(_without_accents(stem.rpartition("/")[2]))
-            if is_alone or (stem in keys and stem not in with_color):
-                self.colors[name] = stem
-            else:
-                self.unknown.append(name)
+    Returns:
+        Stems of colors by file name, and the names of unknown files.
+    """
+    with_color = {entry.key for entry in named.values() if entry.part == "base"}
+    keys = {entry.key for entry in named.values()}
+    folders = {stems[name].rpartition("/")[0] for name in named}
+    unnamed = {name: stem for name, stem in stems.items() if name not in named}
+    repeated = _find_repeated(unnamed.values())
+    colors: dict[str, str] = {}
+    unknown: list[str] = []
+    for name, stem in unnamed.items():
+        is_alone = stem.rpartition("/")[0] not in folders and not name.lower().endswith(".exr")
+        is_alone &= stem not in repeated
+        is_alone &= not _NO_COLOR.fullmatch(_without_accents(stem.rpartition("/")[2]))
+        if is_alone or (stem in keys and stem not in with_color):
+            colors[name] = stem
+        else:
+            unknown.append(name)
+    return colors, unknown
 
 
 def _find_repeated(stems: Iterable[str]) -> set[str]:

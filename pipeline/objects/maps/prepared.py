@@ -1,5 +1,9 @@
 """Prepared textures and maps, as scenes use them.
 
+The base color of a texture is sRGB-encoded, all else is linear. Means are of linear values; the
+mean of roughness is that of the GGX width, its square. There is no Fresnel term here: a surface
+with a metallic map, or with a base color alone, gets its albedos from storage.optics.fresnel.
+
 A child process reads a file once, and the user's cache keeps the outcome under a key of all that it
 depends on. The cache keeps no refusal: it costs little, and the user may fix the file.
 """
@@ -16,9 +20,11 @@ from pipeline.foreign.light_pictures import read_linear_picture
 from pipeline.objects.maps.names import TEXTURE_PARTS, packed_channels
 from pipeline.objects.maps.picture import are_normals, picture_values
 from pipeline.objects.maps.radiance import usable_map
-from pipeline.objects.maps.texture_set import texture_set
+from pipeline.objects.maps.resample import area_means
+from storage.conventions import linear_from_srgb
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
+from storage.optics.fresnel import constant_albedos
 from storage.records.objects import SKY
 from storage.records.safe_read import read_safetensors
 from storage.records.texture import content_digest
@@ -54,8 +60,8 @@ class PreparedMap:
     content_sha256: str
     """Digest that decides the split: of the base color, or of the whole map, as read."""
     arrays: Mapping[str, NDArray[np.float32]]
-    """Arrays: "diffuse", "specular" and optionally "roughness" of a texture; "radiance" of a map.
-    """
+    """Arrays, the top row first: "radiance" of a map; "diffuse" [H, W, 3] and "specular" [H, W, 3]
+    of a texture, at most 1 together, and "roughness" [H, W, 1] where there is a picture of it."""
 
     def encode(self) -> bytes:
         """Return the bytes of its file."""
@@ -99,12 +105,7 @@ def prepare_map(map_files: MapFiles) -> tuple[bytes, tuple[str, ...]]:
         raise Rejected(
             "unknown_map", "its values are unit vectors, as of a normal map; end it in _normal"
         )
-    result = texture_set(unpack_parts(pictures), map_files.size)
-    maps = {"diffuse": result.diffuse_rgb, "specular": result.specular_rgb}
-    if result.roughness is not None:
-        maps["roughness"] = result.roughness
-    prepared = PreparedMap(content_sha256=result.content_sha256, arrays=maps)
-    return prepared.encode(), tuple(unread)
+    return texture_set(unpack_parts(pictures), map_files.size).encode(), tuple(unread)
 
 
 def _prepare_sky(data: bytes, rows: int) -> tuple[bytes, tuple[str, ...]]:
@@ -118,6 +119,55 @@ def _prepare_sky(data: bytes, rows: int) -> tuple[bytes, tuple[str, ...]]:
         arrays={"radiance": np.ascontiguousarray(usable_map(radiance, rows))},
     )
     return prepared.encode(), picture.unread
+
+
+def texture_set(pictures: Mapping[str, NDArray[np.float32]], size: int) -> PreparedMap:
+    """Return a texture.
+
+    Args:
+        pictures: encoded values [H, W, 1 or 3] of the component "base", and of "specular",
+            "roughness" and "metallic" where present. They may differ in size.
+        size: most texels along a side of the result.
+    """
+    base = pictures["base"]
+    height, width = _fitting_size(base.shape[:2], size)
+
+    def means(values: NDArray) -> NDArray[np.float64]:
+        return area_means(values, height, width)
+
+    color = _three(means(linear_from_srgb(base).astype(np.float32)))
+    metallic = means(_grey(pictures["metallic"])) if "metallic" in pictures else np.zeros(1)
+    if "specular" in pictures:
+        diffuse = color * (1 - metallic)
+        # where both are over 1, the lobe gives way
+        specular = np.minimum(_three(means(pictures["specular"])), 1 - diffuse)
+    else:
+        diffuse, specular = constant_albedos(color, metallic)
+        specular = np.broadcast_to(specular, diffuse.shape)
+    arrays = {
+        "diffuse": diffuse.astype(np.float32),
+        "specular": np.ascontiguousarray(specular, np.float32),
+    }
+    if "roughness" in pictures:
+        widths = means(np.square(_grey(pictures["roughness"])))
+        arrays["roughness"] = np.sqrt(widths).astype(np.float32)
+    # Copies share the digest of the base color as read, whatever their other pictures.
+    return PreparedMap(content_sha256=content_digest("base colour", base), arrays=arrays)
+
+
+def _fitting_size(shape: tuple[int, ...], size: int) -> tuple[int, int]:
+    """Return height and width with the proportions of a picture and no side over `size`."""
+    shrink = min(1.0, size / max(shape))
+    height, width = (max(1, round(side * shrink)) for side in shape)
+    return height, width
+
+
+def _grey(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    return values.mean(axis=2, keepdims=True, dtype=np.float32)
+
+
+def _three(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.repeat(values, 3, axis=2) if values.shape[2] == 1 else values
 
 
 def unpack_parts(

@@ -5,33 +5,29 @@ server's version of it is stored below `versions`: while the server reports the 
 file is not downloaded again. The files that a glTF names are downloaded with it.
 """
 
+import dataclasses
 import errno
 import json
 import os
 import posixpath
 import threading
-from functools import partial
+from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 from urllib.parse import unquote, urlsplit
-
-from fsspec.asyn import sync
-from fsspec.callbacks import Callback
 
 from pipeline.objects.remote.folder import RemoteFolder
 from storage.atomic import atomic_writer, remove_leftovers, write_atomically
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.remote.fetch import version_of
+from storage.remote.fetch import download, version_of
 from storage.remote.safe_url import printable
-from storage.remote.tries import Interrupted, Pace, TransferFailed, with_tries
-from storage.remote.url import transfer_timeout
+from storage.remote.tries import TransferFailed, with_tries
 from storage.typed_json import read_json
 
 _MAX_NAME_BYTES = 220
 """File systems allow 255; the rest is for the name of an unfinished file."""
 _MAX_PATH_BYTES = 2000
-_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 _NAME_ERRORS = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.EILSEQ)
 _MAX_BUFFERS = 100
 _MAX_JSON_BYTES = 64_000_000
@@ -55,7 +51,7 @@ class RemoteFiles:
         self._folder = folder
         self._max_bytes = max_bytes
         self._lock = threading.Lock()
-        self._outcomes: dict[str, _Outcome] = {}
+        self._outcomes: dict[str, Future[Path]] = {}
         # younger files may belong to a running process
         remove_leftovers(self.files, older_than_s=_STALE_S)
 
@@ -98,23 +94,19 @@ class RemoteFiles:
     def fetch(self, name: str) -> Path:
         """Download one file once per instance; raises as `fetch_object`."""
         with self._lock:
-            outcome = self._outcomes.setdefault(name, _Outcome())
-        with outcome.lock:
-            if outcome.path is None and outcome.error is None:
-                try:
-                    outcome.path = self.path(name)
-                    limit = _Limit(self._check_size, self.stop)
-                    with_tries(lambda: self._refresh(name, self.path(name), limit))
-                except TransferFailed as error:
-                    outcome.error = error
-        if outcome.error is not None:
-            raise outcome.error
-        assert outcome.path is not None
-        return outcome.path
+            is_first = name not in self._outcomes
+            outcome = self._outcomes.setdefault(name, Future())
+        if is_first:
+            try:
+                outcome.set_result(self._refresh(name))
+            except BaseException as error:
+                outcome.set_exception(error)
+        return outcome.result()
 
-    def _refresh(self, name: str, path: Path, limit: "_Limit") -> None:
-        """Download a file unless the local copy has the server's version."""
-        facts = self._folder.facts(name)
+    def _refresh(self, name: str) -> Path:
+        """Download a file unless the local copy has the server's version; return its path."""
+        path = self.path(name)
+        facts = with_tries(lambda: self._folder.facts(name))
         if facts.get("type") == "directory":
             raise TransferFailed("download_failed", "is a folder, not a file")
         size = facts.get("size")
@@ -123,40 +115,22 @@ class RemoteFiles:
         if size is not None:
             version["size"] = str(size)
         note = self._versions / f"{sha256_hex(os.fsencode(name))}.json"
-        if version and _is_here(path, note, version):
-            return
-        self._transfer(name, path, size, limit)
-        write_atomically(note, json.dumps(version, sort_keys=True).encode())
+        if not version or not _is_here(path, note, version):
+            self._transfer(name, path, size)
+            write_atomically(note, json.dumps(version, sort_keys=True).encode())
+        return path
 
-    def _transfer(self, name: str, path: Path, size: int | None, limit: "_Limit") -> None:
+    def _transfer(self, name: str, path: Path, size: int | None) -> None:
+        url = dataclasses.replace(self._folder.url, root=self._folder.address(name))
         try:
             with atomic_writer(path) as stream:
-                self._fill(name, Path(stream.name), size, limit)
+                target = cast(BinaryIO, _StoppableStream(stream, self.stop))
+                download(url, target, num_bytes=size, max_bytes=self._max_bytes)
         except TrilightError as error:
             if isinstance(error.__cause__, OSError) and error.__cause__.errno in _NAME_ERRORS:
                 message = f"the name {printable(name)[:100]!r} clashes with another one here"
                 raise TransferFailed("unsafe_name", message) from error
             raise
-
-    def _fill(self, name: str, temporary: Path, size: int | None, limit: "_Limit") -> None:
-        """Write the bytes of a file to a temporary path, which the caller holds open."""
-        limit.value = 0  # every try starts again
-        driver = self._folder.driver
-        address = self._folder.address(name)
-        get = driver.get_file
-        if self._folder.url.is_http:  # `get_file` would apply its own limits
-            get = partial(sync, driver.loop, partial(driver._get_file, timeout=transfer_timeout()))
-        try:
-            get(address, str(temporary), callback=limit)
-        except OSError as error:
-            if error.errno in _DISK_ERRORS:
-                raise
-            # Network errors are OSErrors too, and must not count as disk errors.
-            raise Interrupted from error
-        received = temporary.stat().st_size
-        self._check_size(received)
-        if size is not None and received != size:
-            raise Interrupted from EOFError(f"got {received} of {size} bytes")
 
     def _check_size(self, size: int) -> None:
         if size > self._max_bytes:
@@ -164,35 +138,20 @@ class RemoteFiles:
             raise TransferFailed("too_large_bytes", message)
 
 
-class _Outcome:
-    """The outcome of one file's download; its lock is held during the transfer."""
+class _StoppableStream:
+    """An open file that takes no more bytes once the run has ended."""
 
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
-        self.path: Path | None = None
-        self.error: TransferFailed | None = None
-
-
-class _Limit(Callback):
-    """Aborts a transfer that grows too large, is too slow, or belongs to an ended run."""
-
-    def __init__(self, check: Any, stop: threading.Event) -> None:
-        super().__init__()
-        self._check = check
+    def __init__(self, stream: Any, stop: threading.Event) -> None:
+        self._stream = stream
         self._stop = stop
-        self._pace = Pace(lambda: self.value)
 
-    def set_size(self, size: int | None) -> None:
-        super().set_size(size)
-        self._check(size or 0)
-
-    def relative_update(self, inc: int = 1) -> None:
-        super().relative_update(inc)
-        self._check(self.value)
-        if self.value != self.size:  # a complete file is not too slow
-            self._pace.require()
+    def write(self, data: bytes) -> None:
         if self._stop.is_set():
             raise TransferFailed("download_failed", "the run was ended")
+        self._stream.write(data)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 def _is_here(path: Path, note: Path, version: dict[str, str]) -> bool:

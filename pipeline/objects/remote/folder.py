@@ -7,7 +7,7 @@ from urllib.parse import quote, unquote
 
 from storage.errors import TrilightError
 from storage.remote.tries import TransferFailed, is_absent, with_tries
-from storage.remote.url import RemoteUrl, open_driver
+from storage.remote.url import RemoteUrl, shared_driver
 
 _MAX_FOLDERS = 10_000
 _MAX_DEPTH = 32
@@ -20,7 +20,8 @@ class RemoteFolder:
     def __init__(self, url: RemoteUrl) -> None:
         """Open the driver; raises TrilightError where its package is missing."""
         self.url = url
-        self.driver = open_driver(url)
+        self.driver = shared_driver(url)
+        self.driver.invalidate_cache()  # one driver keeps listings although that is turned off
         self._addresses: dict[str, str] = {}
         self._facts: dict[str, dict[str, Any]] = {}
 
@@ -58,8 +59,7 @@ class RemoteFolder:
         except TransferFailed as error:
             raise TrilightError(
                 f"objects {self.url.display_url!r}: cannot be read ({error.message}); expected a "
-                "folder "
-                "that can be reached. Check the URL and your access to it."
+                "folder that can be reached. Check the URL and your access to it."
             ) from error
 
     def names(self) -> list[str]:

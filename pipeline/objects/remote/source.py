@@ -38,9 +38,7 @@ def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
     Only the catalogue is downloaded here. Later downloads go to the cache; a cached object is
     downloaded again only where the server reports a change.
 
-    Args:
-        url: the folder.
-        licence: the user's licence for files without a statement.
+    `licence` is the user's for files without a statement.
 
     Raises:
         TrilightError: a driver is missing, the folder cannot be read or listed or holds no object,
@@ -50,12 +48,12 @@ def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
     root = cache_folder("objects") / sha256_hex(url.display_url.encode())[:32]
     files = RemoteFiles(folder, root, MAX_BYTES)
     catalogue = only_catalogue(folder.has)
-    failures: list[Failure] = []
-    if catalogue is not None:
+    if catalogue is None:
+        records, failures = _list_object_files(folder, files, stated_licence(licence))
+    else:
         require_unstated(licence, catalogue)
         records = _list_catalogue(folder, files, catalogue)
-    else:
-        records, failures = _list_object_files(folder, files, stated_licence(licence))
+        failures = []
     return Listing(records=records, failures=failures, fetch=partial(_fetch, folder, files))
 
 
@@ -65,8 +63,7 @@ def _list_catalogue(folder: RemoteFolder, files: RemoteFiles, catalogue: str) ->
     except TransferFailed as error:
         raise TrilightError(
             f"objects {folder.url.display_url!r}: {catalogue} cannot be read ({error.message}); "
-            "expected "
-            "it to be fetched. Try again, or check your access to it."
+            "expected it to be fetched. Try again, or check your access to it."
         ) from error
     return [
         dataclasses.replace(
@@ -84,8 +81,7 @@ def _list_object_files(
         # without the catalogue, the run could use objects that it forbids
         raise TrilightError(
             f"objects {folder.url.display_url!r}: {catalogue} is listed but cannot be fetched; "
-            "expected "
-            "a readable catalogue. Check your access to it."
+            "expected a readable catalogue. Check your access to it."
         )
     names = drop_outputs(names)
     objects = [name for name in names if is_object_file(name)]

@@ -1,7 +1,8 @@
-"""Child calls that fail on purpose, a record of the calls, and the stage that runs them.
+"""A bench of sources whose child calls do as a plan says, write themselves down, and may die.
 
 `recorded_attempt` replaces `stage.attempt_in_child`. It runs in another process, so a file next to
-the source holds its instructions, and it records its calls in another file.
+the source holds its instructions, and it records its calls in another file. As a program, this
+module prepares all sources of a folder and prints their digests.
 """
 
 import ctypes
@@ -9,6 +10,7 @@ import dataclasses
 import json
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,22 +18,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pipeline.assets import stage
 from pipeline.assets.attempt import AssetAttempt
 from pipeline.assets.settings import AssetSettings
-from pipeline.assets.stage import PreparedObject, prepare_assets
 from pipeline.assets.store import AssetStore
 from pipeline.isolation import ChildLimits, IsolatedChild, preload
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Asset, decode_asset
-from storage.records.objects import Failure, ObjectRecord
+from storage.records.objects import Failure
 
-LIMITS = ChildLimits(memory_bytes=3 << 30, wall_s=60, cpu_s=20, calls_per_child=50)
+LIMITS = ChildLimits(memory_bytes=3 << 30, wall_s=300, cpu_s=60, calls_per_child=50)
 CALLS = "calls.jsonl"
 PLAN = "plan.json"
-
-
-def nothing() -> None:
-    """Set up nothing."""
+FIRST, SECOND, THIRD = "pymeshlab_collapse", "meshoptimizer", "meshoptimizer_sloppy"
+SETTINGS = AssetSettings(budgets=(1000, 500, 340))
 
 
 def recorded_attempt(
@@ -56,52 +56,48 @@ def recorded_attempt(
 
 def _without(attempt: AssetAttempt, below: int) -> AssetAttempt:
     """Leave out the levels below a budget, as if they had failed the gate."""
-    kept = tuple(level for level in attempt.asset.levels if level.record.budget >= below)
+    levels = attempt.asset.levels
+    kept = tuple(level for level in levels if level.record.budget >= below)
     gone = {
         level.record.budget: ("silhouette_changed", "planned")
-        for level in attempt.asset.levels
-        if level.record.budget < below
+        for level in levels
+        if level not in kept
     }
     asset = dataclasses.replace(attempt.asset, levels=kept)
     return dataclasses.replace(attempt, asset=asset, missed={**attempt.missed, **gone})
 
 
-def burn(source: Path) -> None:
+def _burn(source: Path) -> None:
     while True:
         pass
 
 
-def fail(source: Path) -> None:
-    raise ZeroDivisionError
+def _raise(error: Exception) -> Callable[[Path], None]:
+    def action(source: Path) -> None:
+        raise error
 
-
-def refuse(source: Path) -> None:
-    raise Rejected("degenerate", "planned")
-
-
-def mistake(source: Path) -> None:
-    raise TrilightError("planned mistake.")
+    return action
 
 
 _ACTIONS: Mapping[str, Callable[[Path], object]] = {
     "work": lambda source: None,
     "crash": lambda source: ctypes.string_at(0),
-    "burn": burn,
+    "burn": _burn,
     "sleep": lambda source: time.sleep(600),
     "eat": lambda source: bytearray(64 << 30),
     "die": lambda source: os.kill(os.getpid(), signal.SIGKILL),
     "leave": lambda source: os._exit(3),
-    "fail": fail,
-    "refuse": refuse,
+    "fail": _raise(ZeroDivisionError()),
+    "refuse": _raise(Rejected("degenerate", "planned")),
     "vanish": Path.unlink,
     "grow": lambda source: source.write_text(source.read_text() + "# more\n"),
-    "mistake": mistake,
+    "mistake": _raise(TrilightError("planned mistake.")),
 }
 
 
 @dataclass
 class Bench:
-    """A folder of sources with a plan, and children to work on them."""
+    """A folder of sources with a plan, a store beside it, and a child to work on them."""
 
     root: Path
     limits: ChildLimits = LIMITS
@@ -118,49 +114,64 @@ class Bench:
         """Say what children do: an action by method, such as `die` or `die once`."""
         (self.root / PLAN).write_text(json.dumps(plan))
 
-    @contextmanager
-    def borrow(self) -> Iterator[IsolatedChild]:
-        yield self.child
-
     @property
     def calls(self) -> list[dict[str, Any]]:
         path = self.root / CALLS
         return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
-    def record(self, name: str) -> ObjectRecord:
+    @property
+    def called(self) -> list[str]:
+        return [call["method"] for call in self.calls]
+
+    @property
+    def num_children(self) -> int:
+        return len({call["pid"] for call in self.calls})
+
+    def run(
+        self,
+        *names: str,
+        settings: AssetSettings = SETTINGS,
+        store: str = "store",
+        done: Callable[[], None] = lambda: None,
+    ) -> tuple[list[stage.PreparedObject], list[Failure]]:
+        """Prepare objects with a store beside the sources."""
         from tests.pipeline.assets.meshes_by_hand import record_of
 
-        return record_of(self.root / name, name)
+        @contextmanager
+        def borrow() -> Iterator[IsolatedChild]:
+            yield self.child
 
+        records = [record_of(self.root / name, name) for name in names]
+        place = AssetStore(self.root.parent / store)
+        return stage.prepare_assets(
+            records, settings, place, borrow_child=borrow, workers=1, done=done
+        )
 
-FIRST, SECOND, THIRD = "pymeshlab_collapse", "meshoptimizer", "meshoptimizer_sloppy"
-SETTINGS = AssetSettings(budgets=(1000, 500, 340))
+    def made(self, name: str = "knot.obj", settings: AssetSettings = SETTINGS) -> Asset:
+        (prepared,), failures = self.run(name, settings=settings)
+        assert not failures
+        return self.stored(prepared)
 
-
-def run(
-    bench: Bench, *names: str, settings: AssetSettings = SETTINGS, store: str = "store"
-) -> tuple[list[PreparedObject], list[Failure]]:
-    """Prepare objects with a store beside the sources."""
-    return prepare_assets(
-        [bench.record(name) for name in names],
-        settings,
-        AssetStore(bench.root.parent / store),
-        borrow_child=bench.borrow,
-        workers=1,
-        done=lambda: None,
-    )
-
-
-def made(bench: Bench, settings: AssetSettings = SETTINGS) -> Asset:
-    (prepared,), failures = run(bench, "knot.obj", settings=settings)
-    assert not failures
-    return stored_asset(bench, prepared)
-
-
-def stored_asset(bench: Bench, prepared: PreparedObject) -> Asset:
-    store = AssetStore(bench.root.parent / "store")
-    return decode_asset(store.asset_path(prepared.asset_name).read_bytes())
+    def stored(self, prepared: stage.PreparedObject) -> Asset:
+        path = AssetStore(self.root.parent / "store").asset_path(prepared.asset_name)
+        return decode_asset(path.read_bytes())
 
 
 def methods(asset: Asset) -> list[tuple[int, str]]:
     return [(level.record.budget, level.record.method) for level in asset.levels]
+
+
+def main() -> None:
+    from tests.pipeline.assets import child_kit  # under the name by which children import it
+
+    stage.attempt_in_child = child_kit.recorded_attempt
+    bench = Bench(Path(sys.argv[1]))
+    names = sorted(path.name for path in bench.root.glob("*.obj"))
+    prepared, failures = bench.run(*names, settings=AssetSettings(budgets=(500,)))
+    bench.child.close()
+    sys.stdout.write(json.dumps({row.record.uid: row.asset_sha256 for row in prepared}))
+    assert not failures, failures
+
+
+if __name__ == "__main__":
+    main()

@@ -56,10 +56,33 @@ def cleaned(mesh: TriangleMesh) -> TriangleMesh:
     return clean(normalize(mesh))
 
 
+def with_faces(mesh: TriangleMesh, faces: NDArray) -> TriangleMesh:
+    return TriangleMesh(positions=mesh.positions, faces=faces)
+
+
+def with_vertex(mesh: TriangleMesh, place: ArrayLike, row: int = 3) -> TriangleMesh:
+    positions = mesh.positions.copy()
+    positions[row] = place
+    return TriangleMesh(positions=positions, faces=mesh.faces)
+
+
 def mesh_of(level: Level) -> TriangleMesh:
     return TriangleMesh(
         positions=level.positions.astype(np.float64), faces=level.faces.astype(np.int64)
     )
+
+
+def check_levels(asset: Asset) -> None:
+    """Assert the laws of levels, which hold whatever came in."""
+    sizes = [len(level.faces) for level in asset.levels]
+    assert sizes == sorted(set(sizes), reverse=True)
+    for level in asset.levels:
+        assert 1 <= len(level.faces) <= level.record.budget
+        assert level.record.quality.error_p99 <= AssetSettings().gate.max_error_p99
+        assert np.isfinite(level.positions).all()
+        assert np.abs(level.positions).max() <= 0.5 + 0.01 * np.sqrt(3)
+        assert level.faces.max() < len(level.positions)
+        assert (np.linalg.norm(mesh_of(level).double_area_vectors, axis=1) > 0).all()
 
 
 def geometry(asset: Asset) -> bytes:
@@ -80,25 +103,44 @@ def moved(mesh: TriangleMesh, scale: ArrayLike = 1.0, offset: ArrayLike = 0.0) -
     return TriangleMesh(positions=positions, faces=mesh.faces)
 
 
+def book(pages: int) -> TriangleMesh:
+    """Faces that all share one edge."""
+    page = np.arange(2, pages + 2)
+    return TriangleMesh(
+        positions=np.random.default_rng(0).random((pages + 2, 3)),
+        faces=np.column_stack([np.zeros_like(page), np.ones_like(page), page]),
+    )
+
+
+def fan(corners: int) -> TriangleMesh:
+    """One face with that many corners, as loaders split it: around the first."""
+    turn = 2 * np.pi * np.arange(corners) / corners
+    rim = np.column_stack([np.cos(turn), np.sin(turn), 0.1 * np.cos(3 * turn)])
+    spokes = np.arange(1, corners - 1)
+    faces = np.column_stack([np.zeros_like(spokes), spokes, spokes + 1])
+    return TriangleMesh(positions=rim, faces=faces)
+
+
+def grid(cells: int) -> TriangleMesh:
+    """A flat unit square around the origin of 2 cells^2 faces that look up."""
+    axis = np.linspace(-0.5, 0.5, cells + 1)
+    u, v = (values.ravel() for values in np.meshgrid(axis, axis, indexing="ij"))
+    start = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).reshape(-1, 1)
+    quads = start + np.array([0, cells + 1, cells + 2, 1])
+    faces = quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+    return TriangleMesh(positions=np.column_stack([u, v, np.zeros(len(u))]), faces=faces)
+
+
 def cube(cells: int = 1) -> TriangleMesh:
     """A closed cube of 12 cells^2 faces, every side a grid of squares."""
-    axis = np.linspace(-0.5, 0.5, cells + 1)
-    u, v = (grid.ravel() for grid in np.meshgrid(axis, axis, indexing="ij"))
-    sheet = grid_faces(cells, cells)
+    flat = grid(cells)
     sides = []
     for k in range(3):
         for end in (-0.5, 0.5):
-            positions = np.roll(np.column_stack([np.full(len(u), end), u, v]), k, axis=1)
-            faces = sheet if end > 0 else sheet[:, ::-1]
-            sides.append(TriangleMesh(positions=positions, faces=faces))
+            place = np.roll(moved(flat, 1, [0, 0, end]).positions, k + 1, axis=1)
+            faces = flat.faces if end > 0 else flat.faces[:, ::-1]
+            sides.append(TriangleMesh(positions=place, faces=faces))
     return joined(*sides)
-
-
-def grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
-    """[2 rows columns, 3] the triangles of a grid of (rows + 1) (columns + 1) vertices."""
-    start: NDArray[np.int64] = np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)
-    quads = start.reshape(-1, 1) + np.array([0, columns + 1, columns + 2, 1])
-    return quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
 
 
 def sphere(rings: int = 15, columns: int = 24) -> TriangleMesh:
@@ -138,14 +180,7 @@ def knot(segments: int = 160, sides: int = 12) -> TriangleMesh:
 def flip_some(mesh: TriangleMesh, share: float, rng: np.random.Generator) -> TriangleMesh:
     """Turn the winding of a share of the faces around."""
     flipped = rng.random(len(mesh.faces)) < share
-    faces = np.where(flipped[:, None], mesh.faces[:, ::-1], mesh.faces)
-    return TriangleMesh(positions=mesh.positions, faces=faces)
-
-
-def volume(mesh: TriangleMesh) -> float:
-    corners = mesh.corners
-    cross = np.cross(corners[:, 1], corners[:, 2])
-    return float(np.einsum("ij,ij->", corners[:, 0], cross)) / 6
+    return with_faces(mesh, np.where(flipped[:, None], mesh.faces[:, ::-1], mesh.faces))
 
 
 def write_obj(path: Path, mesh: TriangleMesh) -> Path:
@@ -224,3 +259,25 @@ WRITERS = {".obj": write_obj, ".off": write_off, ".ply": write_ply, ".stl": writ
 def as_rows(mesh_positions: NDArray, faces: NDArray) -> set[tuple[tuple[float, ...], ...]]:
     """Faces as sets of corner positions: equal for equal surfaces, whatever the order."""
     return {tuple(sorted(map(tuple, corners))) for corners in mesh_positions[faces].tolist()}
+
+
+OUTSIDE = [
+    "../secret.png",
+    "a/../../secret.png",
+    "%2e%2e/secret.png",
+    "/etc/hostname",
+    "file:///etc/hostname",
+    "http://127.0.0.1:1/a.png",
+    "//host/a.png",
+    "link.png",
+]
+"""Addresses that no file may be read from; `secret_beside` lays out the folder."""
+
+
+def secret_beside(tmp_path: Path, data: bytes) -> Path:
+    """Make a folder for an object, with a link to a file beside it."""
+    folder = tmp_path / "objects"
+    folder.mkdir()
+    (tmp_path / "secret.png").write_bytes(data)
+    (folder / "link.png").symlink_to(tmp_path / "secret.png")
+    return folder

@@ -1,14 +1,20 @@
-"""Every reason code has a file that earns it; none of them costs more than a moment."""
+"""Files that are wrong, crash, hang or lead out: an asset or a reason, and no other file.
+
+Every reason code has a file that earns it.
+"""
 
 import gzip
 import io
-import itertools
+import json
 import os
 import struct
+import subprocess
+import sys
 import tarfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,66 +22,72 @@ import pytest
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
+from storage.records.asset import Asset
+from tests.conftest import ROOT
 from tests.for_each import for_each
-from tests.pipeline.assets import meshes_by_hand as by_hand
+from tests.pipeline.assets.child_kit import Bench
+from tests.pipeline.assets.meshes_by_hand import (
+    OUTSIDE,
+    book,
+    check_levels,
+    cube,
+    fan,
+    geometry,
+    gltf_tree,
+    joined,
+    knot,
+    moved,
+    prepare,
+    reason_of,
+    secret_beside,
+    sphere,
+    with_faces,
+    with_vertex,
+    write_glb,
+    write_obj,
+    write_off,
+    write_ply,
+    write_stl,
+)
 
-BALL = by_hand.sphere(rings=5, columns=8)
-
-
-def with_vertex(value: list[float], row: int = 3, mesh: TriangleMesh = BALL) -> TriangleMesh:
-    positions = mesh.positions.copy()
-    positions[row] = value
-    return TriangleMesh(positions=positions, faces=mesh.faces)
-
-
-def moved(scale: float, offset: float) -> TriangleMesh:
-    return TriangleMesh(positions=BALL.positions * scale + offset, faces=BALL.faces)
-
-
-OFF_FILES: dict[str, tuple[str, TriangleMesh]] = {
-    "nan": ("nonfinite_vertices", with_vertex([0, np.nan, 0])),
-    "infinity": ("nonfinite_vertices", with_vertex([np.inf, 0, 0])),
-    "tiny": ("extent_range", moved(1e-10, 0)),
-    "huge": ("extent_range", moved(1e10, 0)),
-    "overflowing": ("extent_range", moved(1e308, 0)),
-    "point": ("extent_range", moved(0.0, 1.0)),
-    "line": ("degenerate", TriangleMesh(positions=BALL.positions * [1, 0, 0], faces=BALL.faces)),
-    "needle": (
-        "degenerate",
-        TriangleMesh(positions=BALL.positions * [1, 1e-6, 1e-6], faces=BALL.faces),
-    ),
+BALL = sphere(rings=5, columns=8)
+NUMBERS: dict[str, tuple[str, TriangleMesh]] = {
+    "nan": ("nonfinite_vertices", with_vertex(BALL, [0, np.nan, 0])),
+    "infinity": ("nonfinite_vertices", with_vertex(BALL, [np.inf, 0, 0])),
+    "tiny": ("extent_range", moved(BALL, 1e-10)),
+    "huge": ("extent_range", moved(BALL, 1e10)),
+    "overflowing": ("extent_range", moved(BALL, 1e308)),
+    "point": ("extent_range", moved(BALL, 0.0, 1.0)),
+    "line": ("degenerate", moved(BALL, [1, 0, 0])),
+    "needle": ("degenerate", moved(BALL, [1, 1e-6, 1e-6])),
     "outlier": (
         "far_outlier",
-        TriangleMesh(
-            positions=np.concatenate([by_hand.knot().positions, [[1e4, 0, 0], [1e4, 1e-3, 0]]]),
-            faces=np.concatenate([by_hand.knot().faces, [[0, 1920, 1921]]]),
+        joined(
+            knot(),
+            TriangleMesh(positions=np.array([[0, 0, 0], [1e4, 0, 0], [1e4, 1e-3, 0]]),
+                         faces=np.array([[0, 1, 2]])),
         ),
     ),
-}
+}  # fmt: skip
 
 
-@for_each("name", OFF_FILES)
+@for_each("name", NUMBERS)
 def test_bad_numbers(tmp_path: Path, name: str) -> None:
-    reason, mesh = OFF_FILES[name]
-    assert by_hand.reason_of(by_hand.write_off(tmp_path / "a.off", mesh)) == reason
+    reason, mesh = NUMBERS[name]
+    assert reason_of(write_off(tmp_path / "a.off", mesh)) == reason
 
 
 def test_an_offset_is_judged_by_the_precision_of_the_format(tmp_path: Path) -> None:
-    far = moved(1.0, 1e6)
-    assert by_hand.reason_of(by_hand.write_stl(tmp_path / "a.stl", far)) == "offset_precision"
-    near = by_hand.prepare(by_hand.write_obj(tmp_path / "a.obj", BALL))
-    exact = by_hand.prepare(by_hand.write_obj(tmp_path / "b.obj", far))
+    far = moved(BALL, 1.0, 1e6)
+    assert reason_of(write_stl(tmp_path / "a.stl", far)) == "offset_precision"
+    near = prepare(write_obj(tmp_path / "a.obj", BALL))
+    exact = prepare(write_obj(tmp_path / "b.obj", far))
     # Text keeps 17 digits: at 1e6 the ball is still known to 1e-10, far below the grid of 1e-6.
     assert exact.geometry_sha256 == near.geometry_sha256
-
-
-def test_unused_vertices_do_not_count(tmp_path: Path) -> None:
-    """A vertex without a face may be anything: exporters leave them behind."""
+    # A vertex without a face may be anything: exporters leave them behind.
     positions = np.concatenate([[[1e30, np.nan, 0]], BALL.positions])
-    mesh = TriangleMesh(positions=positions, faces=BALL.faces + 1)
-    dirty = by_hand.prepare(by_hand.write_off(tmp_path / "a.off", mesh))
-    tidy = by_hand.prepare(by_hand.write_off(tmp_path / "b.off", BALL))
-    assert dirty.geometry_sha256 == tidy.geometry_sha256
+    dirty = write_off(tmp_path / "c.off", TriangleMesh(positions=positions, faces=BALL.faces + 1))
+    assert prepare(dirty).geometry_sha256 == near.geometry_sha256
 
 
 def _tar(data: bytes) -> bytes:
@@ -92,18 +104,6 @@ def _zip(data: bytes) -> bytes:
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("a.obj", data)
     return stream.getvalue()
-
-
-@for_each(
-    ("suffix", "pack"),
-    itertools.product([".obj", ".glb", ".stl", ".ply"], [_zip, _tar, gzip.compress]),
-)
-def test_archives_are_not_opened(
-    tmp_path: Path, suffix: str, pack: Callable[[bytes], bytes]
-) -> None:
-    path = tmp_path / f"a{suffix}"
-    path.write_bytes(pack(b"v 0 0 0\n" * 100_000))
-    assert by_hand.reason_of(path) == "archive_refused"
 
 
 def _ply(header: str, body: bytes = b"") -> bytes:
@@ -142,6 +142,10 @@ RAW_FILES: dict[str, tuple[str, str, bytes]] = (
         "text as archive": ("unsupported_format", ".zip", b"v 0 0 0"),
     }
     | {
+        f"{pack.__name__} as {suffix}": ("archive_refused", suffix, pack(b"v 0 0 0\n" * 100_000))
+        for suffix in (".obj", ".glb", ".stl", ".ply") for pack in (_zip, _tar, gzip.compress)
+    }
+    | {
         f"{form} ply bomb {count} {element}": (
             "header_size_mismatch",
             ".ply",
@@ -162,58 +166,303 @@ def test_bad_files(tmp_path: Path, name: str) -> None:
     reason, suffix, data = RAW_FILES[name]
     path = tmp_path / f"a{suffix}"
     path.write_bytes(data)
-    assert by_hand.reason_of(path) == reason
+    assert reason_of(path) == reason
 
 
-@pytest.mark.parametrize("keep", [0.1, 0.5, 0.97])
+@for_each("keep", [0.1, 0.5, 0.97])
 def test_files_that_were_cut_off(tmp_path: Path, keep: float) -> None:
-    tree, buffer = by_hand.gltf_tree(BALL)
     for path in (
-        by_hand.write_glb(tmp_path / "a.glb", tree, buffer),
-        by_hand.write_stl(tmp_path / "a.stl", BALL),
-        by_hand.write_ply(tmp_path / "a.ply", BALL),
-        by_hand.write_off(tmp_path / "a.off", BALL),
+        write_glb(tmp_path / "a.glb", *gltf_tree(BALL)),
+        write_stl(tmp_path / "a.stl", BALL),
+        write_ply(tmp_path / "a.ply", BALL),
+        write_off(tmp_path / "a.off", BALL),
     ):
         data = path.read_bytes()
         path.write_bytes(data[: int(keep * len(data))])
         expected = {"cut_off", "load_error", "header_size_mismatch", "index_range", "no_faces"}
-        assert by_hand.reason_of(path) in expected
+        assert reason_of(path) in expected
 
 
-@for_each("write", [by_hand.write_stl, by_hand.write_ply, by_hand.write_off, by_hand.write_obj])
+@for_each("write", [write_stl, write_ply, write_off, write_obj])
 def test_limits_of_size(tmp_path: Path, write: Callable[[Path, TriangleMesh], Path]) -> None:
     path = write(tmp_path / f"a.{write.__name__[-3:]}", BALL)
-    assert by_hand.reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
+    assert reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
     small = AssetSettings(max_source_bytes=path.stat().st_size - 1)
-    assert by_hand.reason_of(path, small) == "too_large_bytes"
+    assert reason_of(path, small) == "too_large_bytes"
 
 
 def test_a_header_of_too_many_faces_is_enough(tmp_path: Path) -> None:
     """They are refused before anything is made of them: what follows may be no faces at all."""
-    path = by_hand.write_ply(tmp_path / "a.ply", BALL)
+    path = write_ply(tmp_path / "a.ply", BALL)
     header, end, body = path.read_bytes().partition(b"end_header\n")
     path.write_bytes(header + end + b"\xff" * len(body))
-    assert by_hand.reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
-    assert by_hand.reason_of(path, AssetSettings(max_source_faces=80)) != "too_many_faces"
+    assert reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
+    assert reason_of(path, AssetSettings(max_source_faces=80)) != "too_many_faces"
 
 
 def test_errors_beyond_the_bound_are_stated_and_their_levels_left_out(tmp_path: Path) -> None:
-    path = by_hand.write_obj(tmp_path / "a.obj", by_hand.knot())
+    path = write_obj(tmp_path / "a.obj", knot())
     settings = AssetSettings(budgets=(1000,), gate=GateSettings(max_error_p99=1e-4))
     with pytest.raises(Rejected, match=r"error_over_bound: p99 distance \d+\.\d+%"):
-        by_hand.prepare(path, settings)
+        prepare(path, settings)
     gate = GateSettings(max_error_p99=0.01)
-    asset = by_hand.prepare(path, AssetSettings(budgets=(1400, 60), gate=gate))
+    asset = prepare(path, AssetSettings(budgets=(1400, 60), gate=gate))
     assert [level.record.budget for level in asset.levels] == [1400]
 
 
-@for_each("make", ["nothing", "folder", "pipe", "link to nothing"])
-def test_what_is_no_file(tmp_path: Path, make: str) -> None:
-    path = tmp_path / "a.obj"
-    if make == "folder":
-        path.mkdir()
-    elif make == "pipe":
-        os.mkfifo(path)
-    elif make == "link to nothing":
-        path.symlink_to(tmp_path / "b.obj")
-    assert by_hand.reason_of(path) == "missing_file"
+def test_what_is_no_file_and_odd_names_of_what_is_one(tmp_path: Path) -> None:
+    makes: dict[str, Callable[[Path], object]] = {
+        "nothing": lambda path: None,
+        "folder": Path.mkdir,
+        "pipe": os.mkfifo,
+        "link to nothing": lambda path: path.symlink_to(tmp_path / "b.obj"),
+    }
+    for name, make in makes.items():
+        make(tmp_path / f"{name}.obj")
+        assert reason_of(tmp_path / f"{name}.obj") == "missing_file", name
+    for odd in (b"line\nbreak.obj", b"not-utf8-\xff\xfe.obj", b"'; --.obj"):
+        path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + odd))
+        assert prepare(write_obj(path, BALL)).levels, odd
+
+
+def _add_draco(tree: dict[str, Any], plain: bool = True) -> None:
+    """Compressed geometry that readers may ignore where the accessors have plain data as well."""
+    extension = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}
+    tree["meshes"][0]["primitives"][0]["extensions"] = extension
+    tree["extensionsUsed"] = ["KHR_draco_mesh_compression"]
+    if not plain:
+        del tree["accessors"][0]["bufferView"]
+
+
+def _add_targets(
+    tree: dict[str, Any], of_mesh: list[float] | None, of_node: list[float] | None
+) -> None:
+    """Two morph targets that would move every vertex by itself."""
+    tree["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 0}, {"POSITION": 0}]
+    if of_mesh is not None:
+        tree["meshes"][0]["weights"] = of_mesh
+    if of_node is not None:
+        tree["nodes"][0]["weights"] = of_node
+
+
+Change = Callable[[dict[str, Any]], object]
+
+
+def _requires(extension: str) -> Change:
+    return lambda tree: tree.update(extensionsRequired=[extension])
+
+
+def _node(**fields: Any) -> Change:
+    return lambda tree: tree["nodes"][0].update(fields)
+
+
+def _indices(**fields: Any) -> Change:
+    return lambda tree: tree["accessors"][1].update(fields)
+
+
+TREES: dict[str, tuple[str, Change]] = {
+    "own child": ("scene_cycle", _node(children=[0])),
+    "cycle": (
+        "scene_cycle",
+        lambda t: t.update(nodes=[{"mesh": 0, "children": [1]}, {"children": [0]}]),
+    ),
+    "two parents": (
+        "scene_cycle",
+        lambda t: t.update(nodes=[{"children": [i + 1, i + 1]} for i in range(24)] + [{"mesh": 0}]),
+    ),
+    "instances": (
+        "too_many_instances",
+        lambda t: t.update(nodes=[{"children": list(range(1, 20_001))}] + [{"mesh": 0}] * 20_000),
+    ),
+    "meshopt": ("compressed_geometry", _requires("EXT_meshopt_compression")),
+    "meshopt with a place-holder": (
+        "compressed_geometry",
+        lambda t: t["buffers"].append(
+            {"byteLength": 9999, "extensions": {"EXT_meshopt_compression": {"fallback": True}}}
+        ),
+    ),
+    "draco": ("compressed_geometry", _requires("KHR_draco_mesh_compression")),
+    "draco alone": ("compressed_geometry", lambda t: _add_draco(t, plain=False)),
+    "unknown extension": ("unsupported_extension", _requires("EXT_something_new")),
+    "skin": ("skinned_mesh", _node(skin=0)),
+    "weights of no kind": ("load_error", _node(weights=7)),
+    "extensions of no kind": ("load_error", lambda t: t["buffers"][0].update(extensions=[1])),
+    "all zeros": ("extent_range", lambda t: t["accessors"][0].pop("bufferView")),
+    "sparse of no kind": ("load_error", lambda t: t["accessors"][0].update(sparse={"count": 1})),
+    "lines": ("no_faces", lambda t: t["meshes"][0]["primitives"][0].update(mode=1)),
+    "accessor bomb": ("too_many_faces", _indices(count=2**40)),
+    "accessor too long": ("load_error", _indices(count=3000)),
+    "indices": ("index_range", lambda t: t["accessors"][0].update(count=20)),
+    "no such node": ("load_error", lambda t: t["scenes"][0].update(nodes=[5])),
+    "no such mesh": ("load_error", _node(mesh=5)),
+    "nan in a transform": ("nonfinite_vertices", _node(translation=[float("nan"), 0, 0])),
+    "scaled to nothing": ("extent_range", _node(scale=[0, 0, 0])),
+}
+
+
+@for_each("name", TREES)
+def test_bad_trees(tmp_path: Path, name: str) -> None:
+    reason, change = TREES[name]
+    tree, buffer = gltf_tree(BALL)
+    change(tree)
+    assert reason_of(write_glb(tmp_path / "a.glb", tree, buffer)) == reason
+
+
+HARMLESS: dict[str, Change] = {
+    "draco beside plain data": _add_draco,
+    "targets without weights": lambda t: _add_targets(t, None, None),
+    "targets of weight zero": lambda t: _add_targets(t, [0.0, 0.0], None),
+    "a node that undoes the mesh's weights": lambda t: _add_targets(t, [1.0, 0.0], [0.0, 0.0]),
+    "a skin that no placed node uses": lambda t: t.update(skins=[{"joints": [0]}]),
+    "required materials": _requires("KHR_materials_unlit"),
+    "an empty extension": lambda t: t["buffers"][0].update(extensions={"EXT_other": {}}),
+}
+
+
+def test_what_changes_no_vertex_is_read_as_if_it_were_not_there(tmp_path: Path) -> None:
+    plain = prepare(write_glb(tmp_path / "a.glb", *gltf_tree(BALL)))
+    for name, change in HARMLESS.items():
+        tree, buffer = gltf_tree(BALL)
+        change(tree)
+        changed = prepare(write_glb(tmp_path / "b.glb", tree, buffer))
+        assert geometry(changed) == geometry(plain), name
+
+
+def test_instances_count_as_faces_and_buffers_do_not_lead_out(tmp_path: Path) -> None:
+    tree, buffer = gltf_tree(BALL)
+    tree["nodes"] = [{"children": list(range(1, 101))}] + [{"mesh": 0}] * 100
+    path = write_glb(tmp_path / "a.glb", tree, buffer)
+    assert reason_of(path, AssetSettings(max_source_faces=7999)) == "too_many_faces"
+    path = secret_beside(tmp_path, bytes(10_000)) / "a.gltf"
+    for uri in (*OUTSIDE, "gone.bin"):
+        tree["buffers"][0]["uri"] = uri
+        path.write_text(json.dumps(tree))
+        assert reason_of(path) == ("missing_file" if uri == "gone.bin" else "external_uri"), uri
+
+
+WATCH = """
+import json, sys
+from pathlib import Path
+from pipeline.assets.settings import AssetSettings
+from tests.pipeline.assets.meshes_by_hand import prepare
+import pipeline.assets.decimation.pymeshlab_filters
+opened = []
+def note(event, args):
+    if event == "open":
+        opened.append(str(args[0]))
+    if event.startswith(("socket.", "subprocess.", "os.exec", "os.system")):
+        opened.append(event)
+sys.addaudithook(note)
+for path in sys.argv[1:]:
+    opened.clear()
+    prepare(Path(path))
+    print(json.dumps(opened))
+"""
+
+
+def test_an_obj_opens_no_material_and_a_gltf_its_buffers_and_no_picture(tmp_path: Path) -> None:
+    """Files and sockets that a fresh process opens while it prepares each, by audit hook."""
+    (tmp_path / "secret.mtl").write_text("newmtl a\nmap_Kd ../../../../../etc/hostname\n")
+    (tmp_path / "objects").mkdir()
+    material = write_obj(tmp_path / "objects" / "a.obj", knot(segments=80))
+    heading = "mtllib ../secret.mtl\nmtllib /etc/hostname\nusemtl a\n"
+    material.write_text(heading + material.read_text())
+    tree, buffer = gltf_tree(sphere())
+    tree["buffers"][0]["uri"] = "a.bin"
+    tree["images"] = [{"uri": "../../etc/hostname"}, {"uri": "http://127.0.0.1:1/a.png"}]
+    tree["textures"] = [{"source": 0}, {"source": 1}]
+    tree["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
+    tree["meshes"][0]["primitives"][0]["material"] = 0
+    (tmp_path / "a.bin").write_bytes(buffer)
+    textured = tmp_path / "a.gltf"
+    textured.write_text(json.dumps(tree))
+    result = subprocess.run(
+        [sys.executable, "-c", WATCH, str(material), str(textured)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert [json.loads(line) for line in result.stdout.splitlines()[-2:]] == [
+        [str(material)],
+        [str(textured), str(tmp_path / "a.bin")],
+    ]
+
+
+def outcome(bench: Bench, mesh: TriangleMesh, **settings: Any) -> Asset | str:
+    """Return the asset of a mesh that a child prepares, or the reason for having none."""
+    write_off(bench.root / "a.off", mesh)
+    prepared, failures = bench.run("a.off", settings=AssetSettings(**settings))
+    if failures:
+        return failures[0].reason
+    asset = bench.stored(prepared[0])
+    check_levels(asset)
+    return asset
+
+
+def asset_of(bench: Bench, mesh: TriangleMesh, **settings: Any) -> Asset:
+    asset = outcome(bench, mesh, **settings)
+    assert isinstance(asset, Asset), asset
+    return asset
+
+
+def used_methods(asset: Asset) -> set[str]:
+    return {level.record.method for level in asset.levels}
+
+
+MESHOPTIMIZER = {"meshoptimizer", "meshoptimizer_sloppy"}
+
+
+def test_faces_with_repeated_corners_are_dropped_and_both_sides_count_once(bench: Bench) -> None:
+    one = knot(80)
+    doubled = with_faces(one, np.concatenate([one.faces, one.faces[::3, [0, 1, 1]]]))
+    dirty = asset_of(bench, doubled, budgets=(500,))
+    tidy = asset_of(bench, one, budgets=(500,))
+    both = asset_of(bench, joined(one, with_faces(one, one.faces[:, ::-1])), budgets=(500,))
+    assert dirty.geometry_sha256 == tidy.geometry_sha256
+    assert dirty.source.repaired and not tidy.source.repaired
+    assert dirty.source.num_faces_read == 1920 + 640
+    assert both.source.num_faces == 1920
+    assert both.source.watertight
+
+
+def test_many_faces_on_one_edge_or_vertex_end_without_pymeshlab(bench: Bench) -> None:
+    for pages in (8, 9, 400):
+        asset = asset_of(bench, book(pages), budgets=(1400, 340, 240))
+        assert asset.levels[0].record.method == "source"
+        assert asset.source.nonmanifold_edges == 1
+    assert used_methods(asset) <= {"source", *MESHOPTIMIZER}
+    assert used_methods(asset_of(bench, fan(600), budgets=(500,))) <= MESHOPTIMIZER
+
+
+@for_each("profile", ["faithful", "uniform"])
+def test_a_random_soup_ends_with_a_reason_and_two_triangles_are_an_object(
+    bench: Bench, profile: str
+) -> None:
+    rng = np.random.default_rng(0)
+    soup = TriangleMesh(positions=rng.random((400, 3)), faces=rng.integers(0, 400, (1000, 3)))
+    geometric = {"area_changed", "bbox_escaped", "budget_missed", "error_over_bound"}
+    assert outcome(bench, soup, budgets=(500,), profile=profile) in {
+        *geometric, "crashed_signal_11",
+    }  # fmt: skip
+    corners = np.array([[0, 0, 0], [4, 0, 0], [4, 3, 0], [0, 3, 0]], float)
+    floor = TriangleMesh(positions=corners, faces=np.array([[0, 1, 2], [0, 2, 3]]))
+    asset = asset_of(bench, floor, profile=profile)
+    assert asset.source.num_parts == 1
+    assert asset.source.front_share == pytest.approx(0.5, abs=0.2)
+
+
+@pytest.mark.slow("hostile")
+@pytest.mark.parametrize("profile", ["faithful", "uniform"])
+def test_a_polygon_of_fifty_thousand_corners_ends(bench: Bench, profile: str) -> None:
+    """Its hub has a valence of 50 000; the child of a run that used its seconds is killed."""
+    found = outcome(bench, fan(50_000), budgets=(1400,), profile=profile)
+    assert not str(found).startswith(("timeout", "crashed", "killed", "out_of_memory"))
+
+
+@pytest.mark.parametrize("count", [50, pytest.param(5000, marks=pytest.mark.slow("hostile"))])
+def test_many_boxes_do_not_fit_into_240_triangles(bench: Bench, count: int) -> None:
+    places = np.random.default_rng(0).random((count, 3)) * 50
+    boxes = joined(*(moved(cube(), 1.0, place) for place in places))
+    expected = {"area_changed", "error_over_bound", "parts_lost", "budget_missed"}
+    assert outcome(bench, boxes, budgets=(240,)) in expected

@@ -67,6 +67,13 @@ def test_scenes_objects_surfaces_and_rejections_are_counted(found: Distributions
     ]
     floors = {"noise_floor_db": 40.0, "noise_floor_linear_db": None, "noise_floor_objects_db": None}
     assert found.targets == {"max_triangles": 9, **floors, "min_spp": 64, "max_spp": 256}
+    read = json.loads(json.dumps(found.as_json(), allow_nan=False, sort_keys=True))
+    assert set(read["quantities"]) == set(QUANTITIES)
+    assert read["quantities"]["triangles_per_scene"] == {
+        "count": 5, "min": 3, "p5": 3.4, "median": 5, "mean": 5.4, "p95": 7, "max": 7,
+    }  # fmt: skip
+    assert read["object_uses"]["max"] == 4
+    assert read["scenes"][0] == {"template": "plane", "split": "train", "count": 3}
 
 
 VALUES: list[tuple[str, Sequence[float]]] = [
@@ -110,12 +117,8 @@ def test_values(found: Distributions) -> None:
 
 def test_textures_and_skies(tmp_path: Path) -> None:
     """Two scenes of one look, one with a sky alone, and a plain one."""
-    scenes = [
-        textured_scene(),
-        textured_scene(),
-        tiny_scene(environment=sky(radiance_rgb=np.full((2, 4, 3), 0.5, np.float32))),
-        tiny_scene(),
-    ]
+    half = sky(radiance_rgb=np.full((2, 4, 3), 0.5, np.float32))
+    scenes = [textured_scene(), textured_scene(), tiny_scene(environment=half), tiny_scene()]
     shards = {"train-000000.tar": [sample(key, scene) for key, scene in enumerate(scenes)]}
     maps = dataset_distributions(write_dataset(tmp_path, shards))
     assert maps.all("textures_per_scene").tolist() == [2, 2, 0, 0]
@@ -147,26 +150,13 @@ def test_a_view_has_reached_its_targets_when_it_has_reached_all(found: Distribut
     assert nothing.reaches_targets("train") is None
 
 
-def test_json_holds_all_of_it(found: Distributions) -> None:
-    read = json.loads(json.dumps(found.as_json(), allow_nan=False, sort_keys=True))
-    assert set(read["quantities"]) == set(QUANTITIES)
-    assert read["quantities"]["triangles_per_scene"] == {
-        "count": 5, "min": 3, "p5": 3.4, "median": 5, "mean": 5.4, "p95": 7, "max": 7,
-    }  # fmt: skip
-    assert read["object_uses"]["max"] == 4
-    assert read["scenes"][0] == {"template": "plane", "split": "train", "count": 3}
-
-
-def test_a_dataset_without_shards(tmp_path: Path) -> None:
-    found = dataset_distributions(write_dataset(tmp_path, {}))
+def test_each_shard_is_reported_and_there_may_be_none(tmp_path: Path) -> None:
+    names: list[str] = []
+    dataset_distributions(five_scenes(tmp_path / "five"), shard_done=names.append)
+    assert names == ["test-000005.tar", "train-000000.tar", "train-000001.tar"]
+    found = dataset_distributions(write_dataset(tmp_path / "none", {}))
     assert (found.splits, found.licences, found.rejections) == ([], {}, {})
     assert found.as_json()["quantities"]["spp"] == {"count": 0}
-
-
-def test_each_shard_is_reported(tmp_path: Path) -> None:
-    names: list[str] = []
-    dataset_distributions(five_scenes(tmp_path), shard_done=names.append)
-    assert names == ["test-000005.tar", "train-000000.tar", "train-000001.tar"]
 
 
 def test_bad_samples_and_failures_are_one_clear_line(tmp_path: Path) -> None:
@@ -224,6 +214,10 @@ def test_the_front_matter_says_what_hubs_ask(tmp_path: Path) -> None:
     for split, patterns in files.items():
         found = {path.name for pattern in patterns for path in tmp_path.glob(pattern)}
         assert found == {path.name for path in tmp_path.glob("*.tar") if split in path.name}
+    counts = (0, 999, 1000, 9_999, 10_000, 123_456, 5_000_000, 10**7)
+    assert [_size_category(count) for count in counts] == [
+        "n<1K", "n<1K", "1K<n<10K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "n>10M",
+    ]  # fmt: skip
 
 
 def test_one_licence_is_stated_as_the_hub_spells_it(tmp_path: Path) -> None:
@@ -333,10 +327,3 @@ def test_text_stays_in_its_line_its_code_span_and_its_yaml() -> None:
         "f": [], "g": 3,
     }  # fmt: skip
     assert yaml.safe_load(front_matter(values).strip("-")) == values
-
-
-def test_sizes_are_named_as_the_hub_names_them() -> None:
-    counts = (0, 999, 1000, 9_999, 10_000, 123_456, 5_000_000, 10**7)
-    assert [_size_category(count) for count in counts] == [
-        "n<1K", "n<1K", "1K<n<10K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "n>10M",
-    ]  # fmt: skip

@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import hashlib
+import html
 import json
 import re
 import shlex
@@ -10,7 +11,7 @@ import shlex
 import numpy as np
 
 from pipeline.documents.gallery import Card, gallery_filters, make_card
-from pipeline.documents.pages import is_address, png_uri, render_page
+from pipeline.documents.pages import is_address, render_page
 from pipeline.documents.quality_page import Pair, encode_quality_page
 from storage.conventions import preview_gain, preview_srgb8
 from storage.records.asset import AssetRow
@@ -41,8 +42,15 @@ RIGHTS = {"licence": HARM, "attribution": HARM, "source_url": "javascript:alert(
 HARMFUL = row(HARM, title=HARM, method="pymeshlab_collapse", **RIGHTS)
 
 
-def test_text_from_outside_stays_text() -> None:
-    tags = quality_page([HARMFUL], [failure(HARM, HARM)], pairs=pairs(HARMFUL))
+def test_text_from_outside_stays_text_and_nothing_is_loaded_from_elsewhere() -> None:
+    shown = pairs(HARMFUL)
+    failures = [failure(HARM, HARM)]
+    data = encode_quality_page([HARMFUL, row()], failures, shown, budget=1400, target="x")
+    plain = data.replace(html.escape(HARM).encode(), b"")
+    assert not re.search(rb"https?:|javascript:|<script|@import|url\(", plain)
+    tags = read(data)
+    assert len(tags.links) == 3
+    assert all(link.startswith("data:image/png;base64,") for link in tags.links)
     assert not {"script", "iframe", "link", "a", "object"} & set(tags.tags)
     assert not any(name.startswith("on") for name in tags.names)
     # uid in picture and table, licence in summary and table, item and message of the failure
@@ -67,15 +75,6 @@ def test_a_scene_is_shown_so_dark_that_few_pixels_are_white() -> None:
     assert 0 < (shown == 255).any(axis=-1).mean() < 0.1 and np.median(shown) > 60
 
 
-def test_nothing_is_loaded_from_elsewhere() -> None:
-    shown = pairs(HARMFUL)
-    data = encode_quality_page([HARMFUL, row()], [failure()], shown, budget=1400, target="x")
-    assert not re.search(rb"https?:|javascript:|<script|@import|url\(", data)
-    links = read(data).links
-    assert len(links) == 3
-    assert all(link.startswith("data:image/png;base64,") for link in links)
-
-
 def test_counts_are_those_of_the_rows_and_equal_rows_give_equal_pages() -> None:
     tags = quality_page([row("a"), row("b")], [failure()])
     text = text_of(tags)
@@ -88,17 +87,15 @@ def test_counts_are_those_of_the_rows_and_equal_rows_give_equal_pages() -> None:
 
 
 def test_a_page_without_objects_or_without_failures() -> None:
-    for failures in ([], [failure("bad0"), failure("bad1")]):
-        tags = quality_page([], failures)
-        text = text_of(tags)
-        assert "0 objects accepted, 0 of them repaired" in text
-        assert f"0 watertight; {len(failures)} rejected" in text
-        assert "Licences: none" in text
-        assert "img" not in tags.tags
-        assert ("Rejected" in text) == bool(failures)
-    tags = quality_page([row(str(k), method="meshoptimizer") for k in range(3)], [])
+    tags = quality_page([], [failure("bad0"), failure("bad1")])
+    text = text_of(tags)
+    assert "0 objects accepted, 0 of them repaired" in text
+    assert "0 watertight; 2 rejected" in text
+    assert "Licences: none" in text and "Rejected" in text
+    assert "img" not in tags.tags
+    tags = quality_page([row("a", method="meshoptimizer")], [])
     assert tags.tags.count("img") == 1
-    assert "Rejected" not in " ".join(tags.text)
+    assert "Rejected" not in text_of(tags)
 
 
 def test_each_choice_has_a_button_and_no_choice_has_none() -> None:
@@ -158,9 +155,3 @@ def test_addresses_become_links_and_all_else_stays_text() -> None:
         "https://[broken", "https://e.org/\u202egro", HARM,
     ]:  # fmt: skip
         assert not is_address(url)
-
-
-def test_equal_pictures_give_equal_addresses() -> None:
-    picture = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
-    assert png_uri(picture) == png_uri(picture.copy())
-    assert png_uri(picture).startswith("data:image/png;base64,")

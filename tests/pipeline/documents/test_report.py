@@ -1,23 +1,32 @@
-"""`report.html` and its gallery: harmless, complete, and the same whenever it is written."""
+"""`report.html`, its gallery and figures: harmless, complete, the same whenever it is written."""
 
 import base64
 import io
 import re
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
+import matplotlib
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from pipeline.documents.card import encode_card
 from pipeline.documents.distributions import dataset_distributions
+from pipeline.documents.figures import (
+    Panel,
+    draw_bars,
+    draw_histogram,
+    draw_panels,
+    short_label,
+)
 from pipeline.documents.gallery import write_gallery
 from pipeline.documents.report import write_report
 from pipeline.documents.report_sections import _rejections
 from pipeline.documents.rights import rights_of
-from pipeline.documents.scene_maps import shown_maps
-from pipeline.documents.scene_page import Neighbours, encode_scene_page
+from pipeline.documents.scene_page import Neighbours, encode_scene_page, shown_maps
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError
@@ -103,7 +112,9 @@ def test_only_source_addresses_lead_elsewhere(tmp_path: Path) -> None:
     assert "somebody" in text_of(page)
 
 
-def test_links_lead_somewhere(dataset: Dataset) -> None:
+def test_links_lead_somewhere_in_the_order_of_the_gallery(
+    dataset: Dataset, five: dict[str, Tags]
+) -> None:
     shown = pages(dataset.folder.report)
     followed = 0
     for path, tags in shown.items():
@@ -119,14 +130,11 @@ def test_links_lead_somewhere(dataset: Dataset) -> None:
             followed += 1
     # five cards, five ways back, four neighbours each way, eleven places of the report
     assert followed == 5 + 5 + 4 + 4 + 11
-
-
-def test_neighbours_follow_the_gallery(five: dict[str, Tags]) -> None:
     cards = [link for link in five["report"].links if link.startswith("report/")]
     order = ["000000000", "000000001", "000000002", "000000003", "000000020"]
     assert cards == [f"report/{key}.html" for key in order]
-    pages_only = [link for link in five["000000002"].links if link.endswith(".html")]
-    assert pages_only == ["000000001.html", "000000003.html"]
+    neighbours = [link for link in five["000000002"].links if link.endswith(".html")]
+    assert neighbours == ["000000001.html", "000000003.html"]
 
 
 def test_the_numbers_of_a_dataset_and_of_a_scene_are_on_their_pages(five: dict[str, Tags]) -> None:
@@ -212,7 +220,15 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return dataset
 
 
-def test_the_report_and_the_card_count_maps_and_scenes_show_them(mapped: Dataset) -> None:
+def card_of(dataset: Dataset) -> str:
+    found = dataset_distributions(dataset)
+    rights = rights_of(found.objects)
+    return encode_card(dataset.folder, dataset.manifest, found, rights).decode()
+
+
+def test_the_report_and_the_card_count_maps_and_scenes_show_them(
+    mapped: Dataset, dataset: Dataset, five: dict[str, Tags]
+) -> None:
     page = read(mapped.folder.report.read_bytes())
     text = text_of(page)
     assert "scenes textured 2 66.7% scenes below a sky 1 33.3%" in text
@@ -220,8 +236,7 @@ def test_the_report_and_the_card_count_maps_and_scenes_show_them(mapped: Dataset
     assert "texture colours 0 2 texture roughness 2" in text and "sky sky 0 1" in text
     assert "mean radiance of a sky 1 0.250 0.250 0.250 0.250 0.250 0.250" in text
     assert "#textures-and-skies" in page.links
-    found = dataset_distributions(mapped)
-    card = encode_card(mapped.folder, mapped.manifest, found, rights_of(found.objects)).decode()
+    card = card_of(mapped)
     assert "2 of 3 scenes, 4 maps of 2 families, 2 to 6 texels wide" in card
     assert "1 of 3 scenes, 1 families, mean radiance 0.25; half of the light" in card
     text = text_of(read((mapped.folder.report_pages / "000000000.html").read_bytes()))
@@ -229,12 +244,7 @@ def test_the_report_and_the_card_count_maps_and_scenes_show_them(mapped: Dataset
     assert "sky 0 (environment, seen): mean radiance 0.25, brightest texel 1 times that" in text
     plain = text_of(read((mapped.folder.report_pages / "000000002.html").read_bytes()))
     assert "Textures and environment" not in plain
-
-
-def test_a_plain_dataset_has_no_such_section(dataset: Dataset, five: dict[str, Tags]) -> None:
-    found = dataset_distributions(dataset)
-    card = encode_card(dataset.folder, dataset.manifest, found, rights_of(found.objects))
-    assert b"textures" not in card and b"skies" not in card
+    assert "textures" not in card_of(dataset) and "skies" not in card_of(dataset)
     assert "#textures-and-skies" not in five["report"].links
 
 
@@ -256,3 +266,51 @@ def test_a_texture_is_shown_as_it_lies() -> None:
 def _pixels(link: str) -> np.ndarray:
     data = base64.b64decode(link.partition(",")[2])
     return np.asarray(Image.open(io.BytesIO(data)))
+
+
+VALUES: dict[str, list[float]] = {
+    "none": [],
+    "one": [3.5],
+    "equal": [2.5] * 9,
+    "whole": [1, 2, 2, 5],
+    "wide": [1e-9, 1e30],
+    "not finite": [np.nan, np.inf, 1.0],
+    "all not finite": [np.nan],
+    "many": list(np.linspace(0, 1, 1000)),
+}
+
+
+def test_any_values_can_be_drawn() -> None:
+    marks = {"a": 3.0, "c": np.nan}
+    kinds: tuple[dict[str, Any], ...] = ({"is_rose": True}, {"is_log": True}, {"marks": marks})
+    panels = [
+        Panel(values=values, label=name, unit="y", **more)
+        for more in kinds
+        for name, values in VALUES.items()
+    ]
+    drawn = Image.open(io.BytesIO(draw_panels(panels)))
+    assert drawn.size[0] > 800
+    assert len(drawn.getcolors(1 << 24) or []) > 20
+
+
+def test_bars_hold_every_value_and_names_from_outside_are_labels() -> None:
+    """Heights of the bars add up to the values, and whole numbers have a bar each."""
+
+    def heights(values: list[float]) -> list[float]:
+        axes = Figure().add_subplot()
+        draw_histogram(axes, Panel(values=values, label="x"))
+        return [patch.get_height() for patch in axes.patches]  # type: ignore[attr-defined]
+
+    assert heights([1, 2, 2, 5]) == [1, 2, 0, 0, 1]
+    assert sum(heights(VALUES["many"])) == 1000
+    assert short_label("a\n b\x07\u202e") == "a b"
+    assert len(short_label("x" * 99)) == 26
+    names = ["$\\frac{$", "高 \ud800", "", "x" * 99]
+    drawn = draw_bars(names, {name: [1, 2, 3, 4] for name in names}, label="n")
+    assert Image.open(io.BytesIO(drawn)).size[0] > 800
+    # The reader's settings do not matter.
+    panel = Panel(values=[1.5, 2.5], label="x")
+    plain = draw_panels([panel])
+    with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "black"}):
+        assert draw_panels([panel]) == plain
+        assert matplotlib.rcParams["font.size"] == 30

@@ -14,13 +14,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.documents.distributions import dataset_distributions
-from pipeline.documents.pass_colors import (
-    depth_grays,
-    finite_range,
-    id_colors,
-)
 from pipeline.documents.report import write_report
 from pipeline.documents.scene_page import Neighbours, encode_scene_page
+from pipeline.documents.scene_passes import depth_grays, finite_range, id_colors
 from storage.conventions import look_at_c2w
 from storage.dataset.dataset import open_dataset
 from storage.dataset.manifest import write_manifest

@@ -1,12 +1,9 @@
 """Beside a dataset: sums of what is published, who made its objects, and which scenes are shown."""
 
 import csv
-import dataclasses
 import io
 import itertools
 import subprocess
-from collections.abc import Mapping
-from functools import cached_property
 from pathlib import Path
 from typing import cast
 
@@ -28,13 +25,8 @@ SHARD = "train-000000.tar"
 
 def checked(folder: Path) -> list[str]:
     """Return the files that coreutils find to be others than the sums say."""
-    done = subprocess.run(
-        ["sha256sum", "--quiet", "-c", SUMS],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = ["sha256sum", "--quiet", "-c", SUMS]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     return sorted(line.partition(": ")[0] for line in done.stdout.splitlines())
 
 
@@ -109,12 +101,21 @@ def test_formulas_are_made_inert() -> None:
         assert read[field] == "'" + formula
 
 
-@dataclasses.dataclass
 class Listed:
     """What is chosen from: shards of four scenes, keys numbered through; no file is there."""
 
-    counts: Mapping[str, int]
-    opened: list[str] = dataclasses.field(default_factory=list)
+    def __init__(self, **counts: int) -> None:
+        self.opened: list[str] = []
+        self._keys: dict[ShardEntry, list[str]] = {}
+        key = itertools.count()
+        for split, count in counts.items():
+            for first in range(0, count, 4):
+                held = [f"{next(key):09d}" for _ in range(min(4, count - first))]
+                name = f"{split}-{len(self._keys):06d}.tar"
+                shard = ShardEntry(
+                    name=name, split=split, num_samples=len(held), num_bytes=0, sha256=""
+                )
+                self._keys[shard] = held
 
     def shards_of(self, split: str) -> list[ShardEntry]:
         return [shard for shard in self._keys if shard.split == split]
@@ -123,26 +124,9 @@ class Listed:
         self.opened.append(shard.name)
         return self._keys[shard]
 
-    @cached_property
-    def _keys(self) -> dict[ShardEntry, list[str]]:
-        keys: dict[ShardEntry, list[str]] = {}
-        key = itertools.count()
-        for split, count in self.counts.items():
-            for first in range(0, count, 4):
-                held = [f"{next(key):09d}" for _ in range(min(4, count - first))]
-                shard = ShardEntry(
-                    name=f"{split}-{len(keys):06d}.tar",
-                    split=split,
-                    num_samples=len(held),
-                    num_bytes=0,
-                    sha256="",
-                )
-                keys[shard] = held
-        return keys
-
 
 def chosen_of(max_scenes: int, **counts: int) -> list[ChosenScene]:
-    return choose_scenes(cast(Dataset, Listed(counts)), max_scenes)
+    return choose_scenes(cast(Dataset, Listed(**counts)), max_scenes)
 
 
 def test_all_are_chosen_where_there_are_few_and_exactly_as_many_as_asked_for() -> None:
@@ -166,6 +150,6 @@ def test_small_splits_are_seen() -> None:
 
 
 def test_only_shards_of_chosen_scenes_are_opened() -> None:
-    listed = Listed({"train": 4000, "test": 40})
+    listed = Listed(train=4000, test=40)
     chosen = choose_scenes(cast(Dataset, listed), 10)
     assert sorted(listed.opened) == sorted({entry.shard.name for entry in chosen})

@@ -3,11 +3,12 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pxr import Gf, Sdf, Usd, UsdShade
+from pxr import Gf, Usd
 
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
@@ -18,10 +19,13 @@ from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected
-from storage.records.asset import Asset, decode_asset, encode_asset
+from storage.records.asset import decode_asset, encode_asset
+from storage.records.skin import LevelSkin
+from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import (
     geometry,
     gltf_tree,
+    mesh_of,
     prepare,
     sphere,
     write_glb,
@@ -31,8 +35,6 @@ from tests.pipeline.assets.source_materials.textured_kit import (
     CORNERS,
     KEEP,
     OWN,
-    QUARTERS,
-    SLOPE,
     SQUARE,
     STORED,
     UV_UP,
@@ -45,18 +47,26 @@ from tests.pipeline.assets.source_materials.textured_kit import (
     textured_obj,
     textured_tree,
 )
-from tests.pipeline.assets.source_materials.usd_kit import SHADER, TEXTURE, textured_usd
+from tests.pipeline.assets.source_materials.usd_kit import (
+    TEXTURE,
+    connect_texture,
+    set_inputs,
+    textured_usd,
+)
 
+PICTURE = picture_bytes(CORNERS)
 FILES: dict[str, Callable[[Path], Path]] = {
-    "glb": lambda folder: textured_glb(folder / "a.glb", picture_bytes(CORNERS)),
-    "gltf": lambda folder: textured_gltf(folder / "a.gltf", picture_bytes(CORNERS)),
-    "obj": lambda folder: textured_obj(folder / "o" / "a.obj", picture_bytes(CORNERS)),
+    "glb": lambda folder: textured_glb(folder / "a.glb", PICTURE),
+    "along": lambda folder: textured_glb(folder / "a.glb", PICTURE, np.add(UV_UP, (3, -2))),
+    "back": lambda folder: textured_glb(folder / "a.glb", PICTURE, np.add(UV_UP, (-7, 1))),
+    "gltf": lambda folder: textured_gltf(folder / "a.gltf", PICTURE),
+    "obj": lambda folder: textured_obj(folder / "o" / "a.obj", PICTURE),
 }
 
 
-@pytest.mark.parametrize("kind", FILES)
+@for_each("kind", FILES)
 def test_a_quad_keeps_its_corner_colours(tmp_path: Path, kind: str) -> None:
-    """A mirrored u or v, or a quarter turn, would swap them."""
+    """A mirrored u or v, or a quarter turn, would swap them; beyond 1 the picture repeats."""
     assert_corners(prepare(FILES[kind](tmp_path), KEEP))
 
 
@@ -68,49 +78,45 @@ def test_the_mean_of_colours_is_one_of_light_and_not_of_codes(tmp_path: Path) ->
     assert np.abs(seen_at(asset, 0.25, -0.25) - wanted).max() < STORED
 
 
-@pytest.mark.parametrize("shift", [(0, 0), (3, -2), (-7, 1)])
-def test_coordinates_beyond_the_picture_repeat_it(tmp_path: Path, shift: tuple[int, int]) -> None:
-    path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS), UV_UP + shift)
-    assert_corners(prepare(path, KEEP))
-
-
 def test_a_texture_transform_moves_the_picture(tmp_path: Path) -> None:
     """A quarter turn about the lower left and a shift back: by the formula of the extension."""
-    tree, buffer = textured_tree(picture_bytes(CORNERS))
+    tree, buffer = textured_tree(PICTURE)
     slot = tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
     slot["extensions"] = {
         "KHR_texture_transform": {"rotation": np.pi / 2, "offset": [0.0, 1.0], "scale": [1, 1]}
     }
     asset = prepare(write_glb(tmp_path / "a.glb", tree, buffer), KEEP)
-    for right, up in QUARTERS:
-        u, w = right + 0.5, 0.5 - up  # as glTF counts them, w down
-        moved_u, moved_w = w, 1 - u  # shift + [[cos, sin], [-sin, cos]] (u, w)
-        colour = QUARTERS[(moved_u - 0.5, 0.5 - moved_w)]
-        assert np.abs(seen_at(asset, right, up) - np.array(colour) / 255 * (1 - F)).max() < SLOPE
+    # (u, w), w down, reads shift + [[cos, sin], [-sin, cos]] (u, w) = (w, 1 - u)
+    assert_corners(asset, lambda right, up: (up, -right))
 
 
-def _plain(path: Path, base: list[float], **more: float) -> Asset:
+def _plain_skin(path: Path, extensions: dict[str, Any] | None = None, **metal: Any) -> LevelSkin:
+    """Return the skin of a ball of one material without a picture."""
     tree, buffer = gltf_tree(sphere(rings=6, columns=9))
     tree["meshes"][0]["primitives"][0]["material"] = 0
-    tree["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [*base, 1.0], **more}}]
-    return prepare(write_glb(path, tree, buffer), KEEP)
+    tree["materials"] = [{"pbrMetallicRoughness": metal, "extensions": extensions or {}}]
+    skin = prepare(write_glb(path, tree, buffer), KEEP).levels[0].skin
+    assert skin is not None
+    return skin
 
 
 def test_constants_are_exact_and_metals_have_no_diffuse_part(tmp_path: Path) -> None:
-    base = [0.3, 0.62, 0.011]
-    asset = _plain(tmp_path / "a.glb", base, metallicFactor=0.0, roughnessFactor=0.37)
-    for level in asset.levels:
-        assert level.skin is not None
-        diffuse, specular, roughness = level.skin.textures
-        assert [texture.texels.shape[:2] for texture in level.skin.textures] == [(1, 1)] * 3
-        assert np.array_equal(diffuse.texels[0, 0], (np.array(base) * (1 - F)).astype(np.float32))
-        assert np.array_equal(specular.texels[0, 0], np.full(3, F, np.float32))
-        assert roughness.texels[0, 0, 0] == np.float32(0.37)
-    asset = _plain(tmp_path / "a.glb", [0.9, 0.5, 0.1], metallicFactor=1.0, roughnessFactor=0.2)
-    skin = asset.levels[0].skin
-    assert skin is not None and not skin.textures[0].texels.any()
-    metal = np.array([0.9, 0.5, 0.1])
-    assert np.allclose(skin.textures[1].texels[0, 0], metal + (1 - metal) / 21, atol=1e-6)
+    base, path = np.array([0.3, 0.62, 0.011]), tmp_path / "a.glb"
+    factor: dict[str, Any] = {"baseColorFactor": [*base, 1.0]}
+    skin = _plain_skin(path, **factor, metallicFactor=0.0, roughnessFactor=0.37)
+    diffuse, specular, roughness = skin.textures
+    assert [texture.texels.shape[:2] for texture in skin.textures] == [(1, 1)] * 3
+    assert np.array_equal(diffuse.texels[0, 0], (base * (1 - F)).astype(np.float32))
+    assert np.array_equal(specular.texels[0, 0], np.full(3, F, np.float32))
+    assert roughness.texels[0, 0, 0] == np.float32(0.37)
+    diffuse, specular, _ = _plain_skin(path, **factor, metallicFactor=1.0).textures
+    assert not diffuse.texels.any()
+    assert np.allclose(specular.texels[0, 0], base + (1 - base) / 21, atol=1e-6)
+    words = {"specularFactor": 0.5, "specularColorFactor": [2.0, 1.0, 0.0]}
+    _, specular, _ = _plain_skin(path, {"KHR_materials_specular": words}, metallicFactor=0).textures
+    f0 = np.array([0.04, 0.02, 0.0])
+    # the extension scales what is reflected at grazing angles too: F90 is its factor
+    assert np.allclose(specular.texels[0, 0], f0 + (0.5 - f0) / 21, atol=1e-6)
 
 
 def test_metal_is_blue_and_roughness_green(tmp_path: Path) -> None:
@@ -119,27 +125,9 @@ def test_metal_is_blue_and_roughness_green(tmp_path: Path) -> None:
     metal = tree["materials"][0]["pbrMetallicRoughness"]
     metal |= {"metallicRoughnessTexture": metal.pop("baseColorTexture"), "metallicFactor": 1}
     asset = prepare(write_glb(tmp_path / "a.glb", tree, buffer), KEEP)
-    assert abs(seen_at(asset, -0.25, 0, 2)[0] - 51 / 255) < STORED
-    assert abs(seen_at(asset, 0.25, 0, 2)[0] - 204 / 255) < STORED
-    assert np.abs(seen_at(asset, -0.25, 0) - (1 - F)).max() < STORED
-    assert np.abs(seen_at(asset, 0.25, 0)).max() < STORED
-
-
-def test_the_specular_extension_scales_f0(tmp_path: Path) -> None:
-    tree, buffer = gltf_tree(sphere(rings=6, columns=9))
-    tree["meshes"][0]["primitives"][0]["material"] = 0
-    specular = {"specularFactor": 0.5, "specularColorFactor": [2.0, 1.0, 0.0]}
-    tree["materials"] = [
-        {
-            "pbrMetallicRoughness": {"metallicFactor": 0},
-            "extensions": {"KHR_materials_specular": specular},
-        }
-    ]
-    skin = prepare(write_glb(tmp_path / "a.glb", tree, buffer), KEEP).levels[0].skin
-    assert skin is not None
-    f0 = np.array([0.04, 0.02, 0.0])
-    # the extension scales what is reflected at grazing angles too: F90 is its factor
-    assert np.allclose(skin.textures[1].texels[0, 0], f0 + (0.5 - f0) / 21, atol=1e-6)
+    for right, code, diffuse in ((-0.25, 51, 1 - F), (0.25, 204, 0.0)):
+        assert abs(seen_at(asset, right, 0, 2)[0] - code / 255) < STORED
+        assert np.abs(seen_at(asset, right, 0) - diffuse).max() < STORED
 
 
 def test_an_undecimated_level_shows_the_source_within_a_texel(tmp_path: Path) -> None:
@@ -150,20 +138,18 @@ def test_an_undecimated_level_shows_the_source_within_a_texel(tmp_path: Path) ->
     uv /= uv.max(axis=0)
     path = textured_glb(tmp_path / "a.glb", picture_bytes(np.repeat(ramp, 2, axis=0)), uv, ball)
     own = dataclasses.replace(OWN, texels=128)
-    asset = prepare(path, dataclasses.replace(KEEP, own_materials=own))
-    level = asset.levels[0]
+    level = prepare(path, dataclasses.replace(KEEP, own_materials=own)).levels[0]
     assert level.record.method == "source" and level.skin is not None
     quality = level.skin.quality
     slope = 2.4  # of the sRGB curve at white, by which codes become light
     assert quality.colour_error < slope / quality.texels_per_length
     assert quality.missed_cells == 0 and quality.torn_seams == 0
-    coarse = prepare(path, dataclasses.replace(KEEP, budgets=(60,)))
-    assert coarse.levels[0].skin is not None
-    assert coarse.levels[0].skin.quality.colour_error > 2 * quality.colour_error
+    coarse = prepare(path, dataclasses.replace(KEEP, budgets=(60,))).levels[0].skin
+    assert coarse is not None and coarse.quality.colour_error > 2 * quality.colour_error
 
 
 def test_a_texture_may_be_as_large_as_is_said_and_no_larger(tmp_path: Path) -> None:
-    path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS))
+    path = textured_glb(tmp_path / "a.glb", PICTURE)
 
     def side(size: int) -> int:
         own = dataclasses.replace(OWN, size=size)
@@ -176,24 +162,19 @@ def test_a_texture_may_be_as_large_as_is_said_and_no_larger(tmp_path: Path) -> N
     assert side(wanted - 1) < wanted
 
 
-def test_materials_change_no_triangle_and_nothing_where_they_are_off(tmp_path: Path) -> None:
-    path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS))
+def test_materials_change_no_triangle_survive_their_file_and_are_nothing_where_they_are_off(
+    tmp_path: Path,
+) -> None:
+    path = textured_glb(tmp_path / "a.glb", PICTURE)
     own, plain = prepare(path, KEEP), prepare(path)
     assert geometry(own) == geometry(plain) and own.geometry_sha256 == plain.geometry_sha256
-    stripped = dataclasses.replace(
-        own,
-        materials=None,
-        levels=tuple(dataclasses.replace(level, skin=None) for level in own.levels),
-    )
+    bare = tuple(dataclasses.replace(level, skin=None) for level in own.levels)
+    stripped = dataclasses.replace(own, materials=None, levels=bare)
     assert encode_asset(stripped) == encode_asset(plain)
     assert b"skin" not in encode_asset(plain) and b"materials" not in encode_asset(plain)
-
-
-def test_a_skin_survives_the_file_of_its_asset(tmp_path: Path) -> None:
-    asset = prepare(textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS)), KEEP)
-    again = decode_asset(encode_asset(asset))
-    assert again.materials == asset.materials
-    ours, theirs = asset.levels[0].skin, again.levels[0].skin
+    again = decode_asset(encode_asset(own))
+    assert again.materials == own.materials
+    ours, theirs = own.levels[0].skin, again.levels[0].skin
     assert ours is not None and theirs is not None and ours.quality == theirs.quality
     assert np.array_equal(ours.uv, theirs.uv)
     assert [t.sha256 for t in ours.textures] == [t.sha256 for t in theirs.textures]
@@ -213,7 +194,7 @@ def test_two_materials_meet_in_one_atlas_and_none_says_so(tmp_path: Path) -> Non
 
 
 def test_what_nothing_here_can_show_is_named(tmp_path: Path) -> None:
-    tree, buffer = textured_tree(picture_bytes(CORNERS))
+    tree, buffer = textured_tree(PICTURE)
     tree["materials"][0] |= {"emissiveFactor": [1, 1, 1], "alphaMode": "BLEND"}
     tree["materials"][0]["extensions"] = {"KHR_materials_clearcoat": {}}
     asset = prepare(write_glb(tmp_path / "a.glb", tree, buffer), KEEP)
@@ -221,26 +202,24 @@ def test_what_nothing_here_can_show_is_named(tmp_path: Path) -> None:
     assert asset.materials.lost == ("clearcoat", "emission", "transparency")
 
 
-def test_a_level_over_its_bound_goes_without_or_is_refused(tmp_path: Path) -> None:
+def test_a_level_over_its_bound_goes_without_and_one_far_from_its_source_is_told(
+    tmp_path: Path,
+) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8)
     path = textured_glb(tmp_path / "a.glb", picture_bytes(noise))
     strict = OwnMaterialSettings(keep=True, texels=4, max_colour_error=1e-3)
     asset = prepare(path, AssetSettings(own_materials=strict))
     assert asset.materials is not None and asset.materials.reason == "colours_changed"
     assert all(level.skin is None for level in asset.levels)
-
-
-def test_a_level_that_lies_nowhere_near_its_source_is_told(tmp_path: Path) -> None:
-    """A level that was shrunk behind the back of its own measure."""
     ball = sphere(rings=9, columns=16)
-    uv = ball.positions[:, [0, 2]]
-    path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS), uv, ball)
+    path = textured_glb(tmp_path / "b.glb", PICTURE, ball.positions[:, [0, 2]], ball)
     source = read_source(path, KEEP.read_limits)
     mesh, _ = orient_outward(clean(normalize(load_mesh(source))))
     maker, _ = open_skin_baker(source, mesh, dataclasses.replace(OWN, max_colour_error=1.0))
     level = prepare(path, KEEP).levels[0]
     assert maker.add_skin(level).skin is not None
     with pytest.raises(Rejected, match="colours_missed"):
+        # shrunk behind the back of its own measure
         maker.add_skin(dataclasses.replace(level, positions=0.8 * level.positions))
 
 
@@ -248,11 +227,11 @@ GLOW = AssetSettings(own_materials=dataclasses.replace(OWN, emission=True))
 UPPER, LOWER = 200, 100
 HALVES = np.repeat(np.repeat(np.array([[UPPER], [LOWER]], np.uint8), 32, 0), 64, 1)
 """The upper half brighter than the lower one."""
-PICTURE = picture_bytes(np.repeat(HALVES[..., None], 3, axis=2) * np.array([1, 1, 0], np.uint8))
+LIGHT = picture_bytes(np.repeat(HALVES[..., None], 3, axis=2) * np.array([1, 1, 0], np.uint8))
 
 
 def glb(path: Path, strength: float = 1.0) -> Path:
-    tree, buffer = textured_tree(PICTURE)
+    tree, buffer = textured_tree(LIGHT)
     tree["materials"][0] |= {"emissiveFactor": [1, 0.5, 1], "emissiveTexture": {"index": 0}}
     tree["materials"][0]["extensions"] = {
         "KHR_materials_emissive_strength": {"emissiveStrength": strength}
@@ -262,18 +241,14 @@ def glb(path: Path, strength: float = 1.0) -> Path:
 
 def usd(path: Path) -> Path:
     def glowing(stage: Usd.Stage) -> None:
-        shader = UsdShade.Shader(stage.GetPrimAtPath(SHADER))
-        node = UsdShade.Shader(stage.GetPrimAtPath(TEXTURE))
-        node.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(1, 0.5, 1, 1))
-        shader.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(
-            node.ConnectableAPI(), "rgb"
-        )
+        connect_texture(stage, "./tex.png", {"emissiveColor": "rgb"})
+        set_inputs(stage, TEXTURE, {"scale": Gf.Vec4f(1, 0.5, 1, 1)})
 
-    return textured_usd(path, PICTURE, glowing)
+    return textured_usd(path, LIGHT, glowing)
 
 
 def obj(path: Path) -> Path:
-    return textured_obj(path, PICTURE, "Kd 1 1 1\nKe 1 0.5 1\nmap_Ke its picture.png\n")
+    return textured_obj(path, LIGHT, "Kd 1 1 1\nKe 1 0.5 1\nmap_Ke its picture.png\n")
 
 
 GLOWING: dict[str, Callable[[Path], Path]] = {
@@ -283,32 +258,46 @@ GLOWING: dict[str, Callable[[Path], Path]] = {
 }
 
 
-def emission(path: Path, settings: AssetSettings = GLOW) -> tuple[NDArray, TriangleMesh]:
-    asset = prepare(path, settings)
+def emission(path: Path) -> tuple[NDArray, TriangleMesh]:
+    asset = prepare(path, GLOW)
     assert asset.materials is not None and "emission" not in asset.materials.lost
     level = asset.levels[0]
     assert level.skin is not None and level.skin.emission is not None
-    mesh = TriangleMesh(positions=level.positions.astype(float), faces=level.faces.astype(int))
-    return level.skin.emission, mesh
+    return level.skin.emission, mesh_of(level)
 
 
-@pytest.mark.parametrize("kind", GLOWING)
+@for_each("kind", GLOWING)
 def test_a_triangle_emits_the_mean_of_the_map_over_it(tmp_path: Path, kind: str) -> None:
     """Of a square cut along its diagonal: three quarters of one half, and a quarter of the other.
 
-    To the 36 points of a triangle: one of them is 2.8 % of it.
+    To the 36 points of a triangle: one of them is 2.8 % of it. Materials that are off cost nothing,
+    and what is lost is named.
     """
-    found, mesh = emission(GLOWING[kind](tmp_path))
+    path = GLOWING[kind](tmp_path)
+    found, mesh = emission(path)
     high, low = linear_from_srgb8()[[UPPER, LOWER]]
     above = mesh.corners.mean(axis=1)[:, 2] > 0
     wanted = np.where(above, 0.75 * high + 0.25 * low, 0.25 * high + 0.75 * low)
     assert np.abs(found - wanted[:, None] * [1, 0.5, 0]).max() < 0.03 * (high - low) + 1e-3
+    plain, glows = prepare(path, KEEP), prepare(path, GLOW)
+    assert plain.materials is not None and "emission" in plain.materials.lost
+    assert b"emission_" not in encode_asset(plain) and geometry(plain) == geometry(glows)
+    ours, theirs = plain.levels[0].skin, glows.levels[0].skin
+    assert ours is not None and theirs is not None and ours.packed == theirs.packed
+    again = decode_asset(encode_asset(glows)).levels[0].skin
+    assert again is not None and again.emission is not None
+    assert np.array_equal(again.emission, found)
 
 
-def test_strength_scales_it(tmp_path: Path) -> None:
+def test_strength_scales_it_and_a_missing_picture_of_it_costs_no_material(tmp_path: Path) -> None:
     once, _ = emission(glb(tmp_path / "a.glb"))
     often, _ = emission(glb(tmp_path / "b.glb", strength=12.5))
     assert np.allclose(often, 12.5 * once)
+    path = obj(tmp_path / "o" / "a.obj")
+    (path.parent / "its picture.png").unlink()
+    assert prepare(path, KEEP).levels[0].skin is not None
+    found = prepare(path, GLOW).materials
+    assert found is not None and found.reason == "texture_missing"
 
 
 def test_what_is_far_darker_than_the_brightest_triangle_emits_nothing(tmp_path: Path) -> None:
@@ -322,25 +311,3 @@ def test_what_is_far_darker_than_the_brightest_triangle_emits_nothing(tmp_path: 
     height = mesh.corners[..., 2]
     assert not found[height.max(axis=1) < 0].any()
     assert found[height.min(axis=1) > 0.3].all()
-
-
-@pytest.mark.parametrize("kind", GLOWING)
-def test_materials_that_are_off_cost_nothing(tmp_path: Path, kind: str) -> None:
-    """And what is lost is named; a missing picture of it costs no material."""
-    path = GLOWING[kind](tmp_path)
-    plain, glows = prepare(path, KEEP), prepare(path, GLOW)
-    assert plain.materials is not None and "emission" in plain.materials.lost
-    assert b"emission_" not in encode_asset(plain) and geometry(plain) == geometry(glows)
-    ours, theirs = plain.levels[0].skin, glows.levels[0].skin
-    assert ours is not None and theirs is not None and ours.packed == theirs.packed
-    again = decode_asset(encode_asset(glows)).levels[0].skin
-    assert again is not None and again.emission is not None
-    assert np.array_equal(again.emission, theirs.emission)  # type: ignore[arg-type]
-
-
-def test_a_missing_emissive_picture(tmp_path: Path) -> None:
-    path = obj(tmp_path / "o" / "a.obj")
-    (path.parent / "its picture.png").unlink()
-    assert prepare(path, KEEP).levels[0].skin is not None
-    found = prepare(path, GLOW).materials
-    assert found is not None and found.reason == "texture_missing"

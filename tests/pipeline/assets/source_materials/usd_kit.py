@@ -16,16 +16,10 @@ TEXTURE, SHADER, MESH = "/W/mat/texture", "/W/mat/preview", "/W/mesh"
 
 _TYPES = {
     "file": Sdf.ValueTypeNames.Asset,
-    "roughness": Sdf.ValueTypeNames.Float,
-    "metallic": Sdf.ValueTypeNames.Float,
-    "ior": Sdf.ValueTypeNames.Float,
+    **dict.fromkeys(("roughness", "metallic", "ior", "rotation"), Sdf.ValueTypeNames.Float),
     "useSpecularWorkflow": Sdf.ValueTypeNames.Int,
-    "rotation": Sdf.ValueTypeNames.Float,
-    "scale": Sdf.ValueTypeNames.Float4,
-    "bias": Sdf.ValueTypeNames.Float4,
-    "sourceColorSpace": Sdf.ValueTypeNames.Token,
-    "wrapS": Sdf.ValueTypeNames.Token,
-    "wrapT": Sdf.ValueTypeNames.Token,
+    **dict.fromkeys(("scale", "bias"), Sdf.ValueTypeNames.Float4),
+    **dict.fromkeys(("sourceColorSpace", "wrapS", "wrapT"), Sdf.ValueTypeNames.Token),
 }
 
 
@@ -76,14 +70,10 @@ def material(stage: Usd.Stage, made: Any, inputs: Mapping[str, Any] | None = Non
     return shader
 
 
-def texture(
-    stage: Usd.Stage,
-    shader: Any,
-    file: str,
-    connect: Mapping[str, str] | None = None,
-    path: str = TEXTURE,
+def connect_texture(
+    stage: Usd.Stage, file: str, connect: Mapping[str, str] | None = None, path: str = TEXTURE
 ) -> None:
-    """Define a UsdUVTexture and connect inputs of a shader to its outputs."""
+    """Define a UsdUVTexture and connect inputs of the shader to its outputs."""
     node = UsdShade.Shader.Define(stage, path)
     node.CreateIdAttr("UsdUVTexture")
     set_inputs(stage, path, {"file": file})
@@ -93,10 +83,10 @@ def texture(
     node.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(
         reader.ConnectableAPI(), "result"
     )
+    shader = UsdShade.Shader(stage.GetPrimAtPath(SHADER))
     for name, output in (connect or {"diffuseColor": "rgb"}).items():
-        shader.CreateInput(name, Sdf.ValueTypeNames.Color3f).ConnectToSource(
-            node.ConnectableAPI(), output
-        )
+        kind = _TYPES.get(name, Sdf.ValueTypeNames.Color3f)
+        shader.CreateInput(name, kind).ConnectToSource(node.ConnectableAPI(), output)
 
 
 def textured_usd(
@@ -116,7 +106,8 @@ def textured_usd(
     stage = new_stage(y_up=y_up, unit=unit)
     made = usd_mesh(stage, mesh, y_up=y_up, unit=unit)
     coordinates(made, uv)
-    texture(stage, material(stage, made), "./tex.png", connect)
+    material(stage, made)
+    connect_texture(stage, "./tex.png", connect)
     if change is not None:
         change(stage)
     return exported(stage, path)

@@ -10,10 +10,14 @@ from PIL import Image
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.maps.listing import FoundMaps, find_maps
 from pipeline.objects.maps.names import _parse_name, group_textures
-from pipeline.objects.maps.prepared import MapFiles, decode_prepared, prepare_map
+from pipeline.objects.maps.prepared import (
+    MapFiles,
+    decode_prepared,
+    prepare_map,
+    texture_set,
+)
 from pipeline.objects.maps.radiance import usable_map
 from pipeline.objects.maps.resample import area_means, flux, solid_angle_means
-from pipeline.objects.maps.texture_set import texture_set
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected, TrilightError
 from storage.records.exr import encode_channels
@@ -182,9 +186,14 @@ def test_packed_pictures_gloss_and_floats_are_parts(tmp_path: Path) -> None:
         prepare_map(MapFiles(kind=TEXTURE, files={"base": up}, size=4))
 
 
-def test_a_catalogue_states_licences_and_silence_is_refused(tmp_path: Path) -> None:
+def test_licences_are_those_of_the_catalogue_or_the_stated_one(tmp_path: Path) -> None:
     for name in ("a", "b", "c"):
         exr(tmp_path / f"{name}.exr", np.ones((1, 2, 3), np.float32))
+    png(tmp_path / "a.png", noise(1))
+    assert _find(tmp_path, licence="CC-BY-4.0").maps[0].record.licence == "CC-BY-4.0"
+    assert "licence_refused" in {
+        one.reason for one in _find(tmp_path, licence="CC-BY-NC-4.0").failures
+    }
     (tmp_path / "skies.csv").write_text(
         "uid,path,licence,attribution\na,a.exr,CC-BY-4.0,Ada\nb,b.exr,,\nc,c.exr,CC-BY-NC-4.0,Cy\n"
     )
@@ -196,14 +205,6 @@ def test_a_catalogue_states_licences_and_silence_is_refused(tmp_path: Path) -> N
     assert [failure.reason for failure in found.failures] == ["licence_refused"] * 2
     with pytest.raises(TrilightError, match="states the licence of every"):
         _find(tmp_path, SKY, licence="CC0-1.0")
-
-
-def test_a_stated_licence_holds_for_a_folder_without_a_catalogue(tmp_path: Path) -> None:
-    png(tmp_path / "a.png", noise(1))
-    assert _find(tmp_path, licence="CC-BY-4.0").maps[0].record.licence == "CC-BY-4.0"
-    assert [one.reason for one in _find(tmp_path, licence="CC-BY-NC-4.0").failures] == [
-        "licence_refused"
-    ]
 
 
 def test_links_out_of_the_folder_are_refused(tmp_path: Path) -> None:
@@ -238,6 +239,8 @@ def test_a_sun_of_a_million_keeps_its_energy(height: int) -> None:
     np.testing.assert_allclose(flux(found), flux(radiance), rtol=1e-12)  # sums in float64
     if height == 48:
         np.testing.assert_allclose(found, radiance, rtol=1e-12)
+    ones = np.ones((7, 14, 3), np.float32)
+    np.testing.assert_allclose(solid_angle_means(ones, min(height, 7)), 1, rtol=1e-12)
 
 
 def test_means_are_those_of_the_overlaps() -> None:
@@ -248,36 +251,31 @@ def test_means_are_those_of_the_overlaps() -> None:
     np.testing.assert_allclose(area_means(values, 4, 3), twin, rtol=1e-12)
 
 
-def test_a_constant_map_stays_constant_and_a_small_one_as_it_is() -> None:
-    ones = np.ones((7, 14, 3), np.float32)
-    np.testing.assert_allclose(solid_angle_means(ones, 3), 1, rtol=1e-12)
-    assert usable_map(ones, 64).shape == ones.shape
+def _with(value: float) -> NDArray[np.float32]:
+    radiance = np.ones((4, 8, 3), np.float32)
+    radiance[1, 2] = value
+    return radiance
 
 
-def test_what_is_wrong_with_a_map_is_said() -> None:
-    def wrong(**changes: float) -> np.ndarray:
-        radiance = np.ones((4, 8, 3), np.float32)
-        radiance[1, 2] = changes["value"]
-        return radiance
+WRONG: dict[str, list[NDArray[np.float32]]] = {
+    "not_a_number": [_with(np.nan)],
+    "infinite_radiance": [_with(np.inf)],
+    "negative_radiance": [_with(-1.0), -np.ones((4, 8, 3), np.float32)],
+    "too_bright": [_with(2e9)],
+    "black_map": [np.zeros((4, 8, 3), np.float32)],
+    "not_two_to_one": [np.ones((1, 1, 3), np.float32)],
+}
 
-    cases = {
-        "not_a_number": wrong(value=np.nan),
-        "infinite_radiance": wrong(value=np.inf),
-        "negative_radiance": wrong(value=-1.0),
-        "too_bright": wrong(value=2e9),
-        "black_map": np.zeros((4, 8, 3), np.float32),
-        "not_two_to_one": np.ones((1, 1, 3), np.float32),
-    }
-    for reason, radiance in cases.items():
-        with pytest.raises(Rejected) as found:
-            usable_map(radiance, 16)
-        assert found.value.reason == reason
+
+def test_what_is_wrong_with_a_map_is_said_and_a_good_one_is_as_it_is() -> None:
+    for reason, maps in WRONG.items():
+        for radiance in maps:
+            with pytest.raises(Rejected) as found:
+                usable_map(radiance, 16)
+            assert found.value.reason == reason
     with pytest.raises(Rejected, match="row 1, column 2"):
-        usable_map(cases["not_a_number"], 16)
-    with pytest.raises(Rejected) as found:
-        usable_map(-np.ones((4, 8, 3), np.float32), 16)
-    assert found.value.reason == "negative_radiance"
-    slightly = wrong(value=-1e-3)
+        usable_map(_with(np.nan), 16)
+    slightly = _with(-1e-3)
     np.testing.assert_array_equal(usable_map(slightly, 16), np.maximum(slightly, 0))
 
 
@@ -289,15 +287,15 @@ def test_a_base_colour_is_a_dielectric_or_a_metal_or_leaves_no_room_for_gloss() 
     made = texture_set({"base": _flat(128 / 255, 3)}, 8)
     linear = linear_from_srgb8()[128]
     specular = 0.04 + 0.96 / 21
-    np.testing.assert_allclose(made.specular_rgb, specular, rtol=1e-6)  # float32
-    np.testing.assert_allclose(made.diffuse_rgb, linear * (1 - specular), rtol=1e-6)
-    assert made.roughness is None
+    np.testing.assert_allclose(made.arrays["specular"], specular, rtol=1e-6)  # float32
+    np.testing.assert_allclose(made.arrays["diffuse"], linear * (1 - specular), rtol=1e-6)
+    assert "roughness" not in made.arrays
     metal = texture_set({"base": _flat(1.0, 3), "metallic": _flat(1.0)}, 8)
-    assert metal.diffuse_rgb.max() == 0
-    np.testing.assert_allclose(metal.specular_rgb, 1.0, rtol=1e-6)
+    assert metal.arrays["diffuse"].max() == 0
+    np.testing.assert_allclose(metal.arrays["specular"], 1.0, rtol=1e-6)
     white = texture_set({"base": _flat(1.0, 3), "specular": _flat(0.5)}, 8)
-    assert white.diffuse_rgb.min() == 1 and white.specular_rgb.max() == 0
-    assert white.specular_rgb.shape == (4, 4, 3)
+    assert white.arrays["diffuse"].min() == 1 and white.arrays["specular"].max() == 0
+    assert white.arrays["specular"].shape == (4, 4, 3)
 
 
 def test_means_are_of_linear_values_and_of_widths() -> None:
@@ -305,25 +303,15 @@ def test_means_are_of_linear_values_and_of_widths() -> None:
     squares: NDArray[np.float32] = np.zeros((8, 8, 1), np.float32)
     squares[::2, 1::2] = squares[1::2, ::2] = 1
     made = texture_set({"base": squares, "specular": _flat(0.0), "roughness": squares}, 2)
-    assert made.roughness is not None
-    np.testing.assert_allclose(made.diffuse_rgb, 0.5, rtol=1e-6)
-    np.testing.assert_allclose(made.roughness, np.sqrt(0.5), rtol=1e-6)
+    np.testing.assert_allclose(made.arrays["diffuse"], 0.5, rtol=1e-6)
+    np.testing.assert_allclose(made.arrays["roughness"], np.sqrt(0.5), rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("shape", "fitted"), [((8, 4), (4, 2)), ((3, 9), (1, 4)), ((2, 2), (2, 2))]
-)
-def test_proportions_stay_and_parts_of_other_sizes_fit(
-    shape: tuple[int, int], fitted: tuple[int, int]
-) -> None:
-    base = np.full((*shape, 3), 1, np.float32)
-    made = texture_set({"base": base, "roughness": _flat(0.3)}, 4)
-    assert made.diffuse_rgb.shape[:2] == fitted
-    assert made.roughness is not None and made.roughness.shape == (*fitted, 1)
-
-
-def test_the_content_is_the_base_colour() -> None:
-    base = _flat(0.5, 3)
-    alone, rough = texture_set({"base": base}, 8), texture_set({"base": base, "roughness": base}, 2)
-    assert alone.content_sha256 == rough.content_sha256
-    assert texture_set({"base": base * 0.9}, 8).content_sha256 != alone.content_sha256
+def test_proportions_stay_parts_of_other_sizes_fit_and_the_content_is_the_base_colour() -> None:
+    for shape, fitted in (((8, 4), (4, 2)), ((3, 9), (1, 4)), ((2, 2), (2, 2))):
+        base = np.full((*shape, 3), 0.5, np.float32)
+        made = texture_set({"base": base, "roughness": _flat(0.3)}, 4)
+        assert made.arrays["diffuse"].shape[:2] == fitted
+        assert made.arrays["roughness"].shape == (*fitted, 1)
+        assert texture_set({"base": base}, 8).content_sha256 == made.content_sha256
+        assert texture_set({"base": base * 0.9}, 4).content_sha256 != made.content_sha256
