@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoiser import set_denoiser_threads
-from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans, HostPictures
+from pipeline.renders.frozen_arithmetic.host_pictures import HostPictures
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.results import GrowingPicture, RenderedView, UsedTime, run_to_end
@@ -80,11 +80,15 @@ class SceneRenderer:
                 bounces=settings.split, lobes=settings.split_lobes
             )
         self._tracers = [self._tracer]
+        self._arithmetic: Any = HostPictures
+        if settings.arithmetic == "device":
+            from pipeline.renders.device_pictures import DevicePictures  # imports mitsuba
+
+            self._arithmetic = DevicePictures
         self._sees_sky = scene.environment is not None and scene.environment.is_seen
         if settings.per_light:
-            _refuse_sky(scene)
             most = MAX_PICTURES // max(1, len(settings.part_names))
-            self._tracers = _tracer_of_each_light(self._tracer, scene, most)
+            self._tracers = _tracers_of_lights(self._tracer, scene, most)
 
     @property
     def tracer(self) -> Tracer:
@@ -125,7 +129,7 @@ class SceneRenderer:
         self._refuse_black(samples)
         for _ in samples.passes_to(settled):
             yield Sampling(spp=samples.spp, expected_spp=settled, missing_db=None)
-        pictures = self._pictures(samples, camera)
+        pictures: ViewPictures = self._arithmetic(samples, self._tracer, camera, settings)
         if not self._sees_sky:
             samples.count_over(pictures.visible)
         look = yield from self._sample_until_targets(samples, pictures)
@@ -144,20 +148,14 @@ class SceneRenderer:
             **stored,
         )
 
-    def _pictures(self, samples: DualBuffer, camera: PixelCamera) -> ViewPictures:
-        if self._settings.arithmetic == "numpy":
-            return HostPictures(samples, self._tracer, camera, self._settings)
-        from pipeline.renders.device_pictures import DevicePictures  # imports mitsuba
-
-        return DevicePictures(samples, self._tracer, camera, self._settings)
-
     def _to_stored(self, pictures: NDArray[np.float32]) -> dict[str, Any]:
         """Return the pictures of a view by their fields: the sum of what is apart, as stored."""
         per_light = self._settings.per_light
         names = self._settings.part_names
         if not (per_light or names):
             return {"radiance_rgb": representable(pictures[0])}
-        parts = _by_part(rounded_to_half(representable(pictures)), max(1, len(names)))
+        rounded = rounded_to_half(representable(pictures))  # all parts of one light together
+        parts = rounded.reshape(-1, max(1, len(names)), *pictures.shape[1:]).swapaxes(0, 1)
         lights = sum_of_lights(parts)
         named = zip(names, parts if per_light else parts[:, 0], strict=False)
         return {
@@ -167,13 +165,7 @@ class SceneRenderer:
         }
 
     def _refuse_black(self, samples: DualBuffer) -> None:
-        if self._settings.arithmetic == "numpy":
-            mean = float(HostMeans(samples).mean().sum(axis=0).mean(dtype=np.float64))
-        else:
-            from pipeline.renders.device_pictures import mean_radiance  # imports mitsuba
-
-            mean = mean_radiance(samples)
-        bound = self._settings.min_mean_radiance
+        mean, bound = self._arithmetic.mean_radiance(samples), self._settings.min_mean_radiance
         if mean < bound:
             raise Rejected("black_view", f"mean radiance {mean:.2g} is below {bound:.2g}")
 
@@ -250,24 +242,16 @@ def _by_metric(floor: MeasuredFloor) -> Floors:
     }
 
 
-def _by_part(pictures_rgb: NDArray[np.float32], count: int) -> NDArray[np.float32]:
-    """Return pictures [L * count, R, R, 3] of lights and parts by part, [count, L, R, R, 3]."""
-    return pictures_rgb.reshape(-1, count, *pictures_rgb.shape[1:]).swapaxes(0, 1)
-
-
-def _tracer_of_each_light(tracer: Tracer, scene: Scene, most: int) -> list[Tracer]:
-    rows = light_rows(scene)
-    if len(rows) > most:
-        raise Rejected("too_many_lights", f"{len(rows)} emitters apart; at most {most}")
-    return [tracer.only_light(row) for row in rows]
-
-
-def _refuse_sky(scene: Scene) -> None:
+def _tracers_of_lights(tracer: Tracer, scene: Scene, most: int) -> list[Tracer]:
     if scene.environment is not None:
         raise TrilightError(
             "render settings: per_light is True and an environment lights the scene; expected "
             "emitters alone, whose pictures add up to all light. Leave out --per-light."
         )
+    rows = light_rows(scene)
+    if len(rows) > most:
+        raise Rejected("too_many_lights", f"{len(rows)} emitters apart; at most {most}")
+    return [tracer.only_light(row) for row in rows]
 
 
 def require_surfaces(scene: Scene) -> None:

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from pipeline.renders import denoiser, variant_probe
 from pipeline.renders.denoise_corrections import LEAST_PASSES
 from pipeline.renders.denoiser import denoise, load_oidn, set_denoiser_device
-from pipeline.renders.frozen_arithmetic.denoise_corrections import (
+from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error
+from pipeline.renders.frozen_arithmetic.host_pictures import (
+    HostMeans,
     Pictures,
     keep_converged,
     keep_in_halves,
     with_mean_of,
 )
-from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error
-from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import RenderSettings

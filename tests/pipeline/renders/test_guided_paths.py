@@ -8,10 +8,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.renders import guide_learning, vector_tracer
-from pipeline.renders.guide_cells import GuideCells
-from pipeline.renders.guide_learning import Photons, apportion_entries, learn
-from pipeline.renders.guide_table import BINS, ENTRIES, SIDE, Guidance, GuideTable, bin_of
+from pipeline.renders import guide_table, vector_tracer
+from pipeline.renders.guide_table import (
+    BINS,
+    ENTRIES,
+    SIDE,
+    Guidance,
+    GuideCells,
+    GuideTable,
+    Photons,
+    apportion_entries,
+    bin_of,
+    learn,
+)
 from pipeline.renders.kernel_scene import KernelScene
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
@@ -216,18 +225,18 @@ def test_a_table_is_bounded_however_many_cells_have_photons(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """At most so many rows on each of 4 levels: a row takes as many photons as that needs."""
-    monkeypatch.setattr(guide_learning, "_MOST_ROWS", 200)
-    monkeypatch.setattr(guide_learning, "_LEAST_PHOTONS", 1)
+    monkeypatch.setattr(guide_table, "_MOST_ROWS", 200)
+    monkeypatch.setattr(guide_table, "_LEAST_PHOTONS", 1)
     rng = np.random.default_rng(3)
     far_apart = rng.uniform(0, 10, (2000, 1, 3)) + 0.3 * rng.normal(size=(2000, 3, 3))
     cells = GuideCells(far_apart)
     count = 100_001
-    photons = guide_learning.Photons(
+    photons = guide_table.Photons(
         cell=rng.integers(0, len(cells.facing), count),
         bin=rng.integers(0, BINS, count),
         power=rng.exponential(size=count),
     )
-    table = guide_learning.learn(cells, photons)
+    table = guide_table.learn(cells, photons)
     assert table is not None
     assert len(table._densities) <= (1 + 4 * 200) * BINS
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pipeline.builds.named import named_build
 from pipeline.generation.render_sample import RenderInput, render_sample
 from pipeline.generation.view_progress import ViewProgress
-from pipeline.renders import vector_tracer
+from pipeline.renders import kernel_scene
 from pipeline.renders.device_memory import read_back
 from pipeline.renders.device_pictures import DevicePictures
 from pipeline.renders.load_tracer import load_tracer
@@ -134,13 +134,13 @@ def test_guided_passes_have_one_more_set_of_kernels_for_every_scene() -> None:
 
 def test_all_views_and_lights_share_one_load(monkeypatch: pytest.MonkeyPatch) -> None:
     loads = list[Scene]()
-    load = vector_tracer._load
+    load = kernel_scene.load_triangles
 
     def counted(scene: Scene, *rest: Any, **named: Any) -> Any:
         loads.append(scene)
         return load(scene, *rest, **named)
 
-    monkeypatch.setattr(vector_tracer, "_load", counted)
+    monkeypatch.setattr(kernel_scene, "load_triangles", counted)
     scene = sampled_like_scene(np.random.default_rng(3), num_views=2)
     scene = scene.with_provenance({"camera_attempts": [0] * 2})
     changes = {"renders.min_spp": 8, "renders.max_spp": 8, "renders.per_light": True}

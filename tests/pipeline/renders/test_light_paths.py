@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from pipeline.renders import vector_tracer
 from pipeline.renders.device_memory import read_back
-from pipeline.renders.film import Film
+from pipeline.renders.film import Film, Splats, SplatUnit, splat_unit
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.splats import Splats, SplatUnit, splat_unit
 from pipeline.renders.vector_tracer import (
     VectorTracer,
     even_numbers,

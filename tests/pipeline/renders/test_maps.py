@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.renders import vector_tracer
+from pipeline.renders import kernel_scene
 from pipeline.renders.emitter_table import alias_table
-from pipeline.renders.kernel_textures import KernelTextures
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.sky_share import peaked_radiance, sky_share
-from pipeline.renders.sky_table import SkyTable, alias_rows
+from pipeline.renders.sky_table import SkyTable, alias_rows, peaked_radiance, sky_share
+from pipeline.renders.surface_table import KernelTextures
 from pipeline.renders.tracer import Tracer
 from pipeline.scenes.pieces import apply_skin, concatenate_pieces, emitter_piece, object_piece
 from pipeline.scenes.pool import PooledAsset
@@ -241,7 +240,7 @@ def test_no_share_of_picks_changes_what_is_expected(monkeypatch: pytest.MonkeyPa
     scene = open_scene(smooth())
     usual = render_passes(_tracer(scene), scene, passes=8)
     for share in (0.03, 0.97):
-        monkeypatch.setattr(vector_tracer, "sky_share", lambda *_, share=share: share)
+        monkeypatch.setattr(kernel_scene, "sky_share", lambda *_, share=share: share)
         other = render_passes(_tracer(scene), scene, first_seed=500, passes=8)
         assert_same_light(other, usual, name=f"share {share}")
 

@@ -9,9 +9,18 @@ from numpy.typing import NDArray
 
 from pipeline.renders import preview
 from pipeline.renders.camera import PixelCamera
-from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings, usual_filter
-from pipeline.renders.preview_parts import all_parts, preview_parts, seconds_of, timed_parts
-from pipeline.renders.progressive import FIRST_LOOKS_SPP, ProgressiveRenderer
+from pipeline.renders.preview import (
+    FIRST_LOOKS_SPP,
+    Preview,
+    PreviewRenderer,
+    PreviewSettings,
+    ProgressiveRenderer,
+    all_parts,
+    preview_parts,
+    seconds_of,
+    timed_parts,
+    usual_filter,
+)
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.settings import Filtered, RenderSettings

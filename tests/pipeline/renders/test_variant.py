@@ -15,12 +15,18 @@ import pytest
 
 from infra.render.path_tracer import RenderChild
 from pipeline.generation.environment import environment
-from pipeline.renders import denoiser, variant_probe, vector_tracer
+from pipeline.renders import denoiser, kernel_scene, variant_probe, vector_tracer
 from pipeline.renders import variant as variant_module
 from pipeline.renders.facts import render_facts
-from pipeline.renders.llvm_libraries import llvm_libraries
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
-from pipeline.renders.variant import Device, Variant, _ProbeResult, activate, choose_variant
+from pipeline.renders.variant import (
+    Device,
+    Variant,
+    _ProbeResult,
+    activate,
+    choose_variant,
+    llvm_libraries,
+)
 from pipeline.renders.variant_probe import BLOCK, probe_scene, wrong_picture
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.records.scene_file import encode_scene
@@ -55,7 +61,7 @@ def test_a_library_that_is_none_is_passed_over_and_success_is_remembered(
         patch.setenv("DRJIT_LIBLLVM_PATH", str(bogus))
         assert llvm_libraries()[0] == bogus
         assert choose_variant() == variant
-    memory = own_cache / "cache" / "llvm_probes.json"
+    memory = own_cache / "cache" / "probes.json"
     remembered = json.loads(memory.read_text())
     assert len(remembered) == 1  # what failed may work once its cause is mended
     with monkeypatch.context() as patch:
@@ -343,10 +349,10 @@ def test_another_integrator_agrees_with_the_stored_picture(monkeypatch: pytest.M
 def test_scenes_that_share_a_table_give_the_bits_of_scenes_apart(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    load, made = vector_tracer._load, scenes()
+    load, made = kernel_scene.load_triangles, scenes()
     shared = {name: _picture_of(scene) for name, scene in made.items()}
     monkeypatch.setattr(
-        vector_tracer, "_load", lambda scene, triangles, **_: load(scene, triangles)
+        kernel_scene, "load_triangles", lambda scene, triangles, **_: load(scene, triangles)
     )
     for name, scene in made.items():
         np.testing.assert_array_equal(_picture_of(scene), shared[name], err_msg=name)
