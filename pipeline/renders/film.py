@@ -78,18 +78,15 @@ _SMALLEST_EXPONENT = -90
 class SplatUnit:
     """The radiance of one unit, as kernels read it."""
 
-    def __init__(self, radiance: float) -> None:
-        self.radiance = dr.opaque(mi.Float64, radiance)
+    def __init__(self, scene: Scene) -> None:
+        emission = scene.materials[scene.material_index[scene.triangle_emits], EMISSION]
+        brightest = float(emission.max(initial=0))
+        exponent = max(math.frexp(brightest)[1], _SMALLEST_EXPONENT) + 1 - _STEPS
+        self.value = math.ldexp(0.5, exponent)
+        self.radiance = dr.opaque(mi.Float64, self.value)
         """Float64."""
-        self.per_radiance = dr.opaque(mi.Float, 1 / radiance)
+        self.per_radiance = dr.opaque(mi.Float, 1 / self.value)
         """Float: units of radiance 1."""
-
-
-def splat_unit(scene: Scene) -> float:
-    """Return the radiance of one unit."""
-    emission = scene.materials[scene.material_index[scene.triangle_emits], EMISSION]
-    brightest = float(emission.max(initial=0))
-    return math.ldexp(0.5, max(math.frexp(brightest)[1], _SMALLEST_EXPONENT) + 1 - _STEPS)
 
 
 class Splats:

@@ -13,6 +13,7 @@ picture is their sum; with `split` direct and indirect light are kept apart, and
 Mitsuba is imported inside functions only: `activate` must come first.
 """
 
+import time
 from collections.abc import Generator, Iterator
 from typing import Any
 
@@ -24,7 +25,7 @@ from pipeline.renders.denoiser import set_denoiser_threads
 from pipeline.renders.frozen_arithmetic.host_pictures import HostPictures
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import MeasuredFloor
-from pipeline.renders.results import GrowingPicture, RenderedView, UsedTime, run_to_end
+from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.stopping import Floors, Goal, expected_spp, gaps_db, next_spp
@@ -73,7 +74,7 @@ class SceneRenderer:
         require_surfaces(scene)
         self._settings = settings
         self._shows_looks = shows_looks
-        self._used = UsedTime()
+        self._began_s = 0.0
         self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
         if settings.part_names:
             self._tracer = self._tracer.split_lights(
@@ -116,7 +117,7 @@ class SceneRenderer:
     ) -> Iterator[Sampling | RenderedView]:
         """Do what `render_view` does: yield after each pass of one half, and last the picture."""
         settings = self._settings
-        self._used = UsedTime()
+        self._began_s = time.process_time()
         pose = np.asarray(c2w, np.float64)
         camera = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
         settled = settings.first_spp
@@ -142,7 +143,7 @@ class SceneRenderer:
             noise_floor_linear_db=floor.linear_db,
             object_noise_floor_db=floor.object_log_db,
             at_cap=bool(gaps_db(settings.targets_db, _by_metric(floor))),
-            core_s=self._used.core_s(),
+            core_s=time.process_time() - self._began_s,
             hits=pictures.hits,
             part_floors=look.part_floors or None,
             **stored,
@@ -216,10 +217,10 @@ class SceneRenderer:
         expected_spp: int,
         missing_db: float,
     ) -> GrowingPicture:
-        before_s = self._used.core_s()
+        looked_s = time.process_time()
         picture = self._to_stored(pictures.finish())["radiance_rgb"]
-        core_s = self._used.core_s()
-        self._used.leave_out(core_s - before_s)
+        core_s = time.process_time() - self._began_s
+        self._began_s += time.process_time() - looked_s  # the view takes no time by being shown
         return GrowingPicture(
             spp=samples.spp,
             expected_spp=expected_spp,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders import vector_tracer
 from pipeline.renders.device_memory import read_back
-from pipeline.renders.film import Film, Splats, SplatUnit, splat_unit
+from pipeline.renders.film import Film, Splats, SplatUnit
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.vector_tracer import (
     VectorTracer,
@@ -158,7 +158,7 @@ def _scene(radiance: float = 5.0) -> Scene:
 
 def _splatted(resolution: int, values: Any, pixels: Any, active: bool = True) -> NDArray:
     """Return the picture [R^2, 3] of values [3, N] that are added to pixels."""
-    splats = Splats(resolution, SplatUnit(splat_unit(_scene())))
+    splats = Splats(resolution, SplatUnit(_scene()))
     color = mi.Color3f(*(np.asarray(channel, np.float32) for channel in values))
     splats.add(color, mi.UInt32(np.asarray(pixels, np.uint32)), mi.Bool(active))
     return read_back(splats.picture()).reshape(3, -1).T
@@ -175,7 +175,7 @@ def test_splats_add_up_in_any_order_to_the_nearest_unit() -> None:
     # Float32 values are off by a half of 2^-24 of themselves, units by 5 / 2^33 for each splat.
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-5)
     # Cut off instead, dim light would be lost: 0.75 of a unit would be none, a thousand times.
-    unit = splat_unit(_scene())
+    unit = SplatUnit(_scene()).value
     for units, counted in ((0.25, 0.0), (0.75, 1000.0)):
         dim = _splatted(1, np.full((3, 1000), units * unit), np.zeros(1000))
         np.testing.assert_array_equal(dim / unit, counted)
@@ -193,11 +193,11 @@ def test_a_splat_that_no_sum_can_hold_shows() -> None:
 
 def test_a_unit_is_a_power_of_two_that_goes_with_the_light() -> None:
     for radiance in (1e-30, 1e-3, 1.0, 4095.0, 1e12):
-        unit = splat_unit(_scene(radiance))
+        unit = SplatUnit(_scene(radiance)).value
         assert np.frexp(unit)[0] == 0.5
         if radiance > 1e-27:  # dimmer ones are coarse: nothing that half floats show
             assert 2**33 <= np.float32(radiance) / unit < 2**34
-            assert splat_unit(_scene(2 * radiance)) == 2 * unit
+            assert SplatUnit(_scene(2 * radiance)).value == 2 * unit
         assert np.isfinite(np.float32(1 / unit))
 
 
