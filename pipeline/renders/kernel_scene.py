@@ -38,9 +38,6 @@ class KernelScene:
     Not a dataclass: Dr.Jit would take its arrays for variables of the loop.
     """
 
-    guide: GuideTable | None = None
-    """The directions in which camera paths look for light; None: by the BRDF alone."""
-
     def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int) -> None:
         """Load a scene.
 
@@ -62,6 +59,8 @@ class KernelScene:
         self.table = surface_table(scene, order)
         self.emitters = EmitterTable(scene, emitters, may_be_dark=sky is not None)
         self.cone = EmissionCone(scene)
+        self.guide: GuideTable | None = None
+        """The directions in which camera paths look for light; None: by the BRDF alone."""
         self.sky = None if sky is None else SkyTable(sky, sky_share(scene, sky))
         """The environment map; None compiles a kernel without one."""
         self.albedo = AlbedoLookup()
