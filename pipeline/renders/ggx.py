@@ -102,7 +102,7 @@ def evaluate_bsdf(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> tuple
 
 
 def diffuse_share(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any:
-    """Return the share (Color3f) of the diffuse lobe in what `evaluate_bsdf` reflects; 1 of nothing."""
+    """Return the share (Color3f) of the diffuse lobe in what `evaluate_bsdf` returns; 1 of 0."""
     reflected, _ = evaluate_bsdf(lobes, wi, wo, geometric)
     diffuse = lobes.diffuse * (_INV_PI * dr.maximum(wo.z, 0))
     return dr.select(reflected > diffuse, diffuse / reflected, 1)
