@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from infra.bench.workloads.blender_environment import installed_python, run_blender
 from infra.bench.workloads.cycles import render_with_cycles
-from pipeline.exchange.convert import convert_scene
-from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.usd.write import write_usd
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.settings import RenderSettings
@@ -185,19 +183,6 @@ def test_direct_light_is_that_of_cycles(
     # Half of the blocks agree to the rounding of half floats (5e-4) and what noise is left.
     lit = theirs > 0.02
     assert np.median(abs(ours - theirs)[lit] / theirs[lit]) < 0.001
-
-
-def test_what_was_converted_is_still_that_of_cycles(
-    shared: Path, tmp_path: Path, llvm: None
-) -> None:
-    """By the command's own way there and back; bound and measure as above, where no form is."""
-    source = scene_source(str(shared / "renderformer_scenes" / "cbox.json"))
-    target = tmp_path / "cbox.usdz"
-    convert_scene(source, target, budget=None, done=lambda finished, of: None)
-    ours = _clamped(
-        render_view(load_source(scene_source(str(target))).scene, DIRECT, 1).radiance_rgb
-    )
-    assert psnr_linear_db(ours, _clamped(_reference(shared, "cbox.direct_raw.exr"))) > 76
 
 
 @pytest.mark.parametrize(
