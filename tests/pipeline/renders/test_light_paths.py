@@ -161,7 +161,7 @@ def _splatted(resolution: int, values: Any, pixels: Any, active: bool = True) ->
     splats = Splats(resolution, SplatUnit(_scene()))
     color = mi.Color3f(*(np.asarray(channel, np.float32) for channel in values))
     splats.add(color, mi.UInt32(np.asarray(pixels, np.uint32)), mi.Bool(active))
-    return read_back(splats.picture()).reshape(3, -1).T
+    return read_back(splats.picture()).reshape(-1, 3)
 
 
 def test_splats_add_up_in_any_order_to_the_nearest_unit() -> None:

@@ -132,10 +132,6 @@ def _alone(texels: NDArray, **more: Any) -> Scene:
     return textured(parts, (Texture(texels=texels, **more),), [0, -1, -1], fov=24)
 
 
-def _below(sky: Environment | None, row: NDArray) -> Scene:
-    return join([textured_floor(row), SKY_LAMP], eye=(0, -2.5, 2), fov_deg=40, sky=sky)
-
-
 def test_the_longest_texture_is_looked_up_as_the_records_do() -> None:
     """A ramp of 16,384 texels, whose neighbours differ by 1/16384: float32 places lose no texel."""
     ramp = np.linspace(0, 1, MAX_SIDE, dtype=np.float32)
@@ -162,13 +158,13 @@ def test_memory_for_texels_is_what_is_stated() -> None:
 
 def test_maps_that_break_a_law_never_reach_a_kernel() -> None:
     """Whatever opens or renders a scene checks it first; a child of the renderer trusts that."""
+    plain = _alone(np.full((2, 4, 3), 0.5, np.float32))
     for value in (np.nan, np.inf, -1.0):
         texels = np.full((2, 4, 3), 0.5, np.float32)
         texels[1, 2, 0] = value
-        below = dataclasses.replace(
-            _below(None, material(diffuse=0.5)), environment=Environment(radiance_rgb=texels)
-        )
-        for scene, name in ((below, "environment.radiance_rgb"), (_alone(texels), "textures")):
+        wrong = dataclasses.replace(plain, textures=(Texture(texels=texels),))
+        below = dataclasses.replace(plain, environment=Environment(radiance_rgb=texels))
+        for scene, name in ((below, "environment.radiance_rgb"), (wrong, "textures")):
             with pytest.raises(TrilightError, match=name):
                 render(scene, resolution=16, max_spp=8)
 
