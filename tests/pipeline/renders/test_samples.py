@@ -259,11 +259,11 @@ def test_an_empty_background_earns_nothing() -> None:
     hits, wide = np.zeros((2 * PX, 2 * PX), bool), ((0, PX), (0, PX), (0, 0))
     hits[:PX, :PX] = True
     inner = half(rng), half(rng)
-    framed = [
+    framed, other = (
         Half(raw_rgb=np.pad(each.raw_rgb, wide), denoised_rgb=np.pad(each.denoised_rgb, wide))
         for each in inner
-    ]
-    alone, floor = estimate_error(*inner, EVERYWHERE), estimate_error(*framed, hits)
+    )
+    alone, floor = estimate_error(*inner, EVERYWHERE), estimate_error(framed, other, hits)
     assert floor.object_log_db == pytest.approx(alone.log_db, abs=1e-9)
     assert floor.log_db > alone.log_db + 3, "three quarters of the pixels are exact"
 

@@ -6,7 +6,7 @@ The line between chance and a defect is that of tests.scene_templates.statistics
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -41,7 +41,7 @@ from tests.scene_templates.statistics import (
 
 
 def _composed_table(
-    scenes: list[Scene], pool: list[PooledAsset], published: list[Any]
+    scenes: list[Scene], pool: list[PooledAsset], published: Iterable[Any]
 ) -> dict[str, Any]:
     """Rejected attempts are replaced by scenes of the same kind, and bend no share."""
     odds = Counter[str]()
