@@ -56,7 +56,7 @@ CHOSEN = (
     "tests/pipeline/objects/builtin/test_builtin.py",
     "tests/pipeline/renders/test_stored_pictures.py",
     "tests/pipeline/scenes/test_compose.py",
-    "tests/pipeline/scenes/test_shading.py",
+    "tests/pipeline/scenes/test_shapes.py",
     "tests/scene_templates/skies/test_families.py",
     "tests/scene_templates/surfaces/test_families.py",
     "tests/storage/test_metrics.py",

@@ -20,7 +20,7 @@ from infra.render.preview_table import (
     PreviewTable,
 )
 from infra.render.quality import Budget, FixedSamples, TimeBudget
-from pipeline.renders.preview_parts import SCENE, preview_parts, seconds_of
+from pipeline.renders.preview import SCENE, preview_parts, seconds_of
 from storage.errors import TrilightError
 
 NETWORK = "the network builtin:tokens"

@@ -16,8 +16,7 @@ from typing import Any
 from infra.render.quality import FixedSamples, ToStatedError
 from pipeline.generation.environment import environment
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
-from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings
-from pipeline.renders.progressive import ProgressiveRenderer
+from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings, ProgressiveRenderer
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import GrowingPicture, RenderedView
 from pipeline.renders.settings import FIRST_SPP, RenderSettings

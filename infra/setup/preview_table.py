@@ -40,7 +40,7 @@ from infra.render.raw_references import (
 )
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK
-from pipeline.renders.preview_parts import SCENE, all_parts, timed_parts
+from pipeline.renders.preview import SCENE, all_parts, timed_parts
 from pipeline.renders.settings import Filtered
 from pipeline.renders.variant import choose_variant
 from storage.atomic import write_atomically

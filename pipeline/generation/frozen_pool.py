@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.assets.store import AssetStore
-from pipeline.scenes.budget import least_triangles
-from pipeline.scenes.fitting import FitTable
+from pipeline.scenes.fitting import FitTable, least_triangles
 from pipeline.scenes.pool import IndexedPool, PooledAsset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError

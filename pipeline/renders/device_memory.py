@@ -27,6 +27,11 @@ def own_integers(values: NDArray) -> Any:
     return copy
 
 
+def opaque_vector(values: NDArray) -> Any:
+    """Return three numbers as a mi.Vector3f that is no literal in a kernel."""
+    return mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in values))
+
+
 def read_back(values: Any) -> NDArray:
     """Return an array of Dr.Jit, or the components of a vector of arrays side by side, flat.
 

@@ -53,14 +53,6 @@ Sums = Sequence[Sequence[Sequence[Any]]]
 """Of each half, and in it of each tracer: `DeviceSum.sums`."""
 
 
-def mean_radiance(samples: DualBuffer) -> float:
-    """Return the mean radiance of all pixels so far; raises as `ViewPictures.look`."""
-    resolution = len(samples.spp_of(0))
-    total, broken = read_numbers(_brightness(KernelInputs(), _sums(samples), resolution))
-    require_finite(int(broken))
-    return float(total) / (3 * resolution**2)
-
-
 def read_numbers(numbers: Any) -> NDArray:
     """Return an array of Dr.Jit as one of numpy: all that is read back of a view comes this way."""
     return np.array(numbers)
@@ -99,6 +91,13 @@ class DevicePictures:
         hits = TILE * tile_means(self.hits.astype(np.float64)).ravel()
         everywhere = np.full_like(hits, TILE)
         self._counts = everywhere, everywhere, hits
+
+    @staticmethod
+    def mean_radiance(samples: DualBuffer) -> float:
+        resolution = len(samples.spp_of(0))
+        total, broken = read_numbers(_brightness(KernelInputs(), _sums(samples), resolution))
+        require_finite(int(broken))
+        return float(total) / (3 * resolution**2)
 
     def look(self, quality: Filtered) -> MeasuredLook:
         sums = _sums(self._samples)

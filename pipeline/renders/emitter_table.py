@@ -14,12 +14,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.device_memory import own_floats
+from pipeline.renders.device_memory import opaque_vector, own_floats
 from storage.errors import Rejected
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 
-_ONE_MINUS_EPSILON = 0.99999994
+ONE_MINUS_EPSILON = 0.99999994
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,14 +88,7 @@ class EmitterTable:
 
     def sample(self, u: Any, active: Any) -> EmitterPoint:
         """Return a point drawn by power, from a uniform Point2f."""
-        scaled = u.x * mi.Float(self._count)
-        column = dr.minimum(mi.UInt32(scaled), self._count - 1)
-        fraction = scaled - mi.Float(column)
-        keep, alias = dr.gather(mi.Vector2f, self._alias, column, active)
-        keeps = fraction < keep
-        row = dr.select(keeps, column, mi.UInt32(alias))
-        fraction = dr.select(keeps, fraction / keep, (fraction - keep) / (1 - keep))
-        fraction = dr.clip(fraction, 0, _ONE_MINUS_EPSILON)
+        row, fraction = sample_alias(self._alias, mi.UInt32(0), self._count, u.x, active)
         corner, edge1, edge2, radiance = (self._group(row, group, active) for group in range(4))
         edge1 = mi.Vector3f(edge1.xyz)
         edge2 = mi.Vector3f(edge2.xyz)
@@ -116,6 +109,26 @@ class EmitterTable:
         return dr.gather(mi.Vector4f, self._rows, row * 4 + group, active)
 
 
+def sample_alias(table: Any, first: Any, count: Any, u: Any, active: Any) -> tuple[Any, Any]:
+    """Return an index below `count` drawn from an alias table, and a fresh uniform (Float).
+
+    Args:
+        table: rows of what each column keeps, and the column that the rest goes to (Float).
+        first: UInt32, the row of the table's first column.
+        count: UInt32, its columns.
+        u: Float, uniform.
+        active: Bool.
+    """
+    scaled = u * mi.Float(count)
+    column = dr.minimum(mi.UInt32(scaled), count - 1)
+    fraction = scaled - mi.Float(column)
+    keep, alias = dr.gather(mi.Vector2f, table, first + column, active)
+    keeps = fraction < keep
+    chosen = dr.select(keeps, column, mi.UInt32(alias))
+    fraction = dr.select(keeps, fraction / keep, (fraction - keep) / (1 - keep))
+    return chosen, dr.clip(fraction, 0, ONE_MINUS_EPSILON)
+
+
 def alias_table(share: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
     """Return for each column the part that it keeps and the row that the rest goes to."""
     keep = share * len(share)
@@ -131,3 +144,54 @@ def alias_table(share: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
             small.append(large.pop())
     keep[[*small, *large]] = 1  # what is left over is 1 up to rounding
     return keep, alias
+
+
+_MARGIN = 1.001
+"""The sphere is too large by this: nothing lies on the rim of a cone, where roundings decide."""
+
+
+class EmissionCone:
+    """Directions in which light paths leave an emitter: into the sphere around all surfaces only.
+
+    They are uniform over the cone that the sphere fills; from inside of it, by the cosine over both
+    sides of the emitter.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        corners = scene.vertex_positions[scene.faces[~scene.triangle_emits]].reshape(-1, 3)
+        centre = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+        radius = _MARGIN * np.linalg.norm(corners - centre, axis=1).max()
+        self._centre = mi.Point3f(opaque_vector(centre))
+        self._radius_sq = dr.opaque(mi.Float, float(radius) ** 2)
+
+    def sample(self, position: Any, normal: Any, u: Any) -> Any:
+        """Return a unit direction (Vector3f) from a uniform Point2f."""
+        axis, height, outside = self._cone(position)
+        in_cone = mi.Frame3f(axis).to_world(_cap(height, u))
+        side = dr.mulsign(mi.Float(1), u.x - 0.5)
+        flat = mi.warp.square_to_cosine_hemisphere(mi.Point2f(dr.abs(2 * u.x - 1), u.y))
+        cosine = mi.Frame3f(normal).to_world(flat) * side
+        return mi.Vector3f(dr.select(outside, in_cone, cosine))
+
+    def pdf(self, position: Any, normal: Any, direction: Any) -> Any:
+        """Return the density (Float, per steradian) with which `sample` draws a direction."""
+        axis, height, outside = self._cone(position)
+        down = 0.5 * dr.squared_norm(direction - axis)  # 1 - cos, without cancellation
+        cap = dr.select(down <= height, 1 / (2 * dr.pi * height), 0)
+        return dr.select(outside, cap, dr.abs(dr.dot(normal, direction)) / (2 * dr.pi))
+
+    def _cone(self, position: Any) -> tuple[Any, Any, Any]:
+        """Return the axis, 1 - cos of the half angle, and whether there is a cone."""
+        to_centre = self._centre - position
+        distance_sq = dr.squared_norm(to_centre)
+        sine_sq = self._radius_sq / distance_sq
+        height = sine_sq / (1 + dr.safe_sqrt(1 - sine_sq))  # no cancellation
+        outside = sine_sq < 1
+        return mi.Vector3f(to_centre * dr.rsqrt(distance_sq)), height, outside
+
+
+def _cap(height: Any, u: Any) -> Any:
+    down = height * u.x
+    radius = dr.safe_sqrt(down * (2 - down))
+    sine, cosine = dr.sincos(2 * dr.pi * u.y)
+    return mi.Vector3f(radius * cosine, radius * sine, 1 - down)

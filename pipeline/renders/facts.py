@@ -9,8 +9,8 @@ from pathlib import Path
 
 from pipeline.isolation import die_with_parent
 from pipeline.renders.denoiser import open_device
-from pipeline.renders.variant import Variant, activate
-from storage.installation import IMPORT_ROOT, child_environment
+from pipeline.renders.variant import Variant, activate, run_module
+from storage.installation import child_environment
 
 _ASK_S = 120
 
@@ -25,15 +25,7 @@ def render_facts(variant: Variant) -> dict[str, str]:
     facts = {name: metadata.version(name) for name in ("mitsuba", "drjit", "pyoidn")}
     facts |= {"variant": variant.name, "llvm": Path(variant.libllvm).name}
     try:
-        result = subprocess.run(
-            [sys.executable, "-m", f"{__package__}.facts", json.dumps(vars(variant))],
-            cwd=IMPORT_ROOT,
-            env=child_environment(),
-            capture_output=True,
-            text=True,
-            timeout=_ASK_S,
-            check=False,
-        )
+        result = run_module("facts", json.dumps(vars(variant)), _ASK_S, child_environment())
     except subprocess.TimeoutExpired:  # a busy machine
         return facts
     return facts | json.loads(result.stdout) if result.returncode == 0 else facts

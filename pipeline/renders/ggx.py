@@ -102,7 +102,7 @@ def evaluate_bsdf(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> tuple
 
 
 def diffuse_share(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any:
-    """Return the share (Color3f) of the diffuse lobe in what `evaluate` reflects; 1 of nothing."""
+    """Return the share (Color3f) of the diffuse lobe in what `evaluate_bsdf` returns; 1 of 0."""
     reflected, _ = evaluate_bsdf(lobes, wi, wo, geometric)
     diffuse = lobes.diffuse * (_INV_PI * dr.maximum(wo.z, 0))
     return dr.select(reflected > diffuse, diffuse / reflected, 1)
@@ -117,9 +117,9 @@ def reverse_pdf(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any:
     Args:
         lobes: from `seen_from` wi.
         wi: Vector3f to the viewer.
-        wo: Vector3f to the light, above the shading normal: `evaluate` is 0 elsewhere, and this
-            means nothing there.
-        geometric: as in `evaluate`.
+        wo: Vector3f to the light, above the shading normal: `evaluate_bsdf` is 0 elsewhere, and
+            this means nothing there.
+        geometric: as in `evaluate_bsdf`.
     """
     distribution = _distribution(dr.normalize(wi + wo), lobes.alpha)
     facets = distribution / (2 * (wo.z + _stretch(wo.z, lobes.alpha)))

@@ -5,11 +5,17 @@ ENTRIES. One load draws a bin, and another gives its density, which is exact: th
 unbiased whatever the table says. Bins are squares of the octahedral map (Engelhardt and Dachsbacher
 2008), which takes no trigonometry. Cells that have learnt nothing have row 0.
 
+The table is learnt once for a scene, from photons (after Jensen 1995). Small cells have few of
+them. So cells that lie in one cube of space and face the same way share a row, from small cubes to
+large ones: a cell takes the smallest that has enough photons, with a part of what the next larger
+one says, for what the few have missed.
+
 The path tracer draws a share of its directions from the table and the others by the BRDF. The
 density of this mixture is the c_i of pipeline.renders.light_kernel for i > 1. At x1 the path tracer
 is not guided: light paths land there, and guiding there too made pictures no better (study S18).
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +26,66 @@ from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import own_floats, own_integers
 from pipeline.renders.ggx import KernelLobes
-from pipeline.renders.guide_cells import GuideCells
+
+_CELLS = 1500
+"""A cell is about as large as so many parts of the scene's whole surface, or smaller."""
+
+_MOST_CUTS = 64
+"""Most cells along an edge of a triangle."""
+
+
+class GuideCells:
+    """Cells of triangles, for which directions are learnt: a grid on each of their two sides.
+
+    Not a dataclass: Dr.Jit would take its arrays for loop variables.
+    """
+
+    def __init__(self, corners: NDArray[np.float64]) -> None:
+        """Cut triangles, [T, 3, 3], into cells."""
+        edge1 = corners[:, 1] - corners[:, 0]
+        edge2 = corners[:, 2] - corners[:, 0]
+        normal = np.cross(edge1, edge2)
+        area = 0.5 * np.linalg.norm(normal, axis=1)
+        self.size_m = max(float(np.sqrt(area.sum() / _CELLS)), np.finfo(np.float32).tiny)
+        """About the width of the largest cells."""
+        cuts = np.clip(np.ceil(np.sqrt(area) / self.size_m), 1, _MOST_CUTS).astype(np.int64)
+        first = np.cumsum(2 * cuts**2) - 2 * cuts**2
+        self._rows = own_integers(np.column_stack([first, cuts]))
+        triangle = np.repeat(np.arange(len(cuts)), 2 * cuts**2)
+        column, row, self._front = _places(
+            np.arange(len(triangle)) - first[triangle], cuts[triangle]
+        )
+        u, v = ((place + 0.5) / cuts[triangle] for place in (column, row))
+        is_beyond = u + v > 1
+        u, v = np.where(is_beyond, (1 - v, 1 - u), (u, v))
+        self.centres_m = (
+            corners[triangle, 0] + u[:, None] * edge1[triangle] + v[:, None] * edge2[triangle]
+        )
+        """[C, 3] a point of each cell; of cells beyond the triangle's third edge, one nearby."""
+        outward = normal[triangle] * np.where(self._front, 1.0, -1.0)[:, None]
+        axis = np.abs(outward).argmax(axis=1)
+        self.facing = 2 * axis + (outward[np.arange(len(axis)), axis] > 0)
+        """[C] 0 to 5: the axis and the sign of the largest component of the normal."""
+
+    def index(self, triangle: Any, barycentric: Any, front: Any, active: Any) -> Any:
+        """Return the cell (UInt32) of a point; `front` says which side of the triangle it is."""
+        row = dr.gather(mi.Vector2u, self._rows, triangle, active)
+        first = row.x
+        cuts = row.y
+        column, line = (
+            dr.minimum(mi.UInt32(dr.maximum(weight, 0) * mi.Float(cuts)), cuts - 1)
+            for weight in barycentric
+        )
+        return first + 2 * (line * cuts + column) + dr.select(front, mi.UInt32(1), mi.UInt32(0))
+
+
+def _places(
+    number: NDArray[np.int64], cuts: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Return column, row and side of cells from their numbers within their triangles."""
+    square = number // 2
+    return square % cuts, square // cuts, number % 2 == 1
+
 
 SIDE = 32
 """Bins along each side of the square; a bin is 4 to 8 degrees wide."""
@@ -127,3 +192,83 @@ def _from_square(x: Any, y: Any) -> Any:
     z = 1 - dr.abs(x) - dr.abs(y)
     fold = dr.maximum(-z, 0)
     return dr.normalize(mi.Vector3f(x - dr.mulsign(fold, x), y - dr.mulsign(fold, y), z))
+
+
+_LEVELS = 4
+"""Sizes of cubes: 1, 2, 4 and 8 times a cell."""
+
+_LEAST_PHOTONS = 64
+"""Fewest photons of a row."""
+
+_MOST_ROWS = 2048
+"""Most rows of one level, which bounds the table by 64 MB."""
+
+_PARENT = 0.25
+"""Part of a row that the next larger cube says."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Photons:
+    """Photons that arrived by way of a narrow lobe."""
+
+    cell: NDArray[np.int64]
+    """[P] cell that each photon hit (`GuideCells`)."""
+    bin: NDArray[np.int64]
+    """[P] bin of the direction from which each photon came (`bin_of`)."""
+    power: NDArray[np.float64]
+    """[P] in any unit, above 0."""
+
+
+def learn(cells: GuideCells, photons: Photons) -> GuideTable | None:
+    """Return the guide table, or None if no cell got enough photons."""
+    least = max(_LEAST_PHOTONS, math.ceil(len(photons.cell) / _MOST_ROWS))
+    row_of_cell = np.zeros(len(cells.facing), np.int64)
+    rows = np.zeros((1, BINS))
+    for level in reversed(range(_LEVELS)):
+        group = _groups(cells, cells.size_m * 2**level)
+        large_groups = np.flatnonzero(
+            np.bincount(group[photons.cell], minlength=group.max() + 1) >= least
+        )
+        place = np.full(group.max() + 1, -1)
+        place[large_groups] = np.arange(len(large_groups))
+        finer = _shares(_histograms(place[group], photons, len(large_groups)))
+        parents = np.zeros(len(large_groups), np.int64)
+        held = place[group] >= 0
+        parents[place[group[held]]] = row_of_cell[held]
+        known = (parents > 0)[:, None]
+        finer = np.where(known, (1 - _PARENT) * finer + _PARENT * rows[parents], finer)
+        row_of_cell = np.where(held, len(rows) + place[group], row_of_cell)
+        rows = np.concatenate([rows, finer])
+    used, row_of_cell = np.unique(np.append(row_of_cell, 0), return_inverse=True)
+    if len(used) == 1:
+        return None
+    return GuideTable(cells, row_of_cell[:-1], apportion_entries(rows[used[1:]]))
+
+
+def apportion_entries(shares: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return shares [N, BINS] as whole numbers that add up to ENTRIES; each row of shares to 1."""
+    edges = np.rint(np.cumsum(shares, axis=1) * ENTRIES).astype(np.int64)
+    return np.diff(edges, axis=1, prepend=0)
+
+
+def _groups(cells: GuideCells, width_m: float) -> NDArray[np.int64]:
+    """Return for each cell the number of its cube and facing, [C]."""
+    cube = np.floor(cells.centres_m / width_m).astype(np.int64)
+    _, group = np.unique(np.column_stack([cube, cells.facing]), axis=0, return_inverse=True)
+    return group.ravel()
+
+
+def _histograms(place: NDArray[np.int64], photons: Photons, count: int) -> NDArray[np.float64]:
+    row = place[photons.cell]
+    flat = row[row >= 0] * BINS + photons.bin[row >= 0]
+    sums = np.bincount(flat, photons.power[row >= 0], minlength=count * BINS).astype(np.float64)
+    return sums.reshape(count, SIDE, SIDE)
+
+
+def _shares(histograms: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return each histogram blurred over its neighbours, with a sum of 1, [N, BINS]."""
+    wide = np.pad(histograms, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    wide = wide[:, :-2] + 2 * wide[:, 1:-1] + wide[:, 2:]
+    blurred = (wide[:, :, :-2] + 2 * wide[:, :, 1:-1] + wide[:, :, 2:]).reshape(-1, BINS)
+    shares: NDArray[np.float64] = blurred / blurred.sum(axis=1, keepdims=True)
+    return shares

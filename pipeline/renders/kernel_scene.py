@@ -5,13 +5,19 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
 
-from pipeline.renders.emission_cone import EmissionCone
-from pipeline.renders.emitter_table import EmitterTable
+from pipeline.renders import ggx
+from pipeline.renders.device_memory import own_floats, own_integers
+from pipeline.renders.emitter_table import EmissionCone, EmitterTable
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
 from pipeline.renders.guide_table import GuideTable
-from pipeline.renders.sky_table import SkyTable
-from pipeline.renders.surface_table import SurfacePoint, SurfaceTable
+from pipeline.renders.sky_table import SkyTable, shining_sky, sky_share
+from pipeline.renders.surface_table import SurfacePoint, surface_table
+from pipeline.renders.tracer import split_triangles
+from storage.records.parts import part_names
+from storage.records.scene import Scene
 
 MAX_SURVIVAL = 0.95
 """Largest probability to survive roulette, so that paths between bright surfaces end."""
@@ -32,49 +38,56 @@ class KernelScene:
     Not a dataclass: Dr.Jit would take its arrays for variables of the loop.
     """
 
-    def __init__(
-        self,
-        *,
-        surfaces: Any,
-        everything: Any,
-        table: SurfaceTable,
-        emitters: EmitterTable,
-        cone: EmissionCone,
-        num_surfaces: int,
-        max_depth: int,
-        rr_depth: int,
-        guide: GuideTable | None = None,
-        sky: SkyTable | None = None,
-    ) -> None:
-        """Combine the tables.
+    def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int) -> None:
+        """Load a scene.
 
         Args:
-            surfaces: mi.Scene without emitters: what camera rays meet.
-            everything: mi.Scene with emitters: what all other rays meet.
-            table: geometry and materials of all triangles.
-            emitters: the emitting ones.
-            cone: the directions in which light paths leave them.
-            num_surfaces: the first triangle number that emits.
+            scene: the scene.
             max_depth: longest path in edges.
             rr_depth: edges after which a path goes on by Russian roulette.
-            guide: the directions in which camera paths look for light; None: by the BRDF alone.
-            sky: the environment map; None compiles a kernel without one.
+
+        Raises:
+            Rejected: "unlit_scene" where nothing lights it.
         """
-        self.surfaces = surfaces
-        self.everything = everything
-        self.table = table
-        self.emitters = emitters
-        self.cone = cone
-        self.guide = guide
-        self.sky = sky
+        surfaces, emitters = split_triangles(scene)
+        order = np.concatenate([surfaces, emitters])
+        sky = shining_sky(scene)
+        self.surfaces = load_triangles(scene, surfaces)
+        """mi.Scene without emitters: what camera rays meet."""
+        self.everything = load_triangles(scene, order, child=self.surfaces)
+        """mi.Scene with emitters: what all other rays meet."""
+        self.table = surface_table(scene, order)
+        self.emitters = EmitterTable(scene, emitters, may_be_dark=sky is not None)
+        self.cone = EmissionCone(scene)
+        self.guide: GuideTable | None = None
+        """The directions in which camera paths look for light; None: by the BRDF alone."""
+        self.sky = None if sky is None else SkyTable(sky, sky_share(scene, sky))
+        """The environment map; None compiles a kernel without one."""
         self.albedo = AlbedoLookup()
-        self.num_surfaces = dr.opaque(mi.UInt32, num_surfaces)
+        self.num_surfaces = dr.opaque(mi.UInt32, len(surfaces))
+        """The first triangle number that emits."""
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
 
     def to_pick_pdf(self, pdf: Any) -> Any:
         """Return a density among lamps (Float) as a density among lamps and sky."""
         return pdf if self.sky is None else self.sky.of_lamps(pdf)
+
+
+def load_triangles(scene: Scene, triangles: NDArray[np.intp], child: Any = None) -> Any:
+    """Return a mi.Scene of one mesh, whose triangle numbers are positions in `triangles`.
+
+    One kernel may trace rays into this scene and into `child`. On a GPU all rays of a
+    kernel use one OptiX shader binding table, and miss whatever is in another table. A scene that
+    has another scene as a child shares its table.
+    """
+    mesh = mi.Mesh("triangles", len(scene.vertex_positions), len(triangles))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = own_floats(scene.vertex_positions)
+    parameters["faces"] = own_integers(scene.faces[triangles])
+    parameters.update()
+    children = {"mesh": mesh} if child is None else {"mesh": mesh, "beside": child}
+    return mi.load_dict({"type": "scene", **children})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -122,11 +135,29 @@ def vertex_at(
     )
 
 
+class Hit:
+    """What rays meet. Not a dataclass: Dr.Jit would take it for variables of the loop."""
+
+    def __init__(self, hit: Any) -> None:
+        self.is_valid = hit.is_valid()
+        """Bool."""
+        self.distance = mi.Float(hit.t)
+        self.triangle = mi.UInt32(hit.prim_index)
+        self.barycentric = mi.Point2f(hit.prim_uv)
+        """Weights of the 2nd and 3rd corner."""
+
+
 def off_surface(point: SurfacePoint, direction: Any) -> Any:
     """Return the start (Point3f) of a ray that leaves the surface on the side of `direction`."""
     offset = (1 + dr.max(dr.abs(point.position))) * _OFFSET
     side = dr.mulsign(mi.Float(offset), dr.dot(point.geometric_normal, direction))
     return mi.Point3f(point.position + point.geometric_normal * side)
+
+
+def next_hit(scene: KernelScene, point: SurfacePoint, direction: Any, active: Any) -> Hit:
+    """Return what a ray meets that leaves a surface in a unit direction (Vector3f)."""
+    ray = mi.Ray3f(off_surface(point, direction), direction)
+    return Hit(scene.everything.ray_intersect_preliminary(ray, active=active))
 
 
 def roulette(
@@ -150,3 +181,74 @@ def roulette(
     active &= ~plays | (u < survival)
     throughput = dr.select(plays & active, throughput / survival, throughput)
     return throughput, active & (dr.max(throughput) > 0)
+
+
+class KernelParts:
+    """The sums into which a kernel puts light: direct or indirect, diffuse or specular.
+
+    Which sums there are is decided when a kernel is traced, so that a kernel which keeps all light
+    together is the one that it would be without this class. A path has its samples whatever is
+    asked: the sums add up to the picture that is rendered without parts, but for roundings.
+    Not a dataclass: Dr.Jit would take it for variables of the loop.
+    """
+
+    def __init__(self, *, bounces: bool, lobes: bool) -> None:
+        """Choose the sums, as `storage.records.parts.part_names`."""
+        self._bounces = bounces
+        self._lobes = lobes
+        self.count = max(1, len(part_names(bounces=bounces, lobes=lobes)))
+        """Number of sums."""
+        self.num_lobes = 2 if lobes else 1
+        """Number of sums of light that is indirect all of it."""
+
+    def dark(self) -> list[Any]:
+        """Return sums without light (Color3f)."""
+        return [mi.Color3f(0) for _ in range(self.count)]
+
+    def first_share(self) -> Any:
+        """Return the value of `carry_share` for a path that has hit no surface."""
+        return mi.Color3f(0) if self._lobes else None
+
+    def share(self, vertex: Vertex, local: Any) -> Any:
+        """Return the share (Color3f) of the diffuse lobe in the light that a vertex reflects.
+
+        It is None where lobes are not apart.
+
+        Args:
+            vertex: as the camera path sees it.
+            local: Vector3f, the direction from which the light comes, in the frame.
+        """
+        if not self._lobes:
+            return None
+        return ggx.diffuse_share(vertex.lobes, vertex.incoming, local, vertex.geometric)
+
+    def carry_share(self, vertex: Vertex, local: Any, depth: Any, before: Any) -> Any:
+        """Return the `share` of the first vertex of a path, which has `depth` (UInt32) by now."""
+        if not self._lobes:
+            return None
+        return dr.select(depth == 1, self.share(vertex, local), before)
+
+    def add(self, sums: list[Any], value: Any, depth: Any, share: Any) -> list[Any]:
+        """Return the sums with light (Color3f) of paths of `depth` vertices on surfaces."""
+        values = self.by_lobe(value, share)
+        if self._bounces:
+            direct = depth == 1
+            values = [
+                dr.select(direct == is_direct, part, 0)
+                for part in values
+                for is_direct in (True, False)
+            ]
+        return [total + part for total, part in zip(sums, values, strict=True)]
+
+    def by_lobe(self, value: Any, share: Any) -> list[Any]:
+        """Return light (Color3f) as one, or what the diffuse and the specular lobe have of it."""
+        if not self._lobes:
+            return [value]
+        diffuse = value * share
+        return [diffuse, value - diffuse]
+
+    def of_indirect(self, values: list[Any]) -> list[Any]:
+        """Return the sums of light which is indirect all of it, from those of `by_lobe`."""
+        if not self._bounces:
+            return values
+        return [part for value in values for part in (mi.Color3f(0), value)]

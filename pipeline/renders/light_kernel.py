@@ -40,22 +40,24 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from pipeline.renders import ggx
+from pipeline.renders.device_memory import read_back
 from pipeline.renders.emitter_table import EmitterPoint
-from pipeline.renders.film import Film
-from pipeline.renders.guide_table import GuideTable
-from pipeline.renders.kernel_parts import KernelParts
+from pipeline.renders.film import Film, Splats
+from pipeline.renders.guide_table import GuideCells, GuideTable, Photons, bin_of, rough_share
 from pipeline.renders.kernel_scene import (
     MAX_MIS_RATIO,
     SMALLEST_COSINE,
+    KernelParts,
     KernelScene,
     Vertex,
+    next_hit,
     off_surface,
     roulette,
     vertex_at,
 )
-from pipeline.renders.splats import Splats
 from pipeline.renders.surface_table import SurfacePoint
 
 
@@ -82,20 +84,15 @@ def trace_light(
         sampler: mi.Sampler with a lane for each path.
         splats: the sum of each lobe, or of both.
     """
-    direction = scene.cone.sample(emitter.position, emitter.normal, u_direction)
-    leaving = scene.cone.pdf(emitter.position, emitter.normal, direction)
-    cosine = dr.abs(dr.dot(emitter.normal, direction))
+    start, direction, leaving, inverse_pdf = _leave_emitter(scene, emitter, u_direction)
     active = mi.Bool((leaving > 0) & (dr.max(emitter.radiance) > 0))
-    hit_mis_ratio = mi.Float(cosine / (emitter.area_pdf * leaving))
+    hit_mis_ratio = mi.Float(inverse_pdf)
     strength = dr.max(emitter.radiance) * hit_mis_ratio
     throughput = mi.Color3f(emitter.radiance / dr.max(emitter.radiance))
-    start = SurfacePoint(position=emitter.position, geometric_normal=emitter.normal)
-    ray = mi.Ray3f(off_surface(start, direction), direction)
-    hit = scene.everything.ray_intersect_preliminary(ray, active=active)
-    active &= hit.is_valid()
-    triangle = mi.UInt32(hit.prim_index)
-    barycentric = mi.Point2f(hit.prim_uv)
-    pick_mis_ratio = mi.Float(scene.to_pick_pdf(dr.square(hit.t) / leaving))
+    first = next_hit(scene, start, direction, active)
+    active &= first.is_valid
+    triangle, barycentric = first.triangle, first.barycentric
+    pick_mis_ratio = mi.Float(scene.to_pick_pdf(dr.square(first.distance) / leaving))
     depth = mi.UInt32(1)
     while active:
         point = scene.table.point(triangle, barycentric, active)
@@ -121,11 +118,20 @@ def trace_light(
         pick_mis_ratio = dr.minimum(pick_mis_ratio * onwards * ratio, MAX_MIS_RATIO)
         throughput, active = roulette(scene, throughput, depth, sampler.next_1d(active), active)
         direction = mi.Vector3f(vertex.frame.to_world(local))
-        ray = mi.Ray3f(off_surface(point, direction), direction)
-        hit = scene.everything.ray_intersect_preliminary(ray, active=active)
-        active &= hit.is_valid()
-        triangle = mi.UInt32(hit.prim_index)
-        barycentric = mi.Point2f(hit.prim_uv)
+        hit = next_hit(scene, point, direction, active)
+        active &= hit.is_valid
+        triangle, barycentric = hit.triangle, hit.barycentric
+
+
+def _leave_emitter(
+    scene: KernelScene, emitter: EmitterPoint, u: Any
+) -> tuple[SurfacePoint, Any, Any, Any]:
+    """Return where paths start, their directions, the density of these, and C+ / (a e)."""
+    direction = scene.cone.sample(emitter.position, emitter.normal, u)
+    leaving = scene.cone.pdf(emitter.position, emitter.normal, direction)
+    cosine = dr.abs(dr.dot(emitter.normal, direction))
+    start = SurfacePoint(position=emitter.position, geometric_normal=emitter.normal)
+    return start, direction, leaving, cosine / (emitter.area_pdf * leaving)
 
 
 def _add(splats: Sequence[Splats], values: list[Any], pixel: Any, active: Any) -> None:
@@ -213,3 +219,88 @@ def _flip_to_viewer(
     lobes = ggx.seen_from(vertex.lobes, wi, albedo)
     front = vertex.front ^ (side < 0)
     return replace(vertex, lobes=lobes, incoming=wi, geometric=geometric, front=front), wo
+
+
+_SLOTS = 6
+"""Vertices of a path that are recorded at most."""
+
+_NARROW = 1.0
+"""Least density (per steradian) of a bounce whose arrival is recorded: thrice that of a cosine."""
+
+_LEAST_ROUGH = 0.2
+"""Least share of a surface's lobes that may be guided, for an arrival to be recorded."""
+
+
+class PhotonRecords:
+    """Arrivals of each lane. Not a dataclass: Dr.Jit would take its arrays for loop variables."""
+
+    def __init__(self, count: int) -> None:
+        """Begin with none, for `count` paths."""
+        self._first = dr.arange(mi.UInt32, count) * _SLOTS
+        self._cells = dr.zeros(mi.UInt32, count * _SLOTS)
+        self._bins = dr.zeros(mi.UInt32, count * _SLOTS)
+        self._powers = dr.zeros(mi.Float, count * _SLOTS)
+
+    def add(self, slot: Any, cell: Any, index: Any, power: Any, active: Any) -> None:
+        """Record an arrival of each lane in a cell, from the direction of a bin (UInt32)."""
+        active = active & (slot < _SLOTS)
+        place = self._first + slot
+        dr.scatter(self._cells, cell, place, active)
+        dr.scatter(self._bins, index, place, active)
+        dr.scatter(self._powers, power, place, active)
+
+    def photons(self) -> Photons:
+        """Return all that was recorded, path by path."""
+        powers = read_back(self._powers).astype(np.float64)
+        rows = np.flatnonzero((powers > 0) & np.isfinite(powers))
+        cell, number = (read_back(v)[rows].astype(np.int64) for v in (self._cells, self._bins))
+        return Photons(cell=cell, bin=number, power=powers[rows])
+
+
+@dr.syntax
+def trace_photons(
+    scene: KernelScene,
+    cells: GuideCells,
+    emitter: EmitterPoint,
+    u_direction: Any,
+    sampler: Any,
+    records: PhotonRecords,
+) -> None:
+    """Record where light arrives by way of narrow lobes; see `trace_light` for shared arguments.
+
+    Path guiding learns from it (pipeline.renders.guide_table). Arrivals straight from an emitter
+    are not recorded, because the path tracer picks emitters, nor those by way of wide lobes,
+    because a BRDF sample finds such light.
+    """
+    start, direction, leaving, inverse_pdf = _leave_emitter(scene, emitter, u_direction)
+    active = mi.Bool((leaving > 0) & (dr.max(emitter.radiance) > 0))
+    strength = dr.max(emitter.radiance) * inverse_pdf
+    throughput = mi.Color3f(emitter.radiance / dr.max(emitter.radiance))
+    first = next_hit(scene, start, direction, active)
+    active &= first.is_valid
+    triangle, barycentric = first.triangle, first.barycentric
+    depth = mi.UInt32(1)
+    drawn = mi.Float(0)
+    while active:
+        point = scene.table.point(triangle, barycentric, active)
+        vertex = vertex_at(scene, point, triangle, barycentric, direction, active)
+        cell = cells.index(triangle, barycentric, vertex.front, active)
+        index, _ = bin_of(-direction)
+        reflects = dr.max(vertex.lobes.diffuse + vertex.lobes.specular) > 0
+        arrives = active & (drawn > _NARROW) & (rough_share(vertex.lobes) > _LEAST_ROUGH) & reflects
+        power = dr.mean(throughput) * strength
+        records.add(depth - 2, cell, index, power, arrives)
+        spread = dr.maximum(dr.dot(vertex.geometric, vertex.incoming), SMALLEST_COSINE)
+        throughput /= spread
+        depth += 1
+        active &= depth < scene.max_depth
+        u_lobe = sampler.next_1d(active)
+        u_local = sampler.next_2d(active)
+        local, reflected, _, ratio = bounce(scene, vertex, u_lobe, u_local, active)
+        throughput *= reflected * ratio
+        throughput, active = roulette(scene, throughput, depth, sampler.next_1d(active), active)
+        drawn = dr.abs(dr.dot(vertex.geometric, local)) / ratio
+        direction = mi.Vector3f(vertex.frame.to_world(local))
+        hit = next_hit(scene, point, direction, active)
+        active &= hit.is_valid
+        triangle, barycentric = hit.triangle, hit.barycentric

@@ -12,7 +12,7 @@ from its table (pipeline.renders.guide_table), which makes another kernel. So do
 map (pipeline.renders.sky_table): picks go to it in a stated share, and what meets nothing finds it.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -21,17 +21,18 @@ import mitsuba as mi
 from pipeline.renders import ggx
 from pipeline.renders.film import Film
 from pipeline.renders.guide_table import Guidance
-from pipeline.renders.kernel_parts import KernelParts
 from pipeline.renders.kernel_scene import (
     MAX_MIS_RATIO,
     SMALLEST_COSINE,
+    Hit,
+    KernelParts,
     KernelScene,
     Vertex,
+    next_hit,
     off_surface,
     roulette,
     vertex_at,
 )
-from pipeline.renders.picked_light import picked_light
 from pipeline.renders.surface_table import SurfacePoint
 
 
@@ -50,10 +51,9 @@ def trace(
         sampler: mi.Sampler with a lane for each ray.
         ray: Ray3f from `film`.
     """
-    hit = scene.surfaces.ray_intersect_preliminary(ray, coherent=True)
-    active = mi.Bool(hit.is_valid())
-    distance, triangle, barycentric = _unpack_hit(hit)
-    origin = mi.Point3f(ray.o)
+    first = Hit(scene.surfaces.ray_intersect_preliminary(ray, coherent=True))
+    active = mi.Bool(first.is_valid)
+    distance, triangle, barycentric = first.distance, first.triangle, first.barycentric
     direction = mi.Vector3f(ray.d)
     radiance = _background(scene, parts, direction, active)
     throughput = mi.Color3f(1)
@@ -93,18 +93,12 @@ def trace(
         u_end = sampler.next_1d(active)
         throughput, active = roulette(scene, throughput, depth, u_end, active, guided)
         direction = mi.Vector3f(vertex.frame.to_world(local))
-        origin = off_surface(point, direction)
-        hit = scene.everything.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
+        hit = next_hit(scene, point, direction, active)
         lit = _sky_emission(scene, direction, pdf, throughput, active, hit)
         radiance = radiance if lit is None else parts.add(radiance, lit, depth, share)
-        active &= hit.is_valid()
-        distance, triangle, barycentric = _unpack_hit(hit)
+        active &= hit.is_valid
+        distance, triangle, barycentric = hit.distance, hit.triangle, hit.barycentric
     return radiance
-
-
-def _unpack_hit(hit: Any) -> tuple[Any, Any, Any]:
-    """Return distance (Float), triangle (UInt32) and barycentric weights (Point2f) of a hit."""
-    return mi.Float(hit.t), mi.UInt32(hit.prim_index), mi.Point2f(hit.prim_uv)
 
 
 def _vertex_from_viewer(
@@ -150,12 +144,12 @@ def _background(scene: KernelScene, parts: KernelParts, direction: Any, is_hit: 
 
 
 def _sky_emission(
-    scene: KernelScene, direction: Any, pdf: Any, throughput: Any, active: Any, hit: Any
+    scene: KernelScene, direction: Any, pdf: Any, throughput: Any, active: Any, hit: Hit
 ) -> Any:
     """Return the sky's light where a sampled direction hits nothing; None without a sky."""
     if scene.sky is None:
         return None
-    free = active & ~hit.is_valid()
+    free = active & ~hit.is_valid
     radiance, picks = scene.sky.radiance_and_density(direction, free)
     return throughput * dr.select(free, radiance / (1 + dr.square(picks / pdf)), 0)
 
@@ -238,3 +232,78 @@ def _direct_light(
     lit = useful & ~scene.everything.ray_test(shadow_ray, active=useful)
     weighed = reflected * pick.radiance / (pick.pdf * (1 + other_ratios_sq))
     return dr.select(lit, weighed, 0), local
+
+
+_SHORTENING = 1e-4
+"""Relative length that a shadow ray stops short of its emitter, so that it does not hit it."""
+
+_LEAST_SHARE = 1e-30
+"""Smallest fraction of picks that go to lamps, so that nothing divides by 0."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PickedLight:
+    """One sampled point or direction of light, lane by lane."""
+
+    direction: Any
+    """Unit direction from the path's vertex, Vector3f."""
+    pdf: Any
+    """Float, per steradian; not finite where no light can come from there."""
+    radiance: Any
+    """Radiance of the lamp or the sky, Color3f."""
+    leaving: Any
+    """Float: density per steradian, of a light path in the unit of picks, to leave towards the
+    vertex; 0 of the sky, from which no light paths come."""
+    distance_sq: Any
+    """Squared distance to the point on the lamp, Float; 1 for the sky."""
+    position: Any
+    """Point on the lamp, Point3f; means nothing for the sky."""
+    is_sky: Any = None
+    """Bool; None where there is no sky."""
+
+    def shadow_ray(self, start: Any) -> Any:
+        """Return the ray whose hits are the occluders of the light."""
+        remaining = self.position - start
+        length = dr.norm(remaining)
+        ray = mi.Ray3f(start, mi.Vector3f(remaining / length))
+        ray.maxt = length * (1 - _SHORTENING)
+        if self.is_sky is not None:
+            ray.d = dr.select(self.is_sky, self.direction, ray.d)
+            ray.maxt = dr.select(self.is_sky, dr.largest(mi.Float), ray.maxt)
+        return ray
+
+
+def picked_light(scene: KernelScene, position: Any, u: Any, active: Any) -> PickedLight:
+    """Return a pick for a vertex at a position (Point3f), from a uniform Point2f."""
+    if scene.sky is None:
+        return _of_lamps(scene, position, u, active)
+    is_sky, u_sky, u_lamp = scene.sky.split_picks(u)
+    lamp = _of_lamps(scene, position, u_lamp, active & ~is_sky)
+    sky = scene.sky.sample(u_sky, active & is_sky)
+    # A light path leaves a lamp with its density among lamps; picks have only their share of it.
+    leaving = lamp.leaving / dr.maximum(scene.to_pick_pdf(mi.Float(1)), _LEAST_SHARE)
+    return replace(
+        lamp,
+        direction=mi.Vector3f(dr.select(is_sky, sky.direction, lamp.direction)),
+        pdf=dr.select(is_sky, sky.pdf, scene.to_pick_pdf(lamp.pdf)),
+        radiance=mi.Color3f(dr.select(is_sky, sky.radiance, lamp.radiance)),
+        leaving=dr.select(is_sky, 0, leaving),
+        distance_sq=dr.select(is_sky, 1, lamp.distance_sq),
+        is_sky=is_sky,
+    )
+
+
+def _of_lamps(scene: KernelScene, position: Any, u: Any, active: Any) -> PickedLight:
+    emitter = scene.emitters.sample(u, active)
+    to_emitter = emitter.position - position
+    distance_sq = dr.squared_norm(to_emitter)
+    direction = to_emitter * dr.rsqrt(distance_sq)
+    cosine = dr.abs(dr.dot(emitter.normal, direction))
+    return PickedLight(
+        direction=direction,
+        pdf=emitter.area_pdf * distance_sq / cosine,
+        radiance=emitter.radiance,
+        leaving=scene.cone.pdf(emitter.position, emitter.normal, -direction),
+        distance_sq=distance_sq,
+        position=emitter.position,
+    )

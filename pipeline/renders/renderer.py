@@ -13,6 +13,7 @@ picture is their sum; with `split` direct and indirect light are kept apart, and
 Mitsuba is imported inside functions only: `activate` must come first.
 """
 
+import time
 from collections.abc import Generator, Iterator
 from typing import Any
 
@@ -21,10 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoiser import set_denoiser_threads
-from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans, HostPictures
+from pipeline.renders.frozen_arithmetic.host_pictures import HostPictures
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import MeasuredFloor
-from pipeline.renders.results import GrowingPicture, RenderedView, UsedTime, run_to_end
+from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.stopping import Floors, Goal, expected_spp, gaps_db, next_spp
@@ -73,18 +74,22 @@ class SceneRenderer:
         require_surfaces(scene)
         self._settings = settings
         self._shows_looks = shows_looks
-        self._used = UsedTime()
+        self._began_s = 0.0
         self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
         if settings.part_names:
             self._tracer = self._tracer.split_lights(
                 bounces=settings.split, lobes=settings.split_lobes
             )
         self._tracers = [self._tracer]
+        self._arithmetic: Any = HostPictures
+        if settings.arithmetic == "device":
+            from pipeline.renders.device_pictures import DevicePictures  # imports mitsuba
+
+            self._arithmetic = DevicePictures
         self._sees_sky = scene.environment is not None and scene.environment.is_seen
         if settings.per_light:
-            _refuse_sky(scene)
             most = MAX_PICTURES // max(1, len(settings.part_names))
-            self._tracers = _tracer_of_each_light(self._tracer, scene, most)
+            self._tracers = _tracers_of_lights(self._tracer, scene, most)
 
     @property
     def tracer(self) -> Tracer:
@@ -112,7 +117,7 @@ class SceneRenderer:
     ) -> Iterator[Sampling | RenderedView]:
         """Do what `render_view` does: yield after each pass of one half, and last the picture."""
         settings = self._settings
-        self._used = UsedTime()
+        self._began_s = time.process_time()
         pose = np.asarray(c2w, np.float64)
         camera = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
         settled = settings.first_spp
@@ -125,7 +130,7 @@ class SceneRenderer:
         self._refuse_black(samples)
         for _ in samples.passes_to(settled):
             yield Sampling(spp=samples.spp, expected_spp=settled, missing_db=None)
-        pictures = self._pictures(samples, camera)
+        pictures: ViewPictures = self._arithmetic(samples, self._tracer, camera, settings)
         if not self._sees_sky:
             samples.count_over(pictures.visible)
         look = yield from self._sample_until_targets(samples, pictures)
@@ -138,18 +143,11 @@ class SceneRenderer:
             noise_floor_linear_db=floor.linear_db,
             object_noise_floor_db=floor.object_log_db,
             at_cap=bool(gaps_db(settings.targets_db, _by_metric(floor))),
-            core_s=self._used.core_s(),
+            core_s=time.process_time() - self._began_s,
             hits=pictures.hits,
             part_floors=look.part_floors or None,
             **stored,
         )
-
-    def _pictures(self, samples: DualBuffer, camera: PixelCamera) -> ViewPictures:
-        if self._settings.arithmetic == "numpy":
-            return HostPictures(samples, self._tracer, camera, self._settings)
-        from pipeline.renders.device_pictures import DevicePictures  # imports mitsuba
-
-        return DevicePictures(samples, self._tracer, camera, self._settings)
 
     def _to_stored(self, pictures: NDArray[np.float32]) -> dict[str, Any]:
         """Return the pictures of a view by their fields: the sum of what is apart, as stored."""
@@ -157,7 +155,8 @@ class SceneRenderer:
         names = self._settings.part_names
         if not (per_light or names):
             return {"radiance_rgb": representable(pictures[0])}
-        parts = _by_part(rounded_to_half(representable(pictures)), max(1, len(names)))
+        rounded = rounded_to_half(representable(pictures))  # all parts of one light together
+        parts = rounded.reshape(-1, max(1, len(names)), *pictures.shape[1:]).swapaxes(0, 1)
         lights = sum_of_lights(parts)
         named = zip(names, parts if per_light else parts[:, 0], strict=False)
         return {
@@ -167,13 +166,7 @@ class SceneRenderer:
         }
 
     def _refuse_black(self, samples: DualBuffer) -> None:
-        if self._settings.arithmetic == "numpy":
-            mean = float(HostMeans(samples).mean().sum(axis=0).mean(dtype=np.float64))
-        else:
-            from pipeline.renders.device_pictures import mean_radiance  # imports mitsuba
-
-            mean = mean_radiance(samples)
-        bound = self._settings.min_mean_radiance
+        mean, bound = self._arithmetic.mean_radiance(samples), self._settings.min_mean_radiance
         if mean < bound:
             raise Rejected("black_view", f"mean radiance {mean:.2g} is below {bound:.2g}")
 
@@ -224,10 +217,10 @@ class SceneRenderer:
         expected_spp: int,
         missing_db: float,
     ) -> GrowingPicture:
-        before_s = self._used.core_s()
+        looked_s = time.process_time()
         picture = self._to_stored(pictures.finish())["radiance_rgb"]
-        core_s = self._used.core_s()
-        self._used.leave_out(core_s - before_s)
+        core_s = time.process_time() - self._began_s
+        self._began_s += time.process_time() - looked_s  # the view takes no time by being shown
         return GrowingPicture(
             spp=samples.spp,
             expected_spp=expected_spp,
@@ -250,24 +243,16 @@ def _by_metric(floor: MeasuredFloor) -> Floors:
     }
 
 
-def _by_part(pictures_rgb: NDArray[np.float32], count: int) -> NDArray[np.float32]:
-    """Return pictures [L * count, R, R, 3] of lights and parts by part, [count, L, R, R, 3]."""
-    return pictures_rgb.reshape(-1, count, *pictures_rgb.shape[1:]).swapaxes(0, 1)
-
-
-def _tracer_of_each_light(tracer: Tracer, scene: Scene, most: int) -> list[Tracer]:
-    rows = light_rows(scene)
-    if len(rows) > most:
-        raise Rejected("too_many_lights", f"{len(rows)} emitters apart; at most {most}")
-    return [tracer.only_light(row) for row in rows]
-
-
-def _refuse_sky(scene: Scene) -> None:
+def _tracers_of_lights(tracer: Tracer, scene: Scene, most: int) -> list[Tracer]:
     if scene.environment is not None:
         raise TrilightError(
             "render settings: per_light is True and an environment lights the scene; expected "
             "emitters alone, whose pictures add up to all light. Leave out --per-light."
         )
+    rows = light_rows(scene)
+    if len(rows) > most:
+        raise Rejected("too_many_lights", f"{len(rows)} emitters apart; at most {most}")
+    return [tracer.only_light(row) for row in rows]
 
 
 def require_surfaces(scene: Scene) -> None:

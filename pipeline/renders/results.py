@@ -1,6 +1,5 @@
 """Results of a renderer: progress, pictures that grow, and finished pictures."""
 
-import time
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -59,19 +58,6 @@ class GrowingPicture(Sampling):
     core_s: float
     """Core-seconds that a picture as good as this one takes, without the looks before it and
     without loading the scene."""
-
-
-class UsedTime:
-    """Core-seconds of this process since a view began, less what was left out."""
-
-    def __init__(self) -> None:
-        self._began_s = time.process_time()
-
-    def core_s(self) -> float:
-        return time.process_time() - self._began_s
-
-    def leave_out(self, core_s: float) -> None:
-        self._began_s += core_s
 
 
 def run_to_end(steps: Iterator[Sampling | Result]) -> Result:

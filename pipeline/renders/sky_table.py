@@ -14,11 +14,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.device_memory import own_floats
+from pipeline.renders.device_memory import opaque_vector, own_floats
+from pipeline.renders.emitter_table import ONE_MINUS_EPSILON, sample_alias
 from storage.records.environment import Environment
+from storage.records.material import EMISSION
+from storage.records.scene import Scene
 from storage.records.sky_texels import row_solid_angles, texel_means
 
-_ONE_MINUS_EPSILON = 0.99999994
 _TINY = 1e-30
 
 
@@ -54,7 +56,7 @@ class SkyTable:
         self._columns = own_floats(np.stack(alias_rows(flux), axis=-1))
         self._edges = own_floats(np.cos(np.pi * np.arange(height + 1) / height))
         self._height, self._width = (dr.opaque(mi.UInt32, side) for side in (height, width))
-        self._to_world = [_opaque_vector(sky.rotation[:, axis]) for axis in range(3)]
+        self._to_world = [opaque_vector(sky.rotation[:, axis]) for axis in range(3)]
         self._share = dr.opaque(mi.Float, share)
         self._rest = dr.opaque(mi.Float, 1 - share)
         self.is_seen = sky.is_seen
@@ -62,7 +64,7 @@ class SkyTable:
 
     def split_picks(self, u: Any) -> tuple[Any, Any, Any]:
         """Return which picks go to the map (Bool), and the uniform Point2f for map and lamp."""
-        last = _ONE_MINUS_EPSILON
+        last = ONE_MINUS_EPSILON
         to_sky = dr.minimum(u.x / self._share, last)
         to_lamp = dr.clip((u.x - self._share) / dr.maximum(self._rest, _TINY), 0, last)
         return u.x < self._share, mi.Point2f(to_sky, u.y), mi.Point2f(to_lamp, u.y)
@@ -73,10 +75,8 @@ class SkyTable:
 
     def sample(self, u: Any, active: Any) -> SkySample:
         """Return a direction drawn by the light of the map, from a uniform Point2f."""
-        row, down = self._sample_alias(self._rows, mi.UInt32(0), self._height, u.x, active)
-        column, along = self._sample_alias(
-            self._columns, row * self._width, self._width, u.y, active
-        )
+        row, down = sample_alias(self._rows, mi.UInt32(0), self._height, u.x, active)
+        column, along = sample_alias(self._columns, row * self._width, self._width, u.y, active)
         above = dr.gather(mi.Float, self._edges, row, active)
         below = dr.gather(mi.Float, self._edges, row + 1, active)
         z = above + (below - above) * down
@@ -118,19 +118,6 @@ class SkyTable:
         mean = dr.lerp(above, below, down)
         nearest = dr.select(down < 0.5, *(dr.select(along < 0.5, *row) for row in (upper, lower)))
         return mi.Color3f(mean.xyz), nearest.w * self._share
-
-    def _sample_alias(
-        self, table: Any, first: Any, count: Any, u: Any, active: Any
-    ) -> tuple[Any, Any]:
-        """Return an index below `count` drawn from a row of an alias table, and a fresh uniform."""
-        scaled = u * mi.Float(count)
-        place = dr.minimum(mi.UInt32(scaled), count - 1)
-        fraction = scaled - mi.Float(place)
-        keep, alias = dr.gather(mi.Vector2f, table, first + place, active)
-        keeps = fraction < keep
-        chosen = dr.select(keeps, place, mi.UInt32(alias))
-        fraction = dr.select(keeps, fraction / keep, (fraction - keep) / (1 - keep))
-        return chosen, dr.clip(fraction, 0, _ONE_MINUS_EPSILON)
 
 
 def alias_rows(weights: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
@@ -180,5 +167,49 @@ def _between(place: Any) -> tuple[Any, Any]:
     return mi.Int32(before), shifted - before
 
 
-def _opaque_vector(values: NDArray[np.float32]) -> Any:
-    return mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in values))
+def shining_sky(scene: Scene) -> Environment | None:
+    """Return the environment of a scene, or None where there is none, or one without any light."""
+    sky = scene.environment
+    return sky if sky is not None and sky.radiance_rgb.any() else None
+
+
+def sky_share(scene: Scene, sky: Environment) -> float:
+    """Return the share of the picks that go to the environment: above 0, and 1 without lamps.
+
+    Lamps weigh area x radiance. In that unit a map weighs 2 pi R^2 times its mean radiance, with R
+    the radius of the scene. But most of a smooth map is found by directions that the surface draws,
+    and samples that pick it are taken from the lamps: picked by its whole power, a bright constant
+    map had twice the error. So a map weighs what it has in peaks, its mean less its median, and at
+    least as much as the average lamp (study S29).
+    """
+    power = lamp_power(scene)
+    lamps = len(np.unique(scene.object_index[scene.triangle_emits]))
+    if not power > 0:
+        return 1.0
+    weight = max(2 * np.pi * surface_radius(scene) ** 2 * peaked_radiance(sky), power / lamps)
+    return float(weight / (weight + power))
+
+
+def lamp_power(scene: Scene) -> float:
+    """Return the sum over emitting triangles of area x mean radiance of the three channels."""
+    emits = scene.triangle_emits
+    corners = scene.vertex_positions[scene.faces[emits]].astype(np.float64)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    radiance = scene.materials[scene.material_index[emits]][:, EMISSION].astype(np.float64)
+    return float((0.5 * np.linalg.norm(normal, axis=1) * radiance.mean(axis=1)).sum())
+
+
+def surface_radius(scene: Scene) -> float:
+    """Return the radius of the sphere around the bounding box of all surfaces, emitters not."""
+    corners = scene.vertex_positions[scene.faces[~scene.triangle_emits]].reshape(-1, 3)
+    return float(0.5 * np.linalg.norm(np.ptp(corners.astype(np.float64), axis=0)))
+
+
+def peaked_radiance(sky: Environment) -> float:
+    """Return the mean radiance of a map over the sphere, less its median over the sphere."""
+    grey = sky.radiance_rgb.mean(axis=-1, dtype=np.float64)
+    weight = np.broadcast_to(row_solid_angles(len(grey))[:, None], grey.shape) / (4 * np.pi)
+    order = np.argsort(grey, axis=None, kind="stable")
+    below = np.cumsum(weight.ravel()[order])
+    median = grey.ravel()[order][min(np.searchsorted(below, 0.5), len(order) - 1)]
+    return max(0.0, float((grey * weight).sum() - median))

@@ -44,7 +44,7 @@ class TileChoice:
         """Begin with nothing seen.
 
         Args:
-            shown: [R, R] pixels that may have light at all.
+            visible: [R, R] pixels that may have light at all.
         """
         self._weight = tile_means(visible.astype(np.float64))
         self._seen: list[NDArray[np.int64]] = []

@@ -15,10 +15,12 @@ import contextlib
 import dataclasses
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -26,7 +28,6 @@ from typing import Any, Literal
 
 from pipeline.renders import probe_picture
 from pipeline.renders.denoiser import DenoiserDevice, set_denoiser_device
-from pipeline.renders.llvm_libraries import llvm_libraries
 from pipeline.renders.visible_gpus import gpu_identity, visible_gpus
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
@@ -107,7 +108,7 @@ def choose_variant(default: Device = "cpu", *, device: Device | None = None) -> 
     chosen = device or named_device() or default
     if chosen == "cpu" or (chosen == "auto" and not visible_gpus()):
         return _on_processor()
-    probed = _probe_gpu(retry_failed=chosen == "gpu")
+    probed = _remembered_probe(_GPU, _gpu_identity(), retry_failed=chosen == "gpu")
     if not probed.problem:
         note = (
             probed.denoiser_problem and f"{probed.denoiser_problem}, so the CPU denoises pictures"
@@ -122,34 +123,21 @@ def choose_variant(default: Device = "cpu", *, device: Device | None = None) -> 
     )
 
 
-def _probe_gpu(*, retry_failed: bool) -> "_ProbeResult":
-    """Return the result of a probe of the GPU, remembered or new.
-
-    Args:
-        retry_failed: whether a remembered problem is probed again: its cause may be fixed.
-    """
-    memory = cache_folder("gpu_probes.json")
-    identity = _gpu_identity()
-    known: dict[str, tuple[str, str, str]] = {}
-    with contextlib.suppress(TrilightError):  # damaged: probed again
-        for text in _read_memory(memory):
-            row = read_json(text, tuple[str, str, str], str(memory))
-            known[row[0]] = row
-    if last := known.pop(identity, None):
-        _, problem, denoiser_problem = last
-        if not (problem and retry_failed):
-            return _ProbeResult(problem=problem, denoiser_problem=denoiser_problem)
-    probed = _probe(_GPU)
-    known[identity] = (identity, probed.problem, probed.denoiser_problem)
-    _remember(memory, [json.dumps(row) for row in known.values()])
-    return probed
-
-
 def _on_processor() -> Variant:
     tried = []
     for library in llvm_libraries():
-        if _works(library):
-            return Variant(name="llvm_ad_rgb", libllvm=str(library), note="")
+        variant = Variant(name="llvm_ad_rgb", libllvm=str(library), note="")
+        identity = sha256_hex(canonical_json([_identity(library), probe_picture.TABLE]))
+        probed = _remembered_probe(variant, identity, retry_failed=True)
+        if probed.is_silent:
+            raise EnvironmentFailure(
+                f"{library}: the probe of this LLVM library gave {probed.problem}, at "
+                f"{len(_PROBE_S)} tries; expected a small picture within seconds. Run again when "
+                "the machine is less busy; if the library hangs, name another one by "
+                "DRJIT_LIBLLVM_PATH."
+            )
+        if not probed.problem:
+            return variant
         tried.append(library.name)
     reason = f"of {', '.join(tried)} none works with Mitsuba" if tried else "no LLVM library found"
     raise TrilightError(
@@ -177,42 +165,29 @@ def activate(variant: Variant) -> None:
     set_denoiser_device(variant.denoiser)
 
 
-def _works(library: Path) -> bool:
-    """Return whether Mitsuba renders with a library, from memory or by a probe.
+def _remembered_probe(variant: Variant, identity: str, *, retry_failed: bool) -> "_ProbeResult":
+    """Return the result of a probe of what has this identity, remembered or new.
 
-    Only success is remembered: the cause of a failure may have been mended since.
-
-    Raises:
-        EnvironmentFailure: the probe gave no answer.
+    Args:
+        variant: the variant to probe.
+        identity: a name that changes whenever its answer may.
+        retry_failed: whether a remembered problem is probed again: its cause may be fixed.
     """
-    memory = cache_folder("llvm_probes.json")
-    identity = sha256_hex(canonical_json([_identity(library), probe_picture.TABLE]))
-    known = _read_memory(memory)
-    if identity in known:
-        return True
-    probed = _probe(Variant(name="llvm_ad_rgb", libllvm=str(library), note=""))
-    if probed.is_silent:
-        raise EnvironmentFailure(
-            f"{library}: the probe of this LLVM library gave {probed.problem}, at {len(_PROBE_S)} "
-            "tries; expected a small picture within seconds. Run again when the machine is less "
-            "busy; if the library hangs, name another one by DRJIT_LIBLLVM_PATH."
-        )
-    if probed.problem:
-        return False
-    _remember(memory, [*known, identity])
-    return True
-
-
-def _remember(memory: Path, known: list[str]) -> None:
-    with contextlib.suppress(TrilightError):  # remembered next time, or probed again
-        write_atomically(memory, json.dumps(known[-_REMEMBERED_TRIES:]).encode())
-
-
-def _read_memory(memory: Path) -> list[str]:
-    try:
-        return read_json(memory.read_bytes(), list[str], str(memory))
-    except (OSError, TrilightError):
-        return []
+    memory = cache_folder("probes.json")
+    known: dict[str, tuple[str, str]] = {}
+    with contextlib.suppress(OSError, TrilightError):  # none yet, or damaged: probed again
+        known = read_json(memory.read_bytes(), dict[str, tuple[str, str]], str(memory))
+    if last := known.pop(identity, None):
+        problem, denoiser_problem = last
+        if not (problem and retry_failed):
+            return _ProbeResult(problem=problem, denoiser_problem=denoiser_problem)
+    probed = _probe(variant)
+    if not (probed.problem and retry_failed):
+        known[identity] = (probed.problem, probed.denoiser_problem)
+        newest = dict(list(known.items())[-_REMEMBERED_TRIES:])
+        with contextlib.suppress(TrilightError):  # remembered next time, or probed again
+            write_atomically(memory, json.dumps(newest).encode())
+    return probed
 
 
 def _identity(library: Path) -> str:
@@ -259,16 +234,7 @@ def _probe_within(variant: Variant, wall_s: float) -> _ProbeResult:
         if variant.libllvm:
             environment["DRJIT_LIBLLVM_PATH"] = variant.libllvm
         try:
-            result = subprocess.run(
-                [sys.executable, "-m", f"{__package__}.variant_probe", variant.name],
-                cwd=IMPORT_ROOT,
-                env=environment,
-                capture_output=True,
-                text=True,
-                errors="replace",
-                timeout=wall_s,
-                check=False,
-            )
+            result = run_module("variant_probe", variant.name, wall_s, environment)
         except subprocess.TimeoutExpired:
             return _ProbeResult(problem=f"no answer within {wall_s:g} s", is_silent=True)
     if _RAYS_LEFT_OUT in result.stderr:
@@ -277,3 +243,77 @@ def _probe_within(variant: Variant, wall_s: float) -> _ProbeResult:
         return _ProbeResult(denoiser_problem=result.stdout.strip())
     lines = result.stderr.strip().splitlines()
     return _ProbeResult(problem=lines[-1] if lines else f"it ended with status {result.returncode}")
+
+
+def run_module(
+    name: str, argument: str, wall_s: float, environment: Mapping[str, str]
+) -> subprocess.CompletedProcess[str]:
+    """Run a module of this package in a child; raises TimeoutExpired after so many seconds."""
+    return subprocess.run(
+        [sys.executable, "-m", f"{__package__}.{name}", argument],
+        cwd=IMPORT_ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=wall_s,
+        check=False,
+    )
+
+
+_FOLDERS = (
+    "/usr/lib/*-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib64/llvm*/lib64",
+    "/usr/lib/llvm-*/lib",
+    "/usr/local/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+    "/usr/local/opt/llvm*/lib",
+)
+_NAME = re.compile(r"libLLVM(?:-(\d+))?(?:\.so|\.dylib)?(?:\.(\d+))?[\d.]*(?:\.so|\.dylib)?[\d.]*$")
+_LDCONFIG_S = 20
+_WHEEL = "karellen-llvm-core"
+
+
+def llvm_libraries() -> list[Path]:
+    """Return what may be LLVM: DRJIT_LIBLLVM_PATH, the wheel's, the others by falling version.
+
+    Symbolic links are resolved, so that one library is named once.
+    """
+    named = os.environ.get("DRJIT_LIBLLVM_PATH")
+    candidates = {path.resolve() for path in (*_known_to_loader(), *_in_usual_folders())}
+    ordered = sorted(candidates, key=lambda path: (-_major_version(path), str(path)))
+    first = [Path(named).resolve()] if named else []
+    return [path for path in dict.fromkeys([*first, *_of_wheel(), *ordered]) if path.is_file()]
+
+
+def _of_wheel() -> list[Path]:
+    """Return the library of the wheel: with it, no picture depends on the distribution's LLVM."""
+    try:
+        members = metadata.files(_WHEEL) or []
+    except metadata.PackageNotFoundError:
+        return []
+    return [Path(str(file.locate())).resolve() for file in members if _NAME.match(file.name)]
+
+
+def _major_version(path: Path) -> int:
+    match = _NAME.match(path.name)
+    numbers = [int(group) for group in match.groups() if group] if match else []
+    return numbers[0] if numbers else 0
+
+
+def _known_to_loader() -> Iterable[Path]:
+    ldconfig = shutil.which("ldconfig") or shutil.which("ldconfig", path="/sbin:/usr/sbin")
+    if ldconfig is None:
+        return []
+    listing = subprocess.run(
+        [ldconfig, "-p"], capture_output=True, text=True, timeout=_LDCONFIG_S, check=False
+    ).stdout
+    return [Path(path) for path in re.findall(r"=> (\S*/libLLVM[-.]\S*)", listing)]
+
+
+def _in_usual_folders() -> Iterable[Path]:
+    for pattern in _FOLDERS:
+        for folder in Path("/").glob(pattern.lstrip("/")):
+            for name in ("libLLVM*.so*", "libLLVM*.dylib"):
+                yield from (path for path in folder.glob(name) if _NAME.match(path.name))

@@ -19,23 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.camera import PixelCamera
-from pipeline.renders.device_memory import own_floats, own_integers, read_back
-from pipeline.renders.emission_cone import EmissionCone
+from pipeline.renders.device_memory import own_integers, read_back
 from pipeline.renders.emitter_table import EmitterTable
-from pipeline.renders.film import Film
-from pipeline.renders.guide_cells import GuideCells
-from pipeline.renders.guide_learning import learn
-from pipeline.renders.guide_table import GuideTable
-from pipeline.renders.kernel_parts import KernelParts
-from pipeline.renders.kernel_scene import KernelScene
-from pipeline.renders.light_kernel import trace_light
+from pipeline.renders.film import Film, Splats, SplatUnit
+from pipeline.renders.guide_table import GuideCells, GuideTable, learn
+from pipeline.renders.kernel_scene import KernelParts, KernelScene
+from pipeline.renders.light_kernel import PhotonRecords, trace_light, trace_photons
 from pipeline.renders.path_kernel import trace
-from pipeline.renders.photon_kernel import PhotonRecords, trace_photons
 from pipeline.renders.recorded_calls import KernelInputs, record_launches
-from pipeline.renders.sky_share import shining_sky, sky_share
-from pipeline.renders.sky_table import SkyTable
-from pipeline.renders.splats import Splats, SplatUnit, splat_unit
-from pipeline.renders.textured_table import surface_table
 from pipeline.renders.tracer import Chosen, Features, split_triangles
 from storage.records.scene import Scene
 from storage.seeds import seed_for
@@ -59,35 +50,21 @@ class VectorTracer:
 
     def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int, scale: float = 1) -> None:
         """Load a scene that is `scale` times as large as cameras take it for."""
-        surfaces, emitters = split_triangles(scene)
-        order = np.concatenate([surfaces, emitters])
         self._record = scene
-        self._emitters = emitters
         self._scale = scale
-        seen = _load(scene, surfaces)
-        sky = shining_sky(scene)
-        self._scene = KernelScene(
-            surfaces=seen,
-            everything=_load(scene, order, child=seen),
-            table=surface_table(scene, order),
-            emitters=EmitterTable(scene, emitters, may_be_dark=sky is not None),
-            cone=EmissionCone(scene),
-            num_surfaces=len(surfaces),
-            max_depth=max_depth,
-            rr_depth=rr_depth,
-            sky=None if sky is None else SkyTable(sky, sky_share(scene, sky)),
-        )
+        self._scene = KernelScene(scene, max_depth=max_depth, rr_depth=rr_depth)
         for _ in range(2):  # which arrays of Mitsuba's are one is settled by the first replay
             _settle(KernelInputs(self._scene))
         self._parts = KernelParts(bounces=False, lobes=False)
-        self._unit = SplatUnit(splat_unit(scene))
+        self._unit = SplatUnit(scene)
         self._guide = functools.cache(functools.partial(_learn_guide, scene, self._scene))
 
     def only_light(self, row: int) -> "VectorTracer":
-        lit = self._record.object_index[self._emitters] == row
+        _, emitters = split_triangles(self._record)
+        lit = self._record.object_index[emitters] == row
         tracer = copy.copy(self)
         tracer._scene = copy.copy(self._scene)
-        tracer._scene.emitters = EmitterTable(self._record, self._emitters, lit)
+        tracer._scene.emitters = EmitterTable(self._record, emitters, lit)
         tracer._scene.sky = None
         return tracer
 
@@ -132,20 +109,16 @@ class VectorTracer:
         """What traces a pass."""
         return trace_pass
 
-    def _num_light_paths(self, camera: PixelCamera, spp: int) -> int:
-        """Return the light paths of a pass.
-
-        They are as many as for the whole picture, so that the weights of the strategies stay the
-        same; what lands in other pixels is dropped. In proportion to the chosen pixels they saved
-        10 to 25 % of the time and lost 0.7 to 1.0 dB in hard views.
-        """
-        return int(LIGHT_PATHS * camera.resolution**2 * spp)
-
     def _pass(
         self, camera: PixelCamera, film: Film, pixels: Any, seed: int, spp: int
     ) -> tuple[Any, ...]:
-        """Return the arguments of `_means` and `_sums` for a pass."""
-        count = self._num_light_paths(camera, spp)
+        """Return the arguments of `_means` and `_sums` for a pass.
+
+        Light paths are as many as for the whole picture, so that the weights of the strategies stay
+        the same; what lands in other pixels is dropped. In proportion to the chosen pixels they
+        saved 10 to 25 % of the time and lost 0.7 to 1.0 dB in hard views.
+        """
+        count = int(LIGHT_PATHS * camera.resolution**2 * spp)
         numbers = _PassNumbers(seed, self._light_paths * camera.resolution**2, count)
         inputs = KernelInputs(self._scene, film, self._parts, self._unit, numbers)
         return inputs, pixels, self._traced, camera.resolution, spp, count
@@ -339,22 +312,6 @@ def even_numbers(count: int, shifts: Sequence[Any]) -> list[Any]:
         mi.Float((lane * stride + shift) >> 8) * 2.0**-24
         for stride, shift in zip(strides, shifts, strict=True)
     ]
-
-
-def _load(scene: Scene, triangles: NDArray[np.intp], child: Any = None) -> Any:
-    """Return a mi.Scene of one mesh, whose triangle numbers are positions in `triangles`.
-
-    One kernel may trace rays into this scene and into `child`. On a GPU all rays of a
-    kernel use one OptiX shader binding table, and miss whatever is in another table. A scene that
-    has another scene as a child shares its table.
-    """
-    mesh = mi.Mesh("triangles", len(scene.vertex_positions), len(triangles))
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = own_floats(scene.vertex_positions)
-    parameters["faces"] = own_integers(scene.faces[triangles])
-    parameters.update()
-    children = {"mesh": mesh} if child is None else {"mesh": mesh, "beside": child}
-    return mi.load_dict({"type": "scene", **children})
 
 
 def _pixels(camera: PixelCamera, chosen: Chosen = None) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.noise_floor import MeasuredFloor
+from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered
 from storage.errors import Rejected
 
@@ -42,6 +43,10 @@ class ViewPictures(Protocol):
     """[R, R] true where `Tracer.hits` is."""
     visible: NDArray[np.bool_]
     """[R, R] pixels with a first surface, anywhere within the pixel; all of them if none has."""
+
+    @staticmethod
+    def mean_radiance(samples: DualBuffer) -> float:
+        """Return the mean radiance of all pixels so far; raises as `look`."""
 
     def look(self, quality: Filtered) -> MeasuredLook:
         """Return what is measured now, with halves denoised by a filter of this quality.

@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.scenes.budget import levels_within
-from pipeline.scenes.drawn_columns import with_drawn_columns
-from pipeline.scenes.fitting import draw_rows
+from pipeline.scenes.fitting import draw_rows, levels_within
 from pipeline.scenes.pieces import (
     ScenePiece,
     Skin,
@@ -20,13 +18,13 @@ from pipeline.scenes.pieces import (
     emitter_piece,
     object_piece,
     shell_piece,
+    with_drawn_columns,
 )
 from pipeline.scenes.pool import PooledAsset, fits_of
 from pipeline.scenes.posing import pose_points
 from pipeline.scenes.scene_checks import require_valid
 from pipeline.scenes.shapes import MeshShape
-from pipeline.scenes.source_emission import with_source_emission
-from pipeline.scenes.source_materials import source_skins
+from pipeline.scenes.source_materials import source_skins, with_source_emission
 from pipeline.scenes.subdivision import fill_triangles
 from pipeline.scenes.textured_pieces import with_drawn_textures
 from pipeline.scenes.views import with_first_cameras
@@ -74,8 +72,8 @@ def compose_scene(
     provenance = _provenance(settings, plan, scene_key)
     settings = settings.of_scene(scene_key.index)
     rng = scene_key.rng("scene")
-    chosen = _sample_objects(rng, settings, plan, pool)
-    budget = _object_budget(settings, plan)
+    budget = settings.max_triangles - plan.family.shell_triangles - plan.num_lights
+    chosen = [pool[row] for row in draw_rows(rng, fits_of(pool), plan.num_objects, budget)]
     levels = levels_within([entry.asset for entry in chosen], budget, settings.enough_error)
     shapes = [
         MeshShape(entry.locked.uid, level, settings.centring)
@@ -152,27 +150,13 @@ def _provenance(settings: SceneSettings, plan: ScenePlan, scene_key: SceneKey) -
     return origin
 
 
-def _sample_objects(
-    rng: np.random.Generator,
-    settings: SceneSettings,
-    plan: ScenePlan,
-    pool: Sequence[PooledAsset],
-) -> list[PooledAsset]:
-    budget = _object_budget(settings, plan)
-    return [pool[row] for row in draw_rows(rng, fits_of(pool), plan.num_objects, budget)]
-
-
-def _object_budget(settings: SceneSettings, plan: ScenePlan) -> int:
-    return settings.max_triangles - plan.family.shell_triangles - plan.num_lights
-
-
 def scene_pieces(
     layout: Layout,
     chosen: Sequence[PooledAsset],
     shapes: Sequence[MeshShape],
     settings: SceneSettings,
     rng: np.random.Generator,
-    skins: Sequence[Skin | None] | None = None,
+    skins: Sequence[Skin | None],
 ) -> list[ScenePiece]:
     """Return floor and walls, objects and emitters of a layout, the objects as `shapes`.
 
@@ -187,8 +171,7 @@ def scene_pieces(
     emitters = [emitter_piece(emitter, row) for row, emitter in enumerate(layout.emitters)]
     taken = [piece.entry.name for piece in [*shell, *emitters]]
     objects = []
-    looks = [None] * len(chosen) if skins is None else skins
-    for pooled, shape, placement, skin in zip(chosen, shapes, layout.objects, looks, strict=True):
+    for pooled, shape, placement, skin in zip(chosen, shapes, layout.objects, skins, strict=True):
         entry = _entry(pooled, taken)
         taken.append(entry.name)
         positions = pose_points(shape.points, placement.pose)

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from pipeline.scenes.posing import not_slivers, without_slivers
 from pipeline.scenes.shading import ShadedMesh, flat_shaded, smooth_shaded
 from scene_templates.layout import Emitter, ShellPart, SurfaceLook
-from storage.errors import Rejected
-from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
+from storage.errors import Rejected, TrilightError
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows, laid_out
 from storage.records.scene import SceneObject
 from storage.records.texture import CONSTANT, TEXTURED, Texture
+from storage.seeds import SceneKey
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -188,3 +189,33 @@ def _skins(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
 
 def _starts(counts: Sequence[int]) -> list[int]:
     return [sum(counts[:row]) for row in range(len(counts))]
+
+
+def with_drawn_columns(materials: NDArray[np.float32], scene_key: SceneKey) -> NDArray[np.float32]:
+    """Return the material rows of a scene with values for the columns that have a draw.
+
+    Each column has a random stream of its own, so that it changes no other draw of the scene. Rows
+    that emit keep the default.
+
+    Args:
+        materials: rows with all declared columns, which stay unchanged.
+        scene_key: seed, index and attempt of the scene.
+
+    Raises:
+        TrilightError: a draw returns another shape, or a value outside of its column's range.
+    """
+    drawn = materials.copy()
+    reflects = (materials[:, EMISSION] == 0).all(axis=1)
+    for column, part in laid_out():
+        if column.draw is None:
+            continue
+        rng = scene_key.rng(f"material column {column.name}")
+        values = np.asarray(column.draw(rng, int(reflects.sum())), np.float32)
+        shape = (int(reflects.sum()), column.width)
+        if values.shape != shape or not np.all(column.within.holds(values)):
+            raise TrilightError(
+                f"material column {column.name!r}: its draw returned shape {values.shape}; "
+                f"expected {shape}, with every number {column.within}."
+            )
+        drawn[reflects, part] = values
+    return drawn

@@ -9,8 +9,8 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scenes.drawn_columns import with_drawn_columns
-from pipeline.scenes.pieces import concatenate_pieces, emitter_piece
+from pipeline.scenes.pieces import concatenate_pieces, emitter_piece, with_drawn_columns
+from pipeline.scenes.scene_checks import object_boxes
 from scene_templates.lights import LightSettings, sample_emitters
 from scene_templates.materials import MaterialSettings, sample_material
 from scene_templates.templates import TEMPLATES
@@ -86,11 +86,11 @@ def with_new_lights(
     name = scene.provenance.get("template", "unknown")
     if name not in TEMPLATES:
         raise Rejected("no_layout", f"{name!r} is no layout that draws lights; keep its lights")
-    kinds = np.array([entry.kind for entry in scene.objects])
     lit = np.array([entry.is_lamp for entry in scene.objects])
     count = int(lit.sum()) if num_lights is None else num_lights
     rng = scene_key.rng("new lights")
-    emitters = sample_emitters(rng, settings, TEMPLATES[name].lights, count, _centres(scene, kinds))
+    centres = list(object_boxes(scene).sum(axis=1).astype(np.float64) / 2)
+    emitters = sample_emitters(rng, settings, TEMPLATES[name].lights, count, centres)
     lamps = [emitter_piece(emitter, row) for row, emitter in enumerate(emitters)]
     dark = _without(scene, lit)
     new = concatenate_pieces(lamps)
@@ -115,15 +115,6 @@ def with_new_lights(
         ),
         objects=(*dark.objects, *(lamp.entry for lamp in lamps)),
     )
-
-
-def _centres(scene: Scene, kinds: NDArray[np.str_]) -> list[NDArray[np.float64]]:
-    """Return the middle of each object's bounding box."""
-    centres = []
-    for row in np.flatnonzero(kinds == "object"):
-        points = scene.vertex_positions[scene.faces[scene.object_index == row].ravel()]
-        centres.append((points.min(axis=0) + points.max(axis=0)).astype(np.float64) / 2)
-    return centres
 
 
 def _without(scene: Scene, gone: NDArray[np.bool_]) -> Scene:

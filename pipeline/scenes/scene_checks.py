@@ -38,15 +38,19 @@ def require_valid(scene: Scene, settings: SceneSettings, *, in_budget: bool = Tr
 
 
 def _require_emitters_outside(scene: Scene, num_inside: int) -> None:
-    kinds = [entry.kind for entry in scene.objects]
-    boxes = [_box(scene, row) for row, kind in enumerate(kinds) if kind == "object"]
+    boxes = object_boxes(scene)
     lamps = [row for row, entry in enumerate(scene.objects) if entry.is_lamp]
     for row in lamps[num_inside:]:
         low, high = _box(scene, row)
-        for other_low, other_high in boxes:
-            if (low < other_high).all() and (other_low < high).all():
-                name = scene.objects[row].name
-                raise Rejected("emitter_inside", f"{name} reaches into the box of an object")
+        if ((low < boxes[:, 1]) & (boxes[:, 0] < high)).all(axis=1).any():
+            name = scene.objects[row].name
+            raise Rejected("emitter_inside", f"{name} reaches into the box of an object")
+
+
+def object_boxes(scene: Scene) -> NDArray[np.float32]:
+    """Return the bounding boxes [K, 2, 3] of objects, without shell and emitters."""
+    rows = [row for row, entry in enumerate(scene.objects) if entry.kind == "object"]
+    return np.array([_box(scene, row) for row in rows], np.float32).reshape(-1, 2, 3)
 
 
 def _box(scene: Scene, row: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

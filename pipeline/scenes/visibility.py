@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.scenes.scene_checks import object_boxes
 from storage.conventions import camera_rays, latlong_direction
 from storage.raycast.caster import MISS
 from storage.raycast.embree import MetSurfaces, Surfaces
@@ -52,7 +53,7 @@ class Visibility:
         self._surfaces = Surfaces(scene)
         self._lights = scene.vertex_positions[scene.faces[scene.triangle_emits]].mean(axis=1)
         self._sky = _sky_directions(scene)
-        self._boxes = _object_boxes(scene)
+        self._boxes = object_boxes(scene).astype(np.float64)
 
     def facts(self, c2w: NDArray[np.float32], fov_deg: float, grid: int) -> ViewFacts:
         """Measure one camera, c2w [4, 4], by the rays of a picture of `grid` x `grid` pixels."""
@@ -124,16 +125,6 @@ def _sky_directions(scene: Scene) -> NDArray[np.float32]:
     towards = latlong_direction(uv) @ sky.rotation.T.astype(np.float64)
     far = float(np.ptp(scene.vertex_positions, axis=0).max()) * 4
     return (towards * far).astype(np.float32)
-
-
-def _object_boxes(scene: Scene) -> NDArray[np.float64]:
-    """Return the bounding boxes [K, 2, 3] of objects, without shell and emitters."""
-    boxes = []
-    for row, entry in enumerate(scene.objects):
-        if entry.kind == "object":
-            points = scene.vertex_positions[scene.faces[scene.object_index == row].ravel()]
-            boxes.append([points.min(axis=0), points.max(axis=0)])
-    return np.array(boxes, np.float64).reshape(-1, 2, 3)
 
 
 def _distance_to_boxes(point: NDArray[np.float64], boxes: NDArray[np.float64]) -> float:

@@ -23,8 +23,17 @@ from tests.pipeline.renders.sampling import (
     exact,
     render_blocks,
 )
-from tests.pipeline.renders.scene_kit import Part, box, furnace, join, light, material, quad, sphere
-from tests.pipeline.renders.test_sky_paths import open_scene
+from tests.pipeline.renders.scene_kit import (
+    Part,
+    box,
+    furnace,
+    join,
+    light,
+    material,
+    open_scene,
+    quad,
+    sphere,
+)
 from tests.rigid_motion import moved
 from tests.sky_maps import COLOURS, POLES, constant, one_sun, six_poles, smooth
 

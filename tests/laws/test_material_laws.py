@@ -190,7 +190,7 @@ def mean_radiance(scene: Scene, tracer: Tracer, passes: int = 8, resolution: int
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("tracer", TRACERS)
 def test_a_white_mirror_returns_all_light(tracer: Any) -> None:
-    """Smooth and rough, head-on and grazing; test_kernel_lobes has the roughnesses between."""
+    """Smooth and rough, head-on and grazing; test_ggx has the roughnesses between."""
     for roughness, cosine in CASES:
         scene = plate(roughness, cosine)
         mean = mean_radiance(scene, tracer(scene, max_depth=2, rr_depth=5))

@@ -8,7 +8,7 @@ from storage.records.environment import Environment
 from storage.records.scene import Scene
 from tests.model.hits.kit import corner, direct, traced
 from tests.pipeline.renders.sampling import Estimate, assert_agree, render_blocks
-from tests.pipeline.renders.test_sky_paths import open_scene
+from tests.pipeline.renders.scene_kit import open_scene
 from tests.sky_maps import night, one_sun, smooth
 
 PASSES = 12

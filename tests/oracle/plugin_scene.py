@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.sky_share import lamp_power, shining_sky, sky_share
+from pipeline.renders.sky_table import lamp_power, shining_sky, sky_share
 from pipeline.renders.tracer import split_triangles
 from storage.errors import Rejected
 from storage.optics.bsdf import Lobes, bsdf_lobes

@@ -31,7 +31,7 @@ from infra.render.preview_table import (
 )
 from infra.render.quality import FixedSamples, TimeBudget
 from infra.setup.preview_table import NETWORK, WIDTHS, ladder, part_names, table_of
-from pipeline.renders.preview_parts import all_parts
+from pipeline.renders.preview import all_parts
 from pipeline.renders.settings import Filtered
 from pipeline.renders.variant import Variant
 from storage.errors import TrilightError

@@ -1,9 +1,9 @@
 """Every named build is complete, and is stored as it is; its numbers stand by their digests."""
 
 import json
-from typing import Any
+import types
+from typing import Any, cast
 
-import numpy as np
 import pytest
 
 from pipeline.builds.named import BUILDS, frozen_note, named_build, object_source
@@ -110,30 +110,15 @@ def test_sets_to_be_judged_by_have_objects_of_their_own() -> None:
 
 
 def test_a_frozen_set_says_whether_it_is_the_published_one() -> None:
-    named = BUILDS["benchmark-v1-mini"]
-    published = _statistics(num_scenes=20, scene_digest=str(named.scene_digest))
-    other = _statistics(num_scenes=20, scene_digest="0" * 64)
-    grown = _statistics(num_scenes=40, scene_digest="0" * 64)
-    assert "published 20 scenes" in frozen_note("benchmark-v1-mini", published)[0]
-    assert "cannot be compared" in frozen_note("benchmark-v1-mini", other)[0]
-    assert frozen_note("benchmark-v1-mini", grown) == frozen_note("smoke", other) == ()
+    published = BUILDS["benchmark-v1-mini"].scene_digest
 
+    def note(name: str, num_scenes: int, scene_digest: str | None) -> tuple[str, ...]:
+        found = types.SimpleNamespace(num_scenes=num_scenes, scene_digest=scene_digest)
+        return frozen_note(name, cast(Statistics, found))
 
-def _statistics(*, num_scenes: int, scene_digest: str) -> Statistics:
-    return Statistics(
-        num_scenes=num_scenes,
-        num_scenes_read=num_scenes,
-        scenes_by_split={},
-        scenes_by_template={},
-        scenes_by_excursion={},
-        scene_digest=scene_digest,
-        num_bytes=0,
-        spp=np.zeros(0, np.int64),
-        noise_floor_db=np.zeros(0),
-        noise_floor_linear_db=np.zeros(0),
-        object_noise_floor_db=np.zeros(0),
-        at_cap=np.zeros(0, np.bool_),
-    )
+    assert "published 20 scenes" in note("benchmark-v1-mini", 20, published)[0]
+    assert "cannot be compared" in note("benchmark-v1-mini", 20, "0" * 64)[0]
+    assert note("benchmark-v1-mini", 40, "0" * 64) == note("smoke", 20, "0" * 64) == ()
 
 
 OWN = {"scenes.materials.source": "object"}
@@ -142,17 +127,24 @@ OWN = {"scenes.materials.source": "object"}
 def test_one_word_asks_for_own_materials_and_their_numbers_count_in_the_digest() -> None:
     plain = named_build("smoke", changes=OWN)
     assert plain.mesh_settings.own_materials.keep
+    assert not plain.mesh_settings.own_materials.emission
     record = plain.as_json()
     assert record["assets"]["own_materials"]["keep"] is True
+    assert "emission" not in record["assets"]["own_materials"]
     assert record["scenes"]["materials"]["source"] == "object"
+    assert "own_emission" not in record["scenes"]["materials"]
     again = from_record(BuildSettings, record)
     assert again.digest == plain.digest and again.mesh_settings == plain.mesh_settings
     for name, value in (
         ("assets.own_materials.texels", 64),
         ("assets.own_materials.if_lost", "reject"),
         ("scenes.materials.own_share", 0.5),
+        ("scenes.materials.own_emission", 0.2),
     ):
-        assert named_build("smoke", changes={**OWN, name: value}).digest != plain.digest, name
+        other = named_build("smoke", changes={**OWN, name: value})
+        assert other.digest != plain.digest, name
+        # a share of light asks for what objects emit too
+        assert other.mesh_settings.own_materials.emission == name.endswith("own_emission")
 
 
 def test_a_build_that_draws_its_materials_says_nothing_of_them() -> None:
@@ -162,16 +154,5 @@ def test_a_build_that_draws_its_materials_says_nothing_of_them() -> None:
         assert not {"source", "own_share"} & set(record["scenes"]["materials"])
     smoke = named_build("smoke")
     assert smoke.mesh_settings == smoke.assets
-
-
-def test_a_share_of_light_asks_for_what_objects_emit_too() -> None:
-    plain = named_build("smoke", changes=OWN)
-    lit = named_build("smoke", changes={**OWN, "scenes.materials.own_emission": 0.2})
-    assert lit.mesh_settings.own_materials.emission and lit.digest != plain.digest
-    assert not plain.mesh_settings.own_materials.emission
-    assert "emission" not in plain.as_json()["assets"]["own_materials"]
-    assert "own_emission" not in plain.as_json()["scenes"]["materials"]
     drawn = named_build("smoke", changes={"scenes.materials.own_emission": 0.2})
-    assert (
-        drawn.digest == named_build("smoke").digest and not drawn.mesh_settings.own_materials.keep
-    )
+    assert drawn.digest == smoke.digest and not drawn.mesh_settings.own_materials.keep

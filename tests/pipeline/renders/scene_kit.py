@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from storage.conventions import look_at_c2w
 from storage.records.environment import Environment
+from storage.records.retextured import with_textures
 from storage.records.scene import ObjectKind, Scene, SceneObject
+from storage.records.texture import Texture
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -130,6 +132,64 @@ def join(
     )
     scene.check()
     return scene
+
+
+def furniture() -> list[Part]:
+    """Return things on a floor, nothing smoother than roughness 0.3: the noise has no long tail."""
+    s = 0.5
+    return [
+        quad(
+            [[-s, -s, -s], [s, -s, -s], [s, s, -s], [-s, s, -s]],
+            material(diffuse=[0.2, 0.5, 0.4], specular=0.4, roughness=0.4),
+        ),
+        quad(
+            [[-s, s, -s], [s, s, -s], [s, s, s], [-s, s, s]],
+            material(diffuse=[0.7, 0.3, 0.3], specular=0.2, roughness=0.9),
+        ),
+        sphere([-0.15, 0.1, -0.2], 0.25, material(diffuse=0.1, specular=0.8, roughness=0.3), 8),
+        box([0.25, -0.1, -0.3], 0.3, material(diffuse=[0.1, 0.2, 0.8], roughness=1.0), turn=0.4),
+    ]
+
+
+def open_scene(sky: Environment | None, num_lights: int = 2) -> Scene:
+    """Return the furniture below a sky and so many lamps."""
+    parts = furniture()
+    lamps = [[[0.2, -0.9, 0.9], [0.4, -0.9, 1.0], [0.2, -0.7, 0.8]],
+             [[-0.9, -0.5, 0.6], [-0.9, -0.3, 0.6], [-0.8, -0.4, 0.8]]]  # fmt: skip
+    parts += [light(lamp, [6.0, 8.0, 7.0], diffuse=1.0) for lamp in lamps[:num_lights]]
+    return join(parts, eye=(0.5, -1.7, 0.6), fov_deg=45, sky=sky)
+
+
+SKY_LAMP = light(np.array([[-1, -1, 3], [2, -1, 3], [0, 1, 2.5]]), 5.0)
+
+
+def textured_floor(row: NDArray[np.float64]) -> Part:
+    """Return a floor of 2 m, the part that `textured` puts its textures on."""
+    return quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], row)
+
+
+def textured(
+    parts: list[Part],
+    textures: tuple[Texture, ...],
+    of_floor: list[int],
+    scale: float = 1.0,
+    fov: float = 30,
+) -> Scene:
+    """Return parts, of which the first is textured; u and v go with x and y: 0 to 1 over it."""
+    scene = join(parts, eye=(0, -0.02, 4), fov_deg=fov)
+    index = np.full((len(parts), 3), -1, np.int32)
+    index[0] = of_floor
+    xy = scene.vertex_positions[scene.faces.ravel(), :2]
+    uv = (scale * (xy + 1) / 2).astype(np.float32)
+    found = with_textures(scene, uv, textures, index)
+    found.check()
+    return found
+
+
+def noise_map(seed: int, channels: int, low: float, high: float) -> Texture:
+    """Return a texture of 7 x 5 independent texels."""
+    drawn = np.random.default_rng(seed).uniform(low, high, (5, 7, channels))
+    return Texture(texels=drawn.astype(np.float32))
 
 
 def sampled_like_scene(rng: np.random.Generator, *, num_views: int = 4) -> Scene:

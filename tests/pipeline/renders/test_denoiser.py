@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from pipeline.renders import denoiser, variant_probe
 from pipeline.renders.denoise_corrections import LEAST_PASSES
 from pipeline.renders.denoiser import denoise, load_oidn, set_denoiser_device
-from pipeline.renders.frozen_arithmetic.denoise_corrections import (
+from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error
+from pipeline.renders.frozen_arithmetic.host_pictures import (
+    HostMeans,
     Pictures,
     keep_converged,
     keep_in_halves,
     with_mean_of,
 )
-from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error
-from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import RenderSettings
@@ -38,19 +38,14 @@ def _noisy_step() -> tuple[NDArray[np.float32], NDArray[np.float32], Features]:
     return clean, noisy, Features(albedo=albedo, normal=normal)
 
 
-def test_noise_goes_and_edges_stay() -> None:
+def test_noise_goes_edges_stay_and_what_has_no_light_stays_black() -> None:
+    """The filter alone would paint what it sees of the albedo."""
     clean, noisy, features = _noisy_step()
     for quality in ("high", "fast"):
         picture = denoise(noisy, features, quality)
         assert np.abs(picture - clean).mean() < 0.25 * np.abs(noisy - clean).mean()
-
-
-def test_what_has_no_light_stays_black_and_no_other_light_is_lost() -> None:
-    """The filter alone would paint what it sees of the albedo."""
-    _, noisy, features = _noisy_step()
-    for quality in ("high", "fast"):
+        np.testing.assert_array_equal(picture[:8], 0)
         np.testing.assert_array_equal(denoise(np.zeros_like(noisy), features, quality), 0)
-    np.testing.assert_array_equal(denoise(noisy, features, "high")[:8], 0)
     # a pixel is background only if neither features nor samples saw anything there
     nothing = Features(albedo=np.zeros_like(noisy), normal=np.zeros_like(noisy))
     assert (denoise(noisy, nothing, "high")[8:] > 0).all()
@@ -132,7 +127,6 @@ def test_the_card_is_used_where_it_is_chosen(put_in: Callable[[_Card], None]) ->
         ({"supported": True}, ""),
         ({"supported": False}, "Open Image Denoise does not support the graphics card"),
         ({"supported": True, "error": "no memory"}, "Open Image Denoise: no memory (on CUDA)"),
-        ({"supported": True, "brightens": 1.1}, "Open Image Denoise gives another picture"),
         ({"supported": True, "brightens": np.nan}, "Open Image Denoise gives another picture"),
     ],
 )
@@ -157,48 +151,33 @@ PIXELS = {
 
 def test_a_pixel_is_kept_where_it_stands_out_by_its_own_error() -> None:
     denoised = np.ones((4, 4, 3), np.float32)
-    for name, (raw, errors, kept) in PIXELS.items():
-        noisy = denoised.copy()
-        noisy[1, 2] = raw
-        standard_error = np.full((4, 4), abs(raw - 1) / errors)
-        (picture,) = keep_converged(denoised[None], noisy[None], standard_error)
-        np.testing.assert_array_equal(picture, noisy if kept else denoised, err_msg=name)
-
-
-def test_a_dark_pixel_beside_one_that_is_still_noisy_is_not_kept() -> None:
-    denoised = np.ones((4, 4, 3), np.float32)
-    raw = denoised.copy()
+    for name, (value, errors, kept) in PIXELS.items():
+        raw = denoised.copy()
+        raw[1, 2] = value
+        standard_error = np.full((4, 4), abs(value - 1) / errors)
+        (picture,) = keep_converged(denoised[None], raw[None], standard_error)
+        np.testing.assert_array_equal(picture, raw if kept else denoised, err_msg=name)
+    # a dark pixel beside one that is still noisy is not kept
     raw[1, 2] = 0.1
     standard_error = np.full((4, 4), 0.01)
-    np.testing.assert_array_equal(keep_converged(denoised[None], raw[None], standard_error)[0], raw)
     standard_error[2, 3] = 1.0  # a third of it, in the mean square of nine pixels, is 0.33
-    np.testing.assert_array_equal(
-        keep_converged(denoised[None], raw[None], standard_error)[0], denoised
-    )
+    (picture,) = keep_converged(denoised[None], raw[None], standard_error)
+    np.testing.assert_array_equal(picture, denoised)
 
 
-def test_the_mean_is_that_of_the_samples() -> None:
-    rng = np.random.default_rng(0)
-    raw, denoised = rng.uniform(size=(2, 8, 8, 3)).astype(np.float32)
-    denoised *= 0.9
-    scaled = with_mean_of(denoised, raw)
-    assert scaled.mean(dtype=np.float64) == pytest.approx(raw.mean(dtype=np.float64), rel=1e-6)
-    np.testing.assert_allclose(scaled / denoised, scaled[0, 0, 0] / denoised[0, 0, 0], rtol=1e-6)
-    black = np.zeros_like(raw)
-    np.testing.assert_array_equal(with_mean_of(black, black), 0)
-
-
-def test_what_glints_have_lost_goes_back_to_them() -> None:
+def test_the_mean_is_that_of_the_samples_and_glints_get_back_what_they_lost() -> None:
     """Unless their factor is far from 1: then one sample decided, and one factor is for all."""
-    denoised = np.ones((8, 8, 3), np.float32)
-    denoised[2, 3] = 100
-    raw = denoised.copy()
-    raw[2, 3] = 130
-    np.testing.assert_allclose(with_mean_of(denoised, raw), raw, rtol=1e-6)
-    raw[2, 3] = 200
-    scaled = with_mean_of(denoised, raw)
-    assert scaled.mean(dtype=np.float64) == pytest.approx(raw.mean(dtype=np.float64), rel=1e-6)
-    np.testing.assert_allclose(scaled / denoised, scaled[0, 0, 0], rtol=1e-6)
+    rng = np.random.default_rng(0)
+    noise, black = rng.uniform(size=(8, 8, 3)).astype(np.float32), np.zeros((8, 8, 3), np.float32)
+    np.testing.assert_array_equal(with_mean_of(black, black), 0)
+    glint, more, most = (np.ones((8, 8, 3), np.float32) for _ in range(3))
+    glint[2, 3], more[2, 3], most[2, 3] = 100, 130, 200
+    np.testing.assert_allclose(with_mean_of(glint, more), more, rtol=1e-6)
+    for denoised, raw in ((0.9 * noise, noise[::-1]), (glint, most)):
+        scaled = with_mean_of(denoised, raw)
+        assert scaled.mean(dtype=np.float64) == pytest.approx(raw.mean(dtype=np.float64), rel=1e-6)
+        factors = scaled / denoised
+        np.testing.assert_allclose(factors, factors[0, 0, 0], rtol=1e-6)
 
 
 def test_the_floor_of_a_kept_glint_is_its_noise() -> None:
@@ -226,24 +205,22 @@ def _floor_db(halves: Sequence[tuple[Pictures, Pictures]], hits: NDArray[np.bool
 def test_the_standard_error_is_that_between_passes() -> None:
     """The slow twin keeps every pass and takes the weighted variance of their mean."""
     scene = sampled_like_scene(np.random.default_rng(5), num_views=1)
-    tracer = load_tracer(scene, max_depth=4, rr_depth=2)
-    camera = camera_of(scene, 16)
+    tracer, camera = load_tracer(scene, max_depth=4, rr_depth=2), camera_of(scene, 16)
     asked: list[tuple[int, int]] = []
     samples = DualBuffer([tracer], camera, 3, first_spp=32, max_spp=256)
-    add = type(samples.sums[0][0]).add
+    for (total,) in samples.sums:
 
-    def remembered(part: object, *, seed: int, spp: int, chosen: Chosen = None) -> None:
-        asked.append((seed, spp))
-        add(part, seed=seed, spp=spp, chosen=chosen)  # type: ignore[arg-type]
+        def remembered(*, seed: int, spp: int, chosen: Chosen = None, add: Any = total.add) -> None:
+            asked.append((seed, spp))
+            add(seed=seed, spp=spp, chosen=chosen)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(type(samples.sums[0][0]), "add", remembered)
-        for _ in samples.passes_to(128):
-            pass
-        few = HostMeans(samples).standard_error()
-        assert few is not None and np.isinf(few).all(), "8 passes are too few"
-        for _ in samples.passes_to(256):
-            pass
+        total.add = remembered  # type: ignore[method-assign]
+    for _ in samples.passes_to(128):
+        pass
+    few = HostMeans(samples).standard_error()
+    assert few is not None and np.isinf(few).all(), "8 passes are too few"
+    for _ in samples.passes_to(256):
+        pass
     assert len(asked) == LEAST_PASSES
     greys = np.stack(
         [tracer.radiance(camera, seed=seed, spp=spp).mean(axis=-1) for seed, spp in asked]

@@ -48,39 +48,20 @@ def direction(cosine: float) -> Any:
 
 def test_the_lobe_returns_all_light_from_a_hundred_directions() -> None:
     """By its own samples: the mean of f cos / density, from the normal to a cosine of 1e-3."""
-    for roughness in (0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.85, 1.0):
-        off = _returned(roughness) - 1
-        # Measured: up to 0.37 %, of which the table has 0.25.
-        assert abs(off).max() < 0.005, roughness
-
-
-def _returned(roughness: float) -> NDArray:
-    """Return the share of light that comes back from each of a hundred directions."""
     side, cosines = 96, np.geomspace(1e-3, 1, 100)
     count = side * side
     lanes = np.repeat(cosines, count)
     wi = mi.Vector3f(mi.Float(np.sqrt(1 - lanes**2)), 0, mi.Float(lanes))
-    lobes = seen_at(kernel_lobes(specular=1.0, roughness=roughness), wi)
     middles = (np.arange(side) + 0.5) / side
     grid = [np.repeat(middles, side), np.tile(middles, side)]
     u = mi.Point2f(*(mi.Float(np.tile(axis, len(cosines))) for axis in grid))
-    wo = ggx.sample(lobes, wi, mi.Float(0), u)
-    reflected, pdf = ggx.evaluate_bsdf(lobes, wi, wo, mi.Vector3f(*UP))
-    returned = dr.block_sum(dr.select(pdf > 0, reflected.x / pdf, 0), count) / count
-    return np.array(returned)
-
-
-def test_no_mirror_reflects_to_below_the_triangle() -> None:
-    """Where the shading normal would let it: the diffuse lobe alone is left, exactly."""
-    lobes = kernel_lobes(diffuse=0.3, specular=0.6, roughness=0.8)
-    wi, wo = direction(0.5), mi.Vector3f(-0.8, 0.0, 0.6)
-    leaning = mi.Vector3f(0.8, 0.0, 0.6)
-    reflected, pdf = ggx.evaluate_bsdf(seen_at(lobes, wi), wi, wo, leaning)
-    assert float(reflected.x[0]) == pytest.approx(0.3 * 0.6 / np.pi, rel=1e-6)
-    free, same_pdf = ggx.evaluate_bsdf(seen_at(lobes, wi), wi, wo, mi.Vector3f(*UP))
-    assert float(free.x[0]) > 1.5 * float(reflected.x[0])
-    # It is still sampled, and what is sampled must be counted.
-    assert float(pdf[0]) == float(same_pdf[0])
+    for roughness in (0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.85, 1.0):
+        lobes = seen_at(kernel_lobes(specular=1.0, roughness=roughness), wi)
+        wo = ggx.sample(lobes, wi, mi.Float(0), u)
+        reflected, pdf = ggx.evaluate_bsdf(lobes, wi, wo, mi.Vector3f(*UP))
+        returned = dr.block_sum(dr.select(pdf > 0, reflected.x / pdf, 0), count) / count
+        # Measured: up to 0.37 %, of which the table has 0.25.
+        assert abs(np.array(returned) - 1).max() < 0.005, roughness
 
 
 def test_nothing_is_negative_and_nothing_is_nan() -> None:
@@ -129,23 +110,46 @@ def _unit(vectors: NDArray) -> NDArray:
     return unit
 
 
+def test_the_way_back_has_the_density_that_a_path_from_there_draws() -> None:
+    """On either side of a triangle that leans against the shading normal."""
+    rng = np.random.default_rng(3)
+    wi, wo, geometric = (
+        dr.normalize(mi.Vector3f(rng.normal(size=(3, 4000)) + up * np.array([[0], [0], [1]])))
+        for up in (0.5, 1.5, 1.0)
+    )
+    geometric *= dr.mulsign(mi.Float(1), dr.dot(geometric, wi))  # faces the viewer
+    turn = dr.mulsign(mi.Float(1), dr.dot(geometric, wo))
+    mirror = mi.Vector3f(1, 1, turn)
+    there, back = wo * mirror, wi * mirror
+    normal = geometric * mirror * turn
+    for roughness in (0.1, 0.5, 1.0):
+        lobes = kernel_lobes(diffuse=0.3, specular=0.5, roughness=roughness)
+        expected = ggx.evaluate_bsdf(seen_at(lobes, there), there, back, normal)[1]
+        found = ggx.reverse_pdf(seen_at(lobes, wi), wi, wo, geometric)
+        useful = np.array(ggx.evaluate_bsdf(seen_at(lobes, wi), wi, wo, geometric)[1]) > 0
+        sides = np.array(turn)[useful]
+        assert (sides > 0).sum() > 100 and (sides < 0).sum() > 100
+        # The same formula in another order, in float32.
+        np.testing.assert_allclose(np.array(found)[useful], np.array(expected)[useful], rtol=1e-4)
+
+
 SAMPLES = 300_000
+
+
 SIGNIFICANCE = 0.01
 """Chance that any of all cases is rejected although it is right; the seeds are fixed."""
+
 
 MIRRORS = [(0.01, 0.5), (0.03, 0.02), (0.03, 0.95), (0.1, 0.15), (0.3, 0.5), (1.0, 0.02),
            (1.0, 0.95)]  # fmt: skip
 """Roughness and cosine. Not 0.01 at 0.02: wi + wo is 0.04 long there, so that float32 rounds the
 half vector by 2 % of the lobe's width, and the histogram shows the rounding."""
 
+
 MIXTURES = [(0.5, 0.15), (0.7, 0.5), (1.0, 0.95)]
+
+
 CASES = len(MIRRORS) + len(MIXTURES)
-
-
-@pytest.fixture(autouse=True)
-def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Mitsuba writes what it rejects into the working folder."""
-    monkeypatch.chdir(tmp_path)
 
 
 class FacetDomain:
@@ -216,27 +220,18 @@ def _chi_square(
     return accepted
 
 
-@pytest.mark.parametrize(("roughness", "cosine"), MIRRORS)
-def test_visible_normals_follow_their_density(roughness: float, cosine: float) -> None:
-    lobes = kernel_lobes(specular=[0.9, 0.5, 0.2], roughness=roughness)
-    wi = direction(cosine)
-    domain = FacetDomain(wi, max(roughness**2, 1e-4))
-    assert _chi_square(lobes, wi, domain, domain.area)
-
-
-@pytest.mark.parametrize(("roughness", "cosine"), MIXTURES)
-def test_the_mixture_follows_its_density(roughness: float, cosine: float) -> None:
-    """With a shading normal that leans away from the triangle's, too."""
-    lobes = kernel_lobes(diffuse=[0.1, 0.4, 0.2], specular=0.5, roughness=roughness)
-    domain = mi.chi2.SphericalDomain()
-    leaning = (-0.6, 0.0, 0.8)
-    assert _chi_square(lobes, direction(cosine), domain, lambda _: 1.0, leaning)
-
-
-def test_the_test_notices_a_density_of_five_percent_more_roughness() -> None:
-    wi = direction(0.5)
-    domain = FacetDomain(wi, 0.09)
-    claimed = kernel_lobes(specular=0.5, roughness=0.3 * 1.05)
-    assert not _chi_square(
-        kernel_lobes(specular=0.5, roughness=0.3), wi, domain, domain.area, claimed=claimed
-    )
+def test_directions_follow_their_density(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Visible normals alone, and the mixture with a shading normal that leans away, too."""
+    monkeypatch.chdir(tmp_path)  # Mitsuba writes what it rejects into the working folder
+    for roughness, cosine in MIRRORS:
+        lobes, wi = kernel_lobes(specular=[0.9, 0.5, 0.2], roughness=roughness), direction(cosine)
+        domain = FacetDomain(wi, max(roughness**2, 1e-4))
+        assert _chi_square(lobes, wi, domain, domain.area), (roughness, cosine)
+    for roughness, cosine in MIXTURES:
+        lobes = kernel_lobes(diffuse=[0.1, 0.4, 0.2], specular=0.5, roughness=roughness)
+        sphere, leaning = mi.chi2.SphericalDomain(), (-0.6, 0.0, 0.8)
+        assert _chi_square(lobes, direction(cosine), sphere, lambda _: 1.0, leaning), roughness
+    # The test notices a density of five percent more roughness.
+    wi, claimed = direction(0.5), kernel_lobes(specular=0.5, roughness=0.3 * 1.05)
+    domain, lobes = FacetDomain(wi, 0.09), kernel_lobes(specular=0.5, roughness=0.3)
+    assert not _chi_square(lobes, wi, domain, domain.area, claimed=claimed)

@@ -1,4 +1,4 @@
-"""Path guiding: the density of its table, the same light as without, and the same bits."""
+"""Path guiding: the density of its table, and the same light as without."""
 
 from typing import Any
 
@@ -8,12 +8,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.renders import guide_learning, vector_tracer
-from pipeline.renders.guide_cells import GuideCells
-from pipeline.renders.guide_learning import Photons, apportion_entries, learn
-from pipeline.renders.guide_table import BINS, ENTRIES, SIDE, Guidance, GuideTable, bin_of
+from pipeline.renders import guide_table, vector_tracer
+from pipeline.renders.guide_table import (
+    BINS,
+    ENTRIES,
+    SIDE,
+    Guidance,
+    GuideCells,
+    GuideTable,
+    Photons,
+    apportion_entries,
+    bin_of,
+    learn,
+)
 from pipeline.renders.kernel_scene import KernelScene
-from pipeline.renders.renderer import SceneRenderer, set_threads
+from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.vector_tracer import VectorTracer
 from storage.records.scene import Scene
@@ -25,6 +34,7 @@ from tests.pipeline.renders.sampling import (
     render_passes,
 )
 from tests.pipeline.renders.scene_kit import join, light, material, quad
+from tests.sky_maps import smooth
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -39,44 +49,35 @@ def _guided(tracer: VectorTracer) -> VectorTracer:
     return guided
 
 
+def _below_a_sky() -> Scene:
+    """A mirror that throws a lamp's light and the sky's on a rough floor."""
+    floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], material(diffuse=0.8))
+    mirror = quad(
+        [[-1, 1, 0], [1, 1, 0], [1, 1, 1], [-1, 1, 1]], material(specular=1.0, roughness=0.05)
+    )
+    lamp = light([[0, -0.5, 1], [0.2, -0.5, 1], [0, -0.3, 1]], 10.0)
+    return join([floor, mirror, lamp], eye=(0, -2, 1.5), sky=smooth())
+
+
 @pytest.mark.usefixtures("unrecorded")
 @pytest.mark.parametrize(
     ("scene", "share"),
-    [(mirrors(), 0.95), (lit_by_a_mirror(0.1), 0.5)],
-    ids=["mirrors", "small lamp"],
+    [(mirrors(), 0.95), (lit_by_a_mirror(0.1), 0.5), (_below_a_sky(), 0.5)],
+    ids=["mirrors", "small lamp", "sky"],
 )
 def test_guided_pictures_show_the_same_light(
     scene: Scene, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However much is guided: the weights of all three strategies go by the mixture."""
+    """However much is guided: the weights of all three strategies go by the mixture.
+
+    Where light paths took the density of the BRDF alone for that of the camera paths, the mean of
+    the small lamp's scene was 23 % too high.
+    """
     monkeypatch.setattr("pipeline.renders.guide_table._SHARE", share)
     tracer = _tracer(scene)
     plain = render_passes(tracer, scene, passes=12)
     guided = render_passes(_guided(tracer), scene, passes=12, first_seed=700)
     assert_same_light(guided, plain)
-
-
-def _means(tracer: VectorTracer, scene: Scene, seeds: range) -> tuple[float, float]:
-    """Return the mean of pictures of 64 samples, and its standard error."""
-    pictures = (tracer.radiance(camera_of(scene, 32), seed=seed, spp=64) for seed in seeds)
-    means: NDArray[np.float64] = np.array([picture.mean(dtype=np.float64) for picture in pictures])
-    return float(means.mean()), float(means.std(ddof=1) / np.sqrt(len(means)))
-
-
-@pytest.mark.slow("statistics")
-def test_light_paths_know_how_camera_paths_are_guided() -> None:
-    """The mean of a scene that only a mirror lights, guided and not.
-
-    Where light paths took the density of the BRDF alone for that of the camera paths, the mean was
-    23 % too high. Four standard errors are passed once in 16,000 seeds, and the seeds are fixed.
-    """
-    scene = lit_by_a_mirror(0.1)
-    tracer = _tracer(scene)
-    plain, plain_error = _means(tracer, scene, range(150))
-    guided, guided_error = _means(_guided(tracer), scene, range(1000, 1150))
-    allowed = 4 * np.hypot(plain_error, guided_error)
-    assert allowed < 0.05 * plain, "a bias of 5 % would show"
-    assert abs(guided - plain) < allowed
 
 
 def test_guided_camera_paths_have_less_noise_where_a_mirror_is_the_lamp() -> None:
@@ -93,44 +94,12 @@ def test_guided_camera_paths_have_less_noise_where_a_mirror_is_the_lamp() -> Non
     assert guided < 0.8 * plain
 
 
-def test_a_guided_picture_has_the_same_bits_for_any_number_of_threads() -> None:
-    scene = mirrors(0.05)
-    pictures = []
-    for threads in (1, 2):
-        set_threads(threads)
-        pictures.append(_guided(_tracer(scene)).radiance(camera_of(scene, 32), seed=3, spp=16))
-    set_threads(0)
-    np.testing.assert_array_equal(pictures[0], pictures[1])
-
-
 def test_a_matt_scene_has_nothing_to_learn() -> None:
     scene = join([quad(FLOOR, material(diffuse=0.6)), light(LAMP, 30.0)], eye=(0, -2, 1))
     assert _tracer(scene).with_guide()._scene.guide is None
     nothing = np.zeros(0, np.int64)
     cells = GuideCells(np.random.default_rng(5).normal(size=(9, 3, 3)))
     assert learn(cells, Photons(cell=nothing, bin=nothing, power=np.zeros(0))) is None
-
-
-_ADAPTIVE = RenderSettings(
-    resolution=32, noise_floor_db=90.0, min_spp=32, max_spp=512, min_mean_radiance=0.0
-)
-
-
-@pytest.mark.slow("statistics")
-def test_adaptive_guided_views_keep_the_light() -> None:
-    """Guided where first samples were noisy, more samples where they were: and no light is lost.
-
-    The denoiser keeps the mean. Four standard errors: once in 16,000 seeds, which are fixed.
-    """
-    scene = lit_by_a_mirror(0.3)
-    renderer, camera = SceneRenderer(scene, _ADAPTIVE), camera_of(scene, 32)
-    views = [renderer.render_view(camera.c2w, camera.fov_deg, seed) for seed in range(24)]
-    means = np.array([view.radiance_rgb.mean(dtype=np.float64) for view in views])
-    error = means.std(ddof=1) / np.sqrt(len(means))
-    plain, plain_error = _means(_tracer(scene), scene, range(10_000, 10_100))
-    allowed = 4 * np.hypot(error, plain_error)
-    assert allowed < 0.02 * plain
-    assert abs(means.mean() - plain) < allowed
 
 
 def test_only_views_that_miss_their_floor_are_guided(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,11 +126,7 @@ def test_only_views_that_miss_their_floor_are_guided(monkeypatch: pytest.MonkeyP
         assert len(learnt) == times
 
 
-@pytest.mark.parametrize(
-    ("passes", "most"),
-    [(12, 0.04), pytest.param(40, 0.02, marks=pytest.mark.slow("statistics"))],
-)
-def test_lights_apart_share_a_table_and_add_up(passes: int, most: float) -> None:
+def test_lights_apart_share_a_table_and_add_up() -> None:
     """What was learnt of both lamps guides the paths of each: unbiased, as any table is."""
     lamps = [light(np.array(LAMP) - [1.8 * k, 0, 0.2 * k], 30.0 - 20 * k) for k in range(2)]
     parts = [quad(FLOOR, material(diffuse=0.6)), quad(WALL, material(specular=0.9, roughness=0.2))]
@@ -169,14 +134,11 @@ def test_lights_apart_share_a_table_and_add_up(passes: int, most: float) -> None
     tracer = _tracer(both)
     alone = [tracer.only_light(row).with_guide() for row in (2, 3)]
     assert alone[0]._scene.guide is alone[1]._scene.guide is _guided(tracer)._scene.guide
-    sums = [
-        _means(each, both, range(passes * k, passes * k + passes)) for k, each in enumerate(alone)
+    pictures = [
+        render_passes(each, both, passes=12, first_seed=12 * k) for k, each in enumerate(alone)
     ]
-    plain, error = _means(tracer, both, range(1000, 1000 + passes))
-    # Four standard errors: once in 16,000 seeds, which are fixed.
-    allowed = 4 * np.sqrt(sum(e**2 for _, e in sums) + error**2)
-    assert allowed < most * plain
-    assert abs(sum(mean for mean, _ in sums) - plain) < allowed
+    plain = render_passes(tracer, both, passes=12, first_seed=1000)
+    assert_same_light(np.sum(pictures, axis=0), plain)
 
 
 def _table(peaks: NDArray[np.int64]) -> Any:
@@ -243,12 +205,12 @@ def test_directions_are_drawn_by_the_density() -> None:
         assert abs(by_drawn.mean() - by_twin.mean()) < 5 * error
 
 
-@pytest.mark.parametrize("length", [0.0, np.nan, np.inf])
-def test_what_is_no_direction_still_has_a_bin(length: float) -> None:
+def test_what_is_no_direction_still_has_a_bin() -> None:
     """As an integer it is another one on each kind of processor: one read beyond the table, and
     crashed or not by where that ended in memory."""
-    for direction in ((length, 0, 0), (0, length, 0), (0, 0, -length), (length, length, length)):
-        assert int(np.array(bin_of(mi.Vector3f(*direction))[0])[0]) < 1024
+    for length in (0.0, np.nan, np.inf):
+        for direction in ((length, 0, 0), (0, length, 0), (0, 0, -length), (length,) * 3):
+            assert int(np.array(bin_of(mi.Vector3f(*direction))[0])[0]) < 1024
 
 
 def test_a_cell_that_learnt_nothing_is_not_guided() -> None:
@@ -263,18 +225,18 @@ def test_a_table_is_bounded_however_many_cells_have_photons(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """At most so many rows on each of 4 levels: a row takes as many photons as that needs."""
-    monkeypatch.setattr(guide_learning, "_MOST_ROWS", 200)
-    monkeypatch.setattr(guide_learning, "_LEAST_PHOTONS", 1)
+    monkeypatch.setattr(guide_table, "_MOST_ROWS", 200)
+    monkeypatch.setattr(guide_table, "_LEAST_PHOTONS", 1)
     rng = np.random.default_rng(3)
     far_apart = rng.uniform(0, 10, (2000, 1, 3)) + 0.3 * rng.normal(size=(2000, 3, 3))
     cells = GuideCells(far_apart)
     count = 100_001
-    photons = guide_learning.Photons(
+    photons = guide_table.Photons(
         cell=rng.integers(0, len(cells.facing), count),
         bin=rng.integers(0, BINS, count),
         power=rng.exponential(size=count),
     )
-    table = guide_learning.learn(cells, photons)
+    table = guide_table.learn(cells, photons)
     assert table is not None
     assert len(table._densities) <= (1 + 4 * 200) * BINS
 

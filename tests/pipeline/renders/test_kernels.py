@@ -1,24 +1,43 @@
-"""What is paid once: loading a scene, compiling a kernel. (Memory: tests/extremes.)"""
+"""What is paid once: loading, compiling, recording and reading back. (Memory: tests/extremes.)"""
 
 import dataclasses
-from collections.abc import Callable, Iterator
+import gc
+import itertools
+import weakref
+from collections.abc import Iterator
+from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pipeline.builds.named import named_build
 from pipeline.generation.render_sample import RenderInput, render_sample
 from pipeline.generation.view_progress import ViewProgress
-from pipeline.renders import vector_tracer
-from pipeline.renders.camera import PixelCamera
+from pipeline.renders import kernel_scene
+from pipeline.renders.device_memory import read_back
+from pipeline.renders.device_pictures import DevicePictures
+from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.recorded_calls import KernelInputs, record_launches
 from pipeline.renders.renderer import SceneRenderer
-from pipeline.renders.settings import RenderSettings
+from pipeline.renders.results import RenderedView
+from pipeline.renders.settings import Filtered, RenderSettings
+from pipeline.renders.tracer import Tracer
 from pipeline.renders.vector_tracer import VectorTracer
+from pipeline.renders.view_pictures import MeasuredLook
 from storage.records.scene import Scene
+from tests.for_each import for_each
 from tests.pipeline.renders.guided_scenes import lit_by_a_mirror, mirrors
-from tests.pipeline.renders.sampling import camera_of
+from tests.pipeline.renders.sampling import camera_of, render_view
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene, sphere
+from tests.pipeline.renders.test_renderer import lit_scene
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+PX = 32
+
 
 SETTINGS = RenderSettings(
     resolution=32, noise_floor_db=99.0, min_spp=8, max_spp=8, aux_spp=4, min_mean_radiance=0.0
@@ -44,6 +63,22 @@ def _launched() -> set[str]:
     """Return the hashes of the kernels launched since the last call, but for copies."""
     history = dr.kernel_history([dr.KernelType.JIT])
     return {entry["hash"] for entry in history if entry["operation_count"] > _COPY_OPERATIONS}
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The bytes of each array that is read back from the device."""
+    sizes = list[int]()
+    for way in ("__array__", "numpy"):
+        read = getattr(dr.ArrayBase, way)
+
+        def counted(array: Any, *rest: Any, _read: Any = read, **named: Any) -> Any:
+            values = _read(array, *rest, **named)
+            sizes.append(values.nbytes)
+            return values
+
+        monkeypatch.setattr(dr.ArrayBase, way, counted)
+    return sizes
 
 
 def _render(scene: Scene, settings: RenderSettings = SETTINGS) -> None:
@@ -88,37 +123,24 @@ def test_one_set_of_kernels_serves_every_scene_and_view() -> None:
 @pytest.mark.usefixtures("history")
 def test_guided_passes_have_one_more_set_of_kernels_for_every_scene() -> None:
     """That of a scene's table, of guided camera paths, and of the light paths that know of them."""
-    tracer, seen = _guided(mirrors(), max_depth=10)
-    tracer.radiance(seen, seed=0, spp=16)
-    first = _launched()
-    for depth, scene in enumerate((mirrors(0.05), lit_by_a_mirror(0.1))):
-        tracer, seen = _guided(scene, max_depth=10 + depth)
-        tracer.radiance(seen, seed=0, spp=16)
-    assert _launched() <= first
+    launched = []
+    for depth, scene in enumerate((mirrors(), mirrors(0.05), lit_by_a_mirror(0.1))):
+        tracer = VectorTracer(scene, max_depth=10 + depth, rr_depth=2).with_guide()
+        assert tracer._scene.guide is not None
+        tracer.radiance(camera_of(scene, PX), seed=0, spp=16)
+        launched.append(_launched())
+    assert launched[0] and launched[1] | launched[2] <= launched[0]
 
 
-def _guided(scene: Scene, *, max_depth: int) -> tuple[VectorTracer, PixelCamera]:
-    tracer = VectorTracer(scene, max_depth=max_depth, rr_depth=2).with_guide()
-    assert tracer._scene.guide is not None
-    return tracer, camera_of(scene, 32)
+def test_all_views_and_lights_share_one_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    loads = list[Scene]()
+    load = kernel_scene.load_triangles
 
+    def counted(scene: Scene, *rest: Any, **named: Any) -> Any:
+        loads.append(scene)
+        return load(scene, *rest, **named)
 
-@pytest.mark.usefixtures("history")
-def test_the_count_of_kernels_can_tell() -> None:
-    """A number that is part of the kernel, instead of data for it, makes another kernel."""
-    for step in (1, 2):
-        values = dr.arange(dr.llvm.Float, 77)
-        for power in range(10):
-            values = dr.fma(values, values, step + power)
-        dr.eval(values)
-    assert len(_launched()) == 2
-
-
-def test_all_views_and_lights_share_one_load(llvm: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    loads = list[str]()
-    load = vector_tracer._load
-
-    monkeypatch.setattr(vector_tracer, "_load", _counted("load", load, loads))
+    monkeypatch.setattr(kernel_scene, "load_triangles", counted)
     scene = sampled_like_scene(np.random.default_rng(3), num_views=2)
     scene = scene.with_provenance({"camera_attempts": [0] * 2})
     changes = {"renders.min_spp": 8, "renders.max_spp": 8, "renders.per_light": True}
@@ -131,22 +153,119 @@ def test_all_views_and_lights_share_one_load(llvm: None, monkeypatch: pytest.Mon
     assert len(loads) == 2  # what camera rays meet, and what all other rays meet
 
 
-def test_pictures_come_back_only_where_something_is_decided(
-    llvm: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pictures_come_back_only_where_something_is_decided(reads: list[int]) -> None:
     """A pass that is read back makes a graphics card wait for us, and us for it."""
-    reads = list[str]()
-    for way in ("__array__", "__dlpack__", "numpy"):
-        monkeypatch.setattr(dr.ArrayBase, way, _counted(way, getattr(dr.ArrayBase, way), reads))
     _render(_smallest(), dataclasses.replace(SETTINGS, min_spp=512, max_spp=512))
     # Both halves at the first look for black and at the floor, there with their squares; albedo,
     # normals and hits once.
-    assert reads == ["__array__"] * (2 + 2 + 3 + 2)
+    assert len(reads) == 2 + 2 + 3 + 2
 
 
-def _counted(way: str, read: Callable[..., object], reads: list[str]) -> Callable[..., object]:
-    def counted(*arguments: object, **named: object) -> object:
-        reads.append(way)
-        return read(*arguments, **named)
+ADAPTIVE = dataclasses.replace(SETTINGS, min_spp=32, max_spp=512, aux_spp=16)
+"""To 512 samples: 10 passes and more decide which pixels are kept, and tiles are chosen."""
 
-    return counted
+
+def test_little_is_read_back_by_device_arithmetic(
+    reads: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once at a look, and little; the picture once, and once what shows anything."""
+    num_looks, look = 0, DevicePictures.look
+
+    def counted_look(self: DevicePictures, quality: Filtered) -> MeasuredLook:
+        nonlocal num_looks
+        num_looks += 1
+        return look(self, quality)
+
+    monkeypatch.setattr(DevicePictures, "look", counted_look)
+    settings = dataclasses.replace(ADAPTIVE, resolution=64, max_spp=256, arithmetic="device")
+    render_view(sampled_like_scene(np.random.default_rng(5), num_views=1), settings)
+    picture_bytes = 4 * 3 * 64**2
+    small = [size for size in reads if size < picture_bytes / 4]
+    assert num_looks > 2
+    assert reads.count(picture_bytes) == 1 and len(reads) == len(small) + 1
+    # the mean of the first passes, what shows anything, and each look
+    assert len(small) == 2 + num_looks
+
+
+@for_each(
+    "changes",
+    [
+        {},
+        {"denoiser": "off", "max_spp": 256},
+        {"per_light": True, "max_spp": 256},
+        {"split": True, "split_lobes": True},
+        {"per_light": True, "split": True, "max_spp": 128},
+    ],
+)
+def test_device_arithmetic_gives_the_views_of_numpy_but_for_roundings(
+    changes: dict[str, Any],
+) -> None:
+    settings = dataclasses.replace(ADAPTIVE, **changes)
+    numpys = render_view(lit_scene(), settings, 3)
+    ours = render_view(lit_scene(), dataclasses.replace(settings, arithmetic="device"), 3)
+    assert (ours.spp, ours.at_cap) == (numpys.spp, numpys.at_cap)
+    np.testing.assert_array_equal(ours.hits, numpys.hits)
+    # float32 roundings, and those to half floats where pictures are apart: 2^-11 of each
+    tolerance = 2 * 2**-11 if changes.get("per_light") or changes.get("split") else 1e-5
+    np.testing.assert_allclose(ours.radiance_rgb, numpys.radiance_rgb, rtol=tolerance, atol=1e-6)
+    np.testing.assert_allclose(_floors_db(ours), _floors_db(numpys), rtol=0, atol=0.01)
+
+
+def _floors_db(view: RenderedView) -> list[float]:
+    of_picture = view.noise_floor_db, view.noise_floor_linear_db, view.object_noise_floor_db
+    parts = (view.part_floors or {}).values()
+    return [*of_picture, *(db for floor in parts for db in dataclasses.astuple(floor))]
+
+
+def _sums(tracer: Tracer, scene: Scene, first_seed: int) -> list[NDArray]:
+    """Return the sums of passes of other seeds, samples and pixels, some of them guided."""
+    assert isinstance(tracer, VectorTracer)
+    total, rng = tracer.pass_sum(camera_of(scene, PX)), np.random.default_rng(first_seed)
+    for number, (spp, fraction) in enumerate(itertools.product((4, 16, 64), (1, 0.5, 0.1))):
+        chosen = None if fraction == 1 else rng.random((PX, PX)) < fraction
+        if number == 6:
+            total.guide()
+        total.add(seed=first_seed + number, spp=spp, chosen=chosen)
+    return [read_back(sums) for sums in total.sums]
+
+
+def test_replayed_passes_are_traced_ones_in_every_bit() -> None:
+    """Whichever scene, camera, depth, seed and pixels a recording was made with."""
+    scenes = [mirrors(), lit_by_a_mirror(0.1), sampled_like_scene(np.random.default_rng(3))]
+
+    def sums() -> list[list[NDArray]]:
+        return [
+            _sums(load_tracer(scene, max_depth=5 + repeat, rr_depth=2), scene, 100 * repeat)
+            for repeat, scene in itertools.product(range(2), scenes)
+        ]
+
+    replayed = sums()
+    with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+        traced = sums()
+    for ours, theirs in zip(replayed, traced, strict=True):
+        for a, b in zip(ours, theirs, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_a_scene_that_was_recorded_is_not_kept() -> None:
+    scene = sampled_like_scene(np.random.default_rng(1))
+    tracer = load_tracer(scene, max_depth=4, rr_depth=2)
+    tracer.radiance(camera_of(scene, PX), seed=0, spp=4)
+    table = weakref.ref(vars(vars(tracer)["_scene"])["table"])
+    del tracer
+    assert table() is None
+
+
+def test_old_scenes_are_not_freed_while_a_call_is_recorded() -> None:
+    """Dr.Jit would end the process."""
+    old = load_tracer(mirrors(), max_depth=4, rr_depth=2)
+    vars(old)["itself"] = old
+    del old
+
+    def double(_: Any, values: Any) -> Any:
+        if gc.isenabled():
+            gc.collect()
+        return 2 * values
+
+    doubled = record_launches(double)(KernelInputs(), dr.opaque(mi.Float, 1, 3))
+    np.testing.assert_array_equal(doubled, 2)

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from infra.bench.workloads.blender_environment import installed_python, run_blender
 from infra.bench.workloads.cycles import render_with_cycles
-from pipeline.exchange.convert import convert_scene
-from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.usd.write import write_usd
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.settings import RenderSettings
@@ -29,7 +27,7 @@ from storage.records.passes.pictures import view_passes
 from storage.records.passes.stored import passes_exr
 from storage.records.scene import Scene
 from tests.pipeline.renders.sampling import block_means, camera_of, render_view
-from tests.pipeline.renders.scene_kit import box, furnace, join, light, material, quad, sphere
+from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
 from tests.pipeline.scenes.example_scenes import example_scene
 
 pytestmark = pytest.mark.slow("references")
@@ -127,26 +125,6 @@ def _cycles(scene: Scene, resolution: int, spp: int, bounces: int = 8) -> NDArra
 
 
 @pytest.mark.usefixtures("blender")
-@pytest.mark.parametrize(("diffuse", "specular", "roughness"), [(0.4, 0.6, 0.1), (0, 1, 1)])
-def test_a_white_ball_vanishes_in_uniform_light(
-    diffuse: float, specular: float, roughness: float
-) -> None:
-    """It reflects all that it receives, where it is smooth and where compensation does the most.
-
-    A rough one of specular colour below 1 would absorb what it scatters more than once.
-    """
-    row = material(diffuse=diffuse, specular=specular, roughness=roughness)
-    ball = sphere([0, 0, 0], 0.5, row, 48)
-    picture = _cycles(join([ball, furnace(2.0)], eye=(0, -2, 0), fov_deg=40), 32, 256)
-    inside = picture[12:20, 12:20].mean(axis=(0, 1))
-    # Cycles' tables of directional albedo are good to 0.1 %; single scattering would lose 63 % at
-    # roughness 1. 64 pixels of 256 samples leave 0.1 % of noise.
-    np.testing.assert_allclose(inside, 2.0, rtol=0.005)
-    # The corner looks past the ball at the light, which is hidden from the camera.
-    assert (picture[:2, :2] == 0).all()
-
-
-@pytest.mark.usefixtures("blender")
 def test_both_put_the_same_light_in_the_same_place() -> None:
     """Axes, field of view, colours, normals, units and both sides of an emitter, in one picture."""
     plate = quad([[-0.1, -0.9, 0.3], [0.4, -0.9, 0.3], [0.4, -0.5, 0.5], [-0.1, -0.5, 0.5]], GREY)
@@ -171,17 +149,6 @@ def test_both_put_the_same_light_in_the_same_place() -> None:
     # most where an edge of a shadow runs.
     assert np.median(difference) < 0.003
     assert difference.max() < 0.03
-
-
-@pytest.mark.usefixtures("blender")
-def test_stored_direct_light_comes_again(shared: Path) -> None:
-    scene = example_scene(shared, "cbox")
-    picture = _cycles(scene, 256, 64, bounces=0)
-    stored = decode_exr((shared / "cycles_reference" / "cbox.direct_raw.exr").read_bytes())
-    error = np.clip(block_means(picture, BLOCK), 0, 1) - np.clip(block_means(stored, BLOCK), 0, 1)
-    # Measured: 71.5 dB, and 80 with 512 samples: noise. Blender's usual pixel filter in place of
-    # the box gives 63.
-    assert -10 * np.log10(np.square(error).mean()) > 67.0
 
 
 DIRECT = RenderSettings(
@@ -216,19 +183,6 @@ def test_direct_light_is_that_of_cycles(
     # Half of the blocks agree to the rounding of half floats (5e-4) and what noise is left.
     lit = theirs > 0.02
     assert np.median(abs(ours - theirs)[lit] / theirs[lit]) < 0.001
-
-
-def test_what_was_converted_is_still_that_of_cycles(
-    shared: Path, tmp_path: Path, llvm: None
-) -> None:
-    """By the command's own way there and back; bound and measure as above, where no form is."""
-    source = scene_source(str(shared / "renderformer_scenes" / "cbox.json"))
-    target = tmp_path / "cbox.usdz"
-    convert_scene(source, target, budget=None, done=lambda finished, of: None)
-    ours = _clamped(
-        render_view(load_source(scene_source(str(target))).scene, DIRECT, 1).radiance_rgb
-    )
-    assert psnr_linear_db(ours, _clamped(_reference(shared, "cbox.direct_raw.exr"))) > 76
 
 
 @pytest.mark.parametrize(

@@ -10,17 +10,21 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 import pytest
 
-from infra.render.path_tracer import RenderChild
 from pipeline.generation.environment import environment
 from pipeline.renders import denoiser, variant_probe, vector_tracer
 from pipeline.renders import variant as variant_module
 from pipeline.renders.facts import render_facts
-from pipeline.renders.llvm_libraries import llvm_libraries
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
-from pipeline.renders.variant import Device, Variant, _ProbeResult, activate, choose_variant
+from pipeline.renders.variant import (
+    Device,
+    Variant,
+    _ProbeResult,
+    activate,
+    choose_variant,
+    llvm_libraries,
+)
 from pipeline.renders.variant_probe import BLOCK, probe_scene, wrong_picture
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.records.scene_file import encode_scene
@@ -30,11 +34,9 @@ from tests.oracle.kernel_bsdf import exact_twin
 from tests.pipeline.renders.sampling import (
     Estimate,
     assert_agree,
-    camera_of,
     printed_by,
     render_blocks,
 )
-from tests.pipeline.renders.test_stored_pictures import scenes
 from tests.scenes_by_hand import tiny_scene
 
 
@@ -55,7 +57,7 @@ def test_a_library_that_is_none_is_passed_over_and_success_is_remembered(
         patch.setenv("DRJIT_LIBLLVM_PATH", str(bogus))
         assert llvm_libraries()[0] == bogus
         assert choose_variant() == variant
-    memory = own_cache / "cache" / "llvm_probes.json"
+    memory = own_cache / "cache" / "probes.json"
     remembered = json.loads(memory.read_text())
     assert len(remembered) == 1  # what failed may work once its cause is mended
     with monkeypatch.context() as patch:
@@ -72,13 +74,12 @@ def _must_not_be_asked(variant: Variant) -> _ProbeResult:
 
 
 def test_where_no_library_works_it_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, own_cache: Path
 ) -> None:
-    library = tmp_path / "libLLVM-1.so"
+    library = own_cache / "libLLVM-1.so"
     library.touch()
     monkeypatch.setattr(variant_module, "llvm_libraries", lambda: [library])
     monkeypatch.setattr(variant_module, "_probe", lambda variant: _ProbeResult(problem="abort"))
-    monkeypatch.setattr(variant_module, "_read_memory", lambda memory: [])
     with pytest.raises(TrilightError, match=r"of libLLVM-1.so none works with Mitsuba; .*karellen"):
         choose_variant()
     monkeypatch.setattr(variant_module, "llvm_libraries", list)
@@ -86,6 +87,9 @@ def test_where_no_library_works_it_says_what_to_install(
         monkeypatch.setenv("TRILIGHT_VARIANT", asked)
         with pytest.raises(TrilightError, match="no LLVM library found; .*pip install karellen"):
             choose_variant()
+    monkeypatch.setenv("TRILIGHT_VARIANT", "metal")
+    with pytest.raises(TrilightError, match="'metal'; expected one of llvm_ad_rgb, cuda_ad_rgb"):
+        choose_variant()
 
 
 def test_commands_that_render_say_what_to_install(
@@ -105,9 +109,9 @@ def test_commands_that_render_say_what_to_install(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.safetensors"]
 
 
-@pytest.mark.parametrize("silent", [1, 2])
+@for_each("silent", [1, 2])
 def test_a_probe_without_an_answer_is_tried_again_and_leads_to_no_other_library(
-    monkeypatch: pytest.MonkeyPatch, silent: int
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, silent: int
 ) -> None:
     limits_s: list[float] = []
 
@@ -117,11 +121,11 @@ def test_a_probe_without_an_answer_is_tried_again_and_leads_to_no_other_library(
             raise subprocess.TimeoutExpired("probe", timeout)
         return subprocess.CompletedProcess([], 0, stdout="", stderr="")
 
-    libraries = [Path("/usr/lib/libLLVM-1.so"), Path("/usr/lib/libLLVM-2.so")]
+    libraries = [tmp_path / f"libLLVM-{number}.so" for number in (1, 2)]
+    for library in libraries:
+        library.touch()
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path))
     monkeypatch.setattr(variant_module, "llvm_libraries", lambda: libraries)
-    monkeypatch.setattr(variant_module, "_identity", str)
-    monkeypatch.setattr(variant_module, "_read_memory", lambda memory: [])
-    monkeypatch.setattr(variant_module, "write_atomically", lambda path, data: None)
     monkeypatch.setattr(variant_module.subprocess, "run", run)
     if silent == 1:
         assert choose_variant().libllvm == str(libraries[0])
@@ -129,23 +133,6 @@ def test_a_probe_without_an_answer_is_tried_again_and_leads_to_no_other_library(
         with pytest.raises(EnvironmentFailure, match=r"libLLVM-1.so: .* no answer within 360 s"):
             choose_variant()
     assert limits_s == [180, 360]
-
-
-def test_the_user_may_name_the_variant(monkeypatch: pytest.MonkeyPatch, variant: Variant) -> None:
-    monkeypatch.setenv("TRILIGHT_VARIANT", variant.name)
-    assert choose_variant().name == variant.name
-    monkeypatch.setenv("TRILIGHT_VARIANT", "metal")
-    with pytest.raises(TrilightError, match="'metal'; expected one of llvm_ad_rgb, cuda_ad_rgb"):
-        choose_variant()
-
-
-def test_a_gpu_is_used_only_after_a_probe(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # hides the GPUs of a machine that has some
-    with pytest.raises(
-        TrilightError, match=r"no right picture could be rendered with it here \(.+\)"
-    ):
-        choose_variant()
 
 
 CPU, GPU = "llvm_ad_rgb", "cuda_ad_rgb"
@@ -192,13 +179,6 @@ def test_an_option_names_the_device_before_the_variable_and_the_default(
     assert (variant.address_space(1) == 1) == (chosen == CPU)
 
 
-def test_children_on_a_gpu_may_map_what_cuda_reserves() -> None:
-    """CUDA maps the memory of GPU and machine: with 16 GiB of addresses it does not start."""
-    for variant in (variant_module._GPU, ON_CPU):
-        is_wide = RenderChild(variant, threads=1)._child._limits.memory_bytes > 16 << 30
-        assert is_wide == (variant.device == "gpu")
-
-
 def test_a_probe_of_a_gpu_is_remembered_for_its_driver(
     own_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -223,33 +203,47 @@ def test_a_probe_of_a_gpu_is_remembered_for_its_driver(
     assert len(probes) == 3
 
 
-def test_a_picture_without_some_of_its_rays_is_refused(
-    own_cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Dr.Jit warns of it once, while it compiles, and goes on."""
-    warning = "jit_eval(): more than one OptiX shader binding table. Disabling this ray tracing op"
-    monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
-    for said, refused in ((warning + "eration to avoid", True), ("another warning", False)):
-        ended = subprocess.CompletedProcess([], 0, stdout="", stderr=said)
-        monkeypatch.setattr(variant_module.subprocess, "run", lambda *_, ended=ended, **__: ended)
-        if refused:
-            with pytest.raises(TrilightError, match="Dr.Jit left out some of the rays"):
-                choose_variant()
-        else:
-            assert choose_variant().name == "cuda_ad_rgb"
+WARNING = "jit_eval(): more than one OptiX shader binding table. Disabling this ray tracing op"
 
 
-@pytest.mark.parametrize("problem", ["", "Open Image Denoise: out of memory (on CUDA)"])
-def test_pictures_are_denoised_on_the_gpu_or_it_is_said(
-    problem: str, own_cache: Path, monkeypatch: pytest.MonkeyPatch
+@for_each(
+    ("said", "printed", "refused", "note"),
+    [
+        ("", "", "", ""),
+        ("another warning", "", "", ""),
+        ("", "Open Image Denoise: out of memory (on CUDA)\n", "", "Open Image Denoise: out of"),
+        (WARNING + "eration to avoid", "", "Dr.Jit left out some of the rays", ""),
+    ],
+)
+def test_a_gpu_is_used_by_what_its_probe_says(
+    said: str,
+    printed: str,
+    refused: str,
+    note: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    ended = subprocess.CompletedProcess([], 0, stdout=problem + "\n", stderr="")
+    """Of rays that it leaves out Dr.Jit warns once, while it compiles, and goes on."""
+    ended = subprocess.CompletedProcess([], 0, stdout=printed, stderr=said)
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path))
     monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
     monkeypatch.setattr(variant_module.subprocess, "run", lambda *_, **__: ended)
+    if refused:
+        with pytest.raises(TrilightError, match=refused):
+            choose_variant()
+        return
     chosen = choose_variant()
-    assert chosen.denoiser == ("CPU" if problem else "CUDA")
-    assert bool(chosen.note) == bool(problem) and chosen.note.startswith(problem)
-    assert ("denoiser_device" in environment(chosen)) == (not problem)
+    assert chosen.denoiser == ("CPU" if printed else "CUDA")
+    assert bool(chosen.note) == bool(note) and chosen.note.startswith(note)
+    assert ("denoiser_device" in environment(chosen)) == (not printed)
+
+
+def test_a_gpu_is_used_only_after_a_probe(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # hides the GPUs of a machine that has some
+    refusal = r"no right picture could be rendered with it here \(.+\)"
+    with pytest.raises(TrilightError, match=refusal):
+        choose_variant()
 
 
 def test_a_process_denoises_where_its_variant_says(variant: Variant) -> None:
@@ -269,18 +263,15 @@ def test_asking_does_not_import_mitsuba_nor_the_denoiser_torch() -> None:
     assert printed_by(code) == "[]\nFalse"
 
 
-def test_facts_name_versions_device_and_threads(variant: Variant) -> None:
+def test_facts_name_versions_device_and_threads_as_far_as_there_is_time(
+    variant: Variant, monkeypatch: pytest.MonkeyPatch
+) -> None:
     facts = render_facts(variant)
     assert facts["variant"] == variant.name
     assert facts["denoiser_device"] == "CPU"
     assert int(facts["threads"]) >= 1
     assert {"mitsuba", "drjit", "pyoidn", "llvm", "denoiser"} <= facts.keys()
     assert float(facts["view_s"]) > 0
-
-
-def test_facts_without_an_answer_in_time_are_fewer(
-    variant: Variant, monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setattr("pipeline.renders.facts._ASK_S", 0.01)
     assert render_facts(variant).keys() == {"mitsuba", "drjit", "pyoidn", "variant", "llvm"}
 
@@ -345,26 +336,6 @@ def test_another_integrator_agrees_with_the_stored_picture(monkeypatch: pytest.M
     theirs = render_blocks(scene, resolution=4 * BLOCK, block=BLOCK, passes=256, tracer=twin)
     # The twins of an emitter stand 1e-4 off, which moves direct light by about as much.
     assert_agree(theirs, Estimate(mean=MEAN_RGB, error=DEVIATION_RGB / 32), slack=1e-3)
-
-
-@pytest.mark.parametrize("name", sorted(scenes()))
-def test_scenes_that_share_a_table_give_the_bits_of_scenes_apart(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene = scenes()[name]
-    pictures = [_picture_of(scene)]
-    load = vector_tracer._load
-    monkeypatch.setattr(
-        vector_tracer, "_load", lambda scene, triangles, **_: load(scene, triangles)
-    )
-    pictures.append(_picture_of(scene))
-    np.testing.assert_array_equal(*pictures)
-    assert pictures[0].any()
-
-
-def _picture_of(scene: Any) -> Any:
-    tracer = vector_tracer.VectorTracer(scene, max_depth=10, rr_depth=2)
-    return tracer.radiance(camera_of(scene, 32), seed=3, spp=16)
 
 
 def test_what_rays_of_one_kernel_meet_shares_one_table(monkeypatch: pytest.MonkeyPatch) -> None:

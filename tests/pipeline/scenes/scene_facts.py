@@ -48,3 +48,23 @@ def counts_of(scene: Scene) -> dict[str, int]:
     """Return the number of triangles of each kind."""
     kinds = np.array([entry.kind for entry in scene.objects])[scene.object_index]
     return {kind: int((kinds == kind).sum()) for kind in ("shell", "object", "emitter")}
+
+
+def ray_distances(
+    origins: NDArray[np.float64], directions: NDArray[np.float64], triangles: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return where rays [N, 3] meet triangles [T, 3, 3]: [N, T] in directions, inf for a miss.
+
+    Moeller and Trumbore 1997, two-sided, double precision, every ray against every triangle.
+    """
+    a, ab, ac = triangles[:, 0], *(triangles[:, k] - triangles[:, 0] for k in (1, 2))
+    found = [np.zeros((0, len(triangles)))]
+    for rows in np.array_split(np.arange(len(origins)), len(origins) // 64 + 1):
+        along, away = directions[rows, None], origins[rows, None] - a
+        p, q = np.cross(along, ac[None]), np.cross(away, ab[None])
+        det = np.sum(p * ab, axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v, t = (np.sum(x * y, axis=-1) / det for x, y in ((p, away), (along, q), (q, ac)))
+            is_met = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
+        found.append(np.where(is_met, t, np.inf))
+    return np.concatenate(found)

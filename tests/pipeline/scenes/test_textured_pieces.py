@@ -1,4 +1,4 @@
-"""Procedural textures and subdivided triangles in composed scenes: they change nothing else."""
+"""Textures, materials and light of objects, and subdivided triangles: nothing else changes."""
 
 import dataclasses
 import itertools
@@ -9,8 +9,19 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pipeline.scenes.pieces import ScenePiece, emitter_piece, object_piece, shell_piece
+from pipeline.scenes.pieces import (
+    ScenePiece,
+    Skin,
+    apply_skin,
+    concatenate_pieces,
+    emitter_piece,
+    object_piece,
+    shell_piece,
+)
+from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.redrawn import with_new_lights
 from pipeline.scenes.shading import flat_shaded
+from pipeline.scenes.source_materials import source_skins, with_source_emission
 from pipeline.scenes.subdivision import fill_triangles, subdivide
 from pipeline.scenes.textured_pieces import cube_coordinates, with_drawn_textures
 from scene_templates.families import DEFAULT_FAMILIES
@@ -20,46 +31,108 @@ from scene_templates.rotations import rotate_points
 from scene_templates.settings import SceneSettings
 from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.textures import TextureSettings
-from storage.records.material import default_rows
+from storage.errors import Rejected
+from storage.records.asset import Level
+from storage.records.lookup import texture_values
+from storage.records.material import EMISSION, default_rows
+from storage.records.objects import locked_uids
+from storage.records.packed_maps import pack_texture
 from storage.records.scene import Scene, SceneObject
+from storage.records.scene_file import scene_digest
+from storage.records.skin import LevelSkin, SkinQuality
+from storage.records.texture import Texture
 from storage.seeds import SceneKey
 from storage.settings.changes import changed
 from tests.for_each import for_each
-from tests.pipeline.scenes.small_pool import LOOK, first_scene, small_pool
+from tests.pipeline.scenes.small_pool import LOOK, first_scene, pooled, small_pool
 from tests.scene_templates.balls import STILL
 from tests.scene_templates.statistics import require_plausible, share
 
 SMALL = SurfaceMapSettings(size=8)
 PLAIN = SceneSettings(families=DEFAULT_FAMILIES, num_views=1)
 TEXTURED = dataclasses.replace(PLAIN, textures=TextureSettings(share=0.5, surfaces=SMALL))
+OWN = changed(PLAIN, {"materials.source": "object"})
+GLOWS = changed(OWN, {"materials.own_emission": 0.5})
+QUALITY = SkinQuality(
+    colour_error=0.0,
+    colour_error_p95=0.0,
+    missed_cells=0.0,
+    torn_seams=0.0,
+    texels_per_length=1.0,
+)
 
 
-def _scene(settings: SceneSettings, index: int) -> Scene:
-    return first_scene(settings, small_pool(), seed=0, scene_index=index)
+def _scene(settings: SceneSettings, index: int, pool: list[PooledAsset] | None = None) -> Scene:
+    return first_scene(settings, pool or small_pool(), seed=0, scene_index=index)
 
 
-def test_textures_change_no_other_draw() -> None:
-    for index in range(6):
-        plain, textured = _scene(PLAIN, index), _scene(TEXTURED, index)
-        for name in ("vertex_positions", "vertex_normals", "faces", "object_index", "c2w"):
-            assert np.array_equal(getattr(plain, name), getattr(textured, name)), name
-        emitting = plain.triangle_emits
-        for scene in (plain, textured):
-            assert np.array_equal(scene.triangle_emits, emitting)
-        assert plain.uv is None and textured.provenance == plain.provenance
+def _skinned(level: Level, seed: int = 0, every: int = 0) -> Level:
+    """Return a level with noise on it, whose every so-manieth triangle emits, ever redder."""
+    drawn = np.random.default_rng(seed).uniform(0, 0.5, (4, 4, 7)).astype(np.float32)
+    parts = (slice(0, 3), slice(3, 6), slice(6, 7))
+    first, second, third = (pack_texture(Texture(texels=drawn[..., part])) for part in parts)
+    uv = np.random.default_rng(seed).random((len(level.faces), 3, 2)).astype(np.float32)
+    skin = LevelSkin(uv=uv, packed=(first, second, third), quality=QUALITY)
+    if every:
+        emission = np.zeros((len(level.faces), 3), np.float32)
+        emission[::every] = np.linspace([1, 0.5, 0.2], [3, 0.1, 0], len(emission[::every]))
+        skin = dataclasses.replace(skin, emission=emission)
+    return dataclasses.replace(level, skin=skin)
 
 
-def test_as_many_surfaces_are_textured_as_stated() -> None:
-    found = []
+def _pool(every: int = 0) -> list[PooledAsset]:
+    """All but the first object have a skin at every level."""
+    bare, *others = small_pool()
+    skinned = [bare]
+    for seed, entry in enumerate(others):
+        levels = tuple(_skinned(level, seed, every) for level in entry.asset.levels)
+        asset = dataclasses.replace(entry.asset, levels=levels)
+        skinned.append(dataclasses.replace(entry, asset=asset))
+    return skinned
+
+
+def test_textures_and_own_materials_change_no_other_draw() -> None:
+    for index in range(5):
+        plain, drawn, own = (
+            _scene(PLAIN, index),
+            _scene(TEXTURED, index),
+            _scene(OWN, index, _pool()),
+        )
+        for scene in (drawn, own):
+            for name in ("vertex_positions", "vertex_normals", "faces", "object_index", "c2w"):
+                assert np.array_equal(getattr(plain, name), getattr(scene, name)), name
+            assert np.array_equal(scene.triangle_emits, plain.triangle_emits)
+        assert plain.uv is None and drawn.provenance == plain.provenance
+        assert own.material_textures is not None
+        for row, entry in enumerate(own.objects):
+            mine = own.object_index == row
+            textured = (own.material_textures[own.material_index[mine]] >= 0).any()
+            assert textured == (entry.kind == "object" and entry.uid != "made/ball"), entry
+            if not textured:
+                before = plain.materials[plain.material_index[mine]]
+                assert np.array_equal(before, own.materials[own.material_index[mine]])
+
+
+def test_as_many_surfaces_and_objects_are_textured_as_stated() -> None:
+    drawn = []
     for index in range(30):
         scene = _scene(TEXTURED, index)
         for row, entry in enumerate(scene.objects):
-            if entry.kind == "emitter":
-                continue
-            mine = scene.material_index[scene.object_index == row]
-            index_M3 = scene.material_textures
-            found.append(index_M3 is not None and bool((index_M3[mine] >= 0).any()))
-    require_plausible({"textured": share(found, 0.5)})
+            if entry.kind != "emitter":
+                mine, textures = (
+                    scene.material_index[scene.object_index == row],
+                    scene.material_textures,
+                )
+                drawn.append(textures is not None and bool((textures[mine] >= 0).any()))
+    some = changed(OWN, {"materials.own_share": 0.3})
+    entries = _pool()[1:]
+    levels = [entry.asset.levels[0] for entry in entries]
+    own = []
+    for index in range(60):
+        key = SceneKey(0, index)
+        own += [skin is not None for skin in source_skins(entries, levels, some.materials, key)]
+        assert all(source_skins(entries, levels, OWN.materials, key))
+    require_plausible({"textured": share(drawn, 0.5), "own": share(own, 0.3)})
 
 
 @for_each("side", range(6))
@@ -157,9 +230,9 @@ CLOSED = {
     "ring": trimesh.creation.torus(0.5, 0.2, 9, 7),
     "cone": trimesh.creation.cone(0.5, 1, sections=11),
 }
-ALL = {**CLOSED, "odd": _open_and_odd()}
 
-COUNTS = (13, 200, 701)
+
+ALL = {**CLOSED, "odd": _open_and_odd()}
 
 
 def _corners(piece: ScenePiece) -> NDArray[np.float64]:
@@ -184,18 +257,18 @@ def _edges(piece: ScenePiece) -> dict[frozenset[bytes], int]:
 
 def test_the_number_is_met_to_within_one_edge_and_what_was_closed_stays_closed() -> None:
     """No vertex in the middle of a neighbour's edge: through such a seam light may leak."""
-    for name, smooth in itertools.product(ALL, (False, True)):
+    for name, smooth, count in itertools.product(ALL, (False, True), (13, 200, 701)):
         piece = _piece(ALL[name], smooth=smooth)
         had, edges = len(piece.mesh.faces), set(_edges(piece).values())
-        assert edges == {2} or name not in CLOSED
-        for count in COUNTS:
-            after = subdivide(piece, count)
-            where = (name, smooth, count)
-            if count <= had:
-                assert len(after.mesh.faces) == had, where
-            else:
-                assert count - max(edges) < len(after.mesh.faces) <= count, where
-            assert set(_edges(after).values()) == {2} or name not in CLOSED, where
+        after, where = subdivide(piece, count), (name, smooth, count)
+        if count <= had:
+            assert len(after.mesh.faces) == had, where
+        else:
+            assert count - max(edges) < len(after.mesh.faces) <= count, where
+        assert name not in CLOSED or edges == set(_edges(after).values()) == {2}, where
+    odd = _piece(ALL["odd"], smooth=False)  # an edge of three faces is halved in all three
+    before, halved = (list(_edges(piece).values()) for piece in (odd, subdivide(odd, 900)))
+    assert before.count(3) == 1 and halved.count(3) >= 8 and set(halved) == {1, 2, 3}
 
 
 @for_each("name", ALL)
@@ -242,28 +315,19 @@ def _owner(old: NDArray[np.float64], corners: NDArray[np.float64]) -> int:
     return nearest
 
 
-def test_an_edge_of_three_faces_is_halved_in_all_three() -> None:
-    piece = _piece(_open_and_odd(), smooth=False)
-    after = _edges(subdivide(piece, 900))
-    before = list(_edges(piece).values())
-    assert before.count(3) == 1
-    assert list(after.values()).count(3) >= 8
-    assert set(after.values()) == {1, 2, 3}
-
-
-@pytest.mark.parametrize("name", ["ball", "ring"])
-def test_shading_stays_as_it_was(name: str) -> None:
+def test_shading_stays_as_it_was() -> None:
     """Normals are unit, and in the middle of an edge the mean of its ends: as interpolated."""
-    piece = _piece(CLOSED[name], smooth=True)
-    after = subdivide(piece, 600)
-    assert np.abs(np.linalg.norm(after.mesh.normals, axis=1) - 1).max() < ROUNDING
-    # The vertices of before come first; of a sharp edge there are several in one place.
-    before = len(piece.mesh.positions)
-    assert np.array_equal(after.mesh.positions[:before], piece.mesh.positions)
-    assert np.abs(after.mesh.normals[:before] - piece.mesh.normals).max() < ROUNDING
-    flat = subdivide(_piece(CLOSED[name], smooth=False), 600)
-    geometric = _unit_normals(_corners(flat))
-    assert np.abs(flat.mesh.normals[flat.mesh.faces] - geometric[:, None]).max() < 1e-4
+    for name in ("ball", "ring"):
+        piece = _piece(CLOSED[name], smooth=True)
+        after = subdivide(piece, 600)
+        assert np.abs(np.linalg.norm(after.mesh.normals, axis=1) - 1).max() < ROUNDING
+        # The vertices of before come first; of a sharp edge there are several in one place.
+        before = len(piece.mesh.positions)
+        assert np.array_equal(after.mesh.positions[:before], piece.mesh.positions)
+        assert np.abs(after.mesh.normals[:before] - piece.mesh.normals).max() < ROUNDING
+        flat = subdivide(_piece(CLOSED[name], smooth=False), 600)
+        geometric = _unit_normals(_corners(flat))
+        assert np.abs(flat.mesh.normals[flat.mesh.faces] - geometric[:, None]).max() < 1e-4
 
 
 def test_the_longest_edges_are_halved_first() -> None:
@@ -288,32 +352,188 @@ def _shell() -> ScenePiece:
     return shell_piece(part, np.random.default_rng(0), 30.0)
 
 
-def _light() -> ScenePiece:
-    triangle = np.array([[0, 0, 2], [0.1, 0, 2], [0, 0.1, 2.0]])
-    return emitter_piece(
-        Emitter(triangle=triangle, radiance_rgb=(9.0, 9.0, 9.0), reflectance=0.0), 0
-    )
-
-
-@pytest.mark.parametrize("fill_to", [1000, 2048])
-def test_a_scene_is_filled_by_its_objects_alone(fill_to: int) -> None:
-    pieces = [_shell(), _piece(CLOSED["box"], smooth=False), _piece(CLOSED["ball"], smooth=True)]
-    pieces.append(_light())
-    after = fill_triangles(pieces, fill_to)
-    assert [after[0], after[3]] == [pieces[0], pieces[3]]
-    total = sum(len(piece.mesh.faces) for piece in after)
-    # Short by less than the two faces of an edge for each object, and by what its share rounds off.
-    assert fill_to - 2 * 3 < total <= fill_to
-    box, ball = (len(piece.mesh.faces) for piece in after[1:3])
-    # In proportion to what they had, 12 and 80, to the same few.
-    assert abs(box / (box + ball) - 12 / 92) < 4 / fill_to
-
-
-def test_nothing_to_fill_stays_as_it_is() -> None:
-    bare = [_shell(), _light()]
+def test_a_scene_is_filled_by_its_objects_alone() -> None:
+    lamp = _lamp(np.array([[0, 0, 2], [0.1, 0, 2], [0, 0.1, 2.0]]), (9.0, 9.0, 9.0))
+    box, ball = _piece(CLOSED["box"], smooth=False), _piece(CLOSED["ball"], smooth=True)
+    pieces = [_shell(), box, ball, lamp]
+    for fill_to in (1000, 2048):
+        after = fill_triangles(pieces, fill_to)
+        assert [after[0], after[3]] == [pieces[0], pieces[3]]
+        first, second = (len(piece.mesh.faces) for piece in after[1:3])
+        # Short by less than the two faces of an edge for each object, and by what its share
+        # rounds off.
+        assert fill_to - 2 * 3 < 128 + first + second + 1 <= fill_to
+        # In proportion to what they had, 12 and 80, to the same few.
+        assert abs(first / (first + second) - 12 / 92) < 4 / fill_to
+    bare = [_shell(), lamp]
     assert fill_triangles(bare, 5000) == bare
-    full = [_shell(), _piece(CLOSED["ball"], smooth=False)]
-    same = fill_triangles(full, 208)
+    same = fill_triangles([_shell(), ball], 208)
     assert [len(piece.mesh.faces) for piece in same] == [128, 80]
-    assert np.array_equal(_corners(same[1]), _corners(full[1]))
-    assert dataclasses.replace(same[1].entry) == full[1].entry
+    assert np.array_equal(_corners(same[1]), _corners(ball)) and same[1].entry == ball.entry
+
+
+def test_textures_have_the_rights_and_the_means_of_their_objects() -> None:
+    scene = _scene(OWN, 1, _pool())
+    owners = {entry.uid: entry for entry in scene.objects if entry.uid}
+    assert scene.textures and scene.material_textures is not None
+    for texture in scene.textures:
+        owner, source = owners[texture.source.name.rsplit(" ", 1)[0]], texture.source
+        assert (source.licence, source.attribution, source.source_url) == (
+            owner.licence,
+            owner.attribution,
+            owner.source_url,
+        )
+    both = changed(OWN, {"textures.share": 1.0, "textures.surfaces.size": 8})
+    drawn = _scene(both, 1, _pool())
+    assert {texture.source.name.startswith("made/") for texture in drawn.textures} == {True, False}
+    assert {texture.sha256 for texture in scene.textures} <= {t.sha256 for t in drawn.textures}
+    row = int(np.flatnonzero(scene.material_textures[:, 0] >= 0)[0])
+    texture = scene.textures[scene.material_textures[row, 0]]
+    assert np.array_equal(scene.materials[row, :3], texture.mean)
+    assert texture_values(texture, np.zeros(2)).shape == (3,)
+
+
+def test_an_object_whose_textures_break_a_law_costs_scenes_by_its_name() -> None:
+    entries, level = _pool()[1:2], _skinned(small_pool()[1].asset.levels[0])
+    assert level.skin is not None
+    broken = pack_texture(Texture(texels=np.full((1, 1, 3), np.nan, np.float32)))
+    skin = dataclasses.replace(level.skin, packed=(broken, *level.skin.packed[1:]))
+    levels = [dataclasses.replace(level, skin=skin)]
+    with pytest.raises(Rejected, match=f"^law_broken: object {entries[0].locked.uid}: .*diffuse"):
+        source_skins(entries, levels, OWN.materials, SceneKey(0, 0))
+
+
+def test_subdivision_moves_no_colour() -> None:
+    level = _skinned(small_pool()[1].asset.levels[0])
+    assert level.skin is not None
+    positions = level.positions
+    box, rng = SceneObject(name="box", kind="object"), np.random.default_rng(0)
+    piece = object_piece(box, positions, level.faces, LOOK, rng, 30.0)
+    entries = [pooled("a", [trimesh.creation.box()])]
+    (skin,) = source_skins(entries, [level], OWN.materials, SceneKey(0, 0))
+    assert skin is not None
+    whole = apply_skin(piece, positions, level.faces, skin)
+    more = subdivide(whole, 100)
+    assert more.skin is not None and len(more.mesh.faces) > 90
+
+    centres = more.mesh.positions[more.mesh.faces].astype(np.float64).mean(axis=1)
+    uv = more.skin.uv.reshape(-1, 3, 2).astype(np.float64).mean(axis=1)
+    corners = whole.mesh.positions[whole.mesh.faces].astype(np.float64)
+    before = skin.uv.reshape(-1, 3, 2).astype(np.float64)
+    for centre, found in zip(centres, uv, strict=True):
+        matches = []
+        for triangle, its_uv in zip(corners, before, strict=True):
+            weights = np.linalg.lstsq(np.vstack([triangle.T, np.ones(3)]), [*centre, 1], rcond=None)
+            off = np.abs(np.vstack([triangle.T, np.ones(3)]) @ weights[0] - [*centre, 1]).max()
+            if off < 1e-6 and weights[0].min() > -1e-6:
+                matches.append(np.abs(weights[0] @ its_uv - found).max())
+        assert min(matches) < 1e-5  # float32 positions
+
+
+QUAD = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+FACES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
+
+
+def powers(scene: Scene) -> dict[bool, float]:
+    """Area times mean radiance by whether an emitter is a lamp."""
+    corners = scene.vertex_positions[scene.faces].astype(float)
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    power = np.linalg.norm(cross, axis=1) / 2
+    power *= scene.materials[scene.material_index, EMISSION].mean(axis=1)
+    lamp = np.array([entry.is_lamp for entry in scene.objects])[scene.object_index]
+    return {True: float(power[lamp].sum()), False: float(power[~lamp].sum())}
+
+
+def test_parts_that_emit_give_the_stated_share_of_light() -> None:
+    found = 0
+    for index in range(4):
+        dark, lit = _scene(OWN, index, _pool(every=4)), _scene(GLOWS, index, _pool(every=4))
+        assert scene_digest(dark) == scene_digest(_scene(OWN, index, _pool())), "nobody asked"
+        ours, theirs = (
+            np.sort(each.vertex_positions[each.faces].reshape(-1, 9), axis=0)
+            for each in (dark, lit)
+        )
+        assert np.array_equal(ours, theirs) and np.array_equal(dark.c2w, lit.c2w)
+        own = [entry for entry in lit.objects if entry.kind == "emitter" and entry.uid]
+        assert not [entry for entry in dark.objects if entry.kind == "emitter" and entry.uid]
+        skinned = {entry.uid for entry in dark.objects if entry.uid} - {"made/ball"}
+        assert {entry.uid for entry in own} == skinned
+        owners = {entry.uid: entry for entry in lit.objects if entry.kind == "object"}
+        assert all(entry.licence == owners[entry.uid].licence for entry in own)
+        power = powers(lit)
+        emits = lit.materials[:, EMISSION]
+        lamps = [row for row, entry in enumerate(lit.objects) if entry.is_lamp]
+        of_lamps = emits[lit.material_index[np.isin(lit.object_index, lamps)]]
+        is_bound = emits.max() <= of_lamps.max() * (1 + 1e-6)
+        assert is_bound and power[False] <= 0.5 * power[True] * (1 + 1e-5)
+        found += power[False] == pytest.approx(0.5 * power[True], rel=1e-4)
+        assert power[True] == pytest.approx(powers(dark)[True], rel=1e-6)
+    assert found >= 2
+
+
+def _object(emission: list[list[float]], name: str = "screen") -> ScenePiece:
+    """A square of two triangles that emit so much."""
+    entry = SceneObject(name=name, kind="object", uid=f"made/{name}")
+    rng = np.random.default_rng(0)
+    piece = object_piece(entry, QUAD, FACES, LOOK, rng, 30.0)
+    first, second, third = (
+        Texture(texels=np.full((1, 1, channels), 0.1, np.float32)) for channels in (3, 3, 1)
+    )
+    skin = Skin(
+        uv=np.zeros((6, 2), np.float32),
+        textures=(first, second, third),
+        emission=np.array(emission, np.float32),
+    )
+    return apply_skin(piece, QUAD, FACES, skin)
+
+
+def _lamp(corners: np.ndarray, radiance: tuple[float, float, float]) -> ScenePiece:
+    emitter = Emitter(triangle=corners.astype(np.float64), radiance_rgb=radiance, reflectance=0.2)
+    return emitter_piece(emitter, 0)
+
+
+def test_an_emissive_triangle_is_the_same_lamp_to_the_last_bit() -> None:
+    """Positions, normals and materials; pictures are a function of these."""
+    lamp = _lamp(QUAD[FACES[0]] + [0, 0, 2], (8.0, 8.0, 8.0))
+    piece = _object([[2, 1, 0], [0, 0, 0]])
+    (left,), (own,) = with_source_emission([piece], [lamp], share=0.25)
+    power = 0.25 * 8.0  # areas are equal, and (2 + 1 + 0) / 3 is 1
+    ours = concatenate_pieces([own])
+    twin = concatenate_pieces([_lamp(QUAD[FACES[0]], (2 * power, power, 0.0))])
+    for name in ("vertex_positions", "vertex_normals", "faces", "materials", "material_index"):
+        assert np.array_equal(ours[name], twin[name]), name
+    assert len(left.mesh.faces) == 1 and left.skin is not None and len(left.skin.uv) == 3
+    assert np.array_equal(left.mesh.positions, QUAD[FACES[1]])
+    assert own.entry.kind == "emitter" and own.entry.uid == "made/screen"
+
+
+def test_no_part_outshines_the_brightest_lamp_and_what_emits_stays_in_its_place() -> None:
+    lamp = _lamp(QUAD[FACES[0]] * 10, (3.0, 2.0, 1.0))
+    _, (own,) = with_source_emission([_object([[7, 0, 0], [0, 0, 0]])], [lamp], share=1.0)
+    assert own.materials[0, EMISSION] == pytest.approx([3, 0, 0])
+    pieces, more = with_source_emission([_object([[1, 0, 0], [0, 1, 0]])], [lamp], share=0.1)
+    assert [piece.entry.kind for piece in pieces] == ["emitter"] and not more
+    assert len(pieces[0].materials) == 2 and pieces[0].skin is None
+    entry = pieces[0].entry
+    assert locked_uids([(entry.kind, entry.uid), ("emitter", "")], {}) == ["made/screen"]
+
+
+def test_without_lamps_or_share_all_stays_dark() -> None:
+    for lamps, share_ in (([_lamp(QUAD[FACES[0]], (1.0, 1.0, 1.0))], 0.0), ([], 1.0)):
+        (piece,), more = with_source_emission([_object([[1, 1, 1], [0, 0, 0]])], lamps, share_)
+        assert not more and len(piece.mesh.faces) == 2
+        assert piece.skin is not None and piece.skin.emission is None
+
+
+def test_new_lights_leave_parts_that_emit() -> None:
+    scene = _scene(GLOWS, 1, _pool(every=4))
+    again = with_new_lights(scene, GLOWS.lights, None, SceneKey(3, 0))
+    again.check()
+    before, after = (sum(entry.is_lamp for entry in each.objects) for each in (scene, again))
+    assert before == after
+    own, still = (
+        [entry for entry in each.objects if entry.kind == "emitter" and entry.uid]
+        for each in (scene, again)
+    )
+    assert own and still == own
+    assert powers(again)[False] == pytest.approx(powers(scene)[False])

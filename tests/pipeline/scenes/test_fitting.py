@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.scenes import fitting
-from pipeline.scenes.budget import least_triangles, levels_within
-from pipeline.scenes.fitting import FitTable, draw_rows
+from pipeline.scenes.fitting import FitTable, draw_rows, least_triangles, levels_within
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
@@ -109,23 +108,6 @@ def test_the_worst_error_is_the_least_that_the_budget_allows() -> None:
         better += min(worst) < max(worst)
     assert compared > 200
     assert better > 100  # else any choice would do
-
-
-def test_levels_go_as_fine_as_they_fit_and_what_is_left_goes_on() -> None:
-    assets = [_asset([(12, 0.03), (300, 0.002)]), _asset([(20, 0.001), (400, 0.0005)])]
-    for total, expected in ((32, [12, 20]), (319, [12, 20]), (320, [300, 20]), (700, [300, 400])):
-        levels = levels_within(assets, total, 0.0)
-        assert [len(level.faces) for level in levels] == expected
-    # The second is near enough as it is, and the first when it is finer.
-    assert [len(level.faces) for level in levels_within(assets, 700, 0.005)] == [300, 20]
-    assert [len(level.faces) for level in levels_within(assets, 700, 0.5)] == [12, 20]
-    small, large = _asset([(12, 0.0)]), _asset([(100, 0.03), (500, 0.02), (900, 0.01)])
-    for assets in ([small, large], [large, small]):
-        counts = [len(level.faces) for level in levels_within(assets, 1000, 0.0)]
-        assert sorted(counts) == [12, 900]
-    assets = [_asset([(10, 0.01), (60, 0.0)])] * 3
-    counts = [len(level.faces) for level in levels_within(assets, 130, 0.0)]
-    assert counts == [60, 60, 10]
 
 
 def test_too_little_room_is_rejected_with_the_numbers() -> None:
