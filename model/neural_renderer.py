@@ -28,6 +28,7 @@ from model.replayed import Replayed
 from model.scene_tensors import Cameras, batch_scenes, map_tensors, scene_tensors
 from model.weights import MAX_LIGHTS, TrainedRange, network_digest
 from storage.errors import TrilightError
+from storage.machine import free_memory
 from storage.records.material import unread_columns
 from storage.records.scene import Scene
 
@@ -286,9 +287,4 @@ def _free_bytes(device: torch.device) -> int | None:
     """Return the free memory of a device in bytes, or None where it is unknown."""
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        fields = dict(line.split(":", 1) for line in lines)
-        return int(fields["MemAvailable"].split()[0]) << 10
-    except (OSError, KeyError, ValueError):
-        return None
+    return free_memory()

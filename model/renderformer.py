@@ -21,8 +21,7 @@ from model.hits.tracing import (
 from model.image_head import zero_last_layer
 from model.positions import TriangleRotary, token_positions
 from model.precision import tf32
-from model.scene_tensors import Cameras, SceneBatch, in_light_units
-from model.sky.known import require_known_sky
+from model.scene_tensors import Cameras, SceneBatch, in_light_units, require_known_sky
 from model.triangle_encoder import TriangleEncoder
 from model.view_decoder import ViewDecoder
 from storage.errors import TrilightError

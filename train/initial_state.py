@@ -36,8 +36,7 @@ from train.monitoring.rows import read_rows
 from train.progress import TrainProgress
 from train.result import pretty_json
 from train.resume import Event, ResumePlan, StartOptions, event_records, plan_resume
-from train.settings import TrainSettings
-from train.stored_settings import stored_settings
+from train.settings import TrainSettings, stored_settings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -16,8 +16,7 @@ from storage.settings.changes import changed, differences
 from storage.settings.described import from_record, settings_record
 from storage.settings.fields import describe_fields
 from train.loop.schedule import decay_start_step
-from train.settings import TrainSettings
-from train.stored_settings import known_settings
+from train.settings import TrainSettings, known_settings
 
 DATA = "data"
 """Name of the change to other data. Its value is the start of their digest, after `sha256:` for a
@@ -145,7 +144,7 @@ def plan_resume(
     step = header["step"]
     before = from_record(TrainSettings, known_settings(header["settings"], "checkpoint"))
     old_record = settings_record(before)
-    past_events = events_of(header.get("history", ()))
+    past_events = tuple(Event(**record) for record in header.get("history", ()))
     named_decisions = {name: value for name, value in decisions.items() if name != DATA}
     _require_meaning(named_decisions)
     typed_otherwise = differences(old_record, settings_record(typed))
@@ -192,11 +191,6 @@ def _change_events(
         )
         for name, value in new_values.items()
     ]
-
-
-def events_of(records: Sequence[Mapping[str, Any]]) -> tuple[Event, ...]:
-    """Return events from their JSON records."""
-    return tuple(Event(**record) for record in records)
 
 
 def event_records(events: Sequence[Event]) -> list[dict[str, Any]]:

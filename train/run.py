@@ -11,12 +11,12 @@ import torch
 
 from model.checkpoint_format import saved_steps
 from model.renderformer import count_parameters
-from model.sky.known import lit_sky, require_known_sky
+from model.scene_tensors import lit_sky, require_known_sky
 from storage.dataset.mixed_data import open_mixture
 from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
 from train.data.bad_samples import BadSampleCounter, first_samples
-from train.data.device_prefetch import decodes_on_device, step_scenes
+from train.data.buckets import decodes_on_device, step_scenes
 from train.data.scenes import TrainingScene, training_scene
 from train.data.stream import StreamSettings, stream_batches
 from train.data.workers import choose_workers, detect_machine
@@ -30,9 +30,9 @@ from train.loop.state import TrainState
 from train.loop.trainer import Trainer, scene_flops
 from train.loss.lpips import load_lpips
 from train.loss.objective import TrainingLoss
-from train.monitoring.notes import add_note
+from train.monitoring.boards import require_wandb
+from train.monitoring.rows import add_note
 from train.monitoring.settings import WatchSettings
-from train.monitoring.weights_and_biases import require_wandb
 from train.progress import TrainProgress
 from train.result import TrainResult, finish_run
 from train.resume import StartOptions
@@ -85,73 +85,51 @@ def train_run(
             checkpoint that is missing or of another run, LPIPS without its weights, a start that
             went dead, too little memory, or a signal that asked to stop.
     """
-    require_wandb((watched or WatchSettings()).wandb)
+    began = time.monotonic()
+    watched = watched or WatchSettings()
+    require_wandb(watched.wandb)
     dist_context = dist_context or DistributedContext(device=torch.device("cpu"))
+    if progress is None or not dist_context.is_first:
+        progress = TrainProgress()
     folder = RunFolder(out)
     with claim_run(folder, dist_context):
-        return _train(
-            settings,
-            data=data,
-            folder=folder,
-            start=start or StartOptions(),
+        dataset = open_mixture(data)
+        start = _resolve_restart(start or StartOptions(), folder, dist_context)
+        early_notes = _NoteBuffer(progress)
+        for note in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
+            early_notes.note(note)
+        if workers is None:
+            workers = _choose_workers(settings, dist_context, early_notes)
+        plan = plan_start(settings, folder, dataset.digest, start, dist_context, early_notes)
+        settings = plan.settings
+        lpips = dist_context.run_once_per_machine(partial(load_lpips, start.lpips))
+        objective = TrainingLoss(settings.loss, lpips).to(dist_context.device)
+        _check_data(dataset, settings)
+        state = init_or_resume_state(plan, folder, dataset, dist_context, early_notes)
+        judge = recorder = None
+        if dist_context.is_first:
+            judge = _make_judge(dataset, settings, state.bad_samples)
+            recorder = _recorder(state, settings, folder, judge, progress, watched)
+            _record_start(folder, state, dist_context, early_notes.texts, resumed=start.resume)
+        trainer = Trainer(
+            state=state,
+            settings=settings,
+            objective=objective,
             dist_context=dist_context,
-            workers=workers,
-            watched=watched or WatchSettings(),
-            progress=progress
-            if progress is not None and dist_context.is_first
-            else TrainProgress(),
+            folder=folder,
+            data_digest=dataset.digest,
+            recorder=recorder,
+            watched=watched,
         )
-
-
-def _train(
-    settings: TrainSettings,
-    *,
-    data: Sequence[str],
-    folder: RunFolder,
-    start: StartOptions,
-    dist_context: DistributedContext,
-    workers: int | None,
-    watched: WatchSettings,
-    progress: TrainProgress,
-) -> TrainResult | None:
-    """Train and evaluate in a folder that is locked; arguments as in `train_run`."""
-    began = time.monotonic()
-    dataset = open_mixture(data)
-    start = _resolve_restart(start, folder, dist_context)
-    early_notes = _NoteBuffer(progress)
-    for note in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
-        early_notes.note(note)
-    workers = _choose_workers(settings, dist_context, early_notes) if workers is None else workers
-    plan = plan_start(settings, folder, dataset.digest, start, dist_context, early_notes)
-    settings = plan.settings
-    lpips = dist_context.run_once_per_machine(partial(load_lpips, start.lpips))
-    objective = TrainingLoss(settings.loss, lpips).to(dist_context.device)
-    _check_data(dataset, settings)
-    state = init_or_resume_state(plan, folder, dataset, dist_context, early_notes)
-    judge = _make_judge(dataset, settings, state.bad_samples) if dist_context.is_first else None
-    recorder = None
-    if dist_context.is_first:
-        recorder = _recorder(state, settings, folder, judge, progress, watched)
-        _record_start(folder, state, dist_context, early_notes.texts, resumed=start.resume)
-    trainer = Trainer(
-        state=state,
-        settings=settings,
-        objective=objective,
-        dist_context=dist_context,
-        folder=folder,
-        data_digest=dataset.digest,
-        recorder=recorder,
-        watched=watched,
-    )
-    with closing(_batches(dataset, settings, state, dist_context, workers)) as batches:
-        cost = partial(scene_flops, settings)
-        most = settings.scenes_per_pass
-        with closing(step_scenes(batches, cost, most, dist_context.device)) as steps:
-            trainer.run(steps)
-    if recorder is None:
-        return None
-    recorder.close()
-    return finish_run(state, settings, folder, dataset, judge, time.monotonic() - began)
+        with closing(_batches(dataset, settings, state, dist_context, workers)) as batches:
+            cost = partial(scene_flops, settings)
+            most = settings.scenes_per_pass
+            with closing(step_scenes(batches, cost, most, dist_context.device)) as steps:
+                trainer.run(steps)
+        if recorder is None:
+            return None
+        recorder.close()
+        return finish_run(state, settings, folder, dataset, judge, time.monotonic() - began)
 
 
 def _choose_workers(

@@ -7,7 +7,7 @@ Ward et al. 1988), and costs the same for a picture of any width.
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.camera_hits import CameraHits
+from model.hits.camera import CameraHits
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
 from model.hits.second_hits import blocks, outgoing_radiance

@@ -214,7 +214,7 @@ def chosen_lamp_light(
     solid = np.abs(dot(scene.plane[:, lamp], to_lamp)) * scene.area[lamp] / square / chance
     value, density = lobe(gloss, points, to_lamp, cosine)
     value = value / (1 + np.where(has_lobe_ray, np.square(density * solid), np.float32(0)))
-    albedo = scene.diffuse_at(points)
+    albedo = scene.material_at(points, "diffuse")
     reflected = albedo * (np.maximum(cosine, 0) * _INV_PI) + gloss.color * value
     useful = np.flatnonzero(brightest(reflected) > 0)
     is_free = np.zeros_like(solid)

@@ -18,8 +18,7 @@ from model.hits.radiosity import SceneLight, scene_light
 from model.hits.textures import SurfaceTextures
 from model.hits.traced import INPUTS, Traced, stack_traced
 from model.hits.view_inputs import ViewInputs, view_inputs
-from model.scene_tensors import Cameras, SceneBatch, SceneTensors
-from model.sky.known import require_known_sky
+from model.scene_tensors import Cameras, SceneBatch, SceneTensors, require_known_sky
 from storage.conventions import radiance_from_log10
 from storage.raycast.caster import RayCaster
 from storage.records.environment import Environment

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.hits.anchors import anchor_pixels, gathered_at
-from model.hits.camera import Rays
-from model.hits.camera_hits import CameraHits, camera_hits
+from model.hits.camera import CameraHits, Rays, camera_hits
 from model.hits.device_arrays import DeviceArray, MaskedRows
 from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
 from model.hits.lit_scene import LitScene, Points
@@ -296,9 +295,9 @@ def _add_surface(block: _Block, scene: LitScene, origin: NDArray[np.float32]) ->
     block.add(Channel.DISTANCE, np.sqrt(dot(from_camera, from_camera))[None])
     block.add(Channel.NORMAL, points.normal)
     block.add(Channel.TOWARD, points.to_viewer)
-    block.add(Channel.DIFFUSE, scene.diffuse_at(points))
+    block.add(Channel.DIFFUSE, scene.material_at(points, "diffuse"))
     block.add(Channel.SPECULAR, block.gloss.color)
-    block.add(Channel.ROUGHNESS, scene.roughness_at(points)[None])
+    block.add(Channel.ROUGHNESS, scene.material_at(points, "roughness")[None])
 
 
 def _add_direct(
@@ -328,7 +327,7 @@ def _add_light(block: _Block, scene: LitScene, lit: DirectLight) -> None:
     block.add(Channel.DIRECT_DIFFUSE, lit.diffuse)
     block.add(Channel.OPEN_SPECULAR, lit.open_specular)
     block.add(Channel.DIRECT_SPECULAR, lit.specular)
-    albedo = scene.diffuse_at(block.points)
+    albedo = scene.material_at(block.points, "diffuse")
     block.add(Channel.SHOWN_DIFFUSE, albedo * lit.diffuse)
 
 
@@ -390,7 +389,7 @@ def _add_lobe_rays(
         counts = shading[rows] / block.weight[rows]
         block.add(Channel.MIRRORED, radiance * arrives[:, shaded] * counts, rows)
         path = seen.position - points.position[:, shaded]
-        albedo = scene.diffuse_at(seen) + scene.specular_at(seen)
+        albedo = scene.material_at(seen, "diffuse") + scene.material_at(seen, "specular")
         block.add(Channel.SEEN_ALBEDO, albedo * counts, rows)
         block.add(Channel.SEEN_NEARNESS, (counts / (1 + np.sqrt(dot(path, path))))[None], rows)
 

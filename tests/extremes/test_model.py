@@ -18,7 +18,7 @@ from model.positions import TriangleRotary
 from model.scene_tensors import MAX_NETWORK_M, SceneBatch, batch_scenes, scene_tensors
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
-from tests.model.attention_reference import attend_reference
+from tests.model.kit import attend_reference
 from tests.model.kit import FAMILIES, awake, random_scene, tiny_config
 from tests.train.toy import toy_scene
 

@@ -32,7 +32,7 @@ from storage.renderer import Renderer
 from tests.command_line import trilight
 from tests.for_each import case
 from tests.model.kit import awake
-from tests.model.published.test_convert import publishable
+from tests.model.kit import publishable
 from tests.train.toy import VIEWS, toy_sample, write_toy_dataset
 from train.evaluation import board as board_module
 from train.evaluation.board import NOISE

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from storage.records.sample import Sample
 from storage.renderer import fingerprint
-from train.data.resolution import block_mean
+from train.data.scenes import block_mean
 from train.evaluation.baselines import Baselines
 
 

@@ -52,7 +52,7 @@ def _device(first: Tensor | dict[str, Any]) -> torch.device:
 
 
 PRODUCTS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-"""Types of Muon's products, by precision."""
+"""Types of matrix products, by precision."""
 
 
 class StackedMuon(torch.optim.Muon):
