@@ -146,14 +146,22 @@ def plan_resume(
     old_record = settings_record(before)
     past_events = tuple(Event(**record) for record in header.get("history", ()))
     named_decisions = {name: value for name, value in decisions.items() if name != DATA}
-    _require_meaning(named_decisions)
+    for name, value in named_decisions.items():
+        if name in _EXECUTION:
+            raise TrilightError(
+                f"--change {name}: it is execution, which is free when a run goes on; expected "
+                f"--set {name}={_to_text(value)}."
+            )
     typed_otherwise = differences(old_record, settings_record(typed))
     execution_changes = {
         name: typed_otherwise[name] for name in typed_otherwise if name in _EXECUTION
     }
     settings = changed(before, execution_changes | named_decisions)
     new_values = differences(old_record, settings_record(settings))
-    stated = _original_values(past_events)
+    stated: dict[str, list[Any]] = {}  # earlier values, which a command may still state
+    for event in past_events:
+        values = [event.before, event.after] if event.kind == "earlier" else [event.before]
+        stated.setdefault(event.name, values)
     events = list[Event]()
     undecided = dict[str, Any]()
     for name, value in typed_otherwise.items():
@@ -166,7 +174,10 @@ def plan_resume(
             undecided[name] = value
     if undecided:
         raise _undecided_error(old_record, undecided)
-    events += _change_events(old_record, new_values, step)
+    for name, value in new_values.items():
+        kind: Literal["execution", "meaning"] = "execution" if name in _EXECUTION else "meaning"
+        old = _value_at(old_record, name)
+        events.append(Event(step=step, kind=kind, name=name, before=old, after=value))
     events += _data_event(header, data_digest, decisions.get(DATA))
     _require_possible(before, settings, step, events)
     return ResumePlan(
@@ -177,43 +188,9 @@ def plan_resume(
     )
 
 
-def _change_events(
-    old_record: Mapping[str, Any], new_values: Mapping[str, Any], step: int
-) -> list[Event]:
-    """Return the events of settings that change at a step."""
-    return [
-        Event(
-            step=step,
-            kind="execution" if name in _EXECUTION else "meaning",
-            name=name,
-            before=_value_at(old_record, name),
-            after=value,
-        )
-        for name, value in new_values.items()
-    ]
-
-
 def event_records(events: Sequence[Event]) -> list[dict[str, Any]]:
     """Return events as the JSON records of checkpoints, settings.json and summary.json."""
     return [dataclasses.asdict(event) for event in events]
-
-
-def _original_values(past: Sequence[Event]) -> dict[str, list[Any]]:
-    """Return, by setting, the earlier values that a command may still state."""
-    stated: dict[str, list[Any]] = {}
-    for event in past:
-        values = [event.before, event.after] if event.kind == "earlier" else [event.before]
-        stated.setdefault(event.name, values)
-    return stated
-
-
-def _require_meaning(named: Mapping[str, Any]) -> None:
-    for name, value in named.items():
-        if name in _EXECUTION:
-            raise TrilightError(
-                f"--change {name}: it is execution, which is free when a run goes on; expected "
-                f"--set {name}={_to_text(value)}."
-            )
 
 
 def _data_event(header: Mapping[str, Any], digest: str, decided: Any) -> Iterator[Event]:

@@ -109,8 +109,12 @@ def train_run(
         judge = recorder = None
         if dist_context.is_first:
             judge = _make_judge(dataset, settings, state.bad_samples)
-            recorder = _recorder(state, settings, folder, judge, progress, watched)
-            _record_start(folder, state, dist_context, early_notes.texts, resumed=start.resume)
+            recorder = _begin_records(state, settings, folder, judge, progress, watched)
+            how = "went on" if start.resume else "began"
+            many = "process" if dist_context.world_size == 1 else "processes"
+            where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"
+            for text in (where, *early_notes.texts):
+                add_note(folder.notes, state.step, text)
         trainer = Trainer(
             state=state,
             settings=settings,
@@ -192,21 +196,6 @@ class _NoteBuffer(TrainProgress):
         self.texts.append(text)
 
 
-def _record_start(
-    folder: RunFolder,
-    state: TrainState,
-    dist_context: DistributedContext,
-    notes: Sequence[str],
-    *,
-    resumed: bool,
-) -> None:
-    """Write the start or resume of the trainer, and its notes so far, into notes.jsonl."""
-    how = "went on" if resumed else "began"
-    many = "process" if dist_context.world_size == 1 else "processes"
-    for text in (f"{how} on {dist_context.device}, {dist_context.world_size} {many}", *notes):
-        add_note(folder.notes, state.step, text)
-
-
 def stream_settings(settings: TrainSettings) -> StreamSettings:
     """Return the settings of the stream that feeds a run."""
     return StreamSettings(
@@ -258,7 +247,7 @@ def _make_judge(
     return Judge(samples, settings.resolution, median_picture(training))
 
 
-def _recorder(
+def _begin_records(
     state: TrainState,
     settings: TrainSettings,
     folder: RunFolder,

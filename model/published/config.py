@@ -72,6 +72,20 @@ _EQUAL = (
 """Pairs of fields of the two stages that are equal in both families, and always here."""
 
 
+_SAME = {
+    "latent_dim": "width",
+    "num_layers": "encoder_layers",
+    "num_heads": "num_heads",
+    "dim_feedforward": "hidden_width",
+    "num_register_tokens": "num_registers",
+    "vn_pe_num_freqs": "normal_octaves",
+    "view_transformer_n_layers": "decoder_layers",
+    "patch_size": "patch_px",
+    "dpt_features": "dpt_features",
+}
+"""Fields whose value is that of one field of ModelConfig."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class PublishedConfig:
     """Content of a published configuration."""
@@ -94,20 +108,12 @@ def decode_published(fields: Mapping[str, Any]) -> PublishedConfig:
     layers = got["view_transformer_n_layers"]
     taps = got["dpt_out_layers"] or range(layers - NUM_TAPS, layers)
     model = ModelConfig(
-        width=got["latent_dim"],
-        num_heads=got["num_heads"],
-        encoder_layers=got["num_layers"],
-        decoder_layers=layers,
-        hidden_width=got["dim_feedforward"],
-        num_registers=got["num_register_tokens"],
+        **{ours: got[theirs] for theirs, ours in _SAME.items()},
         rope_num_freqs=num_freqs,
         rope_max_freq=float(_max_freq(num_freqs, doubled=got["rope_double_max_freq"])),
         register_eps=REGISTER_EPS,
-        normal_octaves=got["vn_pe_num_freqs"],
-        patch_px=got["patch_size"],
         window_bundles=WINDOW_BUNDLES if got["view_transformer_use_swin_attn"] else 0,
         head="dpt",
-        dpt_features=got["dpt_features"],
         dpt_channels=tuple(got["dpt_out_channels"]),
         dpt_taps=tuple(taps),
     )
@@ -136,26 +142,19 @@ def encode_published(config: PublishedConfig) -> dict[str, Any]:
             f"rope_max_freq {model.rope_max_freq} of {model.rope_num_freqs} frequencies",
             "one less than their number, or than twice their number",
         )
-    return _FIXED | {
-        "latent_dim": model.width,
-        "num_layers": model.encoder_layers,
-        "num_heads": model.num_heads,
-        "dim_feedforward": model.hidden_width,
-        "num_register_tokens": model.num_registers,
+    same = {theirs: getattr(model, ours) for theirs, ours in _SAME.items()}
+    equal = {theirs: same[other] for theirs, other in _EQUAL}
+    got = {
+        **same,
+        **equal,
         "rope_double_max_freq": doubled,
         "vertex_pe_num_freqs": 2 * model.rope_num_freqs,
-        "vn_pe_num_freqs": model.normal_octaves,
         "texture_encode_patch_size": config.texture_patch,
-        "view_transformer_latent_dim": model.width,
-        "view_transformer_ffn_hidden_dim": model.hidden_width,
-        "view_transformer_n_heads": model.num_heads,
-        "view_transformer_n_layers": model.decoder_layers,
         "view_transformer_use_swin_attn": bool(model.window_bundles),
-        "patch_size": model.patch_px,
-        "dpt_features": model.dpt_features,
         "dpt_out_channels": list(model.dpt_channels),
         "dpt_out_layers": list(model.dpt_taps),
     }
+    return _FIXED | {name: got[name] for name in _DEFAULTS}
 
 
 def _max_freq(num_freqs: int, *, doubled: bool) -> int:

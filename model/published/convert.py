@@ -117,37 +117,34 @@ def module_names(config: ModelConfig) -> dict[str, str]:
     return table | _dpt("decoder.head", f"{_VIEW}.out_dpt")
 
 
+_SELF_ATTENTION = {"qkv": "in_proj", "q_norm": "q_norm", "k_norm": "k_norm", "out": "out_proj"}
+_CROSS_ATTENTION = {
+    "q": "q_proj", "k": "k_proj", "v": "v_proj", "out": "out_proj",
+    "q_norm": "q_norm", "k_norm": "k_norm",
+}  # fmt: skip
+_FFN = {"ffn.gate": "ffn.w1", "ffn.up": "ffn.w3", "ffn.down": "ffn.w2", "ffn_norm": "ffn_norm"}
+
+
+def _below(ours: str, theirs: str, names: Mapping[str, str]) -> dict[str, str]:
+    return {f"{ours}.{a}": f"{theirs}.{b}" for a, b in names.items()}
+
+
 def _encoder_layer(ours: str, theirs: str) -> dict[str, str]:
     return {
-        **_self_attention(f"{ours}.attention", f"{theirs}.multihead_attn"),
-        f"{ours}.attention_norm": f"{theirs}.query_norm",
-        **_ffn(ours, theirs),
+        **_below(f"{ours}.attention", f"{theirs}.multihead_attn", _SELF_ATTENTION),
+        **_below(ours, theirs, {"attention_norm": "query_norm", **_FFN}),
     }
 
 
 def _decoder_layer(ours: str, theirs: str) -> dict[str, str]:
-    cross = {
-        "q": "q_proj", "k": "k_proj", "v": "v_proj", "out": "out_proj",
-        "q_norm": "q_norm", "k_norm": "k_norm",
+    norms = {
+        "cross.context_norm": "kv_norm", "cross_norm": "query_norm", "self_norm": "self_attn_norm",
     }  # fmt: skip
     return {
-        **_self_attention(f"{ours}.self_attention", f"{theirs}.self_attn"),
-        **{f"{ours}.cross.{a}": f"{theirs}.multihead_attn.{b}" for a, b in cross.items()},
-        f"{ours}.cross.context_norm": f"{theirs}.kv_norm",
-        f"{ours}.cross_norm": f"{theirs}.query_norm",
-        f"{ours}.self_norm": f"{theirs}.self_attn_norm",
-        **_ffn(ours, theirs),
+        **_below(f"{ours}.self_attention", f"{theirs}.self_attn", _SELF_ATTENTION),
+        **_below(f"{ours}.cross", f"{theirs}.multihead_attn", _CROSS_ATTENTION),
+        **_below(ours, theirs, norms | _FFN),
     }
-
-
-def _self_attention(ours: str, theirs: str) -> dict[str, str]:
-    names = {"qkv": "in_proj", "q_norm": "q_norm", "k_norm": "k_norm", "out": "out_proj"}
-    return {f"{ours}.{a}": f"{theirs}.{b}" for a, b in names.items()}
-
-
-def _ffn(ours: str, theirs: str) -> dict[str, str]:
-    names = {"ffn.gate": "ffn.w1", "ffn.up": "ffn.w3", "ffn.down": "ffn.w2", "ffn_norm": "ffn_norm"}
-    return {f"{ours}.{a}": f"{theirs}.{b}" for a, b in names.items()}
 
 
 def _dpt(ours: str, theirs: str) -> dict[str, str]:

@@ -40,7 +40,7 @@ from train.evaluation.chart import plot_leaderboard
 from train.evaluation.judged_view import NETWORK
 from train.evaluation.options import LeaderboardOptions
 from train.evaluation.pairs import METRIC
-from train.evaluation.rows import UNKNOWN_MACHINE, Row, RowKey, Rows
+from train.evaluation.board import UNKNOWN_MACHINE, Row, RowKey, Rows
 from train.evaluation.standings import Standing, WidthStandings
 from train.evaluation.stored_pictures import PictureSource, nearest_view
 from train.evaluation.timing import Price

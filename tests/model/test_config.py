@@ -156,14 +156,10 @@ def wider(config: ModelConfig, times: int) -> ModelConfig:
     )
 
 
-@for_each("name", sorted(SIZES))
-def test_without_a_base_width_nothing_follows_the_width(name: str) -> None:
-    assert set(width_scales(made(SIZES[name]()), BaseWidths()).values()) == {WidthScale()}
-
-
-@for_each("config", [smoke(), hits_smoke()])
-def test_at_the_base_width_all_is_as_it_is(config: ModelConfig) -> None:
-    assert set(width_scales(made(config), BASE).values()) == {WidthScale()}
+def test_without_a_base_width_or_at_it_nothing_follows_the_width() -> None:
+    configs = [(SIZES[name](), BaseWidths()) for name in SIZES]
+    for config, base_widths in (*configs, (smoke(), BASE), (hits_smoke(), BASE)):
+        assert set(width_scales(made(config), base_widths).values()) == {WidthScale()}
 
 
 def test_every_kind_of_weight_follows_its_own_rule() -> None:

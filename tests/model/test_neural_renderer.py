@@ -70,12 +70,11 @@ def test_three_lines_are_enough(tmp_path: Path) -> None:
 
 def test_few_lights_are_the_networks_own_picture() -> None:
     """The same numbers in the same order; one view at a time may sum in another (1e-5 relative)."""
-    model, scene = network(), many_lights(8)
-    scene = scene.with_cameras(tiny_scene().c2w, tiny_scene().fov_deg)
-    with torch.no_grad():
-        whole = radiance(model(batch_scenes([scene_tensors(scene)]), 16)[0].double()).numpy()
-    picture = NeuralRenderer(model).render(scene, 16)
-    np.testing.assert_allclose(picture, np.maximum(whole, 0), rtol=1e-5, atol=1e-6)
+    seen = many_lights(8).with_cameras(tiny_scene().c2w, tiny_scene().fov_deg)
+    for model, scene in ((network(), seen), (awake(KINDS["4 pixels"], torch.float32), corner())):
+        whole = radiance(render(model, scene_tensors(scene), resolution=16)[0].double()).numpy()
+        shown = NeuralRenderer(model).render(scene, 16)
+        np.testing.assert_allclose(shown, np.maximum(whole, 0), rtol=1e-5, atol=1e-6)
 
 
 def test_other_cameras_see_the_same_prepared_scene() -> None:
@@ -417,14 +416,6 @@ def test_it_begins_with_equal_light_everywhere() -> None:
     assert shown.max() > 0.1
     # float32 through a logarithm and back
     torch.testing.assert_close(radiance(half), 0.5 * radiance(shown), rtol=1e-4, atol=1e-6)
-
-
-def test_a_renderer_shows_what_the_network_computes() -> None:
-    scene = corner()
-    model = awake(KINDS["4 pixels"], torch.float32)
-    shown = NeuralRenderer(model).render(scene, RESOLUTION)[0]
-    expected = radiance(picture(model, scene).double()).numpy()
-    np.testing.assert_allclose(shown, expected, rtol=1e-5, atol=1e-6)  # rounded to float32
 
 
 @for_each("small", [(1, 1), (1, 4), (3, 5), (16, 16)])

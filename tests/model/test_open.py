@@ -160,32 +160,26 @@ def same(a: RenderFormer, b: RenderFormer) -> bool:
     return a.config == b.config and all(n == m and torch.equal(x, y) for (n, x), (m, y) in pairs)
 
 
-def test_ours_opens_as_file_and_as_folder(ours: Path) -> None:
-    expected = awake(tiny_config(), torch.float32)
-    for source in (ours, ours / WEIGHTS_NAME):
-        model = open_network(str(source))
-        assert same(model, expected)
-        assert not model.training
-        assert all(weight.requires_grad for weight in model.parameters())
+def test_a_network_opens_as_file_and_as_folder(ours: Path, published: Path) -> None:
+    for folder, config in ((ours, tiny_config()), (published, publishable("swin"))):
+        for source in (folder, folder / WEIGHTS_NAME):
+            model = open_network(str(source))
+            assert same(model, awake(config, torch.float32)) and not model.training
+            assert all(weight.requires_grad for weight in model.parameters())
 
 
-def test_published_opens_as_folder_and_as_file(published: Path) -> None:
-    expected = awake(publishable("swin"), torch.float32)
-    assert same(open_network(str(published)), expected)
-    assert same(open_network(str(published / WEIGHTS_NAME)), expected)
-
-
-def test_a_published_name_is_fetched_from_the_hub(
-    published: Path, monkeypatch: pytest.MonkeyPatch
+@for_each("is_there", [True, False])
+def test_a_published_name_is_fetched_from_the_hub_or_was_before(
+    published: Path, monkeypatch: pytest.MonkeyPatch, is_there: bool
 ) -> None:
     asked = []
 
     def download(repo_id: str, filename: str, local_files_only: bool) -> str:
-        assert not local_files_only
+        assert local_files_only != is_there
         asked.append((repo_id, filename))
         return str(published / filename)
 
-    _stand_in_hub(monkeypatch, download, lambda name, timeout: None)
+    _stand_in_hub(monkeypatch, download, (lambda name, timeout: None) if is_there else _no_route)
     assert same(open_network(PUBLISHED[1]), awake(publishable("swin"), torch.float32))
     assert asked == [(PUBLISHED[1], CONFIG_NAME), (PUBLISHED[1], WEIGHTS_NAME)]
 
@@ -216,17 +210,6 @@ def test_a_hub_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(TrilightError, match=r"the hub did not give it \(no route to host\)") as got:
         open_network(PUBLISHED[0])
     assert "\n" not in str(got.value)
-
-
-def test_what_was_fetched_before_is_opened_without_the_hub(
-    published: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def download(repo_id: str, filename: str, local_files_only: bool) -> str:
-        assert local_files_only
-        return str(published / filename)
-
-    _stand_in_hub(monkeypatch, download, _no_route)
-    assert same(open_network(PUBLISHED[1]), awake(publishable("swin"), torch.float32))
 
 
 def test_without_the_hub_library_the_way_out_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

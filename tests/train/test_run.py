@@ -220,6 +220,9 @@ def test_mistakes_are_named(dataset: Dataset, whole: TrainResult, tmp_path: Path
         trained(tiny_run(views_per_scene=3), dataset, tmp_path / "c")
     with pytest.raises(TrilightError, match="holds a run already; add --resume"):
         trained(tiny_run(), dataset, whole.folder.root)
+    empty = write_toy_dataset(tmp_path / "data", resolution=8, train=0, validation=1)
+    with pytest.raises(TrilightError, match="the train split holds no scene"):
+        trained(tiny_run(resolution=8), empty, tmp_path / "d")
 
 
 def test_data_without_a_validation_split_trains_and_says_so(
@@ -277,12 +280,6 @@ def test_a_run_that_recovers_goes_on_and_counts(
     assert [int(match[1]) for match in named if match] == [*range(2, 11), *range(12, 21)]
     losses = {row["step"]: row["loss"] for row in read_rows(result.folder.metrics) if "loss" in row}
     assert losses[4] is None and losses[12] > 0, "a row without a finite step has no loss"
-
-
-def test_an_empty_training_split_is_named(tmp_path: Path) -> None:
-    dataset = write_toy_dataset(tmp_path / "data", resolution=8, train=0, validation=1)
-    with pytest.raises(TrilightError, match="the train split holds no scene"):
-        trained(tiny_run(resolution=8), dataset, tmp_path / "out")
 
 
 def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) -> None:
@@ -385,7 +382,7 @@ def test_a_run_goes_on_past_a_damaged_checkpoint_to_the_same_weights(
 ) -> None:
     settings = tiny_run(num_steps=8, checkpoints_kept=3)
     whole = trained(settings, dataset, tmp_path)
-    folder_weights, path = (
+    weights, path = (
         whole.folder.weights.read_bytes(),
         path_of_step(whole.folder.checkpoints, 8),
     )
@@ -395,7 +392,7 @@ def test_a_run_goes_on_past_a_damaged_checkpoint_to_the_same_weights(
     notes = Heard()
     again = trained(settings, dataset, tmp_path, resume=True, workers=1, progress=notes)
     assert [str(path) in text for text in notes.notes] == [True]
-    assert again.folder.weights.read_bytes() == folder_weights
+    assert again.folder.weights.read_bytes() == weights
     assert open_network(path).config == settings.model, "it was written again"
 
 
@@ -423,7 +420,7 @@ def test_muon_goes_on_in_another_precision_on_another_processor(
     have_bfloat16(monkeypatch, True)
     whole = trained(settings, dataset, tmp_path)
     assert json.loads(whole.folder.settings.read_text())["muon_precision"] == "bfloat16"
-    folder_weights = open_network(tmp_path).state_dict()
+    weights = open_network(tmp_path).state_dict()
     checkpoints = whole.folder.checkpoints
     path_of_step(checkpoints, 12).unlink()
     begun_at = read_checkpoint(path_of_step(checkpoints, 8)).network().state_dict()
@@ -433,8 +430,8 @@ def test_muon_goes_on_in_another_precision_on_another_processor(
     assert ["Muon's products in float32 instead of bfloat16" in text for text in notes.notes] == [1]
     assert read_checkpoint(path_of_step(checkpoints, 12)).header["muon_precision"] == "float32"
     resumed = open_network(tmp_path).state_dict()
-    apart = sum((resumed[name] - folder_weights[name]).square().sum() for name in folder_weights)
-    way = sum((folder_weights[name] - begun_at[name]).square().sum() for name in folder_weights)
+    apart = sum((resumed[name] - weights[name]).square().sum() for name in weights)
+    way = sum((weights[name] - begun_at[name]).square().sum() for name in weights)
     # measured 0.095: the rounding of four steps, and what gradients then differ; without the
     # memories of the first eight it would be 0.85
     assert 0 < apart < 0.15**2 * way
@@ -444,8 +441,8 @@ RUN = tiny_run(num_steps=8, validate_every=8)
 
 
 @pytest.fixture(scope="module")
-def folder_weights(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """The folder_weights of the run from the folder, uninterrupted."""
+def expected(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The weights of the run from the folder, uninterrupted."""
     out = tmp_path_factory.mktemp("whole")
     return trained(RUN, dataset, out).folder.weights.read_bytes()
 
@@ -461,7 +458,7 @@ def server(dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_run_begun_in_a_folder_goes_on_from_a_server(
-    dataset: Dataset, folder_weights: bytes, server: Site, tmp_path: Path
+    dataset: Dataset, expected: bytes, server: Site, tmp_path: Path
 ) -> None:
     """In the middle of an epoch, over a bad line, with another number of threads."""
     out = tmp_path / "out"
@@ -470,18 +467,18 @@ def test_a_run_begun_in_a_folder_goes_on_from_a_server(
     faults = [Fault(status=503), Fault(cut_after=5000), Fault(flip=True)]
     server.faults = {f"/train-{number:06d}.tar": list(faults) for number in range(3)}
     result = trained(RUN, [server.url], out, resume=True, workers=3)
-    assert result.folder.weights.read_bytes() == folder_weights
+    assert result.folder.weights.read_bytes() == expected
     assert result.unusable == ()
 
 
 def test_a_list_gives_the_same_weights_and_says_what_it_lacks(
-    dataset: Dataset, folder_weights: bytes, server: Site, tmp_path: Path
+    dataset: Dataset, expected: bytes, server: Site, tmp_path: Path
 ) -> None:
     listener = Heard(killed_at=99)
     pattern = f"{server.url}/{{train-000000,train-000001,train-000002,validation-000000}}.tar"
     result = trained(RUN, [pattern], tmp_path / "out", progress=listener)
     # the header alone differs: without a manifest nobody knows how large the scenes may be
-    ours, theirs = load(result.folder.weights.read_bytes()), load(folder_weights)
+    ours, theirs = load(result.folder.weights.read_bytes()), load(expected)
     assert ours.keys() == theirs.keys() and all(torch.equal(ours[n], theirs[n]) for n in ours)
     lacks, *others = listener.notes
     assert lacks == NO_MANIFEST

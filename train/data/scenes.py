@@ -135,22 +135,18 @@ def _scene_of(
     else:
         radiance_VRR3 = block_mean(to_float32(pictures), resolution)
         target_VRR3 = torch.from_numpy(log10_radiance(radiance_VRR3).astype(np.float32))
+    light_of_object = np.full(len(scene.objects), -1, np.int64)
+    rows = list(light_rows(scene))
+    light_of_object[rows] = np.arange(len(rows))
     floors_db = np.array([view.noise_floor_db for view in views], np.float32)
     return TrainingScene(
         key=key,
         tensors=scene_tensors(scene),
         target_VRR3=target_VRR3,
         noise_V=torch.from_numpy(10 ** (-floors_db / 20)),
-        light_T=torch.from_numpy(_lights_of_triangles(scene)),
+        light_T=torch.from_numpy(light_of_object[scene.object_index]),
         levels_L=levels_L,
     )
-
-
-def _lights_of_triangles(scene: Scene) -> NDArray[np.int64]:
-    light_of_object = np.full(len(scene.objects), -1, np.int64)
-    rows = list(light_rows(scene))
-    light_of_object[rows] = np.arange(len(rows))
-    return light_of_object[scene.object_index]
 
 
 def _with_lights(

@@ -345,8 +345,9 @@ class _SceneMaker:
             try:
                 return self._draw_views(shard.stored_sample(at), rng), rng
             except TrilightError as error:
-                shard_error = _with_shard_name(shard.name, error)
-                self._unusable.add(f"{shard.name}: sample {keys[at]}", 1, shard_error)
+                if not str(error).startswith(shard.name):
+                    error = TrilightError(f"{shard.name}: {error}")
+                self._unusable.add(f"{shard.name}: sample {keys[at]}", 1, error)
         return None
 
     def _draw_views(self, sample: StoredSample, rng: np.random.Generator) -> TrainingScene:
@@ -363,11 +364,6 @@ class _SceneMaker:
         views = np.sort(rng.permutation(num_views)[: settings.views_per_scene])
         per_light = settings.augmentation is not None and settings.augmentation.light_mix > 1
         return scene_of_views(sample, views.tolist(), settings.resolution, per_light=per_light)
-
-
-def _with_shard_name(shard: str, error: TrilightError) -> TrilightError:
-    text = str(error)
-    return error if text.startswith(shard) else TrilightError(f"{shard}: {text}")
 
 
 def prefetch(items: Iterator[Item], depth: int) -> Generator[Item, None, None]:

@@ -14,7 +14,7 @@ from storage.records.sample import Sample
 from storage.records.scene import Scene
 from train.data.buckets import collate_batch
 from train.data.scenes import TrainingScene, training_scene
-from train.evaluation.scores import (
+from train.evaluation.metrics import (
     Lead,
     ViewScore,
     fraction_better,

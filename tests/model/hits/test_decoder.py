@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from model.config import ModelConfig, hit_stage
 from model.hits import decoder
-from model.hits.decoder import _around, _in_parts, _whole
+from model.hits.decoder import _around
 from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import SOURCE, DeviceTriangles, build_tree
 from model.hits.traced import INPUTS
@@ -65,14 +65,6 @@ def in_double(batch: SceneBatch) -> SceneBatch:
 def picture(model: RenderFormer, *scenes: SceneTensors) -> Tensor:
     shown: Tensor = model(batch_scenes(scenes), PX)
     return shown
-
-
-def test_parts_of_a_picture_come_together_again() -> None:
-    values = torch.arange(2 * 24 * 24 * 3.0).reshape(2, 24, 24, 3)
-    parts = _in_parts(values, 4)
-    assert parts.shape == (2, 16, 36, 3)
-    assert torch.equal(parts[1, 5], values[1, 6:12, 6:12].reshape(36, 3))
-    assert torch.equal(_whole(parts, 4), values)
 
 
 def test_anchors_around_a_part_are_those_beside_it() -> None:

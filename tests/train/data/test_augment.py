@@ -277,7 +277,7 @@ def test_training_takes_skies_that_its_network_knows(config: object, is_known: b
         maker._draw_views(_below_a_sky(), rng)
 
 
-RESOLUTION, BLOCK, PASSES, SPP = 32, 4, 16, 64
+BLOCK, PASSES, SPP = 4, 16, 64
 
 TRACED_SYMMETRIES = {
     "mirror": AugmentationSettings(mirror=True),

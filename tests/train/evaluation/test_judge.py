@@ -44,10 +44,18 @@ from train.evaluation.error_colors import ERROR_WHITE, error_picture
 from train.evaluation.evaluate import EvalConfig, judge_views, sheet_views
 from train.evaluation.judge import hit_masks
 from train.evaluation.judged_view import NETWORK, JudgedView
-from train.evaluation.metrics import METRICS, noise_floors, picture_scores
+from train.evaluation.metrics import (
+    METRICS,
+    ViewScore,
+    fraction_better,
+    lead,
+    noise_floors,
+    picture_scores,
+    score_view,
+    summarize_scores,
+)
 from train.evaluation.pages import evaluation_page
 from train.evaluation.report import record
-from train.evaluation.scores import ViewScore, fraction_better, lead, score_view, summarize_scores
 from train.evaluation.sheet import (
     NOISE_WHITE,
     SheetView,

@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -68,10 +69,8 @@ def test_a_loader_that_sleeps_is_named_with_its_stack(tmp_path: Path) -> None:
     said: list[str] = []
     settings = WatchSettings(hang_after_s=0.1, hang_factor=2)
     activity = Activity()
-    dog = Watchdog(
-        settings, activity, ALONE, tmp_path / "watching", note=said.append, report_hang=pytest.fail
-    )
-    with dog:
+    rest: dict[str, Any] = {"note": said.append, "report_hang": pytest.fail}
+    with Watchdog(settings, activity, ALONE, tmp_path / "watching", **rest) as dog:
         for step in range(1, 5):
             dog.begin("step", step)
         activity.begin("data")
@@ -104,8 +103,8 @@ def test_words_of_other_processes_are_passed_on_and_the_run_stops_if_asked(
     os.utime(others, (time.time() + 60, time.time() + 60))  # written while it hangs
     os.utime(old, (0, 0))  # of an earlier call
     pair = DistributedContext(device=CPU, world_size=2)
-    dog = Watchdog(settings, Activity(), pair, tmp_path, note=said.append, report_hang=ended.append)
-    with dog:
+    rest: dict[str, Any] = {"note": said.append, "report_hang": ended.append}
+    with Watchdog(settings, Activity(), pair, tmp_path, **rest) as dog:
         dog.begin("validation", 7)
         until(lambda: ended)
     assert "the validation after step 7 hangs" in ended[0] and len(ended) == 1
@@ -116,16 +115,9 @@ def test_words_of_other_processes_are_passed_on_and_the_run_stops_if_asked(
 def test_a_full_disk_ends_no_watching(tmp_path: Path) -> None:
     said: list[str] = []
     (tmp_path / "watching").write_text("a file where the folder would be")
-    settings = WatchSettings(hang_after_s=0.1)
-    dog = Watchdog(
-        settings,
-        Activity(),
-        ALONE,
-        tmp_path / "watching",
-        note=said.append,
-        report_hang=pytest.fail,
-    )
-    with dog:
+    settings, rest = WatchSettings(hang_after_s=0.1), {"note": said.append}
+    place = tmp_path / "watching"
+    with Watchdog(settings, Activity(), ALONE, place, **rest, report_hang=pytest.fail) as dog:
         dog.begin("step", 1)
         until(lambda: said)
     assert "Stacks" not in said[0]
