@@ -145,7 +145,11 @@ class NeuralRenderer:
         """
         self._require_memory(scene.num_triangles)
         below_sky = scene
-        scene = self._with_known_sky(scene)
+        sky = scene.environment
+        if sky is not None:  # its light alone, or nothing where it is not known
+            knows_sky = self._model.config.sky_rays
+            sky = dataclasses.replace(sky, is_seen=False) if knows_sky else None
+            scene = dataclasses.replace(scene, environment=sky)
         by_hits = isinstance(self._model.config.stage, HitStage)
         all_lights = [LightGroup(scene=scene, fraction=1.0)]
         groups = [
@@ -205,14 +209,6 @@ class NeuralRenderer:
             f"pictures of {resolution} pixels, and the network was trained on {trained}: expect "
             f"a worse one than with --resolution {trained}",
         )
-
-    def _with_known_sky(self, scene: Scene) -> Scene:
-        """Return the scene with the light of its sky alone, or without it where it is not known."""
-        sky = scene.environment
-        if sky is not None:
-            known = self._model.config.sky_rays
-            sky = dataclasses.replace(sky, is_seen=False) if known else None
-        return dataclasses.replace(scene, environment=sky)
 
     def _notes(self, scene: Scene, num_groups: int) -> tuple[str, ...]:
         notes = []

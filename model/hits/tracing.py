@@ -1,6 +1,7 @@
 """Scenes as the network has them -> traced inputs of them and of their views."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
@@ -74,16 +75,11 @@ class TracedScene:
             angle,
             resolution,
             rays_a_side=stage.hit_rays,
-            anchors_a_side=anchors_a_side(stage, resolution),
+            anchors_a_side=math.gcd(stage.hit_anchors, resolution),  # it divides the width
             gather_rays=stage.gather_rays,
             sky_rays=stage.sky_rays,
             seed=seed,
         )
-
-
-def anchors_a_side(stage: HitStage, resolution: int) -> int:
-    """Return the number of anchors along a side of a picture: a divisor of its width."""
-    return int(np.gcd(stage.hit_anchors, resolution))
 
 
 def traced_batch(batch: SceneBatch) -> tuple[TracedScene, ...]:
@@ -94,8 +90,13 @@ def traced_batch(batch: SceneBatch) -> tuple[TracedScene, ...]:
 def traced_scene(lit: LitScene) -> TracedScene:
     """Return surfaces, with the light that they receive, ready for rays."""
     light = scene_light(lit)
-    unit_3 = torch.from_numpy(light.mean_3)
-    return TracedScene(lit=lit, light=light, sides_T12=sides_of(light), unit_3=unit_3)
+    parts = [part[side] for side in (0, 1) for part in (light.direct_2T3, light.indirect_2T3)]
+    return TracedScene(
+        lit=lit,
+        light=light,
+        sides_T12=torch.from_numpy(np.concatenate(parts, axis=-1)),
+        unit_3=torch.from_numpy(light.mean_3),
+    )
 
 
 def lit_scenes(batch: SceneBatch) -> tuple[LitScene, ...]:
@@ -198,9 +199,3 @@ def traced_views(
 def _stack(arrays: list[NDArray]) -> Tensor:
     stacked: Any = np.stack(arrays)
     return stacked.tensor if isinstance(stacked, DeviceArray) else torch.from_numpy(stacked)
-
-
-def sides_of(light: SceneLight) -> Tensor:
-    """Return [T, 12]: direct and indirect light of the front, then of the back."""
-    parts = [part[side] for side in (0, 1) for part in (light.direct_2T3, light.indirect_2T3)]
-    return torch.from_numpy(np.concatenate(parts, axis=-1))
