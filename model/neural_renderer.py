@@ -54,7 +54,6 @@ class NeuralRenderer:
         """Take a network, which stays where it is; `load` reads one.
 
         Args:
-            model: the network.
             trained: what it was trained on, if that is known.
         """
         self._model = model.eval()
@@ -169,7 +168,6 @@ class NeuralRenderer:
         """Return the picture [R, R, 3] of one camera, linear radiance of at least 0.
 
         Args:
-            prepared: the scene.
             c2w: [4, 4] camera to world.
             fov_deg: full field of view in degrees.
             resolution: as in `render`.

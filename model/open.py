@@ -83,9 +83,6 @@ class NetworkFile:
 def open_network(source: str | Path) -> RenderFormer:
     """Return a network, float32, in evaluation mode on the CPU.
 
-    Args:
-        source: as in `find_network`.
-
     Raises:
         TrilightError: no such file, pickled code, a damaged file, or tensors that do not match the
             configuration; the message lists their names.

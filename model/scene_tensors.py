@@ -133,7 +133,6 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
     """Return the tensors of a scene that passes `Scene.check`; its arrays stay unchanged.
 
     Args:
-        scene: scene to convert.
         columns: material columns, such as those of one network (`ModelConfig.material_columns`);
             None for all declared columns.
 

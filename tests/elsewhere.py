@@ -49,9 +49,6 @@ CHOSEN = (
     "tests/model/hits/test_view_inputs.py",
     "tests/model/test_open.py",
     "tests/model/test_neural_renderer.py",
-    "tests/model/test_neural_renderer.py",
-    "tests/model/test_open.py",
-    "tests/model/test_renderformer.py",
     "tests/model/test_renderformer.py",
     "tests/pipeline/objects/builtin/test_builtin.py",
     "tests/pipeline/renders/test_stored_pictures.py",
@@ -65,11 +62,9 @@ CHOSEN = (
     "tests/train/data/test_stream.py",
     "tests/train/evaluation/test_judge.py",
     "tests/train/loop/test_optim.py",
-    "tests/train/loop/test_optim.py",
     "tests/train/loop/test_step.py",
     "tests/train/loss/test_objective.py",
     "tests/train/loop/test_processes.py",
-    "tests/train/test_run.py",
     "tests/train/test_run.py",
 )
 """Where bytes, digests, stored numbers and close tolerances are compared, cheaply."""

@@ -49,11 +49,8 @@ def gathered_at(
     """Return irradiance over pi from other surfaces [A, 3] at the first thing in anchors' pixels.
 
     Args:
-        scene, light: the scene.
-        hits: of the camera.
         anchor: [A] pixels.
         gather_rays: of each anchor; 0 gives 0.
-        seed: of the noise.
     """
     total = np.zeros_like(hits.along, shape=(3, len(anchor)))
     if not gather_rays:

@@ -71,7 +71,6 @@ def lobe(
     """Return D G2 / (4 cos_i cos_o) cos_o without color, and `sample_lobe`'s density, [P] each.
 
     Args:
-        gloss, points: of the points.
         to_light: [3, P] unit vectors.
         cos_light: [P] their cosine with the shading normal; where it is not above 0 the lobe is 0.
     """

@@ -54,7 +54,6 @@ def outgoing_radiance(
     sky there is that of the whole side of the triangle.
 
     Args:
-        scene, light: the scene.
         points: where the rays have met it.
         u_lamp, on_lamp: [P] and [2, P] uniform numbers.
         is_sharp: [P] whether only mirrors have sent the rays.

@@ -93,7 +93,6 @@ def view_inputs(
     """Trace the inputs of a view; equal arguments give equal numbers.
 
     Args:
-        scene, light: the scene.
         c2w: [4, 4] of the camera.
         fov_deg: its full field of view.
         resolution: pixels across.
@@ -345,10 +344,8 @@ def _add_lobe_rays(
     each, so one ray of a pixel stands for all.
 
     Args:
-        block, scene, light: where.
         u: [5, P] uniform numbers.
         shading: [P] rays of the pixel that a ray counts for as to surfaces; 0: it counts for none.
-        sky_rays: as in `view_inputs`.
     """
     some = np.flatnonzero(brightest(block.gloss.color) > DIMMEST)
     direction, weight = sample_lobe(block.gloss.only(some), block.points.only(some), u[:2, some])

@@ -25,9 +25,6 @@ FREQUENCY_TOLERANCE = 1e-6
 def load_published(tensors: Mapping[str, Tensor], config: PublishedConfig) -> RenderFormer:
     """Return the network of published tensors, float32, in evaluation mode on the CPU.
 
-    Args:
-        tensors, config: as published.
-
     Raises:
         TrilightError: names or shapes do not match the configuration (all are listed), or the
             rotary frequencies do not.

@@ -147,7 +147,7 @@ def permute_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
 
 
 def rotate_vertex_order(scene: TrainingScene, first_T: np.ndarray) -> TrainingScene:
-    """Return the scene with each triangle's vertices (0, 1, 2) read from `turn_T[t]` on.
+    """Return the scene with each triangle's vertices (0, 1, 2) read from `first_T[t]` on.
 
     The first vertex of a triangle is arbitrary, but the network's rotary positions depend on it,
     so it has to learn this symmetry from data.

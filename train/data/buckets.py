@@ -146,14 +146,7 @@ def step_scenes(
     max_scenes: int,
     device: torch.device,
 ) -> Generator[StepScenes, None, None]:
-    """Yield the batches of each step, made ahead in a thread; closing it ends the thread.
-
-    Args:
-        scenes_per_step: scenes of each step.
-        cost: as in `bucket_scenes`.
-        max_scenes: as in `bucket_scenes`.
-        device: device of the network.
-    """
+    """Yield the batches of each step, made ahead in a thread; closing it ends the thread."""
     pins = _has_streams(device)
     return prefetch(
         (_make_step_scenes(scenes, cost, max_scenes, pins) for scenes in scenes_per_step), _AHEAD

@@ -110,10 +110,8 @@ def mix_visits(
     """Yield the visits of the stream without end, from position `first` on.
 
     Args:
-        mixture: order of the datasets.
         visits: endless visits of each dataset, after the scenes of `mixture.counts_before`.
         parts: shard numbers of each dataset among all.
-        first: position of the stream.
     """
     for position, source in enumerate(mixture.sources_from(first), first):
         visit = next(visits[source])
@@ -127,8 +125,6 @@ def plan_mixture(
     """Return the mixture of a run from here on; None if it has only had one dataset.
 
     Args:
-        data: data of the run.
-        settings: settings of the next step.
         header: header of the checkpoint that is resumed; None for a new run. A dataset that the run
             has used before continues at its position.
 

@@ -78,10 +78,7 @@ def scene_of_views(
     If pictures are half floats of the right resolution, the target is not looked up yet.
 
     Args:
-        sample: stored sample.
         views: indices of its cameras, at least one.
-        resolution: as in `training_scene`.
-        per_light: as in `training_scene`.
 
     Raises:
         TrilightError: a picture is damaged or invalid; otherwise as `training_scene`.

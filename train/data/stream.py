@@ -95,8 +95,6 @@ def stream_batches(
     Closing the returned iterator ends its threads.
 
     Args:
-        shards: shards of the train split.
-        settings: settings that determine order and scenes.
         first: number of a global batch.
         rank_slice: slice of each batch for this process; all slices have equal size.
         workers: threads that read and decode; with 0 the caller's thread. The result does not
@@ -372,7 +370,6 @@ def prefetch(items: Iterator[Item], depth: int) -> Generator[Item, None, None]:
     Closing the returned iterator ends the thread.
 
     Args:
-        items: source of the items.
         depth: maximum number of items to compute ahead.
     """
     ready: queue.Queue[tuple[Item] | BaseException | None] = queue.Queue(depth)

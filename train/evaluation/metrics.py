@@ -242,11 +242,8 @@ def noise_floors(
     For log_l1 it is an upper bound, since a mean absolute error is at most the root mean square.
 
     Args:
-        sample: stored sample of the view.
-        view: row of its camera.
         target_rgb: [R, R, 3] linear radiance at the resolution of the evaluation.
         hits: [R, R] True for pixels that see geometry.
-        lpips: as in `picture_scores`.
     """
     rng = rng_for(0, f"noise of {sample.key}", view)
     stored = sample.views[view]

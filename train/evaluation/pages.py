@@ -49,9 +49,6 @@ def leaderboard_page(
     """Return leaderboard.md.
 
     Args:
-        about: facts of the dataset by name.
-        widths: table of each width.
-        notes: notes for the reader.
         rival: name of the row that all others are compared with.
     """
     lines = ["# Leaderboard", "", *_facts(about)]

@@ -53,7 +53,6 @@ def record(
     """Return all measurements of an evaluation as JSON values.
 
     Args:
-        views: rows of the evaluation.
         about: network, data, split and resolution, as the report shows them.
         traced: comparison at equal time (evaluation.equal_time); None if it was not measured.
     """

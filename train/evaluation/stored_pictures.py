@@ -36,8 +36,6 @@ def nearest_view(
     picture by the scene can be better.
 
     Args:
-        name: name of the row.
-        resolution: width of the pictures in pixels.
         read: returns the pictures of the lookup; called when the first one is needed.
         pool: digest of the dataset of these pictures.
         not_itself: whether the evaluated scenes are among them.

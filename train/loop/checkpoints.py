@@ -134,11 +134,8 @@ def restore_state(
     """Return the state of a resumed run before its next step.
 
     Args:
-        checkpoint: checkpoint to restore.
         plan: settings and history (train.resume). If the checkpoint has no EMA and the settings
             ask for one, it starts as a copy of the weights.
-        device: as in `new_state`.
-        muon_precision: as in `new_state`.
 
     Raises:
         TrilightError: the run was started with other extensions.
@@ -173,7 +170,6 @@ def newest_checkpoint(
     """Return the newest checkpoint that is not damaged.
 
     Args:
-        folder: folder of the checkpoints.
         dist_context: the processes that resume together; all must call it.
         note: called with a message if a damaged checkpoint was skipped.
 
@@ -230,11 +226,7 @@ def save_checkpoint(
     steps do not count: they were damaged when the run resumed from an earlier one.
 
     Args:
-        folder: folder of the checkpoints.
         state: state to save; it is copied before this returns.
-        settings: settings of the run.
-        data_digest: digest of the training data.
-        world_size: number of processes.
         submit: runs the slow writing; by default at once.
 
     Raises:

@@ -1,6 +1,6 @@
 """Processes that train together: one, or those that torchrun started.
 
-Each takes its slice of every batch (train.data.order.RankShare); torch's DistributedDataParallel
+Each takes its slice of every batch (train.data.order.RankSlice); torch's DistributedDataParallel
 averages gradients over nccl or gloo. Only the first process logs, validates and saves.
 """
 

@@ -17,7 +17,6 @@ def explain_out_of_memory(settings: TrainSettings, step: int) -> Iterator[None]:
     """Convert out-of-memory errors of the block into a TrilightError with remedies.
 
     Args:
-        settings: settings of the run.
         step: number of steps that are done.
     """
     try:

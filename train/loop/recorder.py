@@ -63,7 +63,6 @@ class Recorder:
         """Evaluate the network on the validation split, if there is one, and write its scores.
 
         Args:
-            state: state of the run.
             between: as in `Judge.judge`; if it raises, nothing is written.
         """
         if self._judge is None:

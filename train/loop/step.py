@@ -109,7 +109,6 @@ class Stepper:
 
         Args:
             batches: batches of this process; every process must hold equally many views.
-            learning_rate: rate of AdamW's step.
             asked_to_stop: True if this process received a signal; the statistics carry it to all.
 
         Raises:

@@ -92,7 +92,6 @@ class Lpips(nn.Module):
         """Build the network.
 
         Args:
-            vgg16: state dict of torchvision's vgg16.
             linear: the published linear weights, `lin<k>.model.1.weight` [1, C, 1, 1] for the
                 block k.
 

@@ -77,7 +77,6 @@ class WandbLogger:
         """Start a run of the project.
 
         Args:
-            project: name of the project.
             folder: folder of the training, with files in `wandb/`; its name is that of the group.
             settings: configuration of the run to display.
 

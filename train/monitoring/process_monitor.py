@@ -101,7 +101,7 @@ class ProcessMonitor:
         """End a window; return additional values of its row, and rows of spikes.
 
         All processes must call it. The values: `time_s`, seconds of the window by phase
-        (watching.activity); `memory_mb`; `layers` (watching.layers); and with several processes
+        (monitoring.activity); `memory_mb`; `layers` (monitoring.layers); and with several processes
         `own_s`, the seconds of a step that each spent on its own work.
         """
         taken_s = self._activity.pop_seconds()

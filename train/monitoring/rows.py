@@ -34,9 +34,7 @@ def add_note(path: Path, step: int, text: str) -> None:
     """Append a sentence without its full stop.
 
     Args:
-        path: path of notes.jsonl.
         step: number of steps that were done by then.
-        text: the sentence.
 
     Raises:
         TrilightError: the folder is full or cannot be written.
