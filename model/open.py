@@ -16,8 +16,13 @@ from pathlib import Path
 from safetensors.torch import save
 
 from model.checkpoint_format import find_checkpoint, read_checkpoint
-from model.published.config import PublishedConfig, decode_published, encode_published
-from model.published.convert import load_published, to_published
+from model.published import (
+    PublishedConfig,
+    decode_published,
+    encode_published,
+    load_published,
+    to_published,
+)
 from model.renderformer import RenderFormer
 from model.weights import (
     CONFIG_KEY,

@@ -93,8 +93,9 @@ class Points:
     def only(self, rows: NDArray[np.intp] | None) -> "Points":
         """Return some of the points; of None, all of them with an axis before that of points."""
         fields = {name: each for name, each in vars(self).items() if name != "reflectance"}
-        known = rows is not None and self.reflectance is not None
-        reflectance = self.reflectance.only(rows) if known else None
+        reflectance = None
+        if rows is not None and self.reflectance is not None:
+            reflectance = self.reflectance.only(rows)
         return Points(**some_rows(fields, rows), reflectance=reflectance)
 
     def start(self, direction: Floats) -> Floats:

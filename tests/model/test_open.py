@@ -40,12 +40,14 @@ from model.open import (
     open_network,
     save_published,
 )
-from model.published.config import PublishedConfig, decode_published, encode_published
-from model.published.convert import (
+from model.published import (
     NORMAL,
     TANGENT_NORMAL,
     TEXTURE_CHANNELS,
+    PublishedConfig,
     _require_frequencies,
+    decode_published,
+    encode_published,
     fold,
     load_published,
     to_published,

@@ -8,6 +8,7 @@ rays are the conventions', and rotary products see differences of positions only
 import dataclasses
 import math
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -241,7 +242,10 @@ def test_one_encoding_serves_every_camera_in_any_order(family: str) -> None:
     with torch.no_grad():
         encoded = model.encode(batch)
         for index in (2, 0, 1, 0):
-            camera = {"c2w_V44": scene.c2w_V44[[index]], "fov_deg_V": scene.fov_deg_V[[index]]}
+            camera: dict[str, Any] = {
+                "c2w_V44": scene.c2w_V44[[index]],
+                "fov_deg_V": scene.fov_deg_V[[index]],
+            }
             alone = dataclasses.replace(scene, **camera)
             got = model.decode(encoded, batch_scenes([alone]).cameras, RESOLUTION)
             close(got[0], render(model, alone)[0])

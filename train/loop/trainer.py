@@ -20,11 +20,10 @@ from train.loop.checkpoints import BackgroundWriter, save_checkpoint
 from train.loop.distributed import DistributedContext
 from train.loop.interrupts import Stopped, ValidationInterrupted, deferred_interrupts
 from train.loop.muon import PRODUCTS
-from train.loop.out_of_memory import explain_out_of_memory
 from train.loop.recorder import Recorder
 from train.loop.schedule import decay_start_step, learning_rate
 from train.loop.state import TrainState
-from train.loop.step import PendingStats, Stepper, StepReport
+from train.loop.step import PendingStats, Stepper, StepReport, explain_out_of_memory
 from train.loop.window import Window, device_peak
 from train.loss.objective import TrainingLoss
 from train.monitoring.process_monitor import ProcessMonitor

@@ -27,7 +27,6 @@ from tests.train.kit import eval_config, tiny_run
 from tests.train.loss.test_objective import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
-from train.evaluation.baselines import MEDIAN, NEAREST, Baselines, median_picture
 from train.evaluation.chart import plot_excursions
 from train.evaluation.equal_time import TRACER
 from train.evaluation.evaluate import (
@@ -45,6 +44,7 @@ from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
 from train.evaluation.options import EvaluationOptions
 from train.evaluation.pages import evaluation_page
 from train.evaluation.report import BENCHMARK, record
+from train.evaluation.stored_pictures import MEDIAN, NEAREST, Baselines, median_picture
 from train.loop.state import new_state
 from train.loss.lpips import Lpips
 

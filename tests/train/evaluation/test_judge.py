@@ -26,7 +26,6 @@ from tests.train.kit import eval_config
 from tests.train.loss.test_objective import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
-from train.evaluation.baselines import median_picture
 from train.evaluation.equal_time import (
     CAPTION,
     TRACER,
@@ -63,6 +62,7 @@ from train.evaluation.sheet import (
     noise_picture,
     write_picture,
 )
+from train.evaluation.stored_pictures import median_picture
 from train.evaluation.timing import Price, time_scene
 from train.loss.lpips import Lpips
 
