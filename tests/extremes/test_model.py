@@ -18,8 +18,7 @@ from model.positions import TriangleRotary
 from model.scene_tensors import MAX_NETWORK_M, SceneBatch, batch_scenes, scene_tensors
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
-from tests.model.kit import attend_reference
-from tests.model.kit import FAMILIES, awake, random_scene, tiny_config
+from tests.model.kit import FAMILIES, attend_reference, awake, random_scene, tiny_config
 from tests.train.toy import toy_scene
 
 EMISSIONS = [0.0, 1e-6, 1.0, 1e6]

@@ -8,7 +8,6 @@ rays are the conventions', and rotary products see differences of positions only
 import dataclasses
 import math
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -242,11 +241,9 @@ def test_one_encoding_serves_every_camera_in_any_order(family: str) -> None:
     with torch.no_grad():
         encoded = model.encode(batch)
         for index in (2, 0, 1, 0):
-            camera: dict[str, Any] = {
-                "c2w_V44": scene.c2w_V44[[index]],
-                "fov_deg_V": scene.fov_deg_V[[index]],
-            }
-            alone = dataclasses.replace(scene, **camera)
+            alone = dataclasses.replace(
+                scene, c2w_V44=scene.c2w_V44[[index]], fov_deg_V=scene.fov_deg_V[[index]]
+            )
             got = model.decode(encoded, batch_scenes([alone]).cameras, RESOLUTION)
             close(got[0], render(model, alone)[0])
             close(got[0, 0], together[index])
