@@ -158,10 +158,7 @@ def plan_resume(
     }
     settings = changed(before, execution_changes | named_decisions)
     new_values = differences(old_record, settings_record(settings))
-    stated: dict[str, list[Any]] = {}  # earlier values, which a command may still state
-    for event in past_events:
-        values = [event.before, event.after] if event.kind == "earlier" else [event.before]
-        stated.setdefault(event.name, values)
+    stated = _original_values(past_events)
     events = list[Event]()
     undecided = dict[str, Any]()
     for name, value in typed_otherwise.items():
@@ -191,6 +188,15 @@ def plan_resume(
 def event_records(events: Sequence[Event]) -> list[dict[str, Any]]:
     """Return events as the JSON records of checkpoints, settings.json and summary.json."""
     return [dataclasses.asdict(event) for event in events]
+
+
+def _original_values(past: Sequence[Event]) -> dict[str, list[Any]]:
+    """Return, by setting, the earlier values that a command may still state."""
+    stated: dict[str, list[Any]] = {}
+    for event in past:
+        values = [event.before, event.after] if event.kind == "earlier" else [event.before]
+        stated.setdefault(event.name, values)
+    return stated
 
 
 def _data_event(header: Mapping[str, Any], digest: str, decided: Any) -> Iterator[Event]:

@@ -85,55 +85,70 @@ def train_run(
             checkpoint that is missing or of another run, LPIPS without its weights, a start that
             went dead, too little memory, or a signal that asked to stop.
     """
-    began = time.monotonic()
     watched = watched or WatchSettings()
     require_wandb(watched.wandb)
     dist_context = dist_context or DistributedContext(device=torch.device("cpu"))
     if progress is None or not dist_context.is_first:
         progress = TrainProgress()
     folder = RunFolder(out)
+    start = start or StartOptions()
     with claim_run(folder, dist_context):
-        dataset = open_mixture(data)
-        start = _resolve_restart(start or StartOptions(), folder, dist_context)
-        early_notes = _NoteBuffer(progress)
-        for note in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
-            early_notes.note(note)
-        if workers is None:
-            workers = _choose_workers(settings, dist_context, early_notes)
-        plan = plan_start(settings, folder, dataset.digest, start, dist_context, early_notes)
-        settings = plan.settings
-        lpips = dist_context.run_once_per_machine(partial(load_lpips, start.lpips))
-        objective = TrainingLoss(settings.loss, lpips).to(dist_context.device)
-        _check_data(dataset, settings)
-        state = init_or_resume_state(plan, folder, dataset, dist_context, early_notes)
-        judge = recorder = None
-        if dist_context.is_first:
-            judge = _make_judge(dataset, settings, state.bad_samples)
-            recorder = _begin_records(state, settings, folder, judge, progress, watched)
-            how = "went on" if start.resume else "began"
-            many = "process" if dist_context.world_size == 1 else "processes"
-            where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"
-            for text in (where, *early_notes.texts):
-                add_note(folder.notes, state.step, text)
-        trainer = Trainer(
-            state=state,
-            settings=settings,
-            objective=objective,
-            dist_context=dist_context,
-            folder=folder,
-            data_digest=dataset.digest,
-            recorder=recorder,
-            watched=watched,
-        )
-        with closing(_batches(dataset, settings, state, dist_context, workers)) as batches:
-            cost = partial(scene_flops, settings)
-            most = settings.scenes_per_pass
-            with closing(step_scenes(batches, cost, most, dist_context.device)) as steps:
-                trainer.run(steps)
-        if recorder is None:
-            return None
-        recorder.close()
-        return finish_run(state, settings, folder, dataset, judge, time.monotonic() - began)
+        return _train(settings, data, folder, start, dist_context, workers, watched, progress)
+
+
+def _train(
+    settings: TrainSettings,
+    data: Sequence[str],
+    folder: RunFolder,
+    start: StartOptions,
+    dist_context: DistributedContext,
+    workers: int | None,
+    watched: WatchSettings,
+    progress: TrainProgress,
+) -> TrainResult | None:
+    """Train and evaluate in a folder that is locked; arguments as in `train_run`."""
+    began = time.monotonic()
+    dataset = open_mixture(data)
+    start = _resolve_restart(start, folder, dist_context)
+    early_notes = _NoteBuffer(progress)
+    for note in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
+        early_notes.note(note)
+    if workers is None:
+        workers = _choose_workers(settings, dist_context, early_notes)
+    plan = plan_start(settings, folder, dataset.digest, start, dist_context, early_notes)
+    settings = plan.settings
+    lpips = dist_context.run_once_per_machine(partial(load_lpips, start.lpips))
+    objective = TrainingLoss(settings.loss, lpips).to(dist_context.device)
+    _check_data(dataset, settings)
+    state = init_or_resume_state(plan, folder, dataset, dist_context, early_notes)
+    judge = recorder = None
+    if dist_context.is_first:
+        judge = _make_judge(dataset, settings, state.bad_samples)
+        recorder = _begin_records(state, settings, folder, judge, progress, watched)
+        how = "went on" if start.resume else "began"
+        many = "process" if dist_context.world_size == 1 else "processes"
+        where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"
+        for text in (where, *early_notes.texts):
+            add_note(folder.notes, state.step, text)
+    trainer = Trainer(
+        state=state,
+        settings=settings,
+        objective=objective,
+        dist_context=dist_context,
+        folder=folder,
+        data_digest=dataset.digest,
+        recorder=recorder,
+        watched=watched,
+    )
+    with closing(_batches(dataset, settings, state, dist_context, workers)) as batches:
+        cost = partial(scene_flops, settings)
+        most = settings.scenes_per_pass
+        with closing(step_scenes(batches, cost, most, dist_context.device)) as steps:
+            trainer.run(steps)
+    if recorder is None:
+        return None
+    recorder.close()
+    return finish_run(state, settings, folder, dataset, judge, time.monotonic() - began)
 
 
 def _choose_workers(
