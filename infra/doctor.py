@@ -132,7 +132,7 @@ def _renderer() -> Finding:
     text = f"mitsuba {metadata.version('mitsuba')}"
     finding = _probe(
         "renderer",
-        "import mitsuba; mitsuba.set_variant('scalar_rgb')",
+        f"import {module_name('pipeline.renders')}, mitsuba; mitsuba.set_variant('scalar_rgb')",
         summary=text,
         consequence="nothing can be rendered",
         mend=f"{_APT} libatomic1",
@@ -149,7 +149,7 @@ def _renderer() -> Finding:
             state="missing",
             found=str(error),
             consequence="nothing can be rendered",
-            mend=f"{_APT} libllvm19",
+            mend="pip install karellen-llvm-core",
         )
     text = ", ".join(part for part in (text, variant.name, variant.libllvm) if part)
     return Finding(name="renderer", state="ok", found=text)
@@ -184,8 +184,8 @@ def _denoiser() -> Finding:
 def _mesh_decimation() -> Finding:
     return _probe(
         "mesh decimation",
-        "import meshoptimizer",
-        summary=f"meshoptimizer {metadata.version('meshoptimizer')}",
+        f"import {module_name('pipeline.assets.decimation.meshopt')}",
+        summary=f"wasmtime {metadata.version('wasmtime')}",
         consequence="meshes cannot be decimated where pymeshlab fails",
         mend="make setup",
     )
@@ -197,7 +197,7 @@ def _mesh_filters() -> Finding:
             name="mesh filters",
             state="slower",
             found="no pymeshlab (GPL)",
-            consequence="decimated meshes have twice the error, and the profile uniform is missing",
+            consequence="libigl decimates: other meshes, other digests, and no profile uniform",
             mend="make setup",
         )
     code = (
@@ -209,7 +209,7 @@ def _mesh_filters() -> Finding:
         "mesh filters",
         code,
         summary=f"pymeshlab {metadata.version('pymeshlab')}",
-        consequence="every object is rejected, or decimated by meshoptimizer with twice the error",
+        consequence="no mesh can be made by pymeshlab",
         mend=f"{_APT} libgl1 libopengl0",
     )
 

@@ -13,7 +13,7 @@ from infra.processor import processor
 ROOT = Path(__file__).parents[2]
 
 _LIBRARIES = ("trilight", "mitsuba", "drjit", "pyoidn", "numpy", "torch", "pymeshlab",
-              "meshoptimizer", "libigl", "OpenEXR", "h5py")  # fmt: skip
+              "wasmtime", "libigl", "OpenEXR", "h5py")  # fmt: skip
 
 
 def machine_record(device: str) -> dict[str, Any]:
