@@ -1,4 +1,4 @@
-"""Attention of the network; tests/model/attention_reference.py is its slow reference.
+"""Attention of the network; `attend_reference` of tests/model/kit.py is its slow reference.
 
 All optimizations (kernels, precisions, packed sequences) are behind this function.
 

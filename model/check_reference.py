@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import elu
 
-from model.published.config import decode_published
-from model.published.convert import NORMAL, load_published
+from model.published import NORMAL, decode_published, load_published
 from model.renderformer import ELU_ALPHA, RenderFormer
 from model.scene_tensors import SceneBatch
 from model.weights import read_tensors

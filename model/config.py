@@ -260,19 +260,14 @@ def tiny() -> ModelConfig:
 
 def small() -> ModelConfig:
     """Return 71 M parameters: a third of the paper's, at two thirds of its width."""
-    return ModelConfig(
+    return dataclasses.replace(
+        base(),
         width=512,
         num_heads=4,
         encoder_layers=8,
-        decoder_layers=6,
         hidden_width=2048,
-        num_registers=16,
-        rope_num_freqs=6,
-        rope_max_freq=5.0,
-        head="dpt",
         dpt_features=112,
         dpt_channels=(64, 128, 256, 512),
-        dpt_taps=(2, 3, 4, 5),
     )
 
 
@@ -296,17 +291,15 @@ def base() -> ModelConfig:
 
 def large() -> ModelConfig:
     """Return V1.1-Large: 483 M parameters, Swin windows in the view stage."""
-    return ModelConfig(
+    return dataclasses.replace(
+        base(),
         width=1024,
         num_heads=8,
-        encoder_layers=12,
         decoder_layers=12,
         hidden_width=4096,
         num_registers=32,
-        rope_num_freqs=6,
         rope_max_freq=11.0,
         window_bundles=8,
-        head="dpt",
         dpt_features=256,
         dpt_channels=(256, 512, 1024, 1024),
         dpt_taps=(2, 5, 8, 11),

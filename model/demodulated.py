@@ -14,7 +14,6 @@ import math
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import softplus
 
@@ -66,29 +65,17 @@ def albedo_of_cameras(
 def _of_views(
     scene: LitScene, c2w_V44: Tensor, fov_deg_V: Tensor, resolution: int, rays_a_side: int
 ) -> Tensor:
-    views = [
-        first_albedo(scene, c2w_44.detach().cpu().numpy(), float(fov_deg), resolution, rays_a_side)
-        for c2w_44, fov_deg in zip(c2w_V44, fov_deg_V, strict=True)
-    ]
-    return torch.from_numpy(np.stack(views))
-
-
-def first_albedo(
-    scene: LitScene,
-    c2w: NDArray[np.float32],
-    fov_deg: float,
-    resolution: int,
-    rays_a_side: int,
-) -> NDArray[np.float32]:
-    """Return the diffuse and specular albedo [R, R, 6] of visible surfaces.
+    """Return the diffuse and specular albedo [V, R, R, 6] of visible surfaces.
 
     Each pixel is the mean over its rays_a_side^2 rays; a miss counts as black.
     """
-    rays = Rays(c2w, fov_deg, resolution, rays_a_side)
     nothing = np.zeros((6, 1), np.float32)  # the last column, which a miss picks
     table = np.concatenate([np.concatenate([scene.diffuse, scene.specular]), nothing], axis=1)
-    total = np.zeros((6, resolution**2), np.float32)
-    for jitter in range(rays.rays_per_pixel):
-        total += table[:, scene.first_hits(rays.origin, rays.direction(jitter)).triangle]
-    mean: NDArray[np.float32] = total.T / np.float32(rays.rays_per_pixel)
-    return mean.reshape(resolution, resolution, 6)
+    views = []
+    for c2w_44, fov_deg in zip(c2w_V44.detach().cpu().numpy(), fov_deg_V, strict=True):
+        rays = Rays(c2w_44, float(fov_deg), resolution, rays_a_side)
+        total = np.zeros((6, resolution**2), np.float32)
+        for jitter in range(rays.rays_per_pixel):
+            total += table[:, scene.first_hits(rays.origin, rays.direction(jitter)).triangle]
+        views.append(total.T / np.float32(rays.rays_per_pixel))
+    return torch.from_numpy(np.stack(views)).unflatten(1, (resolution, resolution))

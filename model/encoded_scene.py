@@ -36,7 +36,6 @@ class TokenPositions:
 
         Args:
             x: tensor with the device and type of the attention.
-            head_width: width of the attention's heads.
         """
         if self.lengths is None or not supports_packed(x, head_width):
             return None

@@ -5,7 +5,7 @@ neighboring bundles, so that their borders do not show. Both start at a black pi
 where they predict light (model.demodulated), at equal dim light everywhere.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -166,24 +166,3 @@ class DptHead(nn.Module):
         per_side = round(tokens_MQW.shape[1] ** 0.5)
         grid_MWQQ = tokens_MQW.transpose(1, 2).unflatten(2, (per_side, per_side))
         return self.reassemble[level](self.resize[level](self.project[level](grid_MWQQ)))
-
-
-def build_head(config: ModelConfig) -> LinearHead | DptHead:
-    """Return the head that the configuration names."""
-    return DptHead(config) if config.head == "dpt" else LinearHead(config)
-
-
-def zero_last_layer(head: Any) -> None:
-    """Zero the last layer, so that training starts at a black picture.
-
-    This is safe only because the loss is taken before the ELU: after it, a start at 0 has a
-    thousandth of the gradient on one side, and most runs stay black.
-    """
-    nn.init.zeros_(head.last.weight)
-    assert head.last.bias is not None
-    nn.init.zeros_(head.last.bias)
-
-
-def stack_taps(layers: Mapping[int, Tensor], taps: Sequence[int]) -> list[Tensor]:
-    """Return the outputs [M, Q, W] of the layers that a head reads, in its order."""
-    return [torch.flatten(layers[tap], 0, 1) for tap in taps]

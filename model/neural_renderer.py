@@ -28,6 +28,7 @@ from model.replayed import Replayed
 from model.scene_tensors import Cameras, batch_scenes, map_tensors, scene_tensors
 from model.weights import MAX_LIGHTS, TrainedRange, network_digest
 from storage.errors import TrilightError
+from storage.machine import free_memory
 from storage.records.material import unread_columns
 from storage.records.scene import Scene
 
@@ -53,7 +54,6 @@ class NeuralRenderer:
         """Take a network, which stays where it is; `load` reads one.
 
         Args:
-            model: the network.
             trained: what it was trained on, if that is known.
         """
         self._model = model.eval()
@@ -144,7 +144,11 @@ class NeuralRenderer:
         """
         self._require_memory(scene.num_triangles)
         below_sky = scene
-        scene = self._with_known_sky(scene)
+        sky = scene.environment
+        if sky is not None:  # its light alone, or nothing where it is not known
+            knows_sky = self._model.config.sky_rays
+            sky = dataclasses.replace(sky, is_seen=False) if knows_sky else None
+            scene = dataclasses.replace(scene, environment=sky)
         by_hits = isinstance(self._model.config.stage, HitStage)
         all_lights = [LightGroup(scene=scene, fraction=1.0)]
         groups = [
@@ -164,7 +168,6 @@ class NeuralRenderer:
         """Return the picture [R, R, 3] of one camera, linear radiance of at least 0.
 
         Args:
-            prepared: the scene.
             c2w: [4, 4] camera to world.
             fov_deg: full field of view in degrees.
             resolution: as in `render`.
@@ -204,14 +207,6 @@ class NeuralRenderer:
             f"pictures of {resolution} pixels, and the network was trained on {trained}: expect "
             f"a worse one than with --resolution {trained}",
         )
-
-    def _with_known_sky(self, scene: Scene) -> Scene:
-        """Return the scene with the light of its sky alone, or without it where it is not known."""
-        sky = scene.environment
-        if sky is not None:
-            known = self._model.config.sky_rays
-            sky = dataclasses.replace(sky, is_seen=False) if known else None
-        return dataclasses.replace(scene, environment=sky)
 
     def _notes(self, scene: Scene, num_groups: int) -> tuple[str, ...]:
         notes = []
@@ -286,9 +281,4 @@ def _free_bytes(device: torch.device) -> int | None:
     """Return the free memory of a device in bytes, or None where it is unknown."""
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        fields = dict(line.split(":", 1) for line in lines)
-        return int(fields["MemAvailable"].split()[0]) << 10
-    except (OSError, KeyError, ValueError):
-        return None
+    return free_memory()

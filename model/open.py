@@ -16,8 +16,13 @@ from pathlib import Path
 from safetensors.torch import save
 
 from model.checkpoint_format import find_checkpoint, read_checkpoint
-from model.published.config import PublishedConfig, decode_published, encode_published
-from model.published.convert import load_published, to_published
+from model.published import (
+    PublishedConfig,
+    decode_published,
+    encode_published,
+    load_published,
+    to_published,
+)
 from model.renderformer import RenderFormer
 from model.weights import (
     CONFIG_KEY,
@@ -83,9 +88,6 @@ class NetworkFile:
 def open_network(source: str | Path) -> RenderFormer:
     """Return a network, float32, in evaluation mode on the CPU.
 
-    Args:
-        source: as in `find_network`.
-
     Raises:
         TrilightError: no such file, pickled code, a damaged file, or tensors that do not match the
             configuration; the message lists their names.
@@ -126,7 +128,9 @@ def find_network(place: str | Path) -> NetworkFile:
         path=weights,
         trained=PUBLISHED_RANGE,
         any_width=False,
-        open=lambda: _open_published(weights),
+        open=lambda: load_published(
+            read_tensors(weights)[0], _read_config(weights.parent / CONFIG_NAME)
+        ),
     )
 
 
@@ -155,7 +159,8 @@ def _weights_file(source: str, path: Path) -> Path:
             )
         path = _download(source)
     weights = path / WEIGHTS_NAME if path.is_dir() else path
-    if path.is_dir() and not weights.exists() and not _has_pickles(path):
+    has_pickles = path.is_dir() and any(each.suffix in _PICKLES for each in path.iterdir())
+    if path.is_dir() and not weights.exists() and not has_pickles:
         raise TrilightError(
             f"checkpoint {source}: no checkpoint here; expected {WEIGHTS_NAME}, as `trilight "
             "train` writes it and published folders hold it."
@@ -166,15 +171,6 @@ def _weights_file(source: str, path: Path) -> Path:
             "not read. Convert them with the tool that wrote them."
         )
     return weights
-
-
-def _open_published(weights: Path) -> RenderFormer:
-    tensors, _ = read_tensors(weights)
-    return load_published(tensors, _read_config(weights.parent / CONFIG_NAME))
-
-
-def _has_pickles(folder: Path) -> bool:
-    return any(path.suffix in _PICKLES for path in folder.iterdir())
 
 
 def save_published(model: RenderFormer, folder: Path) -> None:

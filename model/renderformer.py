@@ -18,11 +18,9 @@ from model.hits.tracing import (
     traced_batch,
     traced_cameras,
 )
-from model.image_head import zero_last_layer
 from model.positions import TriangleRotary, token_positions
 from model.precision import tf32
-from model.scene_tensors import Cameras, SceneBatch, in_light_units
-from model.sky.known import require_known_sky
+from model.scene_tensors import Cameras, SceneBatch, in_light_units, require_known_sky
 from model.triangle_encoder import TriangleEncoder
 from model.view_decoder import ViewDecoder
 from storage.errors import TrilightError
@@ -114,7 +112,8 @@ class RenderFormer(nn.Module):
         keys_values: tuple[KeysValues, ...] = ()
         packing = None
         if self.encoder is not None:
-            packing = self.encoder.packing(places)
+            layer_weight = next(self.encoder.layers.parameters())
+            packing = places.packing(layer_weight, self.config.head_width)
             if sides_BT12 is not None and unit_B3 is not None:
                 sides_BT12 = sides_BT12 / unit_B3.repeat(1, 4)[:, None]
                 batch = in_light_units(batch, unit_B3)
@@ -190,12 +189,17 @@ class RenderFormer(nn.Module):
                 nn.init.xavier_uniform_(module.weight, generator=generator)
                 if module.bias is not None:
                     nn.init.zeros_(module.bias)
-        tokens = [] if self.encoder is None else self.encoder.learned_tokens()
+        tokens: list[nn.Parameter] = []
+        if self.encoder is not None:
+            tokens += [self.encoder.tokens.token_W, self.encoder.registers_NW]
         if isinstance(self.decoder, ViewDecoder):
             tokens.append(self.decoder.token_W)
         for token in tokens:
             nn.init.normal_(token, std=TOKEN_STD, generator=generator)
-        zero_last_layer(self.decoder.head)
+        # A black picture is a safe start only because the loss is taken before the ELU: after it, a
+        # start at 0 has a thousandth of the gradient on one side, and most runs stay black.
+        nn.init.zeros_(self.decoder.head.last.weight)
+        nn.init.zeros_(self.decoder.head.last.bias)
 
 
 def radiance(log10_rgb: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ the padding is zero, because a mask hides finite values but not NaN (0 * NaN is 
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
@@ -22,12 +22,14 @@ from torch import Tensor
 
 from model.hits.textures import SurfaceTextures, surface_textures
 from model.hits.traced import Traced, stack_traced
-from model.sky.known import lit_sky
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import PUBLISHED_COLUMNS, chosen_columns, laid_out, material_columns
 from storage.records.scene import Scene
+
+if TYPE_CHECKING:  # it loads pydantic
+    from model.config import ModelConfig
 
 MAX_NETWORK_M = 1000.0
 """Farthest vertex coordinate that a network reads. At 11 radians per metre, float32 knows rotary
@@ -131,7 +133,6 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
     """Return the tensors of a scene that passes `Scene.check`; its arrays stay unchanged.
 
     Args:
-        scene: scene to convert.
         columns: material columns, such as those of one network (`ModelConfig.material_columns`);
             None for all declared columns.
 
@@ -218,3 +219,30 @@ def _stack_padded(rows: Sequence[Tensor], length: int) -> Tensor:
     for index, row in enumerate(rows):
         stacked[index, : len(row)] = row
     return stacked
+
+
+def lit_sky(sky: Environment | None) -> Environment | None:
+    """Return the environment, or None if it is missing or black."""
+    return sky if sky is not None and sky.radiance_rgb.any() else None
+
+
+def require_known_sky(sky: Environment | None, config: "ModelConfig") -> None:
+    """Raise if a scene has a sky that the network does not support.
+
+    Raises:
+        TrilightError: the network has no input for a sky, or cameras see the sky directly, which no
+            network renders.
+    """
+    if sky is None:
+        return
+    if not config.sky_rays:
+        raise TrilightError(
+            "scene: it has an environment, and this network does not know its light; expected "
+            "none. Use a network of hits that knows skies (model.sky_rays=16), or scenes without "
+            "one (scenes.skies.share=0)."
+        )
+    if sky.is_seen:
+        raise TrilightError(
+            "scene: cameras see its environment behind everything, which networks leave black; "
+            "expected one that is not seen (scenes.skies.seen_share=0)."
+        )

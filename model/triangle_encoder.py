@@ -78,10 +78,6 @@ class TriangleEncoder(nn.Module):
             for _ in range(config.encoder_layers)
         )
 
-    def packing(self, places: TokenPositions) -> Packing | None:
-        """Return the packing of the tokens before the layers, or None without packing."""
-        return places.packing(next(self.layers.parameters()), self.rotary.head_width)
-
     def forward(
         self,
         batch: SceneBatch,
@@ -110,7 +106,3 @@ class TriangleEncoder(nn.Module):
                 layer, x_BNW, due_BNW, rotation, keys, recompute=self.recompute
             )
         return x_BNW if due_BNW is None else x_BNW + due_BNW
-
-    def learned_tokens(self) -> list[nn.Parameter]:
-        """Return the learned tokens, which are initialized with small values."""
-        return [self.tokens.token_W, self.registers_NW]

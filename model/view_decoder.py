@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from model.config import ModelConfig
 from model.encoded_scene import EncodedScene, KeysValues, TokenPositions
-from model.image_head import build_head, stack_taps
+from model.image_head import DptHead, LinearHead
 from model.layers import TOKEN_NORM_EPS, DecoderLayer, Norm, dtype_of, run_layer
 from model.packing import Packing
 from model.positions import (
@@ -47,7 +47,8 @@ class ViewDecoder(nn.Module):
             DecoderLayer(config.width, config.num_heads, config.hidden_width)
             for _ in range(config.decoder_layers)
         )
-        self.head = build_head(config)
+        is_dpt = config.head == "dpt"
+        self.head: LinearHead | DptHead = DptHead(config) if is_dpt else LinearHead(config)
 
     def keys_values(
         self, context_BNW: Tensor, places: TokenPositions, packing: Packing | None = None
@@ -99,7 +100,7 @@ class ViewDecoder(nn.Module):
             )
             if index in self.head.taps:
                 outputs[index] = x_BVQW
-        return stack_taps(outputs, self.head.taps)
+        return [torch.flatten(outputs[tap], 0, 1) for tap in self.head.taps]
 
     def bundle_tokens(self, fov_deg_BV: Tensor, resolution: int) -> Tensor:
         """Return the tokens [B, V, Q, W] of square pictures, float32 under autocast too."""

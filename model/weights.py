@@ -74,7 +74,6 @@ def encode_weights(model: RenderFormer, trained: TrainedRange | None = None) -> 
     """Return the bytes of a network's file; equal networks give equal bytes.
 
     Args:
-        model: the network.
         trained: range of its training data, if known.
     """
     tensors = {name: tensor.contiguous() for name, tensor in model.state_dict().items()}

@@ -52,7 +52,7 @@ class RunFolder:
 
     @property
     def notes(self) -> Path:
-        """Dated notes: starts, resumes, warnings (watching.notes)."""
+        """Dated notes: starts, resumes, warnings (monitoring.rows)."""
         return self.root / "notes.jsonl"
 
     @property

@@ -36,8 +36,7 @@ from train.monitoring.rows import read_rows
 from train.progress import TrainProgress
 from train.result import pretty_json
 from train.resume import Event, ResumePlan, StartOptions, event_records, plan_resume
-from train.settings import TrainSettings
-from train.stored_settings import stored_settings
+from train.settings import TrainSettings, stored_settings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -128,7 +127,8 @@ def init_or_resume_state(
         digest = None
         if plan.network is not None:
             digest = sha256_hex(encode_weights(plan.network))
-            header = _header_of(Path(plan.network_source)) | {"sha256": digest}
+            source = find_checkpoint(Path(plan.network_source))
+            header = {**(read_header(source) if source else {}), "sha256": digest}
             state.history = (_origin(0, "weights", header),)
         if dist_context.is_first:
             more = {"begun_with_sha256": digest}
@@ -155,7 +155,11 @@ def _write_resumed_run(
 ) -> None:
     """Write how a run resumes, so that a kill before its next checkpoint loses nothing."""
     if plan.branch is not None:
-        _copy_log_of_parent(plan.branch, folder, state.step)
+        root = plan.branch if plan.branch.is_dir() else plan.branch.parent.parent
+        log = MetricsLog(folder.metrics, first_step=0)
+        for row in read_rows(RunFolder(root).metrics):
+            if row["step"] <= state.step:
+                log.append(row)
     _write_settings(folder, plan.settings, state, data_digest, dist_context)
     if plan.branch is not None or (
         plan.resume_plan is not None and plan.resume_plan.changes_meaning
@@ -178,21 +182,6 @@ def _origin(step: int, name: str, header: Mapping[str, Any]) -> Event:
         "sha256": header.get("sha256"),
     }
     return Event(step=step, kind="origin", name=name, after=after)
-
-
-def _header_of(path: Path) -> dict[str, Any]:
-    """Return the header of a checkpoint, or an empty one for other weights files."""
-    checkpoint = find_checkpoint(path)
-    return read_header(checkpoint) if checkpoint else {}
-
-
-def _copy_log_of_parent(path: Path, folder: RunFolder, step: int) -> None:
-    """Copy the parent's metrics up to the step of the branch."""
-    parent = RunFolder(path if path.is_dir() else path.parent.parent)
-    log = MetricsLog(folder.metrics, first_step=0)
-    for row in read_rows(parent.metrics):
-        if row["step"] <= step:
-            log.append(row)
 
 
 def _write_settings(

@@ -29,7 +29,7 @@ class TrainProgress:
         """Receive `step` finished steps; `loss` is the mean over the views of the last one."""
 
     def report_validation(self, *, step: int, scores: Mapping[str, float]) -> None:
-        """Receive the scores of a validation after `step` steps (evaluation.scores)."""
+        """Receive the scores of a validation after `step` steps (evaluation.metrics)."""
 
     def report_hang(self, text: str) -> None:
         """Receive a hang of a run that is to stop on one; called from another thread.

@@ -9,7 +9,7 @@ from model.weights import TrainedRange, encode_weights
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData
 from train.evaluation.judge import Judge
-from train.evaluation.scores import Lead
+from train.evaluation.metrics import Lead
 from train.evaluation.sheet import draw_validation_sheet, write_picture
 from train.folder import RunFolder
 from train.loop.state import TrainState
@@ -67,7 +67,8 @@ def finish_run(
     """Evaluate the finished network, and write its weights, sheet and summary."""
     trained = TrainedRange(max_triangles=data.max_triangles, resolution=settings.resolution)
     write_atomically(folder.weights, encode_weights(state.eval_model, trained))
-    loss_at_start, loss_at_end = _losses(folder)
+    losses = [row["loss"] for row in read_rows(folder.metrics) if row.get("loss") is not None]
+    count = max(len(losses) // LOSS_SHARE, 1)
     validation = None
     if judge is not None:
         validation = judge.judge(state.eval_model)
@@ -77,8 +78,8 @@ def finish_run(
         num_parameters=count_parameters(state.model),
         num_steps=state.step,
         skipped_steps=state.skipped_steps,
-        loss_at_start=loss_at_start,
-        loss_at_end=loss_at_end,
+        loss_at_start=sum(losses[:count]) / count,
+        loss_at_end=sum(losses[-count:]) / count,
         scores=validation.scores if validation else None,
         median_scores=judge.median_scores if judge else None,
         lead=validation.lead if validation else None,
@@ -95,10 +96,3 @@ def finish_run(
 def pretty_json(record: object) -> bytes:
     """Return indented, sorted JSON with a final newline."""
     return json.dumps(record, indent=1, sort_keys=True).encode() + b"\n"
-
-
-def _losses(folder: RunFolder) -> tuple[float, float]:
-    """Return the mean training loss of the first and of the last rows of the log."""
-    rows = [row["loss"] for row in read_rows(folder.metrics) if row.get("loss") is not None]
-    count = max(len(rows) // LOSS_SHARE, 1)
-    return sum(rows[:count]) / count, sum(rows[-count:]) / count

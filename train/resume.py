@@ -16,8 +16,7 @@ from storage.settings.changes import changed, differences
 from storage.settings.described import from_record, settings_record
 from storage.settings.fields import describe_fields
 from train.loop.schedule import decay_start_step
-from train.settings import TrainSettings
-from train.stored_settings import known_settings
+from train.settings import TrainSettings, known_settings
 
 DATA = "data"
 """Name of the change to other data. Its value is the start of their digest, after `sha256:` for a
@@ -145,9 +144,14 @@ def plan_resume(
     step = header["step"]
     before = from_record(TrainSettings, known_settings(header["settings"], "checkpoint"))
     old_record = settings_record(before)
-    past_events = events_of(header.get("history", ()))
+    past_events = tuple(Event(**record) for record in header.get("history", ()))
     named_decisions = {name: value for name, value in decisions.items() if name != DATA}
-    _require_meaning(named_decisions)
+    for name, value in named_decisions.items():
+        if name in _EXECUTION:
+            raise TrilightError(
+                f"--change {name}: it is execution, which is free when a run goes on; expected "
+                f"--set {name}={_to_text(value)}."
+            )
     typed_otherwise = differences(old_record, settings_record(typed))
     execution_changes = {
         name: typed_otherwise[name] for name in typed_otherwise if name in _EXECUTION
@@ -167,7 +171,10 @@ def plan_resume(
             undecided[name] = value
     if undecided:
         raise _undecided_error(old_record, undecided)
-    events += _change_events(old_record, new_values, step)
+    for name, value in new_values.items():
+        kind: Literal["execution", "meaning"] = "execution" if name in _EXECUTION else "meaning"
+        old = _value_at(old_record, name)
+        events.append(Event(step=step, kind=kind, name=name, before=old, after=value))
     events += _data_event(header, data_digest, decisions.get(DATA))
     _require_possible(before, settings, step, events)
     return ResumePlan(
@@ -176,27 +183,6 @@ def plan_resume(
         notes=tuple(_notes(before, settings, step, past_events, events)),
         changes_meaning=any(event.kind == "meaning" for event in events),
     )
-
-
-def _change_events(
-    old_record: Mapping[str, Any], new_values: Mapping[str, Any], step: int
-) -> list[Event]:
-    """Return the events of settings that change at a step."""
-    return [
-        Event(
-            step=step,
-            kind="execution" if name in _EXECUTION else "meaning",
-            name=name,
-            before=_value_at(old_record, name),
-            after=value,
-        )
-        for name, value in new_values.items()
-    ]
-
-
-def events_of(records: Sequence[Mapping[str, Any]]) -> tuple[Event, ...]:
-    """Return events from their JSON records."""
-    return tuple(Event(**record) for record in records)
 
 
 def event_records(events: Sequence[Event]) -> list[dict[str, Any]]:
@@ -211,15 +197,6 @@ def _original_values(past: Sequence[Event]) -> dict[str, list[Any]]:
         values = [event.before, event.after] if event.kind == "earlier" else [event.before]
         stated.setdefault(event.name, values)
     return stated
-
-
-def _require_meaning(named: Mapping[str, Any]) -> None:
-    for name, value in named.items():
-        if name in _EXECUTION:
-            raise TrilightError(
-                f"--change {name}: it is execution, which is free when a run goes on; expected "
-                f"--set {name}={_to_text(value)}."
-            )
 
 
 def _data_event(header: Mapping[str, Any], digest: str, decided: Any) -> Iterator[Event]:

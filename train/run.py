@@ -11,17 +11,17 @@ import torch
 
 from model.checkpoint_format import saved_steps
 from model.renderformer import count_parameters
-from model.sky.known import lit_sky, require_known_sky
+from model.scene_tensors import lit_sky, require_known_sky
 from storage.dataset.mixed_data import open_mixture
 from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
 from train.data.bad_samples import BadSampleCounter, first_samples
-from train.data.device_prefetch import decodes_on_device, step_scenes
+from train.data.buckets import decodes_on_device, step_scenes
 from train.data.scenes import TrainingScene, training_scene
 from train.data.stream import StreamSettings, stream_batches
 from train.data.workers import choose_workers, detect_machine
-from train.evaluation.baselines import median_picture
 from train.evaluation.judge import Judge
+from train.evaluation.stored_pictures import median_picture
 from train.folder import RunFolder, claim_run
 from train.initial_state import init_or_resume_state, plan_start
 from train.loop.distributed import DistributedContext
@@ -30,9 +30,9 @@ from train.loop.state import TrainState
 from train.loop.trainer import Trainer, scene_flops
 from train.loss.lpips import load_lpips
 from train.loss.objective import TrainingLoss
-from train.monitoring.notes import add_note
+from train.monitoring.boards import require_wandb
+from train.monitoring.rows import add_note
 from train.monitoring.settings import WatchSettings
-from train.monitoring.weights_and_biases import require_wandb
 from train.progress import TrainProgress
 from train.result import TrainResult, finish_run
 from train.resume import StartOptions
@@ -85,27 +85,19 @@ def train_run(
             checkpoint that is missing or of another run, LPIPS without its weights, a start that
             went dead, too little memory, or a signal that asked to stop.
     """
-    require_wandb((watched or WatchSettings()).wandb)
+    watched = watched or WatchSettings()
+    require_wandb(watched.wandb)
     dist_context = dist_context or DistributedContext(device=torch.device("cpu"))
+    if progress is None or not dist_context.is_first:
+        progress = TrainProgress()
     folder = RunFolder(out)
+    start = start or StartOptions()
     with claim_run(folder, dist_context):
-        return _train(
-            settings,
-            data=data,
-            folder=folder,
-            start=start or StartOptions(),
-            dist_context=dist_context,
-            workers=workers,
-            watched=watched or WatchSettings(),
-            progress=progress
-            if progress is not None and dist_context.is_first
-            else TrainProgress(),
-        )
+        return _train(settings, data, folder, start, dist_context, workers, watched, progress)
 
 
 def _train(
     settings: TrainSettings,
-    *,
     data: Sequence[str],
     folder: RunFolder,
     start: StartOptions,
@@ -121,18 +113,23 @@ def _train(
     early_notes = _NoteBuffer(progress)
     for note in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
         early_notes.note(note)
-    workers = _choose_workers(settings, dist_context, early_notes) if workers is None else workers
+    if workers is None:
+        workers = _choose_workers(settings, dist_context, early_notes)
     plan = plan_start(settings, folder, dataset.digest, start, dist_context, early_notes)
     settings = plan.settings
     lpips = dist_context.run_once_per_machine(partial(load_lpips, start.lpips))
     objective = TrainingLoss(settings.loss, lpips).to(dist_context.device)
     _check_data(dataset, settings)
     state = init_or_resume_state(plan, folder, dataset, dist_context, early_notes)
-    judge = _make_judge(dataset, settings, state.bad_samples) if dist_context.is_first else None
-    recorder = None
+    judge = recorder = None
     if dist_context.is_first:
-        recorder = _recorder(state, settings, folder, judge, progress, watched)
-        _record_start(folder, state, dist_context, early_notes.texts, resumed=start.resume)
+        judge = _make_judge(dataset, settings, state.bad_samples)
+        recorder = _begin_records(state, settings, folder, judge, progress, watched)
+        how = "went on" if start.resume else "began"
+        many = "process" if dist_context.world_size == 1 else "processes"
+        where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"
+        for text in (where, *early_notes.texts):
+            add_note(folder.notes, state.step, text)
     trainer = Trainer(
         state=state,
         settings=settings,
@@ -214,21 +211,6 @@ class _NoteBuffer(TrainProgress):
         self.texts.append(text)
 
 
-def _record_start(
-    folder: RunFolder,
-    state: TrainState,
-    dist_context: DistributedContext,
-    notes: Sequence[str],
-    *,
-    resumed: bool,
-) -> None:
-    """Write the start or resume of the trainer, and its notes so far, into notes.jsonl."""
-    how = "went on" if resumed else "began"
-    many = "process" if dist_context.world_size == 1 else "processes"
-    for text in (f"{how} on {dist_context.device}, {dist_context.world_size} {many}", *notes):
-        add_note(folder.notes, state.step, text)
-
-
 def stream_settings(settings: TrainSettings) -> StreamSettings:
     """Return the settings of the stream that feeds a run."""
     return StreamSettings(
@@ -280,7 +262,7 @@ def _make_judge(
     return Judge(samples, settings.resolution, median_picture(training))
 
 
-def _recorder(
+def _begin_records(
     state: TrainState,
     settings: TrainSettings,
     folder: RunFolder,

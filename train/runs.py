@@ -283,9 +283,6 @@ def _as_run(settings: Any) -> Callable[[], TrainSettings]:
 def named_run(name: str) -> TrainSettings:
     """Return the settings of a run.
 
-    Args:
-        name: one of RUNS.
-
     Raises:
         TrilightError: the name is unknown, or a user's run has the name of one of ours.
     """
@@ -310,7 +307,6 @@ def changed_run(
     """Return the settings of a named run with some values replaced.
 
     Args:
-        name: name of the run.
         changes: values by dotted name, as `storage.settings.changes` takes them.
         steps: replaces the number of steps; if it is smaller, the warm-up and the intervals that
             `changes` does not name shrink in proportion.
@@ -335,7 +331,6 @@ def scale_intervals(run: TrainSettings, steps: int, stated: Mapping[str, Any]) -
     permanent checkpoints on checkpoints.
 
     Args:
-        run: settings of the named run.
         steps: the smaller number of steps.
         stated: values by name that the user gave; these are kept.
     """

@@ -132,7 +132,7 @@ def run_record(base: BaseSettings) -> dict[str, Any]:
     """
     if base.like is None:
         return {}
-    from train.stored_settings import known_settings
+    from train.settings import known_settings
 
     path = Path(base.like) / "settings.json"
     try:

@@ -7,7 +7,7 @@ Ward et al. 1988), and costs the same for a picture of any width.
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.camera_hits import CameraHits
+from model.hits.camera import CameraHits
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
 from model.hits.second_hits import blocks, outgoing_radiance
@@ -49,11 +49,8 @@ def gathered_at(
     """Return irradiance over pi from other surfaces [A, 3] at the first thing in anchors' pixels.
 
     Args:
-        scene, light: the scene.
-        hits: of the camera.
         anchor: [A] pixels.
         gather_rays: of each anchor; 0 gives 0.
-        seed: of the noise.
     """
     total = np.zeros_like(hits.along, shape=(3, len(anchor)))
     if not gather_rays:

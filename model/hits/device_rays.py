@@ -197,7 +197,6 @@ def goes_right(
     Args:
         least, most: [A, 3] corners of their boxes.
         group: [A] of `num_groups`.
-        num_groups: how many there are.
         is_even: whether halves are to have as many triangles as each other.
     """
     size = np.bincount(group, minlength=num_groups)

@@ -60,8 +60,6 @@ def direct_light(
     """Return the light of all lamps.
 
     Args:
-        scene: the scene.
-        points: where.
         gloss: the lobes there; None where the specular part is not wanted, which is then 0.
         on_lamps: [2, lamps, P] in the unit square: where on each lamp's triangle.
         lobe_rays: 1 where a ray is drawn by the lobe at each of these points too: what such rays
@@ -137,7 +135,6 @@ def lobe_ray_weight(
     The rest is what `direct_light` brings, or `chosen_lamp_light`.
 
     Args:
-        scene: the scene.
         hit_points: what the rays hit, lamps or not.
         start: [3, P] where they began.
         density: [P] of the lobe along the rays.
@@ -196,7 +193,6 @@ def chosen_lamp_light(
 
     Args:
         scene: with at least one lamp.
-        points, gloss: where.
         chances: of the lamps there (`lamp_chances`).
         u_lamp: [P] uniform numbers that choose the lamp.
         on_lamp: [2, P] where on it.
@@ -214,7 +210,7 @@ def chosen_lamp_light(
     solid = np.abs(dot(scene.plane[:, lamp], to_lamp)) * scene.area[lamp] / square / chance
     value, density = lobe(gloss, points, to_lamp, cosine)
     value = value / (1 + np.where(has_lobe_ray, np.square(density * solid), np.float32(0)))
-    albedo = scene.diffuse_at(points)
+    albedo = scene.material_at(points, "diffuse")
     reflected = albedo * (np.maximum(cosine, 0) * _INV_PI) + gloss.color * value
     useful = np.flatnonzero(brightest(reflected) > 0)
     is_free = np.zeros_like(solid)

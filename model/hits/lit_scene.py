@@ -1,20 +1,19 @@
 """`LitScene`: the triangles of a scene as rays need them, with their lobes and their emission."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from model.hits.device_arrays import DeviceArray, DevicePlace
-from model.hits.device_textures import DeviceTextures
-from model.hits.textures import SurfaceTextures
+from model.hits.sky_sampler import SkySampler
+from model.hits.textures import DeviceTextures, SurfaceTextures
 from model.hits.vectors import Floats, as_rows, brightest, dot, unit
-from model.sky.sampler import SkySampler
 from storage.optics.bsdf import bsdf_lobes
 from storage.optics.multiscatter import scattered_again
 from storage.raycast.caster import RayCaster, RayHits
@@ -25,6 +24,9 @@ from storage.records.material import EMISSION, ROUGHNESS
 _OFFSET = np.float32(1500 * 2.0**-24)
 """Distance from a surface at which rays start, as a fraction of 1 m plus their distance from the
 origin: as in the renderer (pipeline.renders.kernel_scene)."""
+
+
+MaterialName = Literal["diffuse", "specular", "alpha", "multiscatter", "roughness"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,7 +46,13 @@ class Reflectance:
 
     def only(self, rows: NDArray[np.intp]) -> "Reflectance":
         """Return some of them."""
-        return Reflectance(**{name: each[..., rows] for name, each in vars(self).items()})
+        return Reflectance(**some_rows(vars(self), rows))
+
+
+def some_rows(arrays: Mapping[str, Any], rows: Any) -> dict[str, Any]:
+    """Return the same rows of arrays [..., P]; of None, all with an axis before that of rows."""
+    index = (..., None, slice(None)) if rows is None else (..., rows)
+    return {name: each[index] for name, each in arrays.items()}
 
 
 def reflectance_of(materials: NDArray[np.float32]) -> Reflectance:
@@ -84,18 +92,11 @@ class Points:
 
     def only(self, rows: NDArray[np.intp] | None) -> "Points":
         """Return some of the points; of None, all of them with an axis before that of points."""
-        return Points(
-            triangle=self.triangle[rows],
-            position=self.position[:, rows],
-            normal=self.normal[:, rows],
-            geometric_normal=self.geometric_normal[:, rows],
-            to_viewer=self.to_viewer[:, rows],
-            edge=self.edge[:, rows],
-            back=self.back[rows],
-            reflectance=None
-            if rows is None or self.reflectance is None
-            else self.reflectance.only(rows),
-        )
+        fields = {name: each for name, each in vars(self).items() if name != "reflectance"}
+        reflectance = None
+        if rows is not None and self.reflectance is not None:
+            reflectance = self.reflectance.only(rows)
+        return Points(**some_rows(fields, rows), reflectance=reflectance)
 
     def start(self, direction: Floats) -> Floats:
         """Return the starts of rays [3, P] that leave the surface."""
@@ -199,35 +200,12 @@ class LitScene:
         """All triangles, which block and reflect light."""
         return Triangles(self._corner_rows, np.arange(self.num_triangles))
 
-    def diffuse_at(self, points: Points) -> Floats:
-        """Return the diffuse albedo [3, P]."""
+    def material_at(self, points: Points, name: MaterialName) -> Floats:
+        """Return an entry of `Reflectance` at points: [3, P], or [P] of alpha and roughness."""
         if points.reflectance is not None:
-            return points.reflectance.diffuse
-        return np.take(self.diffuse, points.triangle, axis=1)
-
-    def specular_at(self, points: Points) -> Floats:
-        """Return the specular albedo [3, P]."""
-        if points.reflectance is not None:
-            return points.reflectance.specular
-        return np.take(self.specular, points.triangle, axis=1)
-
-    def multiscatter_at(self, points: Points) -> Floats:
-        """Return Fms of multiple scattering [3, P]."""
-        if points.reflectance is not None:
-            return points.reflectance.multiscatter
-        return np.take(self.multiscatter, points.triangle, axis=1)
-
-    def alpha_at(self, points: Points) -> Floats:
-        """Return the GGX width [P]."""
-        if points.reflectance is not None:
-            return points.reflectance.alpha
-        return self.alpha[points.triangle]
-
-    def roughness_at(self, points: Points) -> Floats:
-        """Return the roughness [P]."""
-        if points.reflectance is not None:
-            return points.reflectance.roughness
-        return self.roughness[points.triangle]
+            at_points: Floats = getattr(points.reflectance, name)
+            return at_points
+        return np.take(getattr(self, name), points.triangle, axis=-1)
 
     def points(self, triangle: NDArray[np.intp], uv: Floats, direction: Floats) -> Points:
         """Return the points at which rays along unit `direction` [3, P] meet triangles.

@@ -3,6 +3,7 @@
 One number a side of a triangle, which a scene's tokens and gathering rays read.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -84,41 +85,47 @@ def scene_light(scene: LitScene) -> SceneLight:
 
 
 def _direct(scene: LitScene, rng: np.random.Generator) -> Floats:
-    rows = _sides(scene)
-    total = np.zeros((3, len(rows)), np.float32)
+    """Return the light of the lamps [2, T, 3], with its shadows."""
+    num_sides = 2 * scene.num_triangles
     if not len(scene.lamps):
-        return _by_side(total, scene)
-    on_triangle = rng.random((2, len(rows)), np.float32)
-    on_lamps = rng.random((2, len(scene.lamps), len(rows)), np.float32)
-    for trial in range(DIRECT_POINTS):
-        places = spread(on_triangle, trial)
-        for first in range(0, len(rows), _BLOCK):
-            some = slice(first, first + _BLOCK)
-            points = _points(scene, rows[some], places[:, some])
-            lit = direct_light(
-                scene, points, None, spread(on_lamps[:, :, some], trial), lobe_rays=0
-            )
-            total[:, some] += lit.diffuse
-    return _by_side(total / np.float32(DIRECT_POINTS), scene)
+        return np.zeros((2, scene.num_triangles, 3), np.float32)
+    on_triangle = rng.random((2, num_sides), np.float32)
+    on_lamps = rng.random((2, len(scene.lamps), num_sides), np.float32)
+
+    def from_lamps(points: Points, some: slice, trial: int) -> Floats:
+        on_some = spread(on_lamps[:, :, some], trial)
+        return direct_light(scene, points, None, on_some, lobe_rays=0).diffuse
+
+    return _mean_of_sides(scene, on_triangle, from_lamps)
 
 
 def _from_sky(scene: LitScene, rng: np.random.Generator) -> Floats:
     """Return the light of the sky [2, T, 3], with its shadows."""
+    on_triangle = rng.random((2, 2 * scene.num_triangles), np.float32)
+    towards = rng.random((2, 2 * scene.num_triangles), np.float32)
+
+    def from_sky(points: Points, some: slice, trial: int) -> Floats:
+        light = no_light(points)
+        shift = towards[:, some]
+        add_sky_light(light, scene, points, None, shift, trial, rays=SKY_RAYS, lobe_rays=0)
+        return light.diffuse
+
+    return _mean_of_sides(scene, on_triangle, from_sky)
+
+
+def _mean_of_sides(
+    scene: LitScene, on_triangle: Floats, light_at: Callable[[Points, slice, int], Floats]
+) -> Floats:
+    """Return the mean [2, T, 3] of the light [3, P] at some points of each side, block by block."""
     rows = _sides(scene)
     total = np.zeros((3, len(rows)), np.float32)
-    on_triangle = rng.random((2, len(rows)), np.float32)
-    towards = rng.random((2, len(rows)), np.float32)
     for trial in range(DIRECT_POINTS):
         places = spread(on_triangle, trial)
         for first in range(0, len(rows), _BLOCK):
             some = slice(first, first + _BLOCK)
-            points = _points(scene, rows[some], places[:, some])
-            light = no_light(points)
-            add_sky_light(
-                light, scene, points, None, towards[:, some], trial, rays=SKY_RAYS, lobe_rays=0
-            )
-            total[:, some] += light.diffuse
-    return _by_side(total / np.float32(DIRECT_POINTS), scene)
+            total[:, some] += light_at(_points(scene, rows[some], places[:, some]), some, trial)
+    mean = total / np.float32(DIRECT_POINTS)
+    return np.ascontiguousarray(mean.T).reshape(2, scene.num_triangles, 3)
 
 
 def _bounce_light(scene: LitScene, direct_2T3: Floats, rng: np.random.Generator) -> Floats:
@@ -165,7 +172,3 @@ def _points(scene: LitScene, sides: NDArray[np.intp], u: Floats) -> Points:
         edge=points.edge,
         back=sides >= scene.num_triangles,
     )
-
-
-def _by_side(light_3S: Floats, scene: LitScene) -> Floats:
-    return np.ascontiguousarray(light_3S.T).reshape(2, scene.num_triangles, 3)

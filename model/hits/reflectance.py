@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.lit_scene import LitScene, Points
+from model.hits.lit_scene import LitScene, Points, some_rows
 from model.hits.vectors import Floats, dot, tangents, unit
 from storage.optics.multiscatter import ROUGHNESS_STEPS, X_STEPS, albedo_table
 
@@ -34,18 +34,12 @@ class Gloss:
 
     def only(self, rows: NDArray[np.intp] | None) -> "Gloss":
         """Return some of the points, as `Points.only`."""
-        return Gloss(
-            color=self.color[:, rows],
-            alpha=self.alpha[rows],
-            cos_seen=self.cos_seen[rows],
-            stretch_seen=self.stretch_seen[rows],
-            faces=self.faces[rows],
-        )
+        return Gloss(**some_rows(vars(self), rows))
 
 
 def gloss_at(scene: LitScene, points: Points, least_alpha: Floats | None = None) -> Gloss:
     """Return the lobes of points, those that are narrower than `least_alpha` [P] widened to it."""
-    alpha = scene.alpha_at(points)
+    alpha = scene.material_at(points, "alpha")
     if least_alpha is not None:
         alpha = np.maximum(alpha, least_alpha)
     cosine = dot(points.normal, points.to_viewer)
@@ -53,8 +47,8 @@ def gloss_at(scene: LitScene, points: Points, least_alpha: Floats | None = None)
     stretch = stretched_length(seen, alpha)
     albedo = np.maximum(_albedo(scene, seen / stretch, alpha), np.float32(1e-3))
     lost = (1 - albedo) / albedo
-    specular = scene.specular_at(points)
-    multiscatter = scene.multiscatter_at(points)
+    specular = scene.material_at(points, "specular")
+    multiscatter = scene.material_at(points, "multiscatter")
     return Gloss(
         color=specular * (1 + multiscatter * lost),
         alpha=alpha,
@@ -77,7 +71,6 @@ def lobe(
     """Return D G2 / (4 cos_i cos_o) cos_o without color, and `sample_lobe`'s density, [P] each.
 
     Args:
-        gloss, points: of the points.
         to_light: [3, P] unit vectors.
         cos_light: [P] their cosine with the shading normal; where it is not above 0 the lobe is 0.
     """

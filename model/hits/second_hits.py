@@ -54,18 +54,17 @@ def outgoing_radiance(
     sky there is that of the whole side of the triangle.
 
     Args:
-        scene, light: the scene.
         points: where the rays have met it.
         u_lamp, on_lamp: [P] and [2, P] uniform numbers.
         is_sharp: [P] whether only mirrors have sent the rays.
         mirrors: followed at most.
     """
-    specular = scene.specular_at(points)
-    alpha = scene.alpha_at(points)
+    specular = scene.material_at(points, "specular")
+    alpha = scene.material_at(points, "alpha")
     is_mirror = alpha < SMOOTH_ALPHA
     is_mirror &= brightest(specular) > DIMMEST
     is_mirror &= mirrors > 0
-    spread_out = scene.diffuse_at(points)
+    spread_out = scene.material_at(points, "diffuse")
     spread_out = spread_out + np.where(is_mirror, np.float32(0), specular)
     sides = points.back.astype(np.intp)
     sent: Floats = spread_out * light.but_lamps_2T3[sides, points.triangle].T

@@ -1,6 +1,7 @@
 """Scenes as the network has them -> traced inputs of them and of their views."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
@@ -15,14 +16,11 @@ from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import DeviceTriangles, compiled_kernel
 from model.hits.lit_scene import LitScene
 from model.hits.radiosity import SceneLight, scene_light
-from model.hits.textures import SurfaceTextures
 from model.hits.traced import INPUTS, Traced, stack_traced
 from model.hits.view_inputs import ViewInputs, view_inputs
-from model.scene_tensors import Cameras, SceneBatch, SceneTensors
-from model.sky.known import require_known_sky
+from model.scene_tensors import Cameras, SceneBatch, SceneTensors, batch_scenes, require_known_sky
 from storage.conventions import radiance_from_log10
 from storage.raycast.caster import RayCaster
-from storage.records.environment import Environment
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
 
 MOST_LAMPS = 256
@@ -77,38 +75,11 @@ class TracedScene:
             angle,
             resolution,
             rays_a_side=stage.hit_rays,
-            anchors_a_side=anchors_a_side(stage, resolution),
+            anchors_a_side=math.gcd(stage.hit_anchors, resolution),  # it divides the width
             gather_rays=stage.gather_rays,
             sky_rays=stage.sky_rays,
             seed=seed,
         )
-
-
-def anchors_a_side(stage: HitStage, resolution: int) -> int:
-    """Return the number of anchors along a side of a picture: a divisor of its width."""
-    return int(np.gcd(stage.hit_anchors, resolution))
-
-
-def lit_scene(
-    triangles_T33: Tensor,
-    normals_T33: Tensor,
-    materials_TM: Tensor,
-    textures: SurfaceTextures | None = None,
-    sky: Environment | None = None,
-) -> LitScene:
-    """Return the surfaces of a scene.
-
-    Args:
-        triangles_T33, normals_T33: as in SceneTensors.
-        materials_TM: its published columns.
-        textures, sky: as in SceneTensors.
-    """
-    materials = materials_TM.detach().cpu().numpy().copy()
-    for column, part in laid_out(PUBLISHED_COLUMNS):
-        if column.is_log_encoded:
-            materials[:, part] = np.maximum(radiance_from_log10(materials[:, part]), 0)
-    triangles, normals = (each.detach().cpu().numpy() for each in (triangles_T33, normals_T33))
-    return LitScene(triangles, normals, materials, textures, sky)
 
 
 def traced_batch(batch: SceneBatch) -> tuple[TracedScene, ...]:
@@ -119,26 +90,39 @@ def traced_batch(batch: SceneBatch) -> tuple[TracedScene, ...]:
 def traced_scene(lit: LitScene) -> TracedScene:
     """Return surfaces, with the light that they receive, ready for rays."""
     light = scene_light(lit)
-    unit_3 = torch.from_numpy(light.mean_3)
-    return TracedScene(lit=lit, light=light, sides_T12=sides_of(light), unit_3=unit_3)
+    parts = [part[side] for side in (0, 1) for part in (light.direct_2T3, light.indirect_2T3)]
+    return TracedScene(
+        lit=lit,
+        light=light,
+        sides_T12=torch.from_numpy(np.concatenate(parts, axis=-1)),
+        unit_3=torch.from_numpy(light.mean_3),
+    )
 
 
 def lit_scenes(batch: SceneBatch) -> tuple[LitScene, ...]:
     """Return the surfaces of the scenes of a batch, without their padding."""
-    materials = batch.material_of(PUBLISHED_COLUMNS)
+    materials_BTM = batch.material_of(PUBLISHED_COLUMNS)
     scenes = []
-    for row in range(len(materials)):
+    for row in range(len(materials_BTM)):
         rows = slice(None) if batch.is_triangle_BT is None else batch.is_triangle_BT[row]
-        scenes.append(
-            lit_scene(
-                batch.triangles_BT33[row][rows],
-                batch.normals_BT33[row][rows],
-                materials[row][rows],
-                None if batch.textures is None else batch.textures[row],
-                None if batch.skies is None else batch.skies[row],
-            )
+        triangles, normals, materials = (
+            each[row][rows].detach().cpu().numpy()
+            for each in (batch.triangles_BT33, batch.normals_BT33, materials_BTM)
         )
+        materials = materials.copy()
+        for column, part in laid_out(PUBLISHED_COLUMNS):
+            if column.is_log_encoded:
+                materials[:, part] = np.maximum(radiance_from_log10(materials[:, part]), 0)
+        textures = None if batch.textures is None else batch.textures[row]
+        sky = None if batch.skies is None else batch.skies[row]
+        scenes.append(LitScene(triangles, normals, materials, textures, sky))
     return tuple(scenes)
+
+
+def lit_scene_of(scene: SceneTensors) -> LitScene:
+    """Return the surfaces of a scene."""
+    (lit,) = lit_scenes(batch_scenes([scene]))
+    return lit
 
 
 def with_traced(
@@ -163,16 +147,6 @@ def with_traced(
     traced = traced_views(ready, cameras[0], cameras[1], resolution, hit_stage(config), seed)
     traced = traced.convert_tensors(lambda each: each.to(scene.c2w_V44.device))
     return dataclasses.replace(scene, traced=traced)
-
-
-def lit_scene_of(scene: SceneTensors) -> LitScene:
-    """Return the surfaces of a scene."""
-    columns = {column.name: part for column, part in laid_out(scene.columns)}
-    numbers = [scene.material_TM[:, columns[name]] for name in PUBLISHED_COLUMNS]
-    materials_TM = torch.cat(numbers, dim=-1)
-    return lit_scene(
-        scene.triangles_T33, scene.normals_T33, materials_TM, scene.textures, scene.sky
-    )
 
 
 def traced_cameras(
@@ -225,9 +199,3 @@ def traced_views(
 def _stack(arrays: list[NDArray]) -> Tensor:
     stacked: Any = np.stack(arrays)
     return stacked.tensor if isinstance(stacked, DeviceArray) else torch.from_numpy(stacked)
-
-
-def sides_of(light: SceneLight) -> Tensor:
-    """Return [T, 12]: direct and indirect light of the front, then of the back."""
-    parts = [part[side] for side in (0, 1) for part in (light.direct_2T3, light.indirect_2T3)]
-    return torch.from_numpy(np.concatenate(parts, axis=-1))

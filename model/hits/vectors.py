@@ -66,12 +66,6 @@ def tangents(n: Floats, along: Floats) -> tuple[Floats, Floats]:
     return first, cross(n, first)
 
 
-def from_frame(local: Floats, n: Floats, along: Floats) -> Floats:
-    """Return vectors given in the frame of `tangents`, whose third axis is n, in the world."""
-    first, second = tangents(n, along)
-    return first * local[0] + second * local[1] + n * local[2]
-
-
 def spread(shift: Floats, index: int | NDArray[np.intp]) -> Floats:
     """Return points of a sequence in the unit square, moved by shifts [2, ...].
 
@@ -94,4 +88,5 @@ def cosine_direction(u: Floats, n: Floats, along: Floats) -> Floats:
     radius = np.sqrt(u[0])
     angle = np.float32(2 * np.pi) * u[1]
     height = np.sqrt(np.maximum(1 - u[0], 0))
-    return from_frame(np.stack([radius * np.cos(angle), radius * np.sin(angle), height]), n, along)
+    first, second = tangents(n, along)
+    return first * (radius * np.cos(angle)) + second * (radius * np.sin(angle)) + n * height

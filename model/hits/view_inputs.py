@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.hits.anchors import anchor_pixels, gathered_at
-from model.hits.camera import Rays
-from model.hits.camera_hits import CameraHits, camera_hits
+from model.hits.camera import CameraHits, Rays, camera_hits
 from model.hits.device_arrays import DeviceArray, MaskedRows
 from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
 from model.hits.lit_scene import LitScene, Points
@@ -94,7 +93,6 @@ def view_inputs(
     """Trace the inputs of a view; equal arguments give equal numbers.
 
     Args:
-        scene, light: the scene.
         c2w: [4, 4] of the camera.
         fov_deg: its full field of view.
         resolution: pixels across.
@@ -296,9 +294,9 @@ def _add_surface(block: _Block, scene: LitScene, origin: NDArray[np.float32]) ->
     block.add(Channel.DISTANCE, np.sqrt(dot(from_camera, from_camera))[None])
     block.add(Channel.NORMAL, points.normal)
     block.add(Channel.TOWARD, points.to_viewer)
-    block.add(Channel.DIFFUSE, scene.diffuse_at(points))
+    block.add(Channel.DIFFUSE, scene.material_at(points, "diffuse"))
     block.add(Channel.SPECULAR, block.gloss.color)
-    block.add(Channel.ROUGHNESS, scene.roughness_at(points)[None])
+    block.add(Channel.ROUGHNESS, scene.material_at(points, "roughness")[None])
 
 
 def _add_direct(
@@ -328,7 +326,7 @@ def _add_light(block: _Block, scene: LitScene, lit: DirectLight) -> None:
     block.add(Channel.DIRECT_DIFFUSE, lit.diffuse)
     block.add(Channel.OPEN_SPECULAR, lit.open_specular)
     block.add(Channel.DIRECT_SPECULAR, lit.specular)
-    albedo = scene.diffuse_at(block.points)
+    albedo = scene.material_at(block.points, "diffuse")
     block.add(Channel.SHOWN_DIFFUSE, albedo * lit.diffuse)
 
 
@@ -346,10 +344,8 @@ def _add_lobe_rays(
     each, so one ray of a pixel stands for all.
 
     Args:
-        block, scene, light: where.
         u: [5, P] uniform numbers.
         shading: [P] rays of the pixel that a ray counts for as to surfaces; 0: it counts for none.
-        sky_rays: as in `view_inputs`.
     """
     some = np.flatnonzero(brightest(block.gloss.color) > DIMMEST)
     direction, weight = sample_lobe(block.gloss.only(some), block.points.only(some), u[:2, some])
@@ -390,7 +386,7 @@ def _add_lobe_rays(
         counts = shading[rows] / block.weight[rows]
         block.add(Channel.MIRRORED, radiance * arrives[:, shaded] * counts, rows)
         path = seen.position - points.position[:, shaded]
-        albedo = scene.diffuse_at(seen) + scene.specular_at(seen)
+        albedo = scene.material_at(seen, "diffuse") + scene.material_at(seen, "specular")
         block.add(Channel.SEEN_ALBEDO, albedo * counts, rows)
         block.add(Channel.SEEN_NEARNESS, (counts / (1 + np.sqrt(dot(path, path))))[None], rows)
 

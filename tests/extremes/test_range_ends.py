@@ -45,8 +45,7 @@ from storage.settings.changes import changed
 from storage.settings.fields import FieldDescription
 from tests.extremes.test_ranges import FIELDS, SMOKE, End
 from tests.for_each import case, for_each
-from tests.model.attention_reference import attend_reference
-from tests.model.kit import FAMILIES, awake, random_scene, tiny_config
+from tests.model.kit import FAMILIES, attend_reference, awake, random_scene, tiny_config
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.train.kit import stepper, tiny_run
 from tests.train.toy import toy_sample, toy_scene

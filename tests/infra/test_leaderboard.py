@@ -31,16 +31,14 @@ from storage.records.exr import encode_channels
 from storage.renderer import Renderer
 from tests.command_line import trilight
 from tests.for_each import case
-from tests.model.kit import awake
-from tests.model.published.test_convert import publishable
+from tests.model.kit import awake, publishable
 from tests.train.toy import VIEWS, toy_sample, write_toy_dataset
 from train.evaluation import board as board_module
-from train.evaluation.board import NOISE
+from train.evaluation.board import NOISE, UNKNOWN_MACHINE, Row, RowKey, Rows
 from train.evaluation.chart import plot_leaderboard
 from train.evaluation.judged_view import NETWORK
 from train.evaluation.options import LeaderboardOptions
 from train.evaluation.pairs import METRIC
-from train.evaluation.rows import UNKNOWN_MACHINE, Row, RowKey, Rows
 from train.evaluation.standings import Standing, WidthStandings
 from train.evaluation.stored_pictures import PictureSource, nearest_view
 from train.evaluation.timing import Price

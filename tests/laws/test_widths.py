@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from model.base_widths import BaseWidths
 from model.config import ModelConfig
 from model.hits.tracing import with_traced
-from tests.model.hits.test_decoder import hits_config
+from tests.model.kit import hits_config
 from tests.train.kit import TINY_MODEL, tiny_run
 from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, collate_batch

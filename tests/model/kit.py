@@ -1,6 +1,7 @@
-"""Tiny networks with awake heads, and random scenes for them."""
+"""Tiny networks with awake heads, random scenes for them, and attention in plain lines."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -83,12 +84,6 @@ def render(model: RenderFormer, *scenes: SceneTensors, resolution: int = RESOLUT
     return pictures
 
 
-def one_view(scene: SceneTensors, index: int) -> SceneTensors:
-    return dataclasses.replace(
-        scene, c2w_V44=scene.c2w_V44[[index]], fov_deg_V=scene.fov_deg_V[[index]]
-    )
-
-
 def picture_and_gradients(
     model: RenderFormer, batch: SceneBatch, resolution: int = RESOLUTION
 ) -> dict[str, Tensor]:
@@ -106,3 +101,40 @@ def value_and_gradients(
     fresh = [each.clone().requires_grad_() for each in inputs]
     value = function(*fresh, *rest)
     return [value.detach(), *torch.autograd.grad(value, fresh, upstream)]
+
+
+def attend_reference(
+    q_BHQD: Tensor, k_BHND: Tensor, v_BHND: Tensor, is_key_BN: Tensor | None
+) -> Tensor:
+    """Return what `attend` returns, scene by scene, slowly, on the keys that exist alone."""
+    pictures = []
+    for scene in range(len(q_BHQD)):
+        keys_HND, values_HND = k_BHND[scene], v_BHND[scene]
+        if is_key_BN is not None:
+            keys_HND = keys_HND[:, is_key_BN[scene]]
+            values_HND = values_HND[:, is_key_BN[scene]]
+        scores_HQN = q_BHQD[scene] @ keys_HND.transpose(-1, -2) / math.sqrt(keys_HND.shape[-1])
+        weights_HQN = scores_HQN.exp() / scores_HQN.exp().sum(dim=-1, keepdim=True)
+        pictures.append(weights_HQN @ values_HND)
+    return torch.stack(pictures)
+
+
+def hits_config(**changes: Any) -> ModelConfig:
+    config = tiny_config(
+        encoder_layers=1,
+        view_stage="hits",
+        hit_rays=2,
+        hit_anchors=8,
+        gather_rays=16,
+        pixel_width=16,
+        filter_width=8,
+    )
+    return dataclasses.replace(config, **changes)
+
+
+def publishable(family: str) -> ModelConfig:
+    """Return a tiny configuration of a published family."""
+    wide = {"width": 144, "num_heads": 2, "rope_num_freqs": 3}
+    if family == "dpt":
+        return tiny_config("dpt", **wide, rope_max_freq=2.0, register_eps=1e-5)
+    return tiny_config("swin", **wide, rope_max_freq=5.0, window_bundles=8, register_eps=1e-5)

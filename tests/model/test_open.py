@@ -1,6 +1,12 @@
-"""Weights go round through bytes; one function opens every checkpoint, and refuses the rest."""
+"""Weights go round through bytes; one function opens every checkpoint, and refuses the rest.
 
+Shipped networks open by name and are those of their cards. Published checkpoints go in and out
+without loss, nothing else goes in, and we are the published network to float32's own floor.
+"""
+
+import dataclasses
 import json
+import re
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -8,10 +14,25 @@ from typing import Any
 
 import pytest
 import torch
-from safetensors.torch import load, save
+from safetensors.torch import load, load_file, save, save_file
 from torch import Tensor
 
+from infra.setup.builtin_network import MOST_BYTES
+from model import check_reference
+from model.check_reference import (
+    TOLERANCE,
+    Differences,
+    Reference,
+    differences,
+    main,
+    read_reference,
+)
+from model.config import SIZES
+from model.neural_renderer import NeuralRenderer
 from model.open import (
+    BUILTIN,
+    BUILTIN_NETWORKS,
+    BUILTIN_TOKENS,
     CONFIG_NAME,
     PUBLISHED,
     WEIGHTS_NAME,
@@ -19,14 +40,37 @@ from model.open import (
     open_network,
     save_published,
 )
-from model.renderformer import RenderFormer
-from model.weights import CONFIG_KEY, TrainedRange, decode_weights, encode_config, encode_weights
+from model.published import (
+    NORMAL,
+    TANGENT_NORMAL,
+    TEXTURE_CHANNELS,
+    PublishedConfig,
+    _require_frequencies,
+    decode_published,
+    encode_published,
+    fold,
+    load_published,
+    to_published,
+    unfold,
+)
+from model.renderformer import RenderFormer, count_parameters
+from model.weights import (
+    CONFIG_KEY,
+    TrainedRange,
+    decode_weights,
+    encode_config,
+    encode_weights,
+    from_tensors,
+    read_tensors,
+    trained_range,
+)
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.safe_read import safetensors_header
 from storage.removed import LAST_COMMIT
 from tests.for_each import case, for_each
-from tests.model.kit import awake, tiny_config
-from tests.model.published.test_convert import publishable
+from tests.model.kit import awake, publishable, tiny_config
+from tests.scenes_by_hand import tiny_scene
 
 
 @for_each("head", ["linear", "dpt"])
@@ -118,32 +162,26 @@ def same(a: RenderFormer, b: RenderFormer) -> bool:
     return a.config == b.config and all(n == m and torch.equal(x, y) for (n, x), (m, y) in pairs)
 
 
-def test_ours_opens_as_file_and_as_folder(ours: Path) -> None:
-    expected = awake(tiny_config(), torch.float32)
-    for source in (ours, ours / WEIGHTS_NAME):
-        model = open_network(str(source))
-        assert same(model, expected)
-        assert not model.training
-        assert all(weight.requires_grad for weight in model.parameters())
+def test_a_network_opens_as_file_and_as_folder(ours: Path, published: Path) -> None:
+    for folder, config in ((ours, tiny_config()), (published, publishable("swin"))):
+        for source in (folder, folder / WEIGHTS_NAME):
+            model = open_network(str(source))
+            assert same(model, awake(config, torch.float32)) and not model.training
+            assert all(weight.requires_grad for weight in model.parameters())
 
 
-def test_published_opens_as_folder_and_as_file(published: Path) -> None:
-    expected = awake(publishable("swin"), torch.float32)
-    assert same(open_network(str(published)), expected)
-    assert same(open_network(str(published / WEIGHTS_NAME)), expected)
-
-
-def test_a_published_name_is_fetched_from_the_hub(
-    published: Path, monkeypatch: pytest.MonkeyPatch
+@for_each("is_there", [True, False])
+def test_a_published_name_is_fetched_from_the_hub_or_was_before(
+    published: Path, monkeypatch: pytest.MonkeyPatch, is_there: bool
 ) -> None:
     asked = []
 
     def download(repo_id: str, filename: str, local_files_only: bool) -> str:
-        assert not local_files_only
+        assert local_files_only != is_there
         asked.append((repo_id, filename))
         return str(published / filename)
 
-    _stand_in_hub(monkeypatch, download, lambda name, timeout: None)
+    _stand_in_hub(monkeypatch, download, (lambda name, timeout: None) if is_there else _no_route)
     assert same(open_network(PUBLISHED[1]), awake(publishable("swin"), torch.float32))
     assert asked == [(PUBLISHED[1], CONFIG_NAME), (PUBLISHED[1], WEIGHTS_NAME)]
 
@@ -174,17 +212,6 @@ def test_a_hub_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(TrilightError, match=r"the hub did not give it \(no route to host\)") as got:
         open_network(PUBLISHED[0])
     assert "\n" not in str(got.value)
-
-
-def test_what_was_fetched_before_is_opened_without_the_hub(
-    published: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def download(repo_id: str, filename: str, local_files_only: bool) -> str:
-        assert local_files_only
-        return str(published / filename)
-
-    _stand_in_hub(monkeypatch, download, _no_route)
-    assert same(open_network(PUBLISHED[1]), awake(publishable("swin"), torch.float32))
 
 
 def test_without_the_hub_library_the_way_out_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,3 +258,303 @@ def test_a_truncated_file_is_refused(ours: Path) -> None:
     path.write_bytes((1 << 40).to_bytes(8, "little") + whole[8:])
     with pytest.raises(TrilightError, match="the header claims 1099511627776 bytes"):
         open_network(str(path))
+
+
+NAMES = tuple(name for name in BUILTIN_NETWORKS if name != BUILTIN)
+
+
+@for_each("name", NAMES)
+def test_the_card_is_of_these_weights(name: str) -> None:
+    file = BUILTIN_NETWORKS[name]
+    weights, card = file.read_bytes(), file.with_name("README.md").read_text()
+    assert len(weights) <= MOST_BYTES
+    assert f"{len(weights)} bytes, sha256 `{sha256_hex(weights)}`" in card
+    (stated,) = re.findall(r"size: (\d+) parameters", card)
+    assert count_parameters(open_network(name)) == int(stated)
+
+
+def test_the_better_one_opens_without_a_name() -> None:
+    assert find_network(BUILTIN).path == find_network("builtin:hits").path
+    assert open_network(BUILTIN).config.view_stage == "hits"
+    assert open_network(BUILTIN_TOKENS).config.view_stage == "bundles"
+
+
+def test_a_name_that_does_not_come_along_is_said() -> None:
+    with pytest.raises(TrilightError, match="builtin:token: no such network comes along.*tokens"):
+        find_network("builtin:token")
+
+
+@for_each("name", NAMES)
+def test_it_renders_by_its_name_and_knows_its_range(name: str) -> None:
+    renderer = NeuralRenderer.load(name, device="cpu")
+    known = renderer.trained
+    assert known.resolution == 64 and known.max_triangles is not None
+    picture = renderer.render(tiny_scene(), 64)
+    assert picture.shape[1:] == (64, 64, 3) and picture.min() >= 0 and picture.max() > 0.01
+    notes = renderer.resolution_notes(128)
+    assert renderer.resolution_notes(64) == ()
+    assert ["trained on 64" in note for note in notes] == [True] * (name == BUILTIN_TOKENS)
+
+
+@for_each("name", NAMES)
+def test_its_file_is_written_again_byte_for_byte(name: str) -> None:
+    """A field of the configuration that came later must not change what older networks are."""
+    tensors, metadata = read_tensors(BUILTIN_NETWORKS[name])
+    network = from_tensors(tensors, metadata)
+    again = encode_weights(network, trained_range(metadata))
+    assert again == BUILTIN_NETWORKS[name].read_bytes()
+
+
+SWIN_LARGE: dict[str, Any] = {
+    "latent_dim": 1024, "num_layers": 12, "num_heads": 8, "dim_feedforward": 4096,
+    "num_register_tokens": 32, "rope_double_max_freq": True, "texture_encode_patch_size": 1,
+    "view_transformer_latent_dim": 1024, "view_transformer_ffn_hidden_dim": 4096,
+    "view_transformer_n_heads": 8, "view_transformer_n_layers": 12,
+    "view_transformer_use_swin_attn": True, "dpt_features": 256,
+    "dpt_out_channels": [256, 512, 1024, 1024], "dpt_out_layers": [2, 5, 8, 11],
+}  # fmt: skip
+"""V1.1-Large as described; what is left out has V1-Base's value."""
+
+FREQS = "view_transformer.transformer.rope_emb.freqs"
+
+
+def test_the_published_sizes_are_the_named_ones() -> None:
+    for fields, name, patch in (({}, "base", 32), (SWIN_LARGE, "large", 1)):
+        got = decode_published(fields)
+        assert dataclasses.replace(got.model, register_eps=0.0) == SIZES[name]()
+        assert got.model.register_eps == 1e-5
+        assert got.texture_patch == patch
+
+
+@for_each("family", ["dpt", "swin"])
+@for_each("patch", [1, 8])
+def test_export_and_import_give_the_same_network(family: str, patch: int) -> None:
+    config = PublishedConfig(model=publishable(family), texture_patch=patch)
+    assert decode_published(json.loads(json.dumps(encode_published(config)))) == config
+    model = awake(config.model, torch.float32)
+    again = load_published(to_published(model, patch), config)
+    assert again.state_dict().keys() == model.state_dict().keys()
+    for name, tensor in again.state_dict().items():
+        assert torch.equal(tensor, model.state_dict()[name]), name
+
+
+@for_each("name", ["base_tiny", "swin_tiny"])
+def test_export_gives_back_what_was_published(shared: Path, name: str) -> None:
+    """All but the texture encoder bit by bit; that one as a function, by the test above."""
+    path = shared / "renderformer_reference" / f"{name}.safetensors"
+    if not path.exists():
+        pytest.skip(f"{path} is missing")
+    _, metadata = read_tensors(path)
+    config = decode_published(json.loads(metadata["config"]))
+    published = {
+        key.removeprefix("param."): tensor.float()
+        for key, tensor in load_file(path).items()
+        if key.startswith("param.")
+    }
+    exported = to_published(load_published(published, config), config.texture_patch)
+    assert exported.keys() == published.keys()
+    for key, tensor in exported.items():
+        assert tensor.shape == published[key].shape, key
+        if not key.startswith("texture_encoder."):
+            assert torch.equal(tensor, published[key]), key
+
+
+def test_frequencies_differ_by_their_rounding_alone() -> None:
+    """Others are those of another configuration, with which the same weights mean other places."""
+    formula = torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
+    _require_frequencies("freqs", formula * (1 + 0.9e-6), formula)
+    for wrong in (1 - 1.5e-6, 1 + 1.5e-6):
+        with pytest.raises(TrilightError, match="freqs is .*expected a config.json that belongs"):
+            _require_frequencies("freqs", formula * wrong, formula)
+
+
+@for_each(
+    ("fields", "message"),
+    [
+        ({"activation": "gelu"}, "activation 'gelu', expected 'swiglu'"),
+        ({"use_dpt_decoder": False}, "use_dpt_decoder False, expected True"),
+        ({"num_frequencies": 3}, r"num_frequencies \(unknown\)"),
+        ({"latent_dim": 1536}, "view_transformer_latent_dim 768, expected latent_dim 1536"),
+        ({"dpt_out_channels": 3}, "dpt_out_channels 3, expected list"),
+        ({"dpt_out_layers": [0, 1, 2, 99]}, "dpt_taps"),
+    ],
+)
+def test_what_was_never_published_is_refused_by_name(fields: dict, message: str) -> None:
+    with pytest.raises(TrilightError, match=message):
+        decode_published(fields)
+
+
+@for_each(
+    ("changes", "message"),
+    [
+        ({"head": "linear", "dpt_features": 0, "dpt_channels": (), "dpt_taps": ()}, "head linear"),
+        ({"window_bundles": 4}, "window_bundles 4"),
+        ({"rope_max_freq": 3.0}, "rope_max_freq 3.0 of 3 frequencies"),
+        ({"demodulated": True, "hit_rays": 1}, "demodulated True"),
+    ],
+)
+def test_what_their_code_cannot_build_is_not_exported(changes: dict, message: str) -> None:
+    model = dataclasses.replace(publishable("dpt"), **changes)
+    with pytest.raises(TrilightError, match=message):
+        encode_published(PublishedConfig(model=model, texture_patch=1))
+
+
+@for_each(
+    ("name", "tensor", "message"),
+    [
+        ("vn_encoding_proj.bias", None, r"vn_encoding_proj.bias is missing, expected \(144,\)"),
+        ("reg_tokens", torch.zeros(1, 3, 144), r"is \(1, 3, 144\), expected \(1, 2, 144\)"),
+        ("stranger.weight", torch.zeros(2), r"stranger.weight is \(2,\), expected no such tensor"),
+        ("texture_encoder.weight", torch.zeros(144, 208), r"is \(144, 208\), expected \(144, 13\)"),
+        (FREQS, torch.tensor([1.01, 2**0.5, 2.0]), f"{FREQS} is .* the configuration means"),
+    ],
+)
+def test_wrong_published_tensors_are_listed(name: str, tensor: Tensor | None, message: str) -> None:
+    config = PublishedConfig(model=publishable("dpt"), texture_patch=1)
+    tensors = to_published(awake(config.model, torch.float32), 1)
+    tensors.pop(name, None)
+    if tensor is not None:
+        tensors[name] = tensor
+    with pytest.raises(TrilightError, match=message):
+        load_published(tensors, config)
+
+
+WIDTH = 5
+
+
+def published_layer(patch: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(patch)
+    inputs = TEXTURE_CHANNELS * patch**2
+    weight = torch.randn(WIDTH, inputs, generator=generator, dtype=torch.float64)
+    return weight, torch.randn(WIDTH, generator=generator, dtype=torch.float64)
+
+
+def texture(material_TM: Tensor, patch: int) -> Tensor:
+    """Return the published input [T, 13 P P], cell by cell."""
+    pictures = torch.zeros(len(material_TM), TEXTURE_CHANNELS, patch, patch, dtype=torch.float64)
+    normal = torch.tensor(TANGENT_NORMAL, dtype=torch.float64).expand(len(material_TM), 3)
+    thirteen = torch.cat([material_TM[:, :7], normal, material_TM[:, 7:]], dim=1)
+    for x in range(patch):
+        for y in range(patch):
+            if x + y <= patch:
+                pictures[:, :, x, y] = thirteen
+    return pictures.flatten(1)
+
+
+@for_each(("patch", "cells"), [(1, 1), (8, 43), (32, 559)])
+def test_a_folded_layer_is_the_unfolded_one(patch: int, cells: int) -> None:
+    weight, bias = published_layer(patch)
+    material = torch.rand(4, 10, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    pictures = texture(material, patch)
+    assert int((pictures[0, : patch**2] != 0).sum()) == cells
+    ten, folded_bias = fold(weight, bias, patch)
+    # float64 sums of 559 x 13 products of size 1
+    expected = pictures @ weight.T + bias
+    torch.testing.assert_close(material @ ten.T + folded_bias, expected, rtol=0, atol=1e-11)
+
+
+@for_each("patch", [1, 8, 32])
+def test_folding_undoes_unfolding_bit_by_bit(patch: int) -> None:
+    ten = torch.randn(WIDTH, 10, generator=torch.Generator().manual_seed(1))
+    bias = torch.randn(WIDTH, generator=torch.Generator().manual_seed(2))
+    weight, same_bias = unfold(ten, bias, patch)
+    assert weight.shape == (WIDTH, TEXTURE_CHANNELS * patch**2)
+    again, again_bias = fold(weight, same_bias, patch)
+    assert torch.equal(again, ten) and torch.equal(again_bias, bias)
+
+
+def test_folding_sums_in_float64() -> None:
+    """559 float32 weights that cancel: a float32 sum would keep their rounding."""
+    weight = torch.full((1, TEXTURE_CHANNELS * 32**2), 0.1)
+    ten, bias = fold(weight, torch.zeros(1), 32)
+    exact = 559 * float(torch.tensor(0.1))
+    assert ten[0, 0].item() == torch.tensor(exact).item()
+    normal_sum = exact * sum(TANGENT_NORMAL)
+    assert bias.item() == torch.tensor(normal_sum).item()
+    assert NORMAL == slice(7, 10)
+
+
+FILES = ["base_tiny.safetensors", "swin_tiny.safetensors"]
+
+
+def found_in(shared: Path, name: str) -> Path:
+    path = shared / "renderformer_reference" / name
+    if not path.exists():
+        pytest.skip(f"{path} is missing")
+    return path
+
+
+@pytest.fixture(scope="module", params=FILES)
+def reference(request: pytest.FixtureRequest, shared: Path) -> Path:
+    return found_in(shared, request.param)
+
+
+@pytest.fixture(scope="module")
+def base(shared: Path) -> Path:
+    return found_in(shared, FILES[0])
+
+
+def changed(reference: Path, folder: Path, name: str, change: Tensor) -> str:
+    """Return a copy of the file in which one tensor is another."""
+    _, metadata = read_tensors(reference)
+    tensors = load_file(reference)
+    path = folder / "changed.safetensors"
+    save_file(tensors | {name: change.to(tensors[name].dtype)}, path, metadata=metadata)
+    return str(path)
+
+
+def test_outputs_are_the_published_ones(
+    reference: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    found: list[Differences] = []
+
+    def kept(read: Reference) -> Differences:
+        found.append(differences(read))
+        return found[0]
+
+    monkeypatch.setattr(check_reference, "differences", kept)
+    assert main([str(reference)]) == 0
+    # float32's own rounding of these files is 6e-8; ten real mistakes would pass at 1e-5
+    assert found[0].padded < 5e-7
+    assert found[0].unpadded < 5e-7
+    assert TOLERANCE == 5e-7
+    printed = capsys.readouterr().out
+    for word in ("padded", "unpadded", "max difference", "passes"):
+        assert word in printed
+
+
+@for_each("place", [0, -1])
+def test_a_pixel_that_differs_is_in_both_differences(base: Path, place: int) -> None:
+    """In the first or the last scene: neither comparison may stop at the other's result."""
+    read = read_reference(base)
+    read.expected_BVRR3[(place,) * 5] += 1e-6
+    found = differences(read)
+    assert found.padded > TOLERANCE and found.unpadded > TOLERANCE and not found.is_accepted
+
+
+def test_the_command_fails_on_nan(
+    base: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    name = "param.view_transformer.out_dpt.scratch.output_conv2.2.bias"
+    assert main([changed(base, tmp_path, name, torch.full((3,), torch.nan))]) == 1
+    assert "FAILS" in capsys.readouterr().out
+
+
+def test_what_stands_in_the_padding_does_not_matter(reference: Path, tmp_path: Path) -> None:
+    tensors = load_file(reference)
+    triangles = tensors["input.triangles"]
+    triangles[tensors["input.valid_mask"] == 0] = torch.nan
+    assert main([changed(reference, tmp_path, "input.triangles", triangles)]) == 0
+
+
+@for_each("arguments", [[], ["a", "b"]])
+def test_the_command_takes_one_file(arguments: list[str]) -> None:
+    assert main(arguments) == 2
+
+
+def test_another_file_is_refused_by_name(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    path = tmp_path / "other.safetensors"
+    save_file({"input.triangles": torch.zeros(1, 1, 3, 3)}, path)
+    assert main([str(path)]) == 1
+    printed = capsys.readouterr().err
+    assert "no input.vertex_normals, " in printed and "config" in printed

@@ -1,32 +1,50 @@
-"""Laws of the whole network, in float64 on tiny sizes, for every family.
+"""Laws of the whole network, in float64 on tiny sizes, for every family; then of its parts.
 
 Tolerance 1e-11: pictures of size 1 after some twenty layers of float64 sums; a broken law changes
-them by 1e-3 and more, as the two guards show.
+them by 1e-3 and more, as the two guards show. Attention, whole and in windows, is its slow twin;
+rays are the conventions', and rotary products see differences of positions only.
 """
 
 import dataclasses
+import math
+from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from model.layers import CrossAttention, merge_heads, split_heads
-from model.positions import Rotation, camera_rotation, rotate, token_positions, world_rotation
+from model.attention import attend
+from model.layers import CrossAttention, SelfAttention, merge_heads, split_heads
+from model.positions import (
+    Rotation,
+    TriangleRotary,
+    camera_rotation,
+    encode_normals,
+    encoded_normal_width,
+    rotate,
+    to_camera,
+    token_positions,
+    world_rotation,
+)
+from model.rays import bundle_rays, ray_directions, unbundle
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, batch_scenes, map_tensors
+from model.windows import attend_in_windows, cut_windows
+from storage.conventions import camera_rays
 from storage.errors import TrilightError
 from tests.for_each import for_each
-from tests.model.attention_reference import attend_reference
 from tests.model.kit import (
     FAMILIES,
     RESOLUTION,
+    attend_reference,
     awake,
-    one_view,
     random_pose,
     random_scene,
     render,
     tiny_config,
+    value_and_gradients,
 )
 
 TIGHT = 1e-11
@@ -223,7 +241,9 @@ def test_one_encoding_serves_every_camera_in_any_order(family: str) -> None:
     with torch.no_grad():
         encoded = model.encode(batch)
         for index in (2, 0, 1, 0):
-            alone = one_view(scene, index)
+            alone = dataclasses.replace(
+                scene, c2w_V44=scene.c2w_V44[[index]], fov_deg_V=scene.fov_deg_V[[index]]
+            )
             got = model.decode(encoded, batch_scenes([alone]).cameras, RESOLUTION)
             close(got[0], render(model, alone)[0])
             close(got[0, 0], together[index])
@@ -292,3 +312,235 @@ def test_registers_stand_where_the_published_divisor_puts_them(eps: float) -> No
         registers = positions.reshape(-1, 3, 3)[:2]
         # float64 means of six vertices of size 5; eps moves them by 5e-6 of that
         torch.testing.assert_close(registers, expected.expand(2, 3, 3), rtol=0, atol=1e-14)
+
+
+SHAPES = [(1, 1, 1, 1, 2), (2, 2, 5, 7, 6), (3, 1, 17, 33, 8), (1, 4, 64, 130, 16)]
+"""(B, H, Q, N, D): one token, odd sizes, and more keys than a kernel's block."""
+
+MASKS = ["none", "all", "first only", "random", "ragged"]
+
+
+def make_mask(kind: str, scenes: int, keys: int) -> Tensor | None:
+    generator = torch.Generator().manual_seed(3)
+    mask = torch.ones(scenes, keys, dtype=torch.bool)
+    if kind == "none":
+        return None
+    if kind == "first only":
+        mask[:, 1:] = False
+    if kind == "random":
+        mask = torch.rand(scenes, keys, generator=generator) < 0.5
+        mask[:, -1] = True
+    if kind == "ragged":
+        mask = torch.arange(keys) < torch.arange(1, scenes + 1)[:, None] * keys / scenes
+        mask[:, 0] = True
+    return mask
+
+
+@for_each("kind", MASKS)
+@for_each("shape", SHAPES)
+@for_each(
+    ("dtype", "tolerance"),
+    # Sums of up to 130 products: rounding of the dtype (1e-16, 6e-8) times their number.
+    [(torch.float64, 1e-13), (torch.float32, 1e-5)],
+)
+def test_fast_attention_equals_its_slow_twin(
+    shape: tuple[int, ...], kind: str, dtype: torch.dtype, tolerance: float
+) -> None:
+    scenes, heads, queries, keys, width = shape
+    generator = torch.Generator().manual_seed(1)
+    sizes = [(scenes, heads, length, width) for length in (queries, keys, keys, queries)]
+    q, k, v, upstream = (torch.randn(s, generator=generator, dtype=dtype) for s in sizes)
+    mask = make_mask(kind, scenes, keys)
+    results = (
+        value_and_gradients(function, (q, k, v), upstream, mask)
+        for function in (attend, attend_reference)
+    )
+    for fast, slow in zip(*results, strict=True):
+        torch.testing.assert_close(fast, slow, rtol=0, atol=tolerance)
+
+
+CPU = torch.device("cpu")
+
+
+def rolled_and_masked(q: Tensor, k: Tensor, v: Tensor, width: int, shifted: bool) -> Tensor:
+    """Return Swin attention as Liu et al. 2021, section 3.2, describe it, window by window."""
+    side = round(q.shape[2] ** 0.5)
+    shift = width // 2 if shifted else 0
+    grids = [x.unflatten(2, (side, side)).roll((-shift, -shift), dims=(2, 3)) for x in (q, k, v)]
+    # regions that a roll brings together but that do not touch in the picture
+    line = torch.zeros(side, dtype=torch.long)
+    if shift:
+        line[side - width : side - shift] = 1
+        line[side - shift :] = 2
+    region = 3 * line[:, None] + line
+    result = torch.zeros_like(grids[0])
+    for row in range(0, side, width):
+        for column in range(0, side, width):
+            rows, columns = slice(row, row + width), slice(column, column + width)
+            q1, k1, v1 = (grid[:, :, rows, columns].flatten(2, 3) for grid in grids)
+            label = region[rows, columns].flatten()
+            for member in label.unique():
+                inside = label == member
+                q2, k2, v2 = (x[:, :, inside] for x in (q1, k1, v1))
+                window = result[:, :, rows, columns].flatten(2, 3)
+                window[:, :, inside] = attend_reference(q2, k2, v2, None)
+                result[:, :, rows, columns] = window.unflatten(2, (width, width))
+    return result.roll((shift, shift), dims=(2, 3)).flatten(2, 3)
+
+
+@for_each("shifted", [False, True])
+@for_each(("side", "width"), [(8, 8), (16, 8), (24, 8), (4, 2), (2, 2)])
+def test_windows_are_those_of_the_roll(side: int, width: int, shifted: bool) -> None:
+    generator = torch.Generator().manual_seed(side)
+    shape = (2, 3, side**2, 4)
+    q, k, v = (torch.randn(shape, generator=generator, dtype=torch.float64) for _ in range(3))
+    upstream = torch.randn(shape, generator=generator, dtype=torch.float64)
+
+    def ours(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        windows = cut_windows(side, width, shifted=shifted, device=CPU)
+        q, k, v = (x[:, :, windows.order_Q] for x in (q, k, v))
+        return attend_in_windows(q, k, v, windows)[:, :, windows.back_Q]
+
+    theirs = partial(rolled_and_masked, width=width, shifted=shifted)
+    results = (value_and_gradients(each, (q, k, v), upstream) for each in (ours, theirs))
+    for got, expected in zip(*results, strict=True):
+        # float64 softmax over at most 64 keys
+        torch.testing.assert_close(got, expected, rtol=0, atol=1e-13)
+
+
+def test_a_shifted_cut_has_whole_windows_strips_and_corners() -> None:
+    windows = cut_windows(24, 8, shifted=True, device=CPU)
+    assert windows.groups == ((4, 64), (8, 32), (4, 16))
+    assert cut_windows(24, 8, shifted=False, device=CPU).groups == ((9, 64),)
+    assert torch.equal(windows.order_Q[windows.back_Q], torch.arange(24**2))
+
+
+@for_each("shifted", [False, True])
+def test_a_bundle_reaches_its_own_window_only(shifted: bool) -> None:
+    layer = SelfAttention(8, 2).double()
+    windows = cut_windows(8, 4, shifted=shifted, device=CPU)
+    x = torch.randn(1, 64, 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    moved = x.clone()
+    moved[0, 0] += 1
+    with torch.no_grad():
+        change = (layer(moved, windows=windows) - layer(x, windows=windows)).abs().amax(dim=-1)
+    reached = change.unflatten(1, (8, 8))[0] > 0
+    width = 2 if shifted else 4
+    expected = torch.zeros(8, 8, dtype=torch.bool)
+    expected[:width, :width] = True
+    assert torch.equal(reached, expected)
+
+
+def test_a_cut_is_made_once_and_asks_no_device() -> None:
+    """On the meta device there is nobody to ask; what inference cut, training may use."""
+    with torch.inference_mode():
+        meta = cut_windows(8, 4, shifted=True, device=torch.device("meta"))
+        cut = cut_windows(8, 4, shifted=True, device=CPU)
+    assert cut is cut_windows(8, 4, shifted=True, device=CPU)
+    assert meta.groups == cut.groups == ((1, 16), (4, 8), (4, 4))
+    assert meta.order_Q.shape == cut.order_Q.shape
+    assert not meta.order_Q.is_inference() and not cut.back_Q.is_inference()
+
+
+@for_each("resolution", [8, 24, 256])
+@for_each("fov_deg", [1.0, 30.0, 45.0, 60.0, 170.0])
+def test_rays_agree_with_the_conventions(resolution: int, fov_deg: float) -> None:
+    _, expected = camera_rays(np.eye(4), fov_deg, resolution)
+    fov = torch.tensor(fov_deg, dtype=torch.float64)
+    got = ray_directions(fov, resolution).movedim(0, -1).numpy()
+    # the same formula in float64 on both sides
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-14)
+    rounded = ray_directions(fov.float(), resolution).movedim(0, -1).numpy()
+    # float32 tangent and square root: a millionth of a radian is a thousandth of a pixel at most
+    np.testing.assert_allclose(rounded, expected, rtol=0, atol=1e-6)
+
+
+def test_a_bundle_holds_its_patch_channel_major_and_unbundling_inverts_it() -> None:
+    resolution, patch = 24, 8
+    picture = torch.arange(3 * resolution**2).reshape(1, 3, resolution, resolution)
+    bundles = bundle_rays(picture, patch)
+    assert bundles.shape == (1, 9, 192)
+    for row in range(3):
+        for column in range(3):
+            rows, columns = slice(8 * row, 8 * row + 8), slice(8 * column, 8 * column + 8)
+            assert torch.equal(bundles[0, 3 * row + column], picture[0, :, rows, columns].flatten())
+    assert torch.equal(unbundle(bundles, patch), picture)
+
+
+@for_each("num_freqs", [1, 2, 3, 6])
+def test_products_of_rotated_vectors_depend_on_the_difference_of_positions(num_freqs: int) -> None:
+    rotary = TriangleRotary(num_freqs=num_freqs, max_freq=5.0, head_width=128).double()
+    generator = torch.Generator().manual_seed(0)
+    q, k = torch.randn(2, 1, 1, 1, 128, generator=generator, dtype=torch.float64)
+    here, there, shift = torch.randn(3, 1, 1, 3, 3, generator=generator, dtype=torch.float64)
+
+    def product(offset: torch.Tensor) -> torch.Tensor:
+        return (rotate(q, *rotary(here + offset)) * rotate(k, *rotary(there + offset))).sum()
+
+    # float64 sums of 128 products of size 1
+    torch.testing.assert_close(product(shift), product(0 * shift), rtol=0, atol=1e-12)
+    assert abs(product(shift) - (q * k).sum()) > 1e-3, "positions must matter at all"
+
+
+def test_angles_are_coordinate_times_frequency_coordinate_major() -> None:
+    rotary = TriangleRotary(num_freqs=2, max_freq=5.0, head_width=40)
+    cos, sin = rotary(torch.arange(1.0, 10.0).reshape(1, 1, 3, 3))
+    expected = [1, 5, 2, 10, 3, 15, 4, 20, 5, 25, 6, 30, 7, 35, 8, 40, 9, 45, 0, 0]
+    # float32 sine of angles up to 45 radians
+    torch.testing.assert_close(cos[0, 0], torch.tensor(expected).cos(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(sin[0, 0], torch.tensor(expected).sin(), rtol=0, atol=1e-5)
+
+
+@for_each(
+    ("num_freqs", "max_freq", "expected"),
+    [
+        (1, 5.0, [1.0]),
+        (3, 5.0, [1.0, 5.0**0.5, 5.0]),
+        # both published sets, as the documents print them
+        (6, 5.0, [1, 1.38, 1.90, 2.63, 3.62, 5.0]),
+        (6, 11.0, [1, 1.62, 2.61, 4.22, 6.81, 11.0]),
+    ],
+)
+def test_frequencies_are_log_spaced(num_freqs: int, max_freq: float, expected: list[float]) -> None:
+    rotary = TriangleRotary(num_freqs=num_freqs, max_freq=max_freq, head_width=128)
+    # two printed decimals
+    torch.testing.assert_close(rotary.freqs_F, torch.tensor(expected), rtol=0, atol=6e-3)
+
+
+def test_rotation_pairs_channel_i_with_channel_i_plus_half() -> None:
+    x = torch.eye(4).reshape(1, 4, 1, 4)
+    angle = torch.tensor([0.3, 0.7])
+    turned = rotate(x, angle.cos().reshape(1, 1, 2), angle.sin().reshape(1, 1, 2))[0, :, 0]
+    a, b = 0.3, 0.7
+    expected = torch.tensor(
+        [
+            [math.cos(a), 0, math.sin(a), 0],
+            [0, math.cos(b), 0, math.sin(b)],
+            [-math.sin(a), 0, math.cos(a), 0],
+            [0, -math.sin(b), 0, math.cos(b)],
+        ]
+    )
+    torch.testing.assert_close(turned, expected)
+
+
+def test_normal_encoding_of_known_numbers() -> None:
+    normals = torch.linspace(-1, 1, 9, dtype=torch.float64).reshape(1, 1, 3, 3)
+    encoded = encode_normals(normals, octaves=3)[0, 0]
+    flat = normals.flatten()
+    phases = [c * 2**k for c in flat.tolist() for k in range(3)]
+    sines = [math.sin(p) for p in phases]
+    cosines = [math.cos(p) for p in phases]
+    expected = torch.tensor([*flat.tolist(), *sines, *cosines], dtype=torch.float64)
+    assert len(encoded) == encoded_normal_width(3)
+    # sin(x + pi / 2) for cos(x), in float64
+    torch.testing.assert_close(encoded, expected, rtol=0, atol=1e-14)
+
+
+def test_camera_space_is_the_inverse_pose() -> None:
+    scene = random_scene(5, num_views=3)
+    inside = to_camera(scene.triangles_T33[None], scene.c2w_V44[None])[0]
+    homogeneous = torch.cat([inside, torch.ones_like(inside[..., :1])], dim=-1)
+    outside = homogeneous @ scene.c2w_V44[:, None].transpose(-1, -2)
+    expected = scene.triangles_T33.expand(3, -1, -1, -1)
+    # float64, coordinates of size 10
+    torch.testing.assert_close(outside[..., :3], expected, rtol=0, atol=1e-13)

@@ -1,20 +1,10 @@
 """One thread for tiny tensors: two would spend their time waiting for each other."""
 
-from collections.abc import Iterator
-
 import pytest
-import torch
 
 from storage.dataset.dataset import Dataset
+from tests.model.conftest import one_thread as one_thread
 from tests.train.toy import write_toy_dataset
-
-
-@pytest.fixture(autouse=True, scope="session")
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

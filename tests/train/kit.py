@@ -9,16 +9,22 @@ from typing import Any
 
 import torch
 
+from model.checkpoint_format import path_of_step
 from model.config import ModelConfig
+from model.renderformer import RenderFormer
+from model.scene_tensors import SceneTensors
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import TrainingData, open_training_data
+from tests.train.toy import toy_sample
 from train.data.bad_samples import BadSampleCounter
+from train.data.buckets import TrainingBatch, collate_batch
 from train.data.mixture import Mixture
 from train.data.order import RankSlice
-from train.data.scenes import TrainingScene
+from train.data.scenes import TrainingScene, training_scene
 from train.data.stream import StreamSettings, stream_batches
+from train.evaluation.evaluate import EvalConfig
 from train.loop.distributed import DistributedContext
-from train.loop.state import TrainState
+from train.loop.state import TrainState, new_state
 from train.loop.step import Stepper
 from train.loss.objective import TrainingLoss
 from train.progress import TrainProgress
@@ -96,6 +102,47 @@ def trained(
     result = train_run(settings, data=places, out=out, start=begun, **rest)
     assert result is not None
     return result
+
+
+def require_resumed_to_the_bit(
+    run: TrainSettings, data: Dataset | Sequence[str], out: Path, **resumed: Any
+) -> None:
+    """Train, take the end of the run away, and resume: the weights are those that were there."""
+    folder = trained(run, data, out).folder
+    weights = folder.weights.read_bytes()
+    path_of_step(folder.checkpoints, run.num_steps).unlink()
+    folder.weights.unlink()
+    again = trained(run, data, out, resume=True, **resumed)
+    assert again.folder.weights.read_bytes() == weights
+
+
+def eval_config(data: Dataset, network: RenderFormer | None = None, **changes: Any) -> EvalConfig:
+    """Return an evaluation of all of a validation split, by default of an untrained network."""
+    config = EvalConfig(
+        network=network or new_state(tiny_run()).model,
+        shards=open_training_data([str(data.folder.root)]).split("validation"),
+        resolution=16,
+        baselines=None,
+        lpips=None,
+        most_scenes=99,
+    )
+    return dataclasses.replace(config, **changes)
+
+
+def toy_batch(*indices: int) -> TrainingBatch:
+    """Return toy scenes of 16 pixels, by their numbers, as one batch."""
+    return collate_batch([training_scene(toy_sample(index), 16) for index in indices])
+
+
+def bare_scene(tensors: SceneTensors) -> TrainingScene:
+    """Return a training scene of one view whose picture does not matter."""
+    return TrainingScene(
+        key="",
+        tensors=tensors,
+        target_VRR3=torch.zeros(1, 4, 4, 3),
+        noise_V=torch.zeros(1),
+        light_T=torch.zeros(tensors.num_triangles, dtype=torch.int64),
+    )
 
 
 def stepper(state: TrainState, settings: TrainSettings) -> Stepper:

@@ -20,14 +20,13 @@ import numpy as np
 import pytest
 import torch
 
-from model.checkpoint_format import path_of_step
 from model.config import ModelConfig
 from model.config import smoke as smoke_model
 from model.hits.traced import INPUTS
 from model.neural_renderer import NeuralRenderer
 from model.open import open_network
 from model.renderformer import RenderFormer
-from storage.dataset.dataset import Dataset
+from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
@@ -35,11 +34,17 @@ from storage.records.retextured import with_textures
 from storage.records.scene import Scene
 from storage.records.texture import Texture
 from tests.for_each import for_each
-from tests.model.hits.test_decoder import hits_config
-from tests.model.kit import tiny_config
+from tests.model.kit import hits_config, tiny_config
 from tests.sky_maps import smooth
 from tests.train.fake_card import CARD, card_process, fake_card
-from tests.train.kit import stepper, take, tiny_run, trained
+from tests.train.kit import (
+    eval_config,
+    require_resumed_to_the_bit,
+    stepper,
+    take,
+    tiny_run,
+    trained,
+)
 from tests.train.loss.test_objective import small_weights
 from tests.train.toy import (
     toy_picture,
@@ -50,10 +55,10 @@ from tests.train.toy import (
 )
 from train.data.buckets import collate_batch
 from train.data.scenes import TrainingScene, training_scene
-from train.evaluation.baselines import MEDIAN, NEAREST
-from train.evaluation.evaluate import EvalConfig, judge_views, make_baselines
+from train.evaluation.evaluate import judge_views, make_baselines
 from train.evaluation.judge import predict
 from train.evaluation.judged_view import NETWORK, summarize_views
+from train.evaluation.stored_pictures import MEDIAN, NEAREST
 from train.loop.distributed import DistributedContext
 from train.loop.schedule import learning_rate
 from train.loop.state import TrainState, new_state
@@ -126,9 +131,10 @@ def test_a_picture_comes_from_its_own_scene() -> None:
 @pytest.mark.slow("training")
 def test_unseen_scenes_look_better_than_any_stored_picture(tmp_path: Path) -> None:
     """Than the median one, and than the closest of all training views, which knows the answer."""
-    folder = write_toy_dataset(
+    dataset = write_toy_dataset(
         tmp_path / "data", train=64, validation=8, per_shard=64, resolution=16
-    ).folder
+    )
+    folder = dataset.folder
     settings = tiny_run(
         model=SMALL,
         num_steps=600,
@@ -140,16 +146,9 @@ def test_unseen_scenes_look_better_than_any_stored_picture(tmp_path: Path) -> No
         checkpoint_every=600,
     )
     trained(settings, [str(folder.root)], tmp_path / "out")
-    data = open_training_data([str(folder.root)])
-    contest = EvalConfig(
-        network=open_network(tmp_path / "out"),
-        shards=data.split("validation"),
-        resolution=16,
-        baselines=make_baselines(data.split("train"), 16),
-        lpips=None,
-        most_scenes=99,
-    )
-    views = judge_views(contest, lambda: None)
+    shards = open_training_data([str(folder.root)]).split("train")
+    network, baselines = open_network(tmp_path / "out"), make_baselines(shards, 16)
+    views = judge_views(eval_config(dataset, network, baselines=baselines), lambda: None)
     means = {
         name: summarize_views(views, name)["log_l1"]["mean"] for name in (NETWORK, MEDIAN, NEAREST)
     }
@@ -226,14 +225,6 @@ def with_maps(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """With steps in which no scene has a sky, or a texture."""
     folder = tmp_path_factory.mktemp("maps")
     return write_toy_dataset(folder, train=6, validation=2, per_shard=3, scene_of=_scene_of_maps)
-
-
-def require_resumed_to_the_bit(run: TrainSettings, data: Dataset, out: Path) -> None:
-    folder = trained(run, data, out).folder
-    weights = folder.weights.read_bytes()
-    path_of_step(folder.checkpoints, run.num_steps).unlink()
-    folder.weights.unlink()
-    assert trained(run, data, out, resume=True).folder.weights.read_bytes() == weights
 
 
 def test_a_run_that_is_told_hits_resumes_to_the_bit(dataset: Dataset, tmp_path: Path) -> None:
@@ -337,15 +328,9 @@ def train_and_judge(run: str, size: str, data: str, lpips: str, out: Path) -> No
         network = RenderFormer(settings.model).to(CARD)
         distance = load_lpips(lpips)
         assert distance is not None
-        contest = EvalConfig(
-            network=network,
-            shards=open_training_data([data]).split("validation"),
-            resolution=RESOLUTION,
-            baselines=None,
-            lpips=distance.to(CARD),
-            most_scenes=1,
-        )
-        (view, *_) = judge_views(contest, lambda: None)
+        judged = {"resolution": RESOLUTION, "lpips": distance.to(CARD), "most_scenes": 1}
+        config = eval_config(open_dataset(data), network, **judged)
+        (view, *_) = judge_views(config, lambda: None)
         assert view.scores["network"]["lpips"] is not None
         assert NeuralRenderer(network).render(toy_scene(0), RESOLUTION).shape[1:] == (64, 64, 3)
 

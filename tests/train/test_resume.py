@@ -20,8 +20,7 @@ from tests.for_each import for_each
 from tests.train.kit import TINY_MODEL, tiny_run
 from train.resume import ResumePlan, event_records, plan_resume
 from train.runs import RUNS, changed_run, named_run, scale_intervals
-from train.settings import AugmentationSettings, TrainSettings
-from train.stored_settings import known_settings, stored_settings
+from train.settings import AugmentationSettings, TrainSettings, known_settings, stored_settings
 
 DIGEST = "d" * 64
 OTHER = "0123456789" * 6 + "abcd"

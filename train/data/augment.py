@@ -22,7 +22,7 @@ from torch import Tensor
 
 from model.hits.textures import SurfaceTextures
 from model.scene_tensors import SceneTensors
-from model.sky import symmetries
+from storage.records.environment import Environment
 from storage.records.material import laid_out
 from train.data.scenes import TrainingScene
 
@@ -93,7 +93,7 @@ def move_scene(scene: TrainingScene, rotation_33: Tensor, shift_3: Tensor) -> Tr
         triangles_T33=(old.triangles_T33.double() @ rotation_33.T + shift_3).float(),
         normals_T33=(old.normals_T33.double() @ rotation_33.T).float(),
         c2w_V44=(motion_44 @ old.c2w_V44.double()).float(),
-        sky=None if old.sky is None else symmetries.rotate_sky(old.sky, rotation_33.numpy()),
+        sky=None if old.sky is None else rotate_sky(old.sky, rotation_33.numpy()),
     )
     return dataclasses.replace(scene, tensors=tensors)
 
@@ -117,7 +117,7 @@ def mirror_scene(scene: TrainingScene) -> TrainingScene:
         textures=_reorder_texture_vertices(
             old, np.tile(np.array([2, 1, 0]), (old.num_triangles, 1))
         ),
-        sky=None if old.sky is None else symmetries.mirror_sky(old.sky, sides_3),
+        sky=None if old.sky is None else mirror_sky(old.sky, sides_3),
     )
     target_VRR3 = torch.from_numpy(_flip_columns(scene.target_VRR3.numpy()))
     return dataclasses.replace(scene, tensors=tensors, target_VRR3=target_VRR3, lights_VLRR3=None)
@@ -135,7 +135,7 @@ def permute_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
         textures = textures.with_channels(order)
     sky = scene.tensors.sky
     if sky is not None:
-        sky = symmetries.permute_sky_channels(sky, order)
+        sky = permute_sky_channels(sky, order)
     return dataclasses.replace(
         scene,
         tensors=dataclasses.replace(
@@ -147,7 +147,7 @@ def permute_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
 
 
 def rotate_vertex_order(scene: TrainingScene, first_T: np.ndarray) -> TrainingScene:
-    """Return the scene with each triangle's vertices (0, 1, 2) read from `turn_T[t]` on.
+    """Return the scene with each triangle's vertices (0, 1, 2) read from `first_T[t]` on.
 
     The first vertex of a triangle is arbitrary, but the network's rotary positions depend on it,
     so it has to learn this symmetry from data.
@@ -201,7 +201,7 @@ def scale_light(scene: TrainingScene, factor: float) -> TrainingScene:
     factor_T = torch.full((scene.tensors.num_triangles,), factor)
     tensors = _scale_emission(scene.tensors, factor_T)
     if tensors.sky is not None:
-        tensors = dataclasses.replace(tensors, sky=symmetries.scale_sky(tensors.sky, factor))
+        tensors = dataclasses.replace(tensors, sky=scale_sky(tensors.sky, factor))
     lit = dataclasses.replace(scene, tensors=tensors, lights_VLRR3=None)
     if scene.levels_L is not None:
         return dataclasses.replace(lit, levels_L=_log10(factor * _linear(scene.levels_L)))
@@ -242,3 +242,34 @@ def _linear(log10: Tensor) -> Tensor:
 
 def _log10(linear: Tensor) -> Tensor:
     return torch.log1p(linear) / LN_10
+
+
+def rotate_sky(sky: Environment, rotation_33: NDArray[np.float64]) -> Environment:
+    """Return the sky after a rotation of the world space."""
+    rotation = rotation_33 @ sky.rotation.astype(np.float64)
+    return dataclasses.replace(sky, rotation=rotation.astype(np.float32))
+
+
+def mirror_sky(sky: Environment, sides_3: NDArray[np.float32]) -> Environment:
+    """Return the mirrored sky; the one coordinate whose `sides` is -1 is negated.
+
+    A mirror reverses the order of columns, which puts texels exactly where the reflection does, and
+    then is a rotation.
+    """
+    reversed_columns = np.diag([1.0, -1.0, 1.0])  # which negate azimuths
+    rotation = np.diag(sides_3.astype(np.float64)) @ sky.rotation.astype(np.float64)
+    return dataclasses.replace(
+        sky,
+        radiance_rgb=np.ascontiguousarray(sky.radiance_rgb[:, ::-1]),
+        rotation=(rotation @ reversed_columns).astype(np.float32),
+    )
+
+
+def permute_sky_channels(sky: Environment, order: NDArray[np.integer]) -> Environment:
+    """Return the sky with permuted color channels."""
+    return dataclasses.replace(sky, radiance_rgb=np.ascontiguousarray(sky.radiance_rgb[..., order]))
+
+
+def scale_sky(sky: Environment, factor: float) -> Environment:
+    """Return the sky with its radiance multiplied by `factor`."""
+    return dataclasses.replace(sky, radiance_rgb=sky.radiance_rgb * np.float32(factor))

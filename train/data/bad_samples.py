@@ -49,7 +49,6 @@ class BadSampleCounter:
         """Count a damaged sample or shard; repeated calls count once.
 
         Args:
-            name: name of the sample or shard.
             num_samples: number of samples that are lost with it.
             error: error of reading it, which includes the name.
 

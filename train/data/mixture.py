@@ -110,10 +110,8 @@ def mix_visits(
     """Yield the visits of the stream without end, from position `first` on.
 
     Args:
-        mixture: order of the datasets.
         visits: endless visits of each dataset, after the scenes of `mixture.counts_before`.
         parts: shard numbers of each dataset among all.
-        first: position of the stream.
     """
     for position, source in enumerate(mixture.sources_from(first), first):
         visit = next(visits[source])
@@ -127,8 +125,6 @@ def plan_mixture(
     """Return the mixture of a run from here on; None if it has only had one dataset.
 
     Args:
-        data: data of the run.
-        settings: settings of the next step.
         header: header of the checkpoint that is resumed; None for a new run. A dataset that the run
             has used before continues at its position.
 
@@ -147,15 +143,18 @@ def plan_mixture(
         if header is None or RECORD not in header:
             return None
     position = 0 if header is None else header["step"] * settings.scenes_per_step
-    seen_counts = (
-        dict[str, int]()
-        if old is None or header is None
-        else _count_seen_scenes(old, header["step"])
+    seen_counts = dict[str, int]()
+    if old is not None and header is not None:
+        counts = old.counts_before(header["step"] * old.scenes_per_step)
+        seen_counts = dict(zip(old.digests, counts, strict=True))
+    shards = data.split("train")
+    weights = tuple(map(float, settings.data_weights)) or tuple(
+        float(sum(map(shards.num_samples, part))) for part in shards.parts
     )
     new = Mixture(
         digests=tuple(source.digest for source in sources),
         names=tuple(source.name for source in sources),
-        weights=tuple(float(w) for w in settings.data_weights) or _sizes(data),
+        weights=weights,
         first=position,
         before=tuple(seen_counts.get(source.digest, 0) for source in sources),
         scenes_per_step=settings.scenes_per_step,
@@ -165,12 +164,6 @@ def plan_mixture(
         getattr(old, name) == getattr(new, name) for name in identity_fields
     )
     return old if unchanged else new
-
-
-def _count_seen_scenes(old: Mixture, step: int) -> dict[str, int]:
-    """Return the number of scenes that a run has used, by digest of the dataset."""
-    counts = old.counts_before(step * old.scenes_per_step)
-    return dict(zip(old.digests, counts, strict=True))
 
 
 def _mixture_of_header(header: Mapping[str, Any]) -> Mixture:
@@ -188,9 +181,3 @@ def _mixture_of_header(header: Mapping[str, Any]) -> Mixture:
         before=(0,),
         scenes_per_step=header["settings"]["scenes_per_step"],
     )
-
-
-def _sizes(data: TrainingData) -> tuple[float, ...]:
-    """Return the number of training scenes of each dataset."""
-    shards = data.split("train")
-    return tuple(float(sum(map(shards.num_samples, part))) for part in shards.parts)

@@ -96,10 +96,7 @@ def windows_from(
     """Yield endless windows, beginning with the one that holds position `first`.
 
     Args:
-        num_shards: number of shards.
         num_samples: returns the size of a shard; called only for shards that are reached.
-        settings: seed and window.
-        first: position in the endless order.
 
     Raises:
         TrilightError: all shards are empty.

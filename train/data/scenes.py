@@ -23,7 +23,6 @@ from storage.records.lights import light_rows
 from storage.records.sample import Sample, ViewRecord
 from storage.records.scene import Scene
 from storage.records.stored_sample import StoredSample
-from train.data.resolution import block_mean, require_divisor
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -79,10 +78,7 @@ def scene_of_views(
     If pictures are half floats of the right resolution, the target is not looked up yet.
 
     Args:
-        sample: stored sample.
         views: indices of its cameras, at least one.
-        resolution: as in `training_scene`.
-        per_light: as in `training_scene`.
 
     Raises:
         TrilightError: a picture is damaged or invalid; otherwise as `training_scene`.
@@ -136,22 +132,18 @@ def _scene_of(
     else:
         radiance_VRR3 = block_mean(to_float32(pictures), resolution)
         target_VRR3 = torch.from_numpy(log10_radiance(radiance_VRR3).astype(np.float32))
+    light_of_object = np.full(len(scene.objects), -1, np.int64)
+    rows = list(light_rows(scene))
+    light_of_object[rows] = np.arange(len(rows))
     floors_db = np.array([view.noise_floor_db for view in views], np.float32)
     return TrainingScene(
         key=key,
         tensors=scene_tensors(scene),
         target_VRR3=target_VRR3,
         noise_V=torch.from_numpy(10 ** (-floors_db / 20)),
-        light_T=torch.from_numpy(_lights_of_triangles(scene)),
+        light_T=torch.from_numpy(light_of_object[scene.object_index]),
         levels_L=levels_L,
     )
-
-
-def _lights_of_triangles(scene: Scene) -> NDArray[np.int64]:
-    light_of_object = np.full(len(scene.objects), -1, np.int64)
-    rows = list(light_rows(scene))
-    light_of_object[rows] = np.arange(len(rows))
-    return light_of_object[scene.object_index]
 
 
 def _with_lights(
@@ -164,3 +156,29 @@ def _with_lights(
         )
     smaller = np.stack([block_mean(lights, resolution) for lights in lights_rgb])
     return dataclasses.replace(scene, lights_VLRR3=torch.from_numpy(smaller))
+
+
+def block_mean(radiance_rgb: NDArray[np.float32], resolution: int) -> NDArray[np.float32]:
+    """Return pictures [V, R, R, 3] as [V, resolution, resolution, 3], exact up to rounding.
+
+    Raises:
+        TrilightError: `resolution` does not divide the pictures' own.
+    """
+    views, stored = radiance_rgb.shape[:2]
+    require_divisor(resolution, stored)
+    factor = stored // resolution
+    if factor == 1:
+        return radiance_rgb
+    # rows first: 4 times faster than both axes at once, which walk memory in small strides
+    rows = radiance_rgb.reshape(views, resolution, factor, stored, 3).sum(axis=2, dtype=np.float32)
+    blocks = rows.reshape(views, resolution, resolution, factor, 3).sum(axis=3, dtype=np.float32)
+    return blocks / np.float32(factor**2)
+
+
+def require_divisor(resolution: int, stored: int) -> None:
+    """Raise TrilightError where `resolution` does not divide that of the stored pictures."""
+    if resolution < 1 or stored % resolution:
+        raise TrilightError(
+            f"resolution {resolution}: expected a divisor of {stored}, the resolution of the "
+            "dataset. Choose one, or generate the dataset at another resolution."
+        )

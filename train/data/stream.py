@@ -8,16 +8,17 @@ import dataclasses
 import itertools
 import queue
 import threading
-from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass
+from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from model.sky.known import lit_sky, require_known_sky
+from model.scene_tensors import lit_sky, require_known_sky
 from storage.dataset.shard_set import OpenShard, ShardSet
 from storage.errors import TrilightError
 from storage.records.stored_sample import StoredSample
@@ -25,7 +26,6 @@ from storage.seeds import rng_for
 from train.data.augment import augment_scene, withhold_inputs
 from train.data.bad_samples import BadSampleCounter, count_lost_samples
 from train.data.mixture import Mixture, mix_visits
-from train.data.open_shards import OpenShards
 from train.data.order import (
     OrderSettings,
     RankSlice,
@@ -95,8 +95,6 @@ def stream_batches(
     Closing the returned iterator ends its threads.
 
     Args:
-        shards: shards of the train split.
-        settings: settings that determine order and scenes.
         first: number of a global batch.
         rank_slice: slice of each batch for this process; all slices have equal size.
         workers: threads that read and decode; with 0 the caller's thread. The result does not
@@ -130,6 +128,64 @@ def stream_batches(
                         yield ready
         finally:
             decoders.shutdown(wait=True, cancel_futures=True)
+
+
+OPENED_AT_ONCE = 4
+"""Maximum number of shards that are fetched and checked at the same time."""
+
+
+class OpenShards:
+    """Open shards of a set, by number. Safe to use from several threads."""
+
+    def __init__(self, shards: ShardSet) -> None:
+        self._shards = shards
+        self._opening = ThreadPoolExecutor(OPENED_AT_ONCE, thread_name_prefix="open-shard")
+        self._open: dict[int, Future[OpenShard]] = {}
+        self._planned: Counter[int] = Counter()
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> "OpenShards":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close all shards; wait for those being opened, whose files must not be left open."""
+        self._opening.shutdown(wait=True, cancel_futures=True)
+        with self._lock:
+            for future in self._open.values():
+                _close(future)
+            self._open.clear()
+
+    def plan(self, numbers: Iterable[int]) -> None:
+        """Start to open the shards of planned samples: one shard number for each sample."""
+        with self._lock:
+            for number in numbers:
+                self._planned[number] += 1
+                if number not in self._open:
+                    self._open[number] = self._opening.submit(self._shards.open, number)
+
+    def read(self, number: int) -> OpenShard:
+        """Return a planned shard after it is open; raises the error of opening it."""
+        with self._lock:
+            future = self._open[number]
+        return future.result()
+
+    def mark_read(self, numbers: Iterable[int]) -> None:
+        """Mark samples as read: one shard number for each, as planned."""
+        with self._lock:
+            self._planned.subtract(numbers)
+            for number in [number for number, count in self._planned.items() if not count]:
+                del self._planned[number]
+                self._open.pop(number).add_done_callback(_close)
+
+
+def _close(future: Future[OpenShard]) -> None:
+    if not future.cancel() and future.exception() is None:
+        future.result().close()
 
 
 class _InlineExecutor(Executor):
@@ -287,8 +343,9 @@ class _SceneMaker:
             try:
                 return self._draw_views(shard.stored_sample(at), rng), rng
             except TrilightError as error:
-                shard_error = _with_shard_name(shard.name, error)
-                self._unusable.add(f"{shard.name}: sample {keys[at]}", 1, shard_error)
+                if not str(error).startswith(shard.name):
+                    error = TrilightError(f"{shard.name}: {error}")
+                self._unusable.add(f"{shard.name}: sample {keys[at]}", 1, error)
         return None
 
     def _draw_views(self, sample: StoredSample, rng: np.random.Generator) -> TrainingScene:
@@ -307,18 +364,12 @@ class _SceneMaker:
         return scene_of_views(sample, views.tolist(), settings.resolution, per_light=per_light)
 
 
-def _with_shard_name(shard: str, error: TrilightError) -> TrilightError:
-    text = str(error)
-    return error if text.startswith(shard) else TrilightError(f"{shard}: {text}")
-
-
 def prefetch(items: Iterator[Item], depth: int) -> Generator[Item, None, None]:
     """Yield the same items, computed ahead in a thread; errors keep their position.
 
     Closing the returned iterator ends the thread.
 
     Args:
-        items: source of the items.
         depth: maximum number of items to compute ahead.
     """
     ready: queue.Queue[tuple[Item] | BaseException | None] = queue.Queue(depth)

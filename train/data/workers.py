@@ -60,7 +60,6 @@ def choose_workers(
     """Return the number of decoding threads.
 
     Args:
-        machine: resources of the node.
         settings: settings of the run, which determine the memory of its scenes.
         on_gpu: True if the network is on a GPU, for which the main thread needs a core.
         busy_threads: CPU threads of a network that is not on a GPU.

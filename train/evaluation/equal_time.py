@@ -166,8 +166,6 @@ def equal_time(views: Sequence[JudgedView], times: EqualTimeResult, which: str) 
     """Compare network and path tracer over the views that have both, as JSON values.
 
     Args:
-        views: rows of the evaluation.
-        times: times of both.
         which: description of the views that the tracer was scored on.
     """
     both = [view for view in views if TRACER in view.scores]

@@ -14,7 +14,7 @@ from storage.records.sample import Sample
 from storage.records.scene import Scene
 from train.data.buckets import collate_batch
 from train.data.scenes import TrainingScene, training_scene
-from train.evaluation.scores import (
+from train.evaluation.metrics import (
     Lead,
     ViewScore,
     fraction_better,
@@ -45,7 +45,7 @@ class ValidationResult:
     views: tuple[ViewScore, ...]
     """Scores of all views, scene after scene."""
     scores: dict[str, float]
-    """Summary (evaluation.scores), and `better_than_median`: the fraction of views won."""
+    """Summary (evaluation.metrics), and `better_than_median`: the fraction of views won."""
     lead: Lead
     """Advantage of the network over the median picture."""
 
@@ -65,7 +65,6 @@ class Judge:
         """Score a network on all scenes.
 
         Args:
-            model: the network.
             between: called before each scene is rendered and before it is scored; an exception
                 ends the validation.
         """

@@ -12,7 +12,7 @@ from train.evaluation.equal_time import TRACER, sentences
 from train.evaluation.judged_view import NEAR_DB, NETWORK
 from train.evaluation.metrics import METRICS
 from train.evaluation.pairs import METRIC, PairedLead, interval_text
-from train.evaluation.published import PUBLISHED, PUBLISHED_ROWS, PUBLISHED_WHERE
+from train.evaluation.report import PUBLISHED, PUBLISHED_ROWS, PUBLISHED_WHERE
 from train.evaluation.standings import WidthStandings
 
 _NONE = "n/a"
@@ -49,9 +49,6 @@ def leaderboard_page(
     """Return leaderboard.md.
 
     Args:
-        about: facts of the dataset by name.
-        widths: table of each width.
-        notes: notes for the reader.
         rival: name of the row that all others are compared with.
     """
     lines = ["# Leaderboard", "", *_facts(about)]

@@ -36,9 +36,7 @@ def time_scene(renderer: Renderer, scene: Scene, name: str, rounds: int = 1) -> 
 
     Args:
         renderer: a renderer that states its CPU seconds.
-        scene: the scene.
         name: name of the scene in messages.
-        rounds: measured rounds.
 
     Raises:
         Unrenderable, TrilightError: as `Renderer.load` and `ReadyScene.render`.

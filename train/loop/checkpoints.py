@@ -9,8 +9,10 @@ that a disk changed.
 import dataclasses
 import json
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Annotated, Any
 
 import torch
@@ -37,8 +39,7 @@ from train.loop.schedule import decay_start_step
 from train.loop.state import TrainState, new_state
 from train.loop.step import StepReport
 from train.resume import Event, ResumePlan, event_records
-from train.settings import Precision, TrainSettings
-from train.stored_settings import stored_settings
+from train.settings import Precision, TrainSettings, stored_settings
 
 UNSEALED = "0" * 64
 """Placeholder of the sha256 while it is computed. Old checkpoints have no sha256."""
@@ -133,11 +134,8 @@ def restore_state(
     """Return the state of a resumed run before its next step.
 
     Args:
-        checkpoint: checkpoint to restore.
         plan: settings and history (train.resume). If the checkpoint has no EMA and the settings
             ask for one, it starts as a copy of the weights.
-        device: as in `new_state`.
-        muon_precision: as in `new_state`.
 
     Raises:
         TrilightError: the run was started with other extensions.
@@ -172,7 +170,6 @@ def newest_checkpoint(
     """Return the newest checkpoint that is not damaged.
 
     Args:
-        folder: folder of the checkpoints.
         dist_context: the processes that resume together; all must call it.
         note: called with a message if a damaged checkpoint was skipped.
 
@@ -229,11 +226,7 @@ def save_checkpoint(
     steps do not count: they were damaged when the run resumed from an earlier one.
 
     Args:
-        folder: folder of the checkpoints.
         state: state to save; it is copied before this returns.
-        settings: settings of the run.
-        data_digest: digest of the training data.
-        world_size: number of processes.
         submit: runs the slow writing; by default at once.
 
     Raises:
@@ -252,3 +245,45 @@ def _write_and_prune(folder: Path, newest: int, data: bytes, settings: TrainSett
         milestone = settings.keep_every and step % settings.keep_every == 0
         if not milestone and step != decay_start_step(settings):
             path_of_step(folder, step).unlink(missing_ok=True)
+
+
+class BackgroundWriter:
+    """Thread that runs one job at a time.
+
+    Errors of a job are raised by the next call, so that only time is lost. The context exits when
+    all jobs are done.
+    """
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
+        self._last: Future[None] | None = None
+
+    def begin(self, work: Callable[[], None]) -> None:
+        """Submit a job after the one before has ended; raises the error of that."""
+        self.wait()
+        self._last = self._pool.submit(work)
+
+    def wait(self) -> None:
+        """Wait until the submitted job has ended; raises its error."""
+        last = self._last
+        self._last = None
+        if last is not None:
+            last.result()
+
+    def __enter__(self) -> "BackgroundWriter":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            self.wait()
+        except TrilightError as failed:
+            if error is None:
+                raise
+            error.add_note(str(failed))
+        finally:
+            self._pool.shutdown()

@@ -42,7 +42,12 @@ def compile_parts(
         )
     torch._dynamo.config.recompile_limit = max(MAX_GRAPHS, torch._dynamo.config.recompile_limit)
     if device.type == "cuda":
-        _without_tiling_analysis()
+        import torch._inductor.config as inductor
+
+        # It fails on dynamic lengths: on an H200, torch 2.11 failed there with an assertion in the
+        # backward pass of `smoke` and `pretrain` (pytorch/pytorch issues 181563 and 197077); the
+        # second is open in later versions too.
+        inductor.triton.coalesce_tiling_analysis = False
     for _, module, method in compiled_parts(model, objective):
         if method == "forward":
             module.compile(dynamic=True)
@@ -66,17 +71,6 @@ def is_compiler_error(error: Exception) -> bool:
     from torch._inductor.exc import InductorError
 
     return isinstance(error, TorchDynamoException | InductorError)
-
-
-def _without_tiling_analysis() -> None:
-    """Disable an analysis of torch's compiler that fails on dynamic lengths.
-
-    On an H200, torch 2.11 failed there with an assertion in the backward pass of `smoke` and
-    `pretrain` (pytorch/pytorch issues 181563 and 197077); the second is open in later versions too.
-    """
-    import torch._inductor.config as inductor
-
-    inductor.triton.coalesce_tiling_analysis = False
 
 
 def compiled_parts(

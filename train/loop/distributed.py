@@ -1,6 +1,6 @@
 """Processes that train together: one, or those that torchrun started.
 
-Each takes its slice of every batch (train.data.order.RankShare); torch's DistributedDataParallel
+Each takes its slice of every batch (train.data.order.RankSlice); torch's DistributedDataParallel
 averages gradients over nccl or gloo. Only the first process logs, validates and saves.
 """
 
@@ -48,9 +48,8 @@ class DistributedContext:
         if self.world_size == 1:
             return list(values)
         # float32, because nccl and gloo both have it everywhere
-        total = torch.tensor(values, dtype=torch.float32, device=self.device)
-        dist.all_reduce(total)
-        return [float(value) / self.world_size for value in total]
+        mine = torch.tensor(values, dtype=torch.float32, device=self.device)
+        return list(map(float, self.mean_on_device(mine)))
 
     def mean_on_device(self, values: Tensor) -> Tensor:
         """Return the means [N] over all processes, on the device and without a wait.

@@ -41,18 +41,14 @@ def muon(
         precision: precision of its products. With bfloat16 on a CPU it is torch's own class.
         thirds: those of the weights that are three stacked matrices.
     """
-    if precision == "bfloat16" and not thirds and not defers_sync(_device(matrices[0])):
+    first = matrices[0] if isinstance(matrices[0], Tensor) else matrices[0]["params"][0]
+    if precision == "bfloat16" and not thirds and not defers_sync(first.device):
         return torch.optim.Muon(matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
     return StackedMuon(matrices, weight_decay, PRODUCTS[precision], thirds)
 
 
-def _device(first: Tensor | dict[str, Any]) -> torch.device:
-    weight: Tensor = first if isinstance(first, Tensor) else first["params"][0]
-    return weight.device
-
-
 PRODUCTS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-"""Types of Muon's products, by precision."""
+"""Types of matrix products, by precision."""
 
 
 class StackedMuon(torch.optim.Muon):

@@ -50,7 +50,8 @@ class Updater:
         muon_weights = list[_Scaled]()
         adamw_weights = list[_Scaled]()
         for weight, name in self._names.items():
-            if settings.muon_rate and _muon_takes(name, weight, settings):
+            is_taken = settings.muon_takes == "matrices" or _LAYERS in name
+            if settings.muon_rate and weight.ndim == 2 and is_taken:
                 muon_weights.append((weight, scales[name].muon))
             else:
                 adamw_weights.append((weight, scales[name].adamw))
@@ -62,9 +63,9 @@ class Updater:
         self._optimizers: list[tuple[torch.optim.Optimizer, float]] = [(adamw, 1.0)]
         self.muon_precision = precision if muon_weights else None
         if muon_weights:
-            thirds = [
-                weight for weight, _ in muon_weights if _is_qkv(self._names[weight], settings)
-            ]
+            by_thirds = settings.muon_takes == "hidden"
+            names = self._names
+            thirds = [w for w, _ in muon_weights if by_thirds and names[w].endswith(_QKV)]
             groups = self._groups(muon_weights, settings)
             optimizer = muon(groups, settings.weight_decay, precision, thirds=thirds)
             self._optimizers.append((optimizer, settings.muon_rate))
@@ -77,7 +78,8 @@ class Updater:
         """
         groups = defaultdict[tuple[float, float], list[Tensor]](list)
         for weight, scale in weights:
-            decays = settings.decayed == "all" or _is_matrix(self._names[weight], weight)
+            is_matrix = weight.ndim > 1 and not self._names[weight].endswith(_TOKENS)
+            decays = settings.decayed == "all" or is_matrix
             groups[scale, settings.weight_decay if decays else 0.0].append(weight)
         return [
             {"params": params, "weight_decay": decay / scale, _SCALE: scale}
@@ -135,18 +137,6 @@ _TOKENS = "registers_NW"
 _LAYERS = ".layers."
 _QKV = ".qkv.weight"
 """Parts of weight names: all layers, and the stacked query, key and value matrices."""
-
-
-def _is_matrix(name: str, weight: Tensor) -> bool:
-    return weight.ndim > 1 and not name.endswith(_TOKENS)
-
-
-def _muon_takes(name: str, weight: Tensor, settings: TrainSettings) -> bool:
-    return weight.ndim == 2 and (settings.muon_takes == "matrices" or _LAYERS in name)
-
-
-def _is_qkv(name: str, settings: TrainSettings) -> bool:
-    return settings.muon_takes == "hidden" and name.endswith(_QKV)
 
 
 def _state_names(optimizer: torch.optim.Optimizer) -> tuple[str, ...]:

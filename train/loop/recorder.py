@@ -5,47 +5,16 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image
-
 from storage.atomic import append_line, write_atomically
 from storage.settings.described import settings_record
 from train.evaluation.judge import Judge
 from train.evaluation.sheet import draw_validation_sheet
 from train.folder import RunFolder
 from train.loop.state import TrainState
-from train.monitoring.notes import add_note
-from train.monitoring.rows import read_rows
-from train.monitoring.scalars import scalars
-from train.monitoring.weights_and_biases import WandbLogger
+from train.monitoring.boards import TensorBoardLogger, WandbLogger
+from train.monitoring.rows import add_note, read_rows
 from train.progress import TrainProgress
 from train.settings import TrainSettings
-
-
-class TensorBoardLogger:
-    """Writes the log's numbers and the validation sheets for TensorBoard.
-
-    A resumed run writes its rows after the first step again.
-    """
-
-    def __init__(self, folder: Path, *, first_step: int) -> None:
-        from torch.utils.tensorboard import SummaryWriter  # half a second to import
-
-        self._writer = SummaryWriter(str(folder), purge_step=first_step + 1)
-
-    def scalars(self, row: Mapping[str, Any]) -> None:
-        """Add a row of the log; values that are not numbers are left out."""
-        step = row["step"]
-        for name, value in scalars(row).items():
-            self._writer.add_scalar(name, value, step)
-
-    def sheet(self, step: int, sheet: Image.Image) -> None:
-        """Add a sheet of validation pictures."""
-        self._writer.add_image("validation", np.asarray(sheet), step, dataformats="HWC")
-
-    def close(self) -> None:
-        """Flush and close the files."""
-        self._writer.close()
 
 
 class Recorder:
@@ -94,7 +63,6 @@ class Recorder:
         """Evaluate the network on the validation split, if there is one, and write its scores.
 
         Args:
-            state: state of the run.
             between: as in `Judge.judge`; if it raises, nothing is written.
         """
         if self._judge is None:

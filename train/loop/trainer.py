@@ -12,21 +12,18 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-
 from model.costs import Workload, training_flops
 from storage.errors import TrilightError
-from train.data.device_prefetch import CopyStream, StepScenes
+from train.data.buckets import CopyStream, StepScenes
 from train.folder import RunFolder
-from train.loop.background import BackgroundWriter
-from train.loop.checkpoints import save_checkpoint
+from train.loop.checkpoints import BackgroundWriter, save_checkpoint
 from train.loop.distributed import DistributedContext
 from train.loop.interrupts import Stopped, ValidationInterrupted, deferred_interrupts
-from train.loop.out_of_memory import explain_out_of_memory
+from train.loop.muon import PRODUCTS
 from train.loop.recorder import Recorder
 from train.loop.schedule import decay_start_step, learning_rate
 from train.loop.state import TrainState
-from train.loop.step import PendingStats, Stepper, StepReport
+from train.loop.step import PendingStats, Stepper, StepReport, explain_out_of_memory
 from train.loop.window import Window, device_peak
 from train.loss.objective import TrainingLoss
 from train.monitoring.process_monitor import ProcessMonitor
@@ -81,8 +78,6 @@ class DeadStartDetector:
         )
 
 
-PRODUCTS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-"""Types of the network's matrix products, by the setting `precision`."""
 MAX_SKIPPED_IN_A_ROW = 10
 """A few steps may overflow; this many in a row mean that the weights themselves are lost."""
 

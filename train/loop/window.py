@@ -2,7 +2,8 @@
 
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
 
@@ -42,9 +43,14 @@ class Window:
         self._waited_s += waited_s
         self._flops += flops
 
-    def pause(self) -> "Pause":
-        """Return a context whose time is excluded, for validation and checkpoints."""
-        return Pause(self)
+    @contextmanager
+    def pause(self) -> Iterator[None]:
+        """Exclude the time of a block from the window's, for validation and checkpoints."""
+        began = time.monotonic()
+        try:
+            yield
+        finally:
+            self._began += time.monotonic() - began
 
     @property
     def views_per_s(self) -> float:
@@ -65,23 +71,6 @@ class Window:
 
     def _seconds(self) -> float:
         return max(time.monotonic() - self._began, 1e-9)
-
-    def exclude(self, seconds: float) -> None:
-        """Exclude some past seconds from the window's time."""
-        self._began += seconds
-
-
-class Pause:
-    """Context whose time a window excludes."""
-
-    def __init__(self, window: Window) -> None:
-        self._window = window
-
-    def __enter__(self) -> None:
-        self._began = time.monotonic()
-
-    def __exit__(self, *_: object) -> None:
-        self._window.exclude(time.monotonic() - self._began)
 
 
 def _finite_mean(values: Iterable[float]) -> float | None:

@@ -43,7 +43,12 @@ class Vgg16(nn.Module):
         channels = 3
         for number in (number for block in BLOCKS for number in block):
             names = [f"features.{number}.{part}" for part in ("weight", "bias")]
-            weight, bias = (_get_weight(state, name) for name in names)
+            if missing := [name for name in names if name not in state]:
+                raise TrilightError(
+                    f"VGG16: the file has no {missing[0]}; expected the state dict of "
+                    "torchvision's vgg16."
+                )
+            weight, bias = (state[name].float() for name in names)
             if weight.shape[1:] != (channels, 3, 3) or bias.shape != weight.shape[:1]:
                 raise TrilightError(
                     f"VGG16: {names[0]} has the shape {tuple(weight.shape)}; expected "
@@ -69,14 +74,6 @@ class Vgg16(nn.Module):
         return taps
 
 
-def _get_weight(state: Mapping[str, Tensor], name: str) -> Tensor:
-    if name not in state:
-        raise TrilightError(
-            f"VGG16: the file has no {name}; expected the state dict of torchvision's vgg16."
-        )
-    return state[name].float()
-
-
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 """ImageNet's mean and spread per channel, for pictures in [-1, 1]."""
@@ -95,7 +92,6 @@ class Lpips(nn.Module):
         """Build the network.
 
         Args:
-            vgg16: state dict of torchvision's vgg16.
             linear: the published linear weights, `lin<k>.model.1.weight` [1, C, 1, 1] for the
                 block k.
 

@@ -66,7 +66,9 @@ class LayerNorms:
         rows = [values[width * row : width * (row + 1)] for row in range(len(self._groups))]
         self.expect_update(False)
         self._row = {
-            layer: [_round_figure(value) for value in row]
+            layer: [
+                float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None for value in row
+            ]
             for layer, row in zip(self._groups, rows, strict=True)
         }
 
@@ -91,7 +93,3 @@ def _length(tensors: Sequence[Tensor], like: Sequence[Tensor]) -> Tensor:
     if not tensors:
         return torch.zeros((), device=like[0].device)
     return nn.utils.get_total_norm(tensors)
-
-
-def _round_figure(value: float) -> float | None:
-    return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None

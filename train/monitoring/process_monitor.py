@@ -1,16 +1,20 @@
 """Monitoring of one training process: hooks for steps, pauses and windows of the loop."""
 
+import json
+import os
+import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
+
+import torch
 
 from train.folder import RunFolder
 from train.loop.distributed import DistributedContext
 from train.loop.step import Stepper, StepReport
-from train.monitoring.process_memory import memory_mb
 from train.monitoring.profiler import StepProfiler
-from train.monitoring.ranks import exchange_values, own_seconds, slowest_rank
 from train.monitoring.settings import WatchSettings
 from train.monitoring.spikes import Spike, SpikeDetector
 from train.monitoring.watchdog import Watchdog
@@ -89,17 +93,15 @@ class ProcessMonitor:
         with self._activity.during(part):
             yield
 
-    @contextmanager
-    def exchange(self) -> Iterator[None]:
+    def exchange(self) -> AbstractContextManager[None]:
         """Time a block as waiting for the other processes."""
-        with self._activity.during("exchange"):
-            yield
+        return self._activity.during("exchange")
 
     def end_window(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         """End a window; return additional values of its row, and rows of spikes.
 
         All processes must call it. The values: `time_s`, seconds of the window by phase
-        (watching.activity); `memory_mb`; `layers` (watching.layers); and with several processes
+        (monitoring.activity); `memory_mb`; `layers` (monitoring.layers); and with several processes
         `own_s`, the seconds of a step that each spent on its own work.
         """
         taken_s = self._activity.pop_seconds()
@@ -109,14 +111,12 @@ class ProcessMonitor:
             "layers": self._layers.pop_row(),
         }
         own_s = own_seconds(taken_s, self._steps)
-        spikes_found = self._spikes_found
+        ours = {"own_s": round(own_s, 4), "spikes": [asdict(spike) for spike in self._spikes_found]}
         self._steps = 0
         self._spikes_found = []
-        spikes = [asdict(spike) for spike in spikes_found]
         with self.exchange():
-            by_rank = exchange_values(
-                self._dist_context, {"own_s": round(own_s, 4), "spikes": spikes}
-            )
+            texts = self._dist_context.gather_text(json.dumps(ours))
+        by_rank = [json.loads(text) for text in texts]
         if self._dist_context.world_size > 1:
             row["own_s"] = [said["own_s"] for said in by_rank]
             self._note_slow_rank(row["own_s"])
@@ -147,3 +147,48 @@ def _merge_spikes(by_rank: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[s
         rest = {name: spike[name] for name in ("what", "value", "bound")}
         rows.append({"step": spike["step"], "spike": {**rest, "keys": keys}})
     return rows
+
+
+_STATM = Path("/proc/self/statm")
+
+
+def memory_mb(device: torch.device) -> dict[str, float]:
+    """Return memory use in megabytes (1e6 bytes) by name.
+
+    `process`: resident memory of the process, shared libraries included; on Linux only.
+    `device_peak`: peak of the tensors on a GPU since the last call, from the host's own counts.
+    """
+    megabytes = {}
+    if _STATM.exists():
+        pages = int(_STATM.read_text().split()[1])
+        megabytes["process"] = round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 1)
+    if device.type == "cuda" and torch.cuda.is_initialized():
+        megabytes["device_peak"] = round(torch.cuda.max_memory_allocated(device) / 1e6, 1)
+        torch.cuda.reset_peak_memory_stats(device)
+    return megabytes
+
+
+OWN_PHASES = ("data", "forward", "backward", "device", "optimiser", "other")
+"""Phases that do not wait for another process. On a GPU `device` does, since the exchange of
+gradients is the GPU's work: there only `data` and host time reveal a slow process."""
+
+SLOW_FACTOR = 1.5
+"""Multiple of the others' median time from which a process counts as slow."""
+
+LEAST_LOST_S = 0.05
+"""Minimum seconds per step that a slow process costs before it is reported."""
+
+
+def own_seconds(taken_s: Mapping[str, float], steps: int) -> float:
+    """Return the seconds per step that a process spent on its own work."""
+    return sum(taken_s[part] for part in OWN_PHASES) / max(steps, 1)
+
+
+def slowest_rank(own_s: Sequence[float]) -> int | None:
+    """Return the rank that all others wait for, or None if no process is slow."""
+    if len(own_s) < 2:
+        return None
+    worst = max(range(len(own_s)), key=own_s.__getitem__)
+    typical_s = statistics.median(value for rank, value in enumerate(own_s) if rank != worst)
+    stands_out = own_s[worst] > SLOW_FACTOR * typical_s and own_s[worst] - typical_s > LEAST_LOST_S
+    return worst if stands_out else None

@@ -22,7 +22,6 @@ class StepProfiler:
 
         Args:
             steps: number of steps; 0 traces none.
-            device: device of the network.
             folder: folder of the trace and the table.
             note: called with a message that names the files.
         """

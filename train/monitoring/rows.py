@@ -1,8 +1,11 @@
-"""Reader of metrics.jsonl: one JSON object per line."""
+"""Reader of metrics.jsonl, and writer of notes.jsonl: one JSON object per line."""
 
+import json
+import time
 from pathlib import Path
 from typing import Any
 
+from storage.atomic import append_line
 from storage.errors import TrilightError
 from storage.records.safe_read import read_plain
 from storage.typed_json import read_json_lines
@@ -25,3 +28,16 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         if not isinstance(row.get("step"), int):
             raise TrilightError(f"{path}:{number}: step is {row.get('step')!r}; expected a number.")
     return rows
+
+
+def add_note(path: Path, step: int, text: str) -> None:
+    """Append a sentence without its full stop.
+
+    Args:
+        step: number of steps that were done by then.
+
+    Raises:
+        TrilightError: the folder is full or cannot be written.
+    """
+    line = json.dumps({"step": step, "at_unix_s": round(time.time()), "text": text})
+    append_line(path, line)

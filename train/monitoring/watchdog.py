@@ -85,10 +85,6 @@ class Watchdog:
         """Create the watchdog.
 
         Args:
-            settings: time limits, and the action on a hang.
-            activity: current phase of the process.
-            dist_context: the processes that train together.
-            folder: folder of the stack files.
             note: called with a message about a hang, in the watchdog's thread.
             report_hang: called GRACE_S after a hang if the run is to stop on one.
         """

@@ -24,8 +24,7 @@ from tests.command_line import trilight
 from tests.crash import crash
 from tests.for_each import case
 from tests.infra.child_here import use_processes
-from tests.model.kit import awake, tiny_config
-from tests.model.published.test_convert import publishable
+from tests.model.kit import awake, publishable, tiny_config
 from tests.pipeline.documents.dataset_by_hand import furnished, sample, write_dataset
 from tests.pipeline.exchange.strangers_stage import write_stage
 from tests.scenes_by_hand import tiny_sample, tiny_scene

@@ -30,7 +30,7 @@ from tests.conftest import ROOT
 from tests.for_each import case
 from tests.pipeline.generation.test_dataset_writer import begin_tiny
 from tests.train.toy import write_toy_dataset
-from train.evaluation.scores import Lead
+from train.evaluation.metrics import Lead
 from train.folder import RunFolder
 from train.loop.interrupts import SAVED_STATUS
 from train.monitoring.rows import read_rows

@@ -7,7 +7,9 @@ from model.hits.radiosity import scene_light
 from model.hits.textures import surface_textures
 from model.hits.view_inputs import Channel, ViewInputs, view_inputs
 from storage.records.environment import Environment
+from storage.records.retextured import with_textures
 from storage.records.scene import Scene
+from storage.records.texture import Texture
 from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
 
 FLOOR = [[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]]
@@ -70,3 +72,20 @@ def direct(inputs: ViewInputs) -> np.ndarray:
     shown = inputs.pixels[..., Channel.SHOWN_DIFFUSE]
     total: np.ndarray = shown + inputs.pixels[..., Channel.DIRECT_SPECULAR]
     return total
+
+
+def textured(*, roughness: bool = True) -> Scene:
+    """Return the corner with a coloured floor, and a ball of which the gloss is textured."""
+    scene = corner()
+    rng = np.random.default_rng(0)
+    colours = Texture(texels=rng.integers(0, 200, (8, 8, 3), np.uint8), is_srgb=True)
+    rough = Texture(texels=rng.uniform(0.2, 0.9, (4, 4, 1)).astype(np.float32))
+    index = np.full((len(scene.materials), 3), -1, np.int32)
+    index[0, 0] = 0
+    if roughness:
+        index[3, 2] = 1
+    uv = 1.3 * scene.vertex_positions[scene.faces.ravel(), :2] - 0.4
+    textures = (colours, rough)[: 1 + roughness]
+    found = with_textures(scene, uv.astype(np.float32), textures, index)
+    found.check()
+    return found

@@ -1,44 +1,45 @@
-"""The network that is told hits: what it passes on, what it reads, what it can do without."""
+"""The network that is told hits: what it passes on, what it reads, what it can do without.
 
+And views whose rays a card traces: their code on the CPU's tensors, and the kernel beside Embree.
+"""
+
+import ctypes
 import dataclasses
+import shutil
+import subprocess
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from model.config import ModelConfig
+from model.config import ModelConfig, hit_stage
 from model.hits import decoder
-from model.hits.decoder import _around, _in_parts, _whole
+from model.hits.decoder import _around
+from model.hits.device_arrays import DeviceArray, DevicePlace
+from model.hits.device_rays import SOURCE, DeviceTriangles, build_tree
 from model.hits.traced import INPUTS
-from model.hits.tracing import with_traced
+from model.hits.tracing import traced_scene, with_traced
 from model.hits.view_inputs import Channel
 from model.neural_renderer import NeuralRenderer
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneBatch, SceneTensors, batch_scenes, scene_tensors
 from model.weights import decode_weights, encode_weights
 from storage.errors import TrilightError
+from storage.raycast.caster import RayHits
+from storage.raycast.embree import Triangles
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from tests.for_each import for_each
-from tests.model.hits.kit import corner, traced
-from tests.model.kit import awake, tiny_config
+from tests.model.hits.kit import FLOOR, WALL, corner, lit_scene, textured, traced
+from tests.model.kit import awake, hits_config
+from tests.pipeline.renders.scene_kit import join, material, quad
+from tests.sky_maps import constant
 
 PX = 32
-
-
-def hits_config(**changes: Any) -> ModelConfig:
-    config = tiny_config(
-        encoder_layers=1,
-        view_stage="hits",
-        hit_rays=2,
-        hit_anchors=8,
-        gather_rays=16,
-        pixel_width=16,
-        filter_width=8,
-    )
-    return dataclasses.replace(config, **changes)
 
 
 def network(**changes: Any) -> RenderFormer:
@@ -64,14 +65,6 @@ def in_double(batch: SceneBatch) -> SceneBatch:
 def picture(model: RenderFormer, *scenes: SceneTensors) -> Tensor:
     shown: Tensor = model(batch_scenes(scenes), PX)
     return shown
-
-
-def test_parts_of_a_picture_come_together_again() -> None:
-    values = torch.arange(2 * 24 * 24 * 3.0).reshape(2, 24, 24, 3)
-    parts = _in_parts(values, 4)
-    assert parts.shape == (2, 16, 36, 3)
-    assert torch.equal(parts[1, 5], values[1, 6:12, 6:12].reshape(36, 3))
-    assert torch.equal(_whole(parts, 4), values)
 
 
 def test_anchors_around_a_part_are_those_beside_it() -> None:
@@ -236,3 +229,122 @@ def test_it_takes_bfloat16_for_what_is_rounded() -> None:
     assert rounded.dtype == torch.float32
     # 8 bits of mantissa in anchors alone, whose numbers gain at most twice what was traced
     assert (rounded - exact).abs().mean() < 0.03 * exact.abs().mean()
+
+
+HOST = torch.device("cpu")
+needs_card = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+
+
+class _OnHost:
+    """Embree for tensors of the HOST."""
+
+    def __init__(self, corners: NDArray, rows: NDArray, place: DevicePlace) -> None:
+        self._embree, self._place = Triangles(corners, rows), place
+
+    def intersect(self, origins: DeviceArray, directions: DeviceArray) -> RayHits:
+        met = self._embree.intersect(origins.tensor.numpy(), directions.tensor.numpy())
+        uv = np.where(met.triangle >= 0, met.uv, np.float32(0))
+        return RayHits(triangle=self._place.array(met.triangle), uv=self._place.array(uv))
+
+    def is_free(self, *rays: DeviceArray) -> DeviceArray:
+        return self._place.array(self._embree.is_free(*(each.tensor.numpy() for each in rays)))
+
+
+@for_each("scene", [corner(), textured()])
+def test_a_view_of_tensors_is_numpys(scene: Scene) -> None:
+    numpy_form = traced_scene(lit_scene(scene))
+    tensor_form = numpy_form.on_place(DevicePlace(HOST), _OnHost)
+    camera = torch.tensor(scene.c2w[0]), torch.tensor(float(scene.fov_deg[0]))
+    stage = hit_stage(dataclasses.replace(hits_config(), hit_rays=2, gather_rays=4))
+    given = (*camera, 32, stage, 0)
+    expected, got = numpy_form.view(*given), tensor_form.view(*given)
+    for name, array in vars(expected).items():
+        tensor = getattr(got, name).tensor
+        np.testing.assert_allclose(tensor.numpy(), array, rtol=1e-3, atol=2e-5, err_msg=name)
+
+
+def _rays(corners: NDArray, count: int) -> tuple[NDArray, NDArray, NDArray]:
+    rng = np.random.default_rng(0)
+    shares = rng.dirichlet([1, 1, 1], count)
+    starts = np.einsum("nk,nki->ni", shares, corners[rng.integers(0, len(corners), count)])
+    starts += rng.normal(size=starts.shape) * 0.3
+    directions = rng.normal(size=starts.shape)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    floats = [each.astype(np.float32) for each in (starts, directions, rng.uniform(0, 2, count))]
+    return floats[0], floats[1], floats[2]
+
+
+def _corners() -> NDArray[np.float32]:
+    scene = textured()
+    return scene.vertex_positions[scene.faces]
+
+
+@for_each("count", [0, 1, 5, 545])
+def test_the_kernel_meets_what_embree_meets(count: int, tmp_path: Path) -> None:
+    """Its text, compiled for this processor: the triangle of each ray, and what is free."""
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("no g++")
+    before = "#include <math.h>\n#define __global__\n#define __device__\n"
+    before += "static struct { int x; } blockIdx, blockDim, threadIdx;\n"
+    source, library = tmp_path / "kernel.cpp", tmp_path / "kernel.so"
+    source.write_text(before + SOURCE + 'extern "C" void at(int ray) { threadIdx.x = ray; }\n')
+    command = [compiler, "-O1", "-shared", "-fPIC", str(source), "-o", str(library)]
+    subprocess.run(command, check=True)
+    compiled = ctypes.CDLL(str(library))
+    corners, rows = _corners(), np.arange(count)
+    tree = build_tree(corners[rows], rows)
+    starts, directions, limits = _rays(corners, 4000)
+    triangle, uv = np.zeros(4000, np.int64), np.zeros((2, 4000), np.float32)
+    free = np.zeros(4000, np.bool_)
+    arrays = (starts, directions, limits, tree.nodes, tree.corners,
+              tree.rows, triangle, uv, free)  # fmt: skip
+    pointers = [ctypes.c_void_p(each.ctypes.data) for each in arrays]
+    for ray in range(4000):
+        compiled.at(ray)
+        for asks_free in (0, 1):
+            compiled.trace(*pointers, 4000, asks_free)
+    embree = Triangles(corners, rows)
+    met = embree.intersect(starts, directions)
+    # where the box stands on the floor, either is right
+    assert (triangle == met.triangle).mean() > 0.99
+    assert (free == embree.is_free(starts, directions, limits)).mean() > 0.999
+    same = (triangle == met.triangle) & (triangle >= 0)
+    np.testing.assert_allclose(uv[:, same], met.uv[:, same], atol=1e-3)
+
+
+@needs_card
+def test_a_card_shows_the_processors_picture() -> None:
+    scene, card = textured(), torch.device("cuda")
+    corners = _corners()
+    starts, directions, _ = _rays(corners, 4000)
+    rows, place = np.arange(len(corners)), DevicePlace(card)
+    met = DeviceTriangles(corners, rows, place).intersect(
+        place.array(starts), place.array(directions)
+    )
+    expected = Triangles(corners, rows).intersect(starts, directions).triangle
+    assert (met.triangle.tensor.cpu().numpy() == expected).mean() > 0.99
+    slow = NeuralRenderer.load("builtin:hits", device="cpu").render(scene, 64)[0]
+    renderer = NeuralRenderer.load("builtin:hits", device="cuda")
+    prepared = renderer.prepare(scene)
+    for _ in range(3):  # one by one, recorded, repeated
+        quick = renderer.view(prepared, scene.c2w[0], float(scene.fov_deg[0]), 64)
+        assert np.abs(quick - slow).mean() < 1e-4 * slow.mean()
+    tensors, config = scene_tensors(scene), hits_config()
+    by_card = with_traced(tensors, 32, config, device=card).traced
+    by_processor = with_traced(tensors, 32, config).traced
+    assert by_card is not None and by_processor is not None
+    torch.testing.assert_close(by_card.pixels_VRRC, by_processor.pixels_VRRC, rtol=1e-3, atol=1e-3)
+
+
+def test_a_ray_towards_a_triangle_meets_it_and_others_meet_nothing() -> None:
+    """From just above the middle of each triangle, down to it and up to the sky."""
+    parts = [quad(FLOOR, material()), quad(WALL, material())]
+    scene = lit_scene(join(parts, eye=(0, -3, 1), sky=constant(1.0)))
+    towards = -scene.plane
+    start = scene.corners.mean(axis=0) - np.float32(1e-3) * towards
+    points, met = scene.meet(scene.everything, start, towards)
+    assert met.all() and points.triangle.tolist() == list(range(scene.num_triangles))
+    up = np.zeros_like(start) + np.array([[0], [0], [1]], np.float32)
+    _, met = scene.meet(scene.everything, start, up)
+    assert not met.any()

@@ -4,25 +4,17 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from model.hits.tracing import TracedScene, traced_batch
-from model.hits.view_inputs import NUM_CHANNELS, Channel, view_inputs
-from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
+from model.hits.view_inputs import NUM_CHANNELS, Channel
 from storage.conventions import pixel_places
 from storage.raycast.first_hits import first_hits
 from storage.records.material import EMISSION
-from storage.records.retextured import with_textures
 from storage.records.scene import Scene
-from storage.records.texture import Texture
 from tests.for_each import for_each
-from tests.model.hits.kit import FLOOR, LAMP, corner, direct, traced
+from tests.model.hits.kit import FLOOR, LAMP, corner, direct, textured, traced
 from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
 from tests.rigid_motion import moved
-from train.data.augment import mirror_scene, permute_channels, rotate_vertex_order
-from train.data.scenes import TrainingScene
 
 LIGHTS = slice(Channel.OPEN_DIFFUSE.start, Channel.MIRRORED.stop)
 
@@ -184,23 +176,6 @@ def test_no_light_at_all_is_black() -> None:
         assert not inputs.gathered.any()
 
 
-def textured(*, roughness: bool = True) -> Scene:
-    """Return the corner with a coloured floor, and a ball of which the gloss is textured."""
-    scene = corner()
-    rng = np.random.default_rng(0)
-    colours = Texture(texels=rng.integers(0, 200, (8, 8, 3), np.uint8), is_srgb=True)
-    rough = Texture(texels=rng.uniform(0.2, 0.9, (4, 4, 1)).astype(np.float32))
-    index = np.full((len(scene.materials), 3), -1, np.int32)
-    index[0, 0] = 0
-    if roughness:
-        index[3, 2] = 1
-    uv = 1.3 * scene.vertex_positions[scene.faces.ravel(), :2] - 0.4
-    textures = (colours, rough)[: 1 + roughness]
-    found = with_textures(scene, uv.astype(np.float32), textures, index)
-    found.check()
-    return found
-
-
 def test_a_pixel_has_the_material_at_its_hit() -> None:
     scene = textured()
     hits = first_hits(scene, resolution=32)
@@ -225,47 +200,3 @@ def test_every_ray_of_a_textured_pixel_counts() -> None:
     whole = np.isfinite(means).all(axis=-1) & (found[..., 0] == 1)
     apart = np.abs(found[..., Channel.DIFFUSE] - means).max(axis=-1)[whole]
     assert np.median(apart) < 1e-4 and np.mean(apart > 0.02) < 0.05  # rims: other rays meet
-
-
-@for_each("symmetry", ["turned", "mirrored", "channels"])
-def test_textures_go_through_the_symmetries_of_training(symmetry: str) -> None:
-    scene = textured()
-    tensors = scene_tensors(scene)
-    training = TrainingScene(
-        key="",
-        tensors=tensors,
-        target_VRR3=torch.zeros(1, 4, 4, 3),
-        noise_V=torch.zeros(1),
-        light_T=torch.zeros(tensors.num_triangles, dtype=torch.int64),
-    )
-    order = np.array([2, 0, 1])
-    if symmetry == "turned":
-        turn = np.random.default_rng(1).integers(0, 3, tensors.num_triangles)
-        changed = rotate_vertex_order(training, turn)
-    elif symmetry == "mirrored":
-        changed = mirror_scene(training)
-    else:
-        changed = permute_channels(training, order)
-    before, after = (
-        _albedo(traced_batch(batch_scenes([each]))[0], each) for each in (tensors, changed.tensors)
-    )
-    if symmetry == "mirrored":
-        after = after[:, ::-1]
-    elif symmetry == "channels":
-        before = before[..., order]
-    assert before.std() > 0.05
-    assert np.mean(np.abs(before - after).max(axis=-1) > 1e-3) < 0.01  # rims
-
-
-def _albedo(scene: TracedScene, tensors: SceneTensors) -> NDArray[np.float32]:
-    found = view_inputs(
-        scene.lit,
-        scene.light,
-        tensors.c2w_V44[0].numpy(),
-        float(tensors.fov_deg_V[0]),
-        32,
-        rays_a_side=1,
-        anchors_a_side=8,
-        gather_rays=0,
-    )
-    return np.asarray(found.pixels[..., Channel.DIFFUSE])

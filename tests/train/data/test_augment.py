@@ -1,11 +1,14 @@
 """Law of every symmetry: rendering the transformed scene gives the transformed picture.
 
 First by the toy's renderer, which knows nothing of symmetries: pixels on an edge may fall on either
-side of it by rounding, so at most 1 % of them may differ. Then below a sky.
+side of it by rounding, so at most 1 % of them may differ. Then below a sky, and by Mitsuba: two
+estimates are compared block by block with their own standard errors. The original is sampled in
+independent passes; each goes through the symmetry as training would send it, with its errors.
 """
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,17 +19,23 @@ from model.hits.radiosity import scene_light
 from model.hits.tracing import lit_scene_of
 from model.hits.view_inputs import Channel, view_inputs
 from model.scene_tensors import SceneTensors, scene_tensors, tensors_of
+from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.renderer import set_threads
+from pipeline.renders.variant import activate, choose_variant
+from storage.conventions import radiance_from_log10
 from storage.errors import TrilightError
+from storage.records.lights import light_rows
 from storage.records.sample import encode_sample
 from storage.records.scene import Scene
 from storage.records.stored_sample import StoredSample, stored_sample
 from storage.seeds import rng_for
 from tests.for_each import for_each
-from tests.model.hits.kit import corner
-from tests.model.hits.test_decoder import hits_config
-from tests.model.kit import tiny_config
-from tests.pipeline.renders.scene_kit import join, light, material, quad
+from tests.model.hits.kit import corner, textured
+from tests.model.kit import hits_config, tiny_config
+from tests.pipeline.renders.sampling import Estimate, assert_agree, camera_of, render_blocks
+from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene
 from tests.sky_maps import smooth
+from tests.train.kit import bare_scene
 from tests.train.toy import toy_picture, toy_sample
 from train.data.augment import (
     augment_scene,
@@ -183,31 +192,47 @@ def test_uniform_rotations_favour_no_direction_and_the_recipe_favours_none_at_al
 ORDER = np.array([2, 0, 1])
 
 
+def _pixels(tensors: SceneTensors, **changes: int) -> NDArray:
+    """Return what rays find of the first view, 32 pixels wide."""
+    lit = lit_scene_of(tensors)
+    camera = tensors.c2w_V44[0].numpy(), float(tensors.fov_deg_V[0])
+    rays: dict[str, Any] = {"rays_a_side": 2, "anchors_a_side": 8, "gather_rays": 0, **changes}
+    return view_inputs(lit, scene_light(lit), *camera, 32, **rays).pixels
+
+
 def _direct(tensors: SceneTensors) -> NDArray:
     """Return the mean of the direct light of several noises, at four pixels by four."""
-    lit = lit_scene_of(tensors)
-    light = scene_light(lit)
-    total = np.zeros((32, 32, 3), np.float32)
-    for seed in range(6):
-        found = view_inputs(
-            lit, light, tensors.c2w_V44[0].numpy(), float(tensors.fov_deg_V[0]), 32,
-            rays_a_side=2, anchors_a_side=8, gather_rays=0, sky_rays=8, seed=seed,
-        ).pixels  # fmt: skip
-        total += found[..., Channel.SHOWN_DIFFUSE] / 6
-    return total.reshape(8, 4, 8, 4, 3).mean(axis=(1, 3))
+    found = [_pixels(tensors, sky_rays=8, seed=seed) for seed in range(6)]
+    mean = np.mean([each[..., Channel.SHOWN_DIFFUSE] for each in found], axis=0)
+    return mean.reshape(8, 4, 8, 4, 3).mean(axis=(1, 3))
+
+
+@for_each("symmetry", ["turned", "mirrored", "channels"])
+def test_textures_go_through_the_symmetries_of_training(symmetry: str) -> None:
+    tensors = scene_tensors(textured())
+    training = bare_scene(tensors)
+    if symmetry == "turned":
+        turn = np.random.default_rng(1).integers(0, 3, tensors.num_triangles)
+        changed = rotate_vertex_order(training, turn)
+    elif symmetry == "mirrored":
+        changed = mirror_scene(training)
+    else:
+        changed = permute_channels(training, ORDER)
+    before, after = (
+        _pixels(each, rays_a_side=1)[..., Channel.DIFFUSE] for each in (tensors, changed.tensors)
+    )
+    if symmetry == "mirrored":
+        after = after[:, ::-1]
+    elif symmetry == "channels":
+        before = before[..., ORDER]
+    assert before.std() > 0.05
+    assert np.mean(np.abs(before - after).max(axis=-1) > 1e-3) < 0.01  # rims
 
 
 @for_each("symmetry", ["moved", "mirrored", "channels", "scaled"])
 def test_a_sky_goes_through_the_symmetries_of_training(symmetry: str) -> None:
     tensors = scene_tensors(corner(sky=smooth(), radiance=0.0))
-    training = TrainingScene(
-        key="",
-        tensors=tensors,
-        target_VRR3=torch.zeros(1, 4, 4, 3),
-        noise_V=torch.zeros(1),
-        light_T=torch.zeros(tensors.num_triangles, dtype=torch.int64),
-    )
-    before = _direct(tensors)
+    training, before = bare_scene(tensors), _direct(tensors)
     if symmetry == "moved":
         rotation = random_rotation("uniform", np.random.default_rng(0))
         after = _direct(move_scene(training, rotation, torch.tensor([0.4, -0.1, 0.2])).tensors)
@@ -250,3 +275,106 @@ def test_training_takes_skies_that_its_network_knows(config: object, is_known: b
         return
     with pytest.raises(TrilightError, match="this network does not know its light"):
         maker._draw_views(_below_a_sky(), rng)
+
+
+BLOCK, PASSES, SPP = 4, 16, 64
+
+TRACED_SYMMETRIES = {
+    "mirror": AugmentationSettings(mirror=True),
+    "channels": AugmentationSettings(channels=True),
+    "vertex order": AugmentationSettings(vertex_order=True),
+    "rotation of the recipe": AugmentationSettings(rotation="recipe", translation=0.25),
+    "any rotation": AugmentationSettings(rotation="uniform"),
+    "light scale": AugmentationSettings(light_scale=4.0),
+    "light mix": AugmentationSettings(light_mix=8.0),
+    "all at once": AugmentationSettings(
+        rotation="uniform",
+        translation=0.25,
+        mirror=True,
+        channels=True,
+        vertex_order=True,
+        light_scale=2.0,
+        light_mix=4.0,
+    ),
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def mitsuba() -> None:
+    activate(choose_variant())
+    set_threads(2)
+
+
+def scene_of_many_lights() -> Scene:
+    """Glossy, coloured, with lights of different colours, so that every symmetry shows."""
+    for index in range(100):
+        scene = sampled_like_scene(rng_for(index, "symmetry"), num_views=1)
+        if len(light_rows(scene)) == 3:
+            break
+    rows = light_rows(scene)
+    materials = scene.materials.copy()
+    colours = rng_for(3, "colours").uniform(0.3, 1, (len(rows), 3))
+    for row, colour in zip(rows, colours, strict=True):
+        of_light = scene.material_index[scene.object_index == row]
+        materials[of_light[0], 7:] *= colour
+    return dataclasses.replace(scene, materials=materials.astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return scene_of_many_lights()
+
+
+@pytest.fixture(scope="module")
+def passes(scene: Scene, mitsuba: None) -> NDArray[np.float32]:
+    """[PASSES, L, R, R, 3]: independent pictures of each light alone."""
+    tracer = load_tracer(scene, max_depth=10, rr_depth=5)
+    camera = camera_of(scene, RESOLUTION)
+    lights = [tracer.only_light(row) for row in light_rows(scene)]
+    return np.stack(
+        [
+            np.stack([light.radiance(camera, seed=1000 + k, spp=SPP) for light in lights])
+            for k in range(PASSES)
+        ]
+    )
+
+
+def transformed(
+    scene: Scene, lights_LRR3: NDArray[np.float32], symmetry: Callable[..., TrainingScene]
+) -> TrainingScene:
+    sample = dataclasses.replace(
+        toy_sample(0, views=1),
+        scene=scene,
+        radiance_rgb=lights_LRR3.sum(axis=0)[None],
+        lights_rgb=lights_LRR3[None],
+    )
+    return symmetry(training_scene(sample, RESOLUTION, lights_apart=True))
+
+
+@pytest.mark.slow("statistics")
+@for_each("name", sorted(TRACED_SYMMETRIES))
+def test_the_path_traced_picture_is_the_transformed_one(
+    name: str, scene: Scene, passes: NDArray[np.float32]
+) -> None:
+    seed = next(s for s in range(9) if rng_for(s, "draw").random() < 0.5)  # a visit that mirrors
+
+    def symmetry(training: TrainingScene) -> TrainingScene:
+        return augment_scene(training, TRACED_SYMMETRIES[name], rng_for(seed, "draw"))
+
+    visits = [transformed(scene, lights, symmetry) for lights in passes]
+    pictures = np.array([radiance_from_log10(v.target_VRR3[0].double()) for v in visits])
+    count = RESOLUTION // BLOCK
+    blocks = pictures.reshape(PASSES, count, BLOCK, count, BLOCK, 3).mean(axis=(2, 4))
+    expected = Estimate(
+        mean=blocks.mean(axis=0), error=blocks.std(axis=0, ddof=1) / np.sqrt(PASSES)
+    )
+    other = scene_behind(visits[0], scene)
+    other.check()
+    estimate = render_blocks(other, resolution=RESOLUTION, block=BLOCK, passes=PASSES)
+    # float32 positions and log10(1 + x): relative 1e-4 covers both
+    assert_agree(estimate, expected, slack=1e-4)
+    if name not in ("vertex order", "rotation of the recipe", "any rotation"):
+        untouched = render_blocks(scene, resolution=RESOLUTION, block=BLOCK, passes=PASSES)
+        with pytest.raises(AssertionError, match="of what is allowed"):
+            assert_agree(estimate, untouched)
+    assert torch.isfinite(visits[0].target_VRR3).all()

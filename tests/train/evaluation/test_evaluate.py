@@ -23,11 +23,10 @@ from storage.records.material import ROUGHNESS
 from storage.seeds import rng_for
 from tests.command_line import trilight
 from tests.pipeline.renders.scene_kit import join, light, material, quad
-from tests.train.kit import tiny_run
+from tests.train.kit import eval_config, tiny_run
 from tests.train.loss.test_objective import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
-from train.evaluation.baselines import MEDIAN, NEAREST, Baselines, median_picture
 from train.evaluation.chart import plot_excursions
 from train.evaluation.equal_time import TRACER
 from train.evaluation.evaluate import (
@@ -44,8 +43,8 @@ from train.evaluation.judged_view import NETWORK, JudgedView, by_group, scene_fa
 from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
 from train.evaluation.options import EvaluationOptions
 from train.evaluation.pages import evaluation_page
-from train.evaluation.published import BENCHMARK
-from train.evaluation.report import record
+from train.evaluation.report import BENCHMARK, record
+from train.evaluation.stored_pictures import MEDIAN, NEAREST, Baselines, median_picture
 from train.loop.state import new_state
 from train.loss.lpips import Lpips
 
@@ -62,16 +61,9 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=5, validation=3, per_shard=3)
 
 
-def contest(dataset: Dataset, lpips: Lpips | None = None) -> EvalConfig:
-    data = open_training_data([str(dataset.folder.root)])
-    return EvalConfig(
-        network=new_state(tiny_run()).model,
-        shards=data.split("validation"),
-        resolution=16,
-        baselines=make_baselines(data.split("train"), 16),
-        lpips=lpips,
-        most_scenes=99,
-    )
+def contest(dataset: Dataset) -> EvalConfig:
+    shards = open_training_data([str(dataset.folder.root)]).split("train")
+    return eval_config(dataset, baselines=make_baselines(shards, 16))
 
 
 def test_hdr_flip_is_the_packages_and_what_cannot_be_measured_is_no_number() -> None:

@@ -1,6 +1,7 @@
 """Laws of judging: hits against a ray tracer, scores against storage, a rival that is a median.
 
-What noise alone would score; and the path tracer in the network's time, over views that have both.
+What noise alone would score; and the path tracer in the network's time: which samples are chosen,
+which views are traced, over views that have both.
 """
 
 import dataclasses
@@ -13,35 +14,47 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from storage.conventions import camera_rays, log10_radiance, radiance_from_log10
-from storage.dataset.training_data import open_training_data
+from storage.errors import TrilightError, Unrenderable
 from storage.metrics import object_psnr_log_db, psnr_linear_db, psnr_log_db
 from storage.records.sample import Sample
 from storage.records.scene import Scene
-from storage.renderer import Camera, OnProgress, ignore_progress
+from storage.renderer import Camera, OnProgress, Renderer, ignore_progress
 from storage.renderer import Image as Rendered
 from storage.seeds import rng_for
-from tests.for_each import for_each
-from tests.train.kit import tiny_run
+from tests.for_each import case, for_each
+from tests.train.kit import eval_config
 from tests.train.loss.test_objective import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
-from train.evaluation.baselines import median_picture
 from train.evaluation.equal_time import (
     CAPTION,
     TRACER,
     EqualTimeResult,
+    Filter,
+    Level,
     TracerTimes,
     equal_time,
     sentences,
+    spread_text,
+    spread_views,
+    time_both,
 )
 from train.evaluation.error_colors import ERROR_WHITE, error_picture
 from train.evaluation.evaluate import EvalConfig, judge_views, sheet_views
 from train.evaluation.judge import hit_masks
 from train.evaluation.judged_view import NETWORK, JudgedView
-from train.evaluation.metrics import METRICS, noise_floors, picture_scores
+from train.evaluation.metrics import (
+    METRICS,
+    ViewScore,
+    fraction_better,
+    lead,
+    noise_floors,
+    picture_scores,
+    score_view,
+    summarize_scores,
+)
 from train.evaluation.pages import evaluation_page
 from train.evaluation.report import record
-from train.evaluation.scores import ViewScore, fraction_better, lead, score_view, summarize_scores
 from train.evaluation.sheet import (
     NOISE_WHITE,
     SheetView,
@@ -49,7 +62,8 @@ from train.evaluation.sheet import (
     noise_picture,
     write_picture,
 )
-from train.loop.state import new_state
+from train.evaluation.stored_pictures import median_picture
+from train.evaluation.timing import Price, time_scene
 from train.loss.lpips import Lpips
 
 
@@ -241,15 +255,7 @@ class StoredTargets:
 @pytest.fixture(scope="module")
 def judging(tmp_path_factory: pytest.TempPathFactory) -> tuple[EvalConfig, list[JudgedView]]:
     dataset = write_toy_dataset(tmp_path_factory.mktemp("toy"), train=1, validation=3)
-    contest = EvalConfig(
-        network=new_state(tiny_run()).model,
-        shards=open_training_data([str(dataset.folder.root)]).split("validation"),
-        resolution=32,
-        baselines=None,
-        lpips=None,
-        most_scenes=99,
-        tracer_views=3,
-    )
+    contest = eval_config(dataset, resolution=32, tracer_views=3)
     contest = dataclasses.replace(contest, tracer=StoredTargets(list(contest.samples())))
     return contest, judge_views(contest, lambda: None)
 
@@ -299,3 +305,96 @@ def test_sheets_show_it_beside_the_prediction(
         shown[1].extra_rgb[CAPTION], shown[1].target_rgb, rtol=1e-5, atol=1e-6
     )
     assert draw_sheet(shown, ("title",)).width > alone.width
+
+
+FILTERS: tuple[Filter, ...] = ("fast", "high")
+LADDER = tuple(1 << step for step in range(13))
+
+
+JUDGED = [(64, 10, 10 * 2), (10, 10, 10), (4, 10, 4), (1, 10, 1)]
+
+
+def test_it_is_judged_on_no_more_views_than_asked_from_all_over_the_split() -> None:
+    for most, scenes, judged in JUDGED:
+        with case(most):
+            every, first = spread_views(most, scenes)
+            numbers = [number for number in range(0, scenes, every) for view in range(2)[:first]]
+            assert len(numbers) == judged <= most
+            assert max(numbers) >= scenes // 2 or most == 1
+            views = "all views" if most == 64 else "the first view"
+            assert spread_text(every, first, 2).startswith(f"{views} of ")
+            assert ("each scene" in spread_text(every, first, 2)) == (most >= scenes)
+
+
+class Clocked:
+    """Renderer that says what it takes; loading takes longest in the first round."""
+
+    name = "clocked"
+    resolution = 16
+    identity: Mapping[str, str] = {}
+    notes: Sequence[str] = ()
+    seconds = 0.0
+
+    def __init__(self, further_s: float, *, dark: str = "", lacking: str = "") -> None:
+        self.further_s = further_s
+        self.cpu_seconds: float | None = None
+        self.loads = 0
+        self._dark = dark
+        self._lacking = lacking
+
+    def load(self, scene: Scene, name: str) -> "Clocked":
+        if self._lacking:
+            raise TrilightError(self._lacking)
+        if name == self._dark:
+            raise Unrenderable(f"{name}: nothing shines")
+        self.cpu_seconds = [100.0, 3.0, 5.0, 4.0][self.loads % 4]
+        self.loads += 1
+        return self
+
+    def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Rendered:
+        return Rendered(radiance_rgb=np.zeros((16, 16, 3), np.float32), cpu_seconds=self.further_s)
+
+    def close(self) -> None:
+        pass
+
+
+def test_the_first_view_pays_for_loading_and_the_round_that_warms_up_counts_not() -> None:
+    renderer = Clocked(1.0)
+    timed = time_scene(renderer, toy_sample(0).scene, "scene", rounds=3)
+    # the median of 3, 5 and 4, and a view
+    assert (renderer.loads, timed.price) == (4, Price(first_s=5.0, further_s=1.0))
+
+
+def test_samples_double_until_they_take_longer_than_the_network() -> None:
+    previews: dict[Level, Renderer] = {
+        (spp, denoiser): Clocked(spp * (1.0 if denoiser == "fast" else 1.4), dark="000000001")
+        for spp in LADDER
+        for denoiser in FILTERS
+    }
+    samples = [toy_sample(0), dataclasses.replace(toy_sample(1), key="000000001")]
+    times = time_both(Clocked(6.0), previews, samples, note="slow")
+    assert times.preview is not None and times.scenes == 2 and times.missing == ""
+    assert (times.preview.samples, times.preview.denoiser) == (4, "high")
+    assert (times.preview.further_s, times.preview.note) == (5.6, "slow")
+    tried = [level for level, each in previews.items() if isinstance(each, Clocked) and each.loads]
+    assert tried == [*((spp, denoiser) for spp in (1, 2, 4) for denoiser in FILTERS), (8, "fast")]
+    least = time_both(Clocked(0.5), previews, samples)
+    assert least.preview is not None, "where nothing fits, the cheapest is shown"
+    assert (least.preview.samples, least.preview.denoiser) == (1, "fast")
+
+
+def test_without_a_path_tracer_it_says_so_and_the_network_is_timed_all_the_same() -> None:
+    network, sample = Clocked(6.0), toy_sample(0)
+    broken: Mapping[Level, Renderer] = {(1, "fast"): Clocked(1.0, lacking="no tracer here.")}
+    dark: Mapping[Level, Renderer] = {(1, "fast"): Clocked(1.0, dark=sample.key)}
+    for previews, missing, said in (
+        (broken, "", "no tracer here"),
+        (dark, "", "the scenes that were timed cannot be traced"),
+        ({}, "no views of it were requested", "no views of it were requested"),
+    ):
+        with case(said):
+            times = time_both(network, previews, [sample], missing=missing)
+            assert times.preview is None and times.missing == said
+            assert times.network_further_s == 6.0 and times.scenes == 1
+    with pytest.raises(TrilightError, match="resolution is 20"):
+        time_both(Clocked(1.0, lacking="resolution is 20"), {}, [sample])

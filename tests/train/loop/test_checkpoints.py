@@ -1,11 +1,18 @@
-"""Checkpoints hold all that changes, a kill leaves the one before whole, and damage is refused."""
+"""Checkpoints hold all that changes, a kill leaves the one before whole, and damage is refused.
 
+Around the steps: who trains where, what a signal does, and checkpoints written meanwhile.
+"""
+
+import ctypes
 import dataclasses
 import json
 import os
+import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +24,7 @@ from model.checkpoint_format import HEADER_KEY, path_of_step, saved_steps
 from model.neural_renderer import NeuralRenderer
 from model.open import find_network, open_network
 from model.weights import encode_weights
+from storage.dataset.dataset import Dataset
 from storage.digests import seal_of
 from storage.errors import TrilightError
 from storage.records.safe_read import read_safetensors
@@ -24,25 +32,26 @@ from storage.settings.described import from_record, settings_record
 from tests.conftest import ROOT
 from tests.extensions_kit import EXAMPLES, loaded, written
 from tests.for_each import for_each
-from tests.train.kit import ALONE, TINY_MODEL, flip_a_bit, stepper, tiny_run
-from tests.train.toy import toy_sample
-from train.data.buckets import TrainingBatch, collate_batch
-from train.data.scenes import training_scene
+from tests.train.kit import ALONE, TINY_MODEL, flip_a_bit, stepper, tiny_run, toy_batch, trained
+from train.data.buckets import TrainingBatch
 from train.folder import RunFolder
+from train.loop import checkpoints, interrupts
 from train.loop.checkpoints import (
     UNSEALED,
+    BackgroundWriter,
     newest_checkpoint,
     read_checkpoint,
     restore_state,
     save_checkpoint,
 )
-from train.loop.distributed import DistributedContext
+from train.loop.distributed import DistributedContext, choose_device, join_processes
+from train.loop.interrupts import deferred_interrupts
 from train.loop.recorder import MetricsLog
 from train.loop.state import TrainState, new_state
 from train.monitoring.rows import read_rows
+from train.progress import TrainProgress
 from train.resume import plan_resume
-from train.settings import TrainSettings
-from train.stored_settings import known_settings
+from train.settings import TrainSettings, known_settings
 
 CASES = [("fsync", "before"), ("replace", "before"), ("replace", "after"), ("unlink", "before")]
 
@@ -54,7 +63,7 @@ from storage.settings.described import from_record
 from train.loop.checkpoints import save_checkpoint
 from train.loop.state import new_state
 from train.settings import TrainSettings
-from train.stored_settings import known_settings
+from train.settings import known_settings
 
 settings = from_record(TrainSettings, json.loads(sys.argv[2]))
 state = new_state(settings)
@@ -247,7 +256,7 @@ DIGEST = "d" * 64
 
 def stepped(steps: int = 3) -> TrainState:
     state = new_state(tiny_run())
-    batch = collate_batch([training_scene(toy_sample(0), 16)])
+    batch = toy_batch(0)
     for _ in range(steps):
         one_step(state, batch)
     return state
@@ -279,7 +288,7 @@ def test_a_loaded_state_goes_on_to_the_bit(tmp_path: Path, steps: int) -> None:
     state = stepped(steps)
     loaded = load(save(tmp_path, state))
     assert (loaded.step, loaded.skipped_steps) == (state.step, state.skipped_steps)
-    batch = collate_batch([training_scene(toy_sample(1), 16)])
+    batch = toy_batch(1)
     for each in (state, loaded):
         one_step(each, batch)
     assert equal_weights(state, loaded)
@@ -291,7 +300,7 @@ def test_equal_states_give_equal_bytes_and_skipped_steps_are_no_updates(tmp_path
     state = stepped(2)
     state.step, state.skipped_steps = 5, 3
     loaded = load(save(tmp_path / "c", state))
-    batch = collate_batch([training_scene(toy_sample(1), 16)])
+    batch = toy_batch(1)
     one_step(loaded, batch)
     one_step(state, batch)
     # AdamW's steps are the longer the fewer it believes to have done
@@ -345,3 +354,179 @@ def test_a_run_of_an_extension_is_resumed_with_the_same_one_only(tmp_path: Path)
     with loaded(EXAMPLES / "metric.py"):  # judges, and decides no weight
         save(tmp_path, stepped(0))
     assert "extensions" not in read_checkpoint(path).header
+
+
+def test_without_torchrun_a_process_is_alone_and_no_missing_device_is_taken(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    with join_processes("cpu") as crew:
+        assert (crew.rank, crew.world_size, crew.is_first) == (0, 1, True)
+        assert crew.mean([1.0, 2.0]) == [1.0, 2.0]
+        assert crew.any(True) and not crew.any(False)
+        assert crew.gather_text("å") == ["å"]
+        assert (crew.rank_slice.rank, crew.rank_slice.world_size) == (0, 1)
+    assert choose_device("cpu").type == "cpu"
+    with pytest.raises(TrilightError, match="device 'tpu'; expected cpu or cuda"):
+        choose_device("tpu")
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    with pytest.raises(TrilightError, match="process 2 of this machine finds 2 GPUs"):
+        choose_device("cuda", 2)
+
+
+@for_each(("local_rank", "order"), [(0, "made waited"), (1, "waited made")])
+def test_the_first_process_of_each_machine_makes_a_thing_before_the_others(
+    monkeypatch: pytest.MonkeyPatch, local_rank: int, order: str
+) -> None:
+    done: list[str] = []
+
+    def made() -> int:
+        done.append("made")
+        return 7
+
+    monkeypatch.setattr(DistributedContext, "any", lambda *_: done.append("waited"))
+    crew = DistributedContext(
+        device=torch.device("cpu"), rank=8, world_size=16, local_rank=local_rank
+    )
+    assert crew.run_once_per_machine(made) == 7
+    assert done == order.split()
+
+
+NEVER_S = 60
+TIMED_OUT = 110
+"""errno's ETIMEDOUT."""
+
+
+class TimeSpec(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+@pytest.fixture(autouse=True)
+def handled() -> Iterator[None]:
+    """Tests that run in the background of a shell begin with a SIGINT that is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_it_is_answered_while_the_main_thread_is_in_a_call_that_does_not_return() -> None:
+    """As a backward pass: Python's own handlers wait until it does. Here it waits for the answer.
+
+    A mutex of the C library, because nothing of Python's blocks without hearing signals.
+    """
+    c, mutex = ctypes.CDLL(None), (ctypes.c_byte * 64)()
+    answers: list[tuple[int, bool]] = []
+
+    def answer(times: int) -> None:
+        answers.append((times, threading.current_thread() is threading.main_thread()))
+        c.pthread_mutex_unlock(mutex)
+
+    assert c.pthread_mutex_lock(mutex) == 0
+    deadline = TimeSpec(int(time.time()) + NEVER_S, 0)
+    main = threading.main_thread().ident
+    assert main is not None
+    with deferred_interrupts(answer) as asked_to_stop:
+        assert not asked_to_stop()
+        press = threading.Timer(0.1, signal.pthread_kill, (main, signal.SIGINT))
+        press.start()
+        ended = c.pthread_mutex_timedlock(mutex, ctypes.byref(deadline))
+        press.join()
+        assert asked_to_stop()
+    assert (ended, answers) == (0, [(1, False)]), ended == TIMED_OUT
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_second_signal_acts_as_it_did_before_but_not_what_torchrun_passes_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(interrupts, "ECHO_S", 0.0)
+    with pytest.raises(KeyboardInterrupt), deferred_interrupts(lambda times: None) as asked:
+        signal.raise_signal(signal.SIGINT)
+        assert asked()
+        signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+    # the terminal sends Ctrl-C to all processes, and torchrun sends it to its own once more
+    monkeypatch.setattr(interrupts, "ECHO_S", 3600.0)
+    answers: list[int] = []
+    with deferred_interrupts(answers.append) as asked:
+        for number in (signal.SIGINT, signal.SIGINT, signal.SIGTERM):
+            signal.raise_signal(number)
+        assert asked()
+    assert answers == [1]
+
+
+PATIENCE_S = 60.0
+"""Of a thread that waits for the other; on a busy machine a step takes tenths of a second."""
+
+
+def full() -> None:
+    raise TrilightError("the disk is full")
+
+
+def test_work_is_done_in_order_and_its_errors_come_at_the_next_call() -> None:
+    goes_on, done = threading.Event(), list[str]()
+
+    def first() -> None:
+        assert goes_on.wait(PATIENCE_S)
+        done.append("first")
+
+    with BackgroundWriter() as background:
+        background.begin(first)
+        assert done == []
+        goes_on.set()
+        background.begin(lambda: done.append("second"))
+        assert done[0] == "first"
+    assert done == ["first", "second"]
+    background = BackgroundWriter()
+    background.begin(full)
+    with pytest.raises(TrilightError, match="the disk is full"):
+        background.begin(lambda: None)
+    background.wait()
+    with pytest.raises(TrilightError, match="the disk is full"), BackgroundWriter() as other:
+        other.begin(full)
+    with pytest.raises(TrilightError, match="a loss") as error, BackgroundWriter() as background:
+        background.begin(full)
+        raise TrilightError("a loss is not finite")
+    assert error.value.__notes__ == ["the disk is full"]
+
+
+class Steps(TrainProgress):
+    """Counts steps, and lets others wait for the next one."""
+
+    def __init__(self) -> None:
+        self.step = 0
+        self._more = threading.Condition()
+
+    def advance(self, *, step: int, **_: Any) -> None:
+        with self._more:
+            self.step = step
+            self._more.notify_all()
+
+    def beyond(self, step: int) -> bool:
+        with self._more:
+            return self._more.wait_for(lambda: self.step > step, PATIENCE_S)
+
+
+def test_steps_go_on_while_a_disk_is_slow(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file of step 4 is not written before step 5 is done, and holds what step 4 left."""
+    settings = tiny_run(num_steps=6)
+    trained(settings, dataset, tmp_path / "quick")
+    steps, write = Steps(), checkpoints._write_sealed
+
+    def slowly(path: Path, encoded: bytes) -> None:
+        assert steps.step == settings.num_steps or steps.beyond(steps.step)
+        write(path, encoded)
+
+    monkeypatch.setattr(checkpoints, "_write_sealed", slowly)
+    trained(settings, dataset, tmp_path / "slow", progress=steps)
+    slow, quick = (RunFolder(tmp_path / name).checkpoints for name in ("slow", "quick"))
+    assert saved_steps(slow) == saved_steps(quick)
+    for step in saved_steps(slow):
+        ours, theirs = (
+            read_checkpoint(checkpoints.path_of_step(folder, step)) for folder in (slow, quick)
+        )
+        assert ours.header["step"] == step
+        assert all((ours.arrays[name] == theirs.arrays[name]).all() for name in theirs.arrays)

@@ -1,12 +1,13 @@
 """Laws of one step: a mean over views, whatever the batches; what is not finite changes nothing.
 
-A decision that only kernels know does what one of the host does; here on a processor.
+A decision that only kernels know does what one of the host does; here on a processor. Compiled
+layers compute what layers compute, from one graph for all of them and all lengths.
 """
 
 import copy
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,26 +15,34 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
+from torch._dynamo.testing import CompileCounterWithBackend
+from torch._inductor.utils import run_and_get_code
 
 from model.checkpoint_format import path_of_step, saved_steps
+from model.image_head import Fusion
 from model.layers import Norm
+from model.renderformer import RenderFormer
+from model.scene_tensors import batch_scenes
+from storage.errors import TrilightError
 from tests.for_each import for_each
-from tests.model.kit import awake, tiny_config
-from tests.train.kit import stepper, tiny_run, trained
+from tests.model.kit import awake, picture_and_gradients, random_scene, tiny_config
+from tests.train.kit import CPU, stepper, tiny_run, toy_batch, trained
 from tests.train.loop.test_optim import with_gradients
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.buckets import TrainingBatch, bucket_scenes, collate_batch
 from train.data.scenes import training_scene
 from train.folder import RunFolder
-from train.loop import muon, optim
+from train.loop import compiled, muon, optim
 from train.loop import step as step_module
 from train.loop.checkpoints import read_checkpoint
+from train.loop.compiled import compile_parts, compiled_parts, undo_compiling
 from train.loop.decision import Decision, move_along, move_towards
 from train.loop.optim import Updater
 from train.loop.state import TrainState, ema_step, new_state
 from train.loop.step import Stepper, StepReport, predict_log10
+from train.loss.objective import TrainingLoss
 from train.monitoring.rows import read_rows
-from train.settings import Precision
+from train.settings import Compile, LossSettings, Precision
 
 RESOLUTION = 16
 
@@ -91,7 +100,7 @@ def test_a_step_that_is_not_finite_changes_nothing(
     ruin: Callable[[TrainState, TrainingBatch], None], muon_rate: float, precision: Precision
 ) -> None:
     state = new_state(tiny_run(ema_decay=0.5, muon_rate=muon_rate), muon_precision=precision)
-    batch = collate_batch(scenes(2))
+    batch = toy_batch(0, 1)
     assert step(state, [batch]).applied
     ruin(state, batch)
     assert state.ema_model is not None
@@ -112,7 +121,7 @@ def test_the_mean_follows_the_weights_faster_at_first() -> None:
     settings = tiny_run(ema_decay=0.5)
     state = new_state(settings)
     assert state.ema_model is not None and state.eval_model is state.ema_model
-    batch = collate_batch(scenes(2))
+    batch = toy_batch(0, 1)
     by_hand = state.model.decoder.rays.weight.detach().clone()
     for updates in range(12):
         stepper(state, settings).step([batch], 3e-3)
@@ -132,7 +141,7 @@ def test_bfloat16_rounds_no_position_ray_or_material_nor_the_last_layers(family:
     The published training rounds positions too, to a grid of up to 0.004 m.
     """
     network, found = awake(tiny_config(family), torch.float32), dict[str, str]()
-    positions, batch = list[Tensor](), collate_batch(scenes(2))
+    positions, batch = list[Tensor](), toy_batch(0, 1)
     network.encoder.rotary.register_forward_pre_hook(lambda _, given: positions.append(given[0]))
     exact_picture = predict_log10(network, batch, RESOLUTION, "float32")
 
@@ -160,13 +169,13 @@ def test_a_step_asks_no_generator() -> None:
     """What does not exist need not be saved: a resumed run is the same whatever the state here."""
     state = new_state(tiny_run())
     before = torch.get_rng_state(), np.random.get_state(legacy=True)[1].copy()  # type: ignore[index] # noqa: NPY002
-    step(state, [collate_batch(scenes(2))])
+    step(state, [toy_batch(0, 1)])
     assert torch.equal(torch.get_rng_state(), before[0])
     assert np.array_equal(np.random.get_state(legacy=True)[1], before[1])  # type: ignore[index] # noqa: NPY002
 
 
 def test_the_report_says_how_bright_and_how_long_before_clipping() -> None:
-    batch = collate_batch(scenes(2))
+    batch = toy_batch(0, 1)
     state = new_state(tiny_run())
     report = step(state, [batch])
     mean = batch.target_BVRR3.mean().item()
@@ -217,7 +226,7 @@ def late(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def batch_of(index: int, *, bad: bool = False) -> TrainingBatch:
-    made = collate_batch([training_scene(toy_sample(index), 16)])
+    made = toy_batch(index)
     if bad:
         made.target_BVRR3[0, 0, 0, 0, 0] = math.inf
     return made
@@ -327,3 +336,154 @@ def test_a_run_that_learns_late_is_the_same_run(
     for arrays in found:
         assert arrays.keys() == wanted.keys()
         assert all(np.array_equal(arrays[name], wanted[name]) for name in wanted)
+
+
+PASSES = ((3, 5), (4, 9, 2), (6, 6), (7,), (11, 2), (8, 3, 5, 1))
+"""Lengths of the scenes of passes: padded, of one length, and one alone."""
+
+
+@pytest.fixture(autouse=True)
+def forgets() -> Iterator[None]:
+    torch._dynamo.reset()
+    yield
+    torch._dynamo.reset()
+
+
+OBJECTIVE = TrainingLoss(LossSettings(perceptual="none"), None)
+
+
+def _compile_by(patch: pytest.MonkeyPatch, backend: Callable[..., Any]) -> None:
+    """Have modules compile by a backend."""
+    real = torch.compile
+    patch.setattr(torch, "compile", lambda f, **_: real(f, backend=backend, dynamic=True))
+    patch.setattr(
+        torch.nn.Module,
+        "compile",
+        lambda module, **_: setattr(
+            module, "_compiled_call_impl", real(module._call_impl, backend=backend, dynamic=True)
+        ),
+    )
+
+
+def _results(model: RenderFormer, lengths: tuple[int, ...]) -> dict[str, Tensor]:
+    scenes = [random_scene(n, num_views=1, seed=n, dtype=torch.float32) for n in lengths]
+    return picture_and_gradients(model, batch_scenes(scenes))
+
+
+@pytest.mark.slow("training")  # Dynamo traces every layer
+@pytest.mark.parametrize(
+    ("backend", "passes", "most_graphs"), [("eager", PASSES, 15), ("inductor", ((3, 5), (2, 7)), 9)]
+)
+def test_compiled_layers_compute_the_same_and_three_kinds_of_pass_are_few_graphs(
+    monkeypatch: pytest.MonkeyPatch,
+    backend: str,
+    passes: tuple[tuple[int, ...], ...],
+    most_graphs: int,
+) -> None:
+    """Layers of a stage share a graph for every length: four functions, two graphs more a kind.
+
+    Inductor guards on more than the lengths' being variables: its second pass has graphs too.
+    """
+    model = awake(tiny_config("linear"), dtype=torch.float32)
+    plain = [_results(model, lengths) for lengths in passes]
+    counter = CompileCounterWithBackend(backend)
+    _compile_by(monkeypatch, counter)
+    names = [name for name, _ in model.named_parameters()]
+    assert compile_parts(model, OBJECTIVE, "yes", CPU)
+    assert [name for name, _ in model.named_parameters()] == names, "checkpoints stay"
+    for lengths, wanted in zip(passes, plain, strict=True):
+        for name, found in _results(model, lengths).items():
+            scale = wanted[name].abs().max().clamp(min=1e-3)
+            assert (found - wanted[name]).abs().max() <= 2e-5 * scale, (lengths, name)
+    assert 0 < counter.frame_count <= most_graphs
+    if backend != "eager":
+        return
+    before = counter.frame_count
+    _results(model, (2, 10, 4))
+    assert counter.frame_count == before, "another length is no other graph"
+
+
+@pytest.mark.slow("training")
+def test_no_way_back_of_the_head_is_a_scatter() -> None:
+    """Sums by atomics were 17 of 195 ms of a step of Base on an H100, and in any order."""
+    fusion = Fusion(4, deepest=True)
+
+    def step() -> None:
+        torch.compile(fusion)(None, torch.randn(1, 4, 4, 4), (8, 8)).sum().backward()
+
+    _, codes = run_and_get_code(step)
+    assert any("mm(" in code for code in codes), "the products are among what is looked through"
+    assert not any("index_put" in code for code in codes)
+
+
+def test_a_part_is_one_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in the eyes of torch 2.11, which cuts where it is asked whether a device has autocast.
+
+    On an H200 it compiled each norm of each layer alone then, and was not done within minutes.
+    """
+
+    def cut(_: str) -> bool:
+        raise AssertionError("torch 2.11 cannot trace this question")
+
+    monkeypatch.setattr(torch.amp, "is_autocast_available", cut)
+    layers = {"encoder_layers": 1, "decoder_layers": 1}
+    model = awake(tiny_config("linear", **layers), dtype=torch.float32)
+    for _, module, method in compiled_parts(model, OBJECTIVE):
+        assert method in ("forward", "keys_values")
+        whole = torch.compile(
+            getattr(module, method), backend="eager", dynamic=True, fullgraph=True
+        )
+        setattr(module, method, whole)
+    _results(model, (3, 5))
+
+
+def test_what_is_compiled_where(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, objective, card = awake(tiny_config()), OBJECTIVE, torch.device("cuda")
+    layers = len(model.encoder.layers) + len(model.decoder.layers)
+    assert len(list(compiled_parts(model, objective))) == layers + 2
+    assert not compile_parts(model, objective, "auto", CPU)
+    assert not compile_parts(model, objective, "no", card)
+    monkeypatch.setattr(compiled, "_has_triton", lambda: False)
+    assert not compile_parts(model, objective, "auto", card)
+    with pytest.raises(TrilightError, match="triton"):
+        compile_parts(model, objective, "yes", card)
+    monkeypatch.setattr(compiled, "_has_triton", lambda: True)
+    assert compile_parts(model, objective, "auto", card)
+
+
+def _fails_to_compile(graph: object, inputs: object) -> object:
+    raise AssertionError("no kernel for this")
+
+
+def _uncompilable(monkeypatch: pytest.MonkeyPatch, compile: Compile) -> Stepper:
+    """Return a stepper on the processor whose compiler, as on some card, fails."""
+    monkeypatch.setattr(compiled, "_is_worthwhile", lambda _: True)
+    _compile_by(monkeypatch, _fails_to_compile)
+    run = tiny_run(compile=compile)
+    return stepper(new_state(run), run)
+
+
+def test_what_cannot_be_compiled_is_trained_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On an H200 torch 2.11 failed to compile `smoke`, and the run ended before its first step."""
+    batch = toy_batch(0, 1)
+    plain = stepper(new_state(tiny_run()), tiny_run())
+    wanted = plain.step([batch], 1e-3)
+    with monkeypatch.context() as patch:
+        failing = _uncompilable(patch, compile="auto")
+        assert failing.step([batch], 1e-3) == wanted
+        (remark,) = failing.remarks
+        assert "cannot compile" in remark and not failing.is_compiled
+        assert failing.step([batch], 1e-3) == plain.step([batch], 1e-3)
+        assert len(failing.remarks) == 1
+    torch._dynamo.reset()
+    insisting = _uncompilable(monkeypatch, compile="yes")
+    with pytest.raises(TrilightError, match="cannot compile the network.*--set compile=no"):
+        insisting.step([batch], 1e-3)
+
+
+def test_compiling_is_undone() -> None:
+    model, objective = awake(tiny_config()), OBJECTIVE
+    compile_parts(model, objective, "yes", CPU)
+    undo_compiling(model, objective)
+    for _, module, method in compiled_parts(model, objective):
+        assert module._compiled_call_impl is None and method not in vars(module)

@@ -1,30 +1,52 @@
 """A step that does not end is told once, with the part it is in and the stacks, and goes on.
 
-Two real processes, of which one is slow and once very slow, which this file is when it is run; and
-what a row of the log gets.
+Two real processes, of which one is slow and once very slow, which this file is when it is run. And
+what else a run tells of itself: times, layers, profiles, spikes, and the boards that show them.
 """
 
+import copy
+import gzip
+import json
+import math
 import os
 import re
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.summary.writer import event_file_writer
+from torch import nn
 
 from storage.dataset.dataset import Dataset
+from storage.errors import TrilightError
+from storage.seeds import rng_for
 from tests.conftest import ROOT
-from tests.train.kit import ALONE, CPU, tiny_run, trained
+from tests.for_each import for_each
+from tests.train.kit import ALONE, CPU, Heard, Killed, stepper, tiny_run, toy_batch, trained
 from train.data import stream
 from train.data.scenes import TrainingScene
 from train.folder import RunFolder
 from train.loop.distributed import DistributedContext, join_processes
+from train.loop.state import new_state
+from train.loop.step import StepReport
 from train.monitoring import spikes, watchdog
 from train.monitoring.activity import PHASES, Activity
+from train.monitoring.boards import WandbLogger, require_wandb, scalars
+from train.monitoring.layers import LayerNorms, layer_of
+from train.monitoring.process_monitor import OWN_PHASES, own_seconds, slowest_rank
+from train.monitoring.profiler import StepProfiler
 from train.monitoring.rows import read_rows
 from train.monitoring.settings import WatchSettings
+from train.monitoring.spikes import LEAST_REMEMBERED, Spike, SpikeDetector, spike_bound
 from train.monitoring.watchdog import Watchdog
 from train.progress import TrainProgress
 from train.run import train_run
@@ -47,10 +69,8 @@ def test_a_loader_that_sleeps_is_named_with_its_stack(tmp_path: Path) -> None:
     said: list[str] = []
     settings = WatchSettings(hang_after_s=0.1, hang_factor=2)
     activity = Activity()
-    dog = Watchdog(
-        settings, activity, ALONE, tmp_path / "watching", note=said.append, report_hang=pytest.fail
-    )
-    with dog:
+    rest: dict[str, Any] = {"note": said.append, "report_hang": pytest.fail}
+    with Watchdog(settings, activity, ALONE, tmp_path / "watching", **rest) as dog:
         for step in range(1, 5):
             dog.begin("step", step)
         activity.begin("data")
@@ -83,8 +103,8 @@ def test_words_of_other_processes_are_passed_on_and_the_run_stops_if_asked(
     os.utime(others, (time.time() + 60, time.time() + 60))  # written while it hangs
     os.utime(old, (0, 0))  # of an earlier call
     pair = DistributedContext(device=CPU, world_size=2)
-    dog = Watchdog(settings, Activity(), pair, tmp_path, note=said.append, report_hang=ended.append)
-    with dog:
+    rest: dict[str, Any] = {"note": said.append, "report_hang": ended.append}
+    with Watchdog(settings, Activity(), pair, tmp_path, **rest) as dog:
         dog.begin("validation", 7)
         until(lambda: ended)
     assert "the validation after step 7 hangs" in ended[0] and len(ended) == 1
@@ -95,16 +115,9 @@ def test_words_of_other_processes_are_passed_on_and_the_run_stops_if_asked(
 def test_a_full_disk_ends_no_watching(tmp_path: Path) -> None:
     said: list[str] = []
     (tmp_path / "watching").write_text("a file where the folder would be")
-    settings = WatchSettings(hang_after_s=0.1)
-    dog = Watchdog(
-        settings,
-        Activity(),
-        ALONE,
-        tmp_path / "watching",
-        note=said.append,
-        report_hang=pytest.fail,
-    )
-    with dog:
+    settings, rest = WatchSettings(hang_after_s=0.1), {"note": said.append}
+    place = tmp_path / "watching"
+    with Watchdog(settings, Activity(), ALONE, place, **rest, report_hang=pytest.fail) as dog:
         dog.begin("step", 1)
         until(lambda: said)
     assert "Stacks" not in said[0]
@@ -204,3 +217,233 @@ def main(data: str, out: Path) -> None:
 
 if __name__ == "__main__":
     main(sys.argv[1], Path(sys.argv[2]))
+
+
+def test_the_parts_add_up_to_the_time_that_passed_and_end_with_an_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now_s = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    activity = Activity()
+    now_s += 1
+    activity.begin("data")
+    now_s += 2
+    with activity.during("validation"):
+        now_s += 4
+        assert activity.now.phase == "validation"
+    now_s += 8
+    # sums of whole numbers below 2^53 are exact
+    taken = {"other": 1, "data": 10, "validation": 4}
+    assert activity.pop_seconds() == dict.fromkeys(PHASES, 0.0) | taken
+    now_s += 16
+    assert activity.pop_seconds()["data"] == 16, "what goes on counts up to now, and once"
+    activity.begin("data")
+    with pytest.raises(ValueError, match="x"), activity.during("saving"):
+        raise ValueError("x")
+    assert activity.now.phase == "data"
+
+
+def test_a_process_stands_out_by_its_own_work_or_none_does() -> None:
+    assert slowest_rank([0.1, 0.1, 0.5, 0.12]) == 2
+    assert slowest_rank([0.5, 0.1]) == 0
+    assert slowest_rank([1.0, 1.2, 1.1]) is None, "less than half more is no news"
+    assert slowest_rank([0.001, 0.01]) is None, "milliseconds are no news"
+    assert slowest_rank([1.0]) is None
+    assert set(PHASES) - set(OWN_PHASES) == {"exchange", "validation", "saving"}
+    assert own_seconds({**dict.fromkeys(PHASES, 0.0), "data": 3.0, "exchange": 9.0}, 2) == 1.5
+
+
+@for_each("clip", [1e9, 1e-3])
+def test_the_figures_are_those_of_an_update_before_clipping(clip: float) -> None:
+    settings = tiny_run(grad_clip=clip)
+    state = new_state(settings)
+    watched = stepper(state, settings)
+    batch = toy_batch(0, 1)
+    before = copy.deepcopy(dict(state.model.named_parameters()))
+    watched.layers.expect_update(True)
+    report = watched.step([batch], 3e-3)
+    row = watched.layers.pop_row()
+    squared: dict[str, np.ndarray] = {}
+    for name, weight in state.model.named_parameters():
+        old, new = (w.detach().double().numpy().ravel() for w in (before[name], weight))
+        sums = squared.setdefault(layer_of(name), np.zeros(2))
+        sums += [old @ old, (new - old) @ (new - old)]
+    assert row.keys() == squared.keys()
+    for layer, (_, weight_norm, ratio) in row.items():
+        length = math.sqrt(squared[layer][0])
+        # four digits are kept
+        assert weight_norm == pytest.approx(length, rel=1e-3)
+        assert ratio == pytest.approx(math.sqrt(squared[layer][1]) / length, rel=1e-3)
+    whole = math.sqrt(sum((grad or 0) ** 2 for grad, _, _ in row.values()))
+    assert whole == pytest.approx(report.grad_norm, rel=1e-3)
+    watched.step([batch], 3e-3)
+    assert watched.layers.pop_row() == {}, "nobody asked for this update"
+
+
+def test_a_gradient_that_is_not_finite_is_none_and_a_missing_one_is_nothing() -> None:
+    model = nn.Sequential(nn.Linear(2, 1, bias=False), nn.Linear(1, 1, bias=False))
+    layers = LayerNorms(model)
+    layers.expect_update(True)
+    model[0].weight.grad = torch.full((1, 2), math.inf)
+    layers.record_gradients()
+    layers.record_update()
+    seen = layers.pending()
+    assert seen is not None
+    layers.set_values(seen.flatten().tolist())
+    row = layers.pop_row()
+    assert row["0.weight"][0] is None
+    assert row["1.weight"][0] == 0 == row["1.weight"][2]
+
+
+def test_the_trace_holds_the_steps_and_the_note_says_how_to_open_it(tmp_path: Path) -> None:
+    said: list[str] = []
+    profiler = StepProfiler(2, CPU, tmp_path, said.append)
+    for step in range(11, 18):
+        profiler.begin_step(step)
+        torch.ones(3, 3) @ torch.ones(3, 3)
+        profiler.end_step(step)
+    profiler.close(17)
+    trace, table = tmp_path / "profile-steps-14-to-15.json.gz", "profile-steps-14-to-15.txt"
+    with gzip.open(trace) as stream:
+        events = json.load(stream)["traceEvents"]
+    assert sum(event.get("name") == "aten::mm" for event in events) == 2
+    assert "aten::mm" in (tmp_path / table).read_text()
+    (note,) = said
+    assert str(trace) in note and "chrome://tracing" in note and table in note
+
+
+@for_each(("asked", "steps"), [(2, 1), (0, 8)])
+def test_what_was_not_reached_is_told(tmp_path: Path, asked: int, steps: int) -> None:
+    told: list[str] = []
+    profiler = StepProfiler(asked, CPU, tmp_path, told.append)
+    for step in range(1, steps + 1):
+        profiler.begin_step(step)
+        profiler.end_step(step)
+    profiler.close(steps)
+    ended = "nothing was profiled: the run ended before step 4 of this call"
+    assert told == ([ended] if asked else [])
+    assert list(tmp_path.iterdir()) == []
+
+
+REPORT = StepReport(loss=1.0, l1=1.0, brightness=1.0, grad_norm=0.1, applied=True)
+
+
+def test_a_gradient_that_jumps_is_found_with_its_scenes_and_a_falling_loss_is_not() -> None:
+    watch, rng = SpikeDetector(8.0), rng_for(0, "spikes")
+    found = []
+    for step in range(1, 401):
+        noise = np.exp(rng.normal(0, 0.1, 2))
+        grad_norm = 5.0 if step == 300 else 0.1 * noise[0]
+        loss = noise[1] / math.sqrt(step)
+        report = replace(REPORT, loss=float(loss), grad_norm=float(grad_norm))
+        found += watch.add(step, report, ["a", f"b{step}"])
+    (spike,) = found
+    assert (spike.step, spike.what, spike.value, spike.keys) == (
+        300,
+        "grad_norm",
+        5.0,
+        ("a", "b300"),
+    )
+    # 8 deviations of 10 % above the median of 0.1; a median of 200 is sure to some per cent
+    assert 0.15 < spike.bound < 0.2
+
+
+def test_a_bound_is_median_and_deviations_and_neither_a_breath_nor_infinity_spikes() -> None:
+    values = [1.0, 2.0, 3.0, 4.0, 100.0] * 20
+    assert spike_bound(values, 2.0) == 3.0 + 2 * 1.4826 * 1.0
+    assert spike_bound(values[: LEAST_REMEMBERED - 1], 2.0) is None
+    watch = SpikeDetector(8.0)
+    for step in range(100):
+        assert watch.add(step, REPORT, []) == []
+    assert watch.add(100, replace(REPORT, loss=1.1), []) == []
+    assert watch.add(101, replace(REPORT, loss=math.nan, grad_norm=math.inf), []) == []
+    assert watch.add(102, replace(REPORT, loss=1.5), ["k"]) == [
+        Spike(step=102, what="loss", value=1.5, bound=1.16, keys=("k",))
+    ]
+
+
+@pytest.fixture
+def package(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
+    """Stands for wandb, and remembers what it was asked."""
+    package = MagicMock()
+    package.Image = lambda picture: ("picture", picture.size)
+    monkeypatch.setitem(sys.modules, "wandb", package)
+    return package
+
+
+def test_rows_and_sheets_of_a_run_are_logged_offline_or_as_the_user_says(
+    dataset: Dataset, package: MagicMock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    settings, out = tiny_run(num_steps=4), tmp_path / "mine"
+    result = trained(settings, dataset, out, watched=WatchSettings(wandb="light"))
+    begun, board = dict(package.init.call_args.kwargs), package.init.return_value
+    config = begun.pop("config")
+    assert (config["num_steps"], config["model"]["width"]) == (4, 36)
+    assert begun == {
+        "project": "light", "group": "mine", "dir": str(out), "mode": "offline",
+    }  # fmt: skip
+    rows = [row for row in read_rows(result.folder.metrics) if "loss" in row]
+    logged = [call.args[0] for call in board.log.call_args_list]
+    losses = {row["step"]: row["train/loss"] for row in logged if "train/loss" in row}
+    assert losses == {row["step"]: row["loss"] for row in rows}
+    assert any("validation/log_l1" in row and row["step"] == 4 for row in logged)
+    assert any(row.get("validation", "")[0:1] == ("picture",) for row in logged)
+    board.define_metric.assert_called_once_with("*", step_metric="step")
+    board.finish.assert_called_once_with()
+    monkeypatch.setenv("WANDB_MODE", "online")
+    WandbLogger("light", tmp_path, {})
+    assert package.init.call_args.kwargs["mode"] == "online"
+
+
+def test_where_it_is_missing_a_run_that_asks_for_it_does_not_begin(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    require_wandb(None)
+    with pytest.raises(TrilightError, match="wandb is not installed.*pip install wandb.*--wandb"):
+        trained(tiny_run(), dataset, tmp_path, watched=WatchSettings(wandb="light"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_groups_become_names_and_what_is_no_number_is_left_out() -> None:
+    row = {
+        "step": 4,
+        "loss": 0.5,
+        "l1": None,
+        "time_s": {"data": 1.0},
+        "memory_mb": {"process": 2.0},
+        "layers": {"decoder.head": [1.0, 2.0, None]},
+        "own_s": [0.1, 0.2],
+    }
+    assert scalars(row) == {
+        "train/loss": 0.5,
+        "time_s/data": 1.0,
+        "memory_mb/process": 2.0,
+        "grad_norm/decoder.head": 1.0,
+        "weight_norm/decoder.head": 2.0,
+        "own_s/process 0": 0.1,
+        "own_s/process 1": 0.2,
+    }
+    assert scalars({"step": 4, "validation": {"log_l1": 0.1}}) == {"validation/log_l1": 0.1}
+    assert scalars({"step": 4, "spike": {"value": 3.0, "keys": ["a"]}}) == {}
+
+
+def test_curves_and_sheets_survive_a_resume(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # TensorBoard reads files of one second by the number of their writer: 10 before 9
+    monkeypatch.setattr(event_file_writer, "_global_uid", event_file_writer.AtomicCounter(0))
+    with pytest.raises(Killed):
+        trained(tiny_run(), dataset, tmp_path, progress=Heard(killed_at=7))
+    result = trained(tiny_run(), dataset, tmp_path, resume=True)
+    events = EventAccumulator(str(result.folder.tensorboard)).Reload()
+    rows = [row for row in read_rows(result.folder.metrics) if "loss" in row]
+    shown = {event.step: event.value for event in events.Scalars("train/loss")}
+    # TensorBoard keeps float32
+    assert shown == pytest.approx({row["step"]: row["loss"] for row in rows}, rel=1e-6)
+    assert [event.step for event in events.Scalars("validation/log_l1")] == [4, 8, 12]
+    assert {event.step for event in events.Images("validation")} == {4, 8, 12}
+    assert result.median_scores is not None
+    median = [event.value for event in events.Scalars("validation/median_picture_log_l1")]
+    assert median == pytest.approx([result.median_scores["log_l1"]] * 3, rel=1e-6)

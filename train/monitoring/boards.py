@@ -1,4 +1,7 @@
-"""Logging to Weights & Biases, if requested and installed."""
+"""Rows of the log as named scalars, and the boards that show them.
+
+TensorBoard always, Weights & Biases if requested and installed.
+"""
 
 import os
 from collections.abc import Mapping
@@ -6,10 +9,62 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
 
 from storage.errors import TrilightError
-from train.monitoring.scalars import scalars
+from train.monitoring.rows import LAYER_COLUMNS
+
+_GROUPED = ("validation", "time_s", "memory_mb")
+
+
+def scalars(row: Mapping[str, Any]) -> dict[str, float]:
+    """Return the numbers of a row by `group/name`; other values are left out."""
+    numbers: dict[str, Any] = {}
+    for name, value in row.items():
+        if name in _GROUPED:
+            numbers |= {f"{name}/{inner}": number for inner, number in (value or {}).items()}
+        elif name == "layers":
+            for layer, figures in value.items():
+                numbers |= {
+                    f"{column}/{layer}": figure
+                    for column, figure in zip(LAYER_COLUMNS, figures, strict=True)
+                }
+        elif name == "own_s":
+            numbers |= {f"own_s/process {rank}": seconds for rank, seconds in enumerate(value)}
+        elif name not in ("step", "spike"):
+            numbers[f"train/{name}"] = value
+    return {
+        name: value
+        for name, value in numbers.items()
+        if isinstance(value, int | float) and not isinstance(value, bool)
+    }
+
+
+class TensorBoardLogger:
+    """Writes the log's numbers and the validation sheets for TensorBoard.
+
+    A resumed run writes its rows after the first step again.
+    """
+
+    def __init__(self, folder: Path, *, first_step: int) -> None:
+        from torch.utils.tensorboard import SummaryWriter  # half a second to import
+
+        self._writer = SummaryWriter(str(folder), purge_step=first_step + 1)
+
+    def scalars(self, row: Mapping[str, Any]) -> None:
+        """Add a row of the log; values that are not numbers are left out."""
+        step = row["step"]
+        for name, value in scalars(row).items():
+            self._writer.add_scalar(name, value, step)
+
+    def sheet(self, step: int, sheet: Image.Image) -> None:
+        """Add a sheet of validation pictures."""
+        self._writer.add_image("validation", np.asarray(sheet), step, dataformats="HWC")
+
+    def close(self) -> None:
+        """Flush and close the files."""
+        self._writer.close()
 
 
 class WandbLogger:
@@ -22,7 +77,6 @@ class WandbLogger:
         """Start a run of the project.
 
         Args:
-            project: name of the project.
             folder: folder of the training, with files in `wandb/`; its name is that of the group.
             settings: configuration of the run to display.
 

@@ -1,1 +1,0 @@
-"""Environment light for networks: importance sampling, and its symmetries."""
