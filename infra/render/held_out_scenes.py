@@ -10,7 +10,7 @@ from pathlib import Path
 from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
 from pipeline.generation.accept_objects import accept_objects
-from pipeline.generation.begin_dataset import begin
+from pipeline.generation.begin_dataset import begin_dataset
 from pipeline.generation.environment import environment
 from pipeline.generation.object_options import ObjectOptions
 from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
@@ -52,7 +52,7 @@ def composing_child(
     """
     variant = variant or choose_variant()
     workers = threads or available_cores()
-    publication = begin(
+    publication = begin_dataset(
         DatasetFolder(folder), build, environment(variant), 1, accept_environment=False
     )
     objects_order = ObjectOptions(

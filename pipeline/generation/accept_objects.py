@@ -50,7 +50,12 @@ def prepare_unfrozen_objects(options: ObjectOptions) -> ListedObjects | None:
             return None
         listed = options.list_source()
         announce_objects(folder, len(listed.allowed))
-    _prepare(listed, listed.allowed, options, should_stop=lambda: writer.has(folder.staged_index))
+    _prepare(
+        listed,
+        listed.allowed,
+        options,
+        should_stop=lambda: writer.is_published(folder.staged_index),
+    )
     return listed
 
 

@@ -123,7 +123,7 @@ def _write_index(
         num_found=num_found,
         num_maps=len(locked) - len(objects),
     )
-    writer.upload(folder.staged_index)
+    writer.publish(folder.staged_index)
 
 
 def read_frozen_objects(writer: DatasetWriter) -> dict[str, LockedObject] | None:

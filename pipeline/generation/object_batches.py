@@ -29,6 +29,7 @@ from storage.claims import WaitNotice
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
+from storage.remote.store import claim_of
 from storage.typed_json import read_json_lines
 
 _CACHE = "object-batches"
@@ -79,7 +80,7 @@ class ObjectBatch:
         name = work.name(records, are_here=work.fetch is None)
         self._file = work.writer.folder.staged_batches / name
         """Result in the dataset's folder, for its other workers."""
-        self.claim_file = self._file.with_suffix(".claim")  # as Publication.claim has it
+        self.claim_file = claim_of(self._file)
         self._cached = cache_folder(_CACHE) / name if work.fetch is None else None
         """Result in the user's cache; None for remote objects until they have been downloaded."""
         self._by_uid = {record.uid: record for record in records}
@@ -123,7 +124,7 @@ class ObjectBatch:
                 write_atomically(self._cached, data)
             write_atomically(self._file, data)
             if is_final:
-                writer.upload(self._file)
+                writer.publish(self._file)
         return True
 
     def forget_transient(self) -> None:

@@ -19,7 +19,7 @@ crash costs one attempt.
 The files on disk are the only state, and every step may be killed at any moment. A mesh is kept in
 the asset store, a scene in the staging folder, a shard in the dataset; the next run looks for these
 and makes the rest. Several runs on one folder share the work (storage.claims), and those on one
-bucket share batches of objects (storage.remote.claims) and shards (pipeline.shards.bucket_mirror).
+bucket share batches of objects (storage.remote.store) and shards (pipeline.shards.published).
 """
 
 import contextlib
@@ -42,7 +42,7 @@ from pipeline.generation.accept_objects import (
 )
 from pipeline.generation.accept_revisited import accept_revisited
 from pipeline.generation.accept_scene_files import accept_scene_files
-from pipeline.generation.bucket_dataset_writer import hold_membership
+from pipeline.generation.begin_dataset import hold_membership
 from pipeline.generation.dataset_order import DatasetOrder, generate_words
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects
@@ -288,5 +288,5 @@ def make_documents(writer: DatasetWriter) -> Statistics:
     """Write the documents of all shards; one worker at a time."""
     with writer.folder.mutex("documents"):
         statistics = write_documents(writer.dataset(), writer.folder)
-        writer.upload_documents()
+        writer.publish_documents()
         return statistics

@@ -10,7 +10,7 @@ from pipeline.exchange.scene_files import SceneFiles
 from pipeline.exchange.scene_folder import SceneFolder, find_scene_files
 from pipeline.generation.accept_revisited import settings_for_revisit
 from pipeline.generation.accept_scene_files import settings_for_files
-from pipeline.generation.bucket_dataset_writer import begin_dataset
+from pipeline.generation.begin_dataset import begin_dataset
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.environment import environment

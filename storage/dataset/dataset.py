@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 from storage.conventions import SPLITS
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import MAX_BESIDE_BYTES, Manifest, ShardEntry, decode_manifest
+from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest
 from storage.dataset.shard import ShardContents, contents_of, samples_of
 from storage.digests import sha256_of_stream
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
@@ -20,9 +20,9 @@ from storage.records.held_maps import HeldMaps
 from storage.records.objects import Failure, LockedObject, decode_failures, decode_objects_lock
 from storage.records.safe_read import open_plain
 from storage.records.sample import Sample, SceneRecord, decode_sample, decode_scene
-from storage.remote.bucket import WRITABLE
 from storage.remote.cache import shard_cache
-from storage.remote.fetch import download, facts_of, unreadable
+from storage.remote.fetch import facts_of, fetch_if_there, unreadable
+from storage.remote.store import MAX_FILE_BYTES, WRITABLE
 from storage.remote.tries import TransferFailed, is_missing
 from storage.remote.url import RemoteUrl, parse_url
 
@@ -122,16 +122,14 @@ class RemoteDatasetFiles(_Files):
         url = self.url.child(name)
         stream: BinaryIO = TemporaryFile()
         try:
-            download(url, stream, num_bytes=None, max_bytes=MAX_BESIDE_BYTES)
-            stream.seek(0)
-            return stream
-        except BaseException as error:
+            if fetch_if_there(url, stream, max_bytes=MAX_FILE_BYTES):
+                stream.seek(0)
+                return stream
+        except BaseException:
             stream.close()
-            if not isinstance(error, TransferFailed):
-                raise
-            if error.__cause__ is not None and is_missing(error.__cause__):
-                return None
-            raise unreadable(url, error) from error
+            raise
+        stream.close()
+        return None
 
     def num_bytes(self, shard: ShardEntry) -> int | None:
         """Return the size of a shard, or None where the server does not state it.

@@ -23,9 +23,9 @@ from storage.cache import cache_folder
 from storage.claims import hold_claim, open_lock, take_lock
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.remote.bucket import WRITABLE
 from storage.remote.safe_url import printable, safe_url
-from storage.remote.url import parse_url
+from storage.remote.store import WRITABLE, BucketStore, LocalStore, Store
+from storage.remote.url import RemoteUrl, parse_url
 
 _LEFT_S = 3600.0
 """Age at which a temporary file counts as left by a kill. Not all file systems carry locks between
@@ -153,6 +153,18 @@ class DatasetFolder:
     def display_name(self) -> str:
         """The dataset's folder or URL, as messages show it."""
         return self.bucket or str(self.root)
+
+    def store(self) -> Store:
+        """Return where the dataset is published: this folder itself, or its bucket."""
+        if not self.bucket:
+            return LocalStore(self.root)
+        url = parse_url(self.bucket, what="out")
+        assert isinstance(url, RemoteUrl)
+        return BucketStore(url, self.root)
+
+    def name_of(self, path: Path) -> str:
+        """Return the name of a file of the folder, relative to it."""
+        return path.relative_to(self.root).as_posix()
 
     def staged_shard(self, name: str) -> Path:
         """Folder of the finished samples of an unfinished shard."""

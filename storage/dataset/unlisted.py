@@ -16,7 +16,7 @@ from storage.dataset.shard_notes import (
     noted_shard,
 )
 from storage.errors import TrilightError
-from storage.remote.bucket import WRITABLE, Bucket
+from storage.remote.store import WRITABLE, BucketStore
 
 
 def with_unlisted(dataset: Dataset) -> Dataset:
@@ -47,7 +47,7 @@ def _notes(dataset: Dataset) -> list[ShardNote]:
     if files.url.scheme not in WRITABLE or len(manifest.shards) >= num_planned(manifest):
         return []
     with contextlib.suppress(TrilightError):  # it may be read and not listed
-        names = Bucket(files.url).names()
+        names = BucketStore(files.url).list_all()
         bucket_root = DatasetFolder(Path())
         listed = {shard.name for shard in manifest.shards}
         unlisted = sorted(filter(SHARD_NAME.fullmatch, names - listed))

@@ -13,7 +13,7 @@ from pipeline.assets.stage import PreparedObject
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.generation import object_batches
-from pipeline.generation.begin_dataset import begin
+from pipeline.generation.begin_dataset import begin_dataset
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects, freeze_objects
 from pipeline.generation.object_options import ObjectOptions
@@ -63,7 +63,7 @@ def prepared(number: int) -> PreparedObject:
 
 def begun(root: Path) -> DatasetWriter:
     """Begin a dataset of four scenes."""
-    return begin(DatasetFolder(root), build(), ENVIRONMENT, 4, accept_environment=False)
+    return begin_dataset(DatasetFolder(root), build(), ENVIRONMENT, 4, accept_environment=False)
 
 
 def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = None) -> ObjectOptions:

@@ -9,7 +9,6 @@ import pytest
 from pipeline.executors.array_job import array_job
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.shards.bucket_mirror import Mirror
 from pipeline.shards.pack import pack_shard
 from storage.dataset.dataset import open_dataset
 from storage.dataset.progress import read_status
@@ -83,10 +82,10 @@ def test_an_old_list_that_arrives_late_is_mended(
     bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Between two requests of the first maker the second one plans more, and finishes it."""
-    send_manifest = Mirror.upload_manifest
+    send_manifest = DatasetWriter.publish_manifest
 
-    def late(self: Mirror) -> None:
-        monkeypatch.setattr(Mirror, "upload_manifest", send_manifest)
+    def late(self: DatasetWriter) -> None:
+        monkeypatch.setattr(DatasetWriter, "publish_manifest", send_manifest)
         with machines.maker("b", 8) as second:
             make(second, 1)
         machines.use("a")
@@ -97,7 +96,7 @@ def test_an_old_list_that_arrives_late_is_mended(
     with machines.maker("a", 4) as first:
         first.lock_objects([_locked()])
         make_tiny_shard(first, 0)
-        monkeypatch.setattr(Mirror, "upload_manifest", late)
+        monkeypatch.setattr(DatasetWriter, "publish_manifest", late)
         listed = first.finish()
     assert listed is not None and len(listed.shards) == 2
     assert open_dataset(OUT).manifest == listed
@@ -211,7 +210,7 @@ def test_access_that_is_lost_in_the_middle_loses_nothing(
 def test_what_is_lacking_is_said_at_once(bucket: Any, machines: Machines, moto: int) -> None:
     bucket.rm("shards", recursive=True)
     with (
-        pytest.raises(TrilightError, match=rf"out '{OUT}': cannot be listed .*404.*that exists"),
+        pytest.raises(TrilightError, match=rf"out '{OUT}': cannot be written .*404.*that exists"),
         machines.maker("a"),
     ):
         pass

@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from pipeline.generation import bucket_dataset_writer, dataset_writer
+from pipeline.generation import dataset_writer
 from pipeline.generation.accept_objects import load_trusted_objects
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.frozen_pool import AssetMissing
 from pipeline.generation.pipeline import prepare_dataset
 from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.scene_origin import ComposedScenes
-from pipeline.shards import bucket_mirror
+from pipeline.shards import published
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
@@ -111,7 +111,7 @@ def _ending_together(machines: Machines) -> Iterator[tuple[DatasetWriter, Datase
         first.lock_objects([_locked()])
         make_tiny_shard(first, 0)
         make_tiny_shard(first, 1)
-        assert first._mirror.is_first_to_list(8)  # type: ignore[attr-defined]
+        assert first.store.create(".staging/listing/000000000008", b"\n")
         machines.use("b")
         second.fetch_lock()
         yield first, second
@@ -122,14 +122,14 @@ def test_of_those_who_end_together_one_reads_the_notes(
 ) -> None:
     """The others wait for its list; one that died over its list is waited for in vain."""
     read: list[str] = []
-    fetched = bucket_mirror.fetch_notes
+    fetched = published.fetch_notes
     monkeypatch.setattr(
-        bucket_mirror, "fetch_notes", lambda how, names, at: fetched(how, _told(names, read), at)
+        published, "fetch_notes", lambda how, names, at: fetched(how, _told(names, read), at)
     )
-    monkeypatch.setattr(bucket_dataset_writer, "_PATIENCE_S", 10.0)
+    monkeypatch.setattr(dataset_writer, "_PATIENCE_S", 10.0)
     with _ending_together(machines) as (first, second):
         waits: list[float] = []
-        monkeypatch.setattr(bucket_dataset_writer.time, "sleep", waits.append)
+        monkeypatch.setattr(dataset_writer.time, "sleep", waits.append)
 
         def meanwhile(pause_s: float) -> None:
             waits.append(pause_s)
@@ -142,7 +142,7 @@ def test_of_those_who_end_together_one_reads_the_notes(
                 read.clear()
 
         with monkeypatch.context() as patch:
-            patch.setattr(bucket_dataset_writer.time, "sleep", meanwhile)
+            patch.setattr(dataset_writer.time, "sleep", meanwhile)
             listed = second.finish()
         assert listed == first.manifest and len(waits) == 3 and read == []
         assert second.left_to_others, "documents too: each reads the whole dataset"
@@ -153,7 +153,7 @@ def test_of_those_who_end_together_one_reads_the_notes(
     with machines.maker("d", 16) as longer:
         for number in (2, 3):
             make_tiny_shard(longer, number)
-        assert longer._mirror.is_first_to_list(16)  # type: ignore[attr-defined]
+        assert longer.store.create(".staging/listing/000000000016", b"\n")
         waits.clear()
         assert longer.finish() is not None
         assert 10 <= sum(waits) < 20, "its maker died over it"
@@ -164,7 +164,7 @@ def test_who_waited_and_then_lists_more_writes_the_documents(
     bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """While it waited for the list of 8 scenes, somebody planned 16 and made them."""
-    monkeypatch.setattr(bucket_dataset_writer, "_PATIENCE_S", 10.0)
+    monkeypatch.setattr(dataset_writer, "_PATIENCE_S", 10.0)
     with _ending_together(machines) as (first, second):
 
         def meanwhile(pause_s: float) -> None:
@@ -177,7 +177,7 @@ def test_who_waited_and_then_lists_more_writes_the_documents(
                 make_tiny_shard(third, 3)
             machines.use("b")
 
-        monkeypatch.setattr(bucket_dataset_writer.time, "sleep", meanwhile)
+        monkeypatch.setattr(dataset_writer.time, "sleep", meanwhile)
         listed = second.finish()
         assert listed is not None and len(listed.shards) == 4
         assert not second.left_to_others
@@ -198,13 +198,13 @@ def test_what_a_killed_machine_has_prepared_is_not_prepared_again(
     object_records(tmp_path / "objects")
     order = tiny_order(out=OUT, objects=str(tmp_path / "objects"), scenes=4)
 
-    def killed(self: bucket_mirror.Mirror, lock: bytes) -> None:
+    def killed(*given: Any) -> None:
         raise Killed
 
     for machine in "ab":
         machines.use(machine)
         with monkeypatch.context() as patch, pytest.raises(Killed):
-            patch.setattr(bucket_mirror.Mirror, "freeze", killed)
+            patch.setattr(DatasetWriter, "lock_objects", killed)
             prepare_dataset(order)
     assert len(mesher.made) == 30 == sum(mesher.made.values())
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.generation.begin_dataset import begin
+from pipeline.generation.begin_dataset import begin_dataset
 from pipeline.generation.derive_dataset import derive_dataset
 from pipeline.shards.derive import DeriveOptions
 from pipeline.shards.plans import Selection
@@ -139,7 +139,7 @@ def test_nothing_is_overwritten_and_nothing_grows(tmp_path: Path) -> None:
     with pytest.raises(TrilightError, match="is there already"):
         derive_dataset([str(a)], reshard, out)
     with pytest.raises(TrilightError, match=r"made by `trilight shards reshard`.*cannot grow"):
-        begin(DatasetFolder(out), _build(), ENVIRONMENT, 4, accept_environment=False)
+        begin_dataset(DatasetFolder(out), _build(), ENVIRONMENT, 4, accept_environment=False)
 
 
 KILLED = """

@@ -29,8 +29,7 @@ from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
-from storage.remote import claims
-from storage.remote.bucket import Bucket
+from storage.remote import store
 from storage.remote.url import RemoteUrl, parse_url
 from tests.conftest import ROOT
 from tests.pipeline.generation.bucket_kit import OUT, Killed, Machines, Writes
@@ -273,7 +272,7 @@ def test_a_kill_before_any_write_leaves_the_same_lock(
     lock_of_one: bytes, machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The n-th write of each run never happens; two machines take turns until one gets through."""
-    monkeypatch.setattr(claims, "LEASE_S", 0.0)
+    monkeypatch.setattr(store, "LEASE_S", 0.0)
     monkeypatch.setattr("pipeline.generation.object_batches._NUM_OBJECTS", NUM_OBJECTS // 2)
     order = tiny_order(out=OUT, objects=str(tmp_path / "objects"), scenes=4)
     writes, runs = Writes(monkeypatch), 0
@@ -289,17 +288,17 @@ def test_a_kill_before_any_write_leaves_the_same_lock(
     assert open_dataset(OUT).lock_bytes() == lock_of_one
 
 
-def _claims(tmp_path: Path, name: str) -> claims.BucketClaims:
+def _machine(tmp_path: Path, name: str) -> store.BucketStore:
     url = parse_url(OUT, what="bucket")
     assert isinstance(url, RemoteUrl)
-    return claims.BucketClaims(Bucket(url), tmp_path / name)
+    return store.BucketStore(url, tmp_path / name)
 
 
 def test_a_claim_keeps_other_machines_off_until_it_ends(
     bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It ends with its block, and for a machine that dies when the lease is over."""
-    a, b = _claims(tmp_path, "a"), _claims(tmp_path, "b")
+    a, b = _machine(tmp_path, "a"), _machine(tmp_path, "b")
     for holder, other in ((a, b), (b, a)):
         with (
             holder.hold_claim("x") as ours,
@@ -307,12 +306,13 @@ def test_a_claim_keeps_other_machines_off_until_it_ends(
             other.hold_claim("y") as free,
         ):
             assert (ours, theirs, free) == (True, False, True)
-    monkeypatch.setattr(claims.BucketClaims, "_free", lambda self, claim: None)
-    with a.hold_claim("z") as ours:
-        assert ours
-    with b.hold_claim("z") as theirs, _claims(tmp_path, "a").hold_claim("z") as again:
+    with monkeypatch.context() as patch:
+        patch.setattr(store.BucketStore, "put", lambda *given: None)  # it dies
+        with a.hold_claim("z") as ours:
+            assert ours
+    with b.hold_claim("z") as theirs, _machine(tmp_path, "a").hold_claim("z") as again:
         assert (theirs, again) == (False, True), "a machine that is started again has its claims"
-    monkeypatch.setattr(claims, "LEASE_S", 0.0)
+    monkeypatch.setattr(store, "LEASE_S", 0.0)
     with b.hold_claim("z") as theirs:
         assert theirs
 

@@ -13,7 +13,7 @@ from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.generation import render_sample as module
 from pipeline.generation import view_progress
-from pipeline.generation.begin_dataset import begin
+from pipeline.generation.begin_dataset import begin_dataset
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.render_sample import RenderInput, render_sample
 from pipeline.generation.view_progress import ViewProgress
@@ -137,7 +137,7 @@ def build(**changes: object) -> BuildSettings:
 
 
 def begun(root: Path, settings: BuildSettings) -> DatasetWriter:
-    return begin(DatasetFolder(root), settings, ENVIRONMENT, 4, accept_environment=False)
+    return begin_dataset(DatasetFolder(root), settings, ENVIRONMENT, 4, accept_environment=False)
 
 
 def finished(root: Path, settings: BuildSettings) -> DatasetWriter:
