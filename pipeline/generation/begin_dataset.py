@@ -128,7 +128,7 @@ def begin_dataset(
             _adopt(folder, store)  # another machine was first
         manifest = read_head(folder.manifest)
         _require_same_dataset(folder, manifest, settings, environment, accept_environment)
-        writer = DatasetWriter(folder, manifest, settings.splits)
+        writer = DatasetWriter(store, folder, manifest, settings.splits)
         if num_planned > manifest.num_scenes:
             writer.extend(num_planned)
     _publish_plan(store, writer.manifest.num_scenes)

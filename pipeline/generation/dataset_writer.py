@@ -87,10 +87,12 @@ class DatasetWriter:
     that moment, and reaches the disk before the call returns.
     """
 
-    def __init__(self, folder: DatasetFolder, manifest: Manifest, splits: SplitSettings) -> None:
-        self.folder = folder
-        self.store = folder.store()
+    def __init__(
+        self, store: Store, folder: DatasetFolder, manifest: Manifest, splits: SplitSettings
+    ) -> None:
+        self.store = store
         """Where the dataset is published."""
+        self.folder = folder
         self.manifest = manifest
         """Manifest of the dataset; it lists shards only once the dataset is finished."""
         self.progress = DatasetProgress()
@@ -101,11 +103,11 @@ class DatasetWriter:
         """True if another machine has just listed the shards, and writes the documents."""
         self._splits = splits
         self._files: DatasetFiles = (
-            RemoteDatasetFiles(self.store.url)
-            if isinstance(self.store, BucketStore)
+            RemoteDatasetFiles(store.url)
+            if isinstance(store, BucketStore)
             else LocalFiles(folder.root)
         )
-        self._shards = PublishedShards(folder, self.store, self._files)
+        self._shards = PublishedShards(folder, store, self._files)
         self._ends: dict[str, range] = {}
         """Last shards of earlier plans of a bucket, by name, with the scenes that they should hold
         now."""

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 from pipeline.generation import dataset_writer
-from pipeline.generation.accept_objects import load_trusted_objects
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.frozen_pool import AssetMissing
 from pipeline.generation.pipeline import prepare_dataset
@@ -215,7 +214,7 @@ def test_who_comes_later_trusts_the_index_of_the_first(bucket: Any, machines: Ma
         accepted = frozen(first, [prepared(number) for number in range(30)])
         assert accepted.num_objects == 30
     with machines.maker("b") as later:
-        trusted = load_trusted_objects(asked(later))
+        trusted = asked(later).load()
         assert trusted is not None and isinstance(trusted.origin, ComposedScenes)
         assert trusted.num_objects == 30
         with pytest.raises(AssetMissing):

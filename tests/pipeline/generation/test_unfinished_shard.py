@@ -132,7 +132,7 @@ def test_who_waits_for_others_says_for_whom(
     )
     _make(tmp_path, 1, 4, Counter())
     with hold_claim(folder.staged_shard(NAME) / f"{sample_key(0)}.claim"):
-        tasks._wait_for_others(run, 0.0)
+        tasks.wait_for_others(run, 0.0)
     assert f"{sample_key(0)}.claim: waiting for 0 s for process {os.getpid()} of" in caplog.text
 
 
