@@ -21,14 +21,14 @@ from pipeline.generation.accept_maps import (
     accept_maps,
 )
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.frozen_pool import FrozenPool
+from pipeline.generation.frozen_pool import ComposedScenes, FrozenPool
 from pipeline.generation.object_batches import (
     ObjectWork,
     PrepareResult,
     cut_objects,
     prepare_in_batches,
 )
-from pipeline.generation.scene_origin import ComposedScenes, SceneOrigin
+from pipeline.generation.revisited_scenes import SceneOrigin
 from pipeline.generation.unread_notes import format_unread, write_unread
 from pipeline.isolation import is_transient
 from pipeline.objects.listing import Fetched

@@ -185,7 +185,7 @@ def test_a_price_that_is_none_is_named_at_the_start(
 def cluster(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
     """The tasks of each array; a thread works on them, as a cluster would."""
     without_rendering(monkeypatch)
-    monkeypatch.setattr("pipeline.executors.slurm.ThreadRunner", Undocumented)
+    monkeypatch.setattr("pipeline.executors.threads.ThreadRunner", Undocumented)
     arrays: list[list[int]] = []
 
     def submit(job: ArrayJob) -> str:

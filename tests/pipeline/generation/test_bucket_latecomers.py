@@ -9,10 +9,9 @@ import pytest
 
 from pipeline.generation import dataset_writer
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.frozen_pool import AssetMissing
+from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes
 from pipeline.generation.pipeline import prepare_dataset
 from pipeline.generation.prepare_isolated import asset_store
-from pipeline.generation.scene_origin import ComposedScenes
 from pipeline.shards import published
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset

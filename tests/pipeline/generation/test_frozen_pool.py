@@ -20,11 +20,9 @@ from pipeline.generation.accept_maps import AcceptedMaps, MapFolders, accept_map
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects, require_same
-from pipeline.generation.frozen_pool import AssetMissing, SplitPool
+from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, SplitPool, user_maps
 from pipeline.generation.prepare_isolated import asset_store
-from pipeline.generation.scene_origin import ComposedScenes
 from pipeline.generation.scene_worker import SceneAttempt
-from pipeline.generation.user_maps import user_maps
 from pipeline.objects.maps.prepared import MapFiles, prepare_map
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.fitting import draw_rows

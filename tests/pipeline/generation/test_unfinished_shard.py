@@ -15,9 +15,9 @@ import pytest
 from PIL import Image
 
 from pipeline.generation import pipeline, render_children, tasks, unfinished_shard
-from pipeline.generation.child_pool import ChildPool
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.pipeline import make_dataset, make_piece
+from pipeline.generation.prepare_isolated import ChildPool
 from pipeline.generation.run import Run, ShardJob, TaskResult
 from pipeline.generation.runner import Runner
 from pipeline.generation.scene_worker import SceneAttempt

@@ -10,9 +10,8 @@ import pytest
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.freeze_objects import AcceptedObjects, ObjectLock
-from pipeline.generation.frozen_pool import FrozenPool
+from pipeline.generation.frozen_pool import ComposedScenes, FrozenPool
 from pipeline.generation.run import ShardJob
-from pipeline.generation.scene_origin import ComposedScenes
 from pipeline.renders.variant import Variant
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.statistics import Statistics

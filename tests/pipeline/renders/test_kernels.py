@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.builds.named import named_build
-from pipeline.generation.render_sample import RenderInput, render_sample
-from pipeline.generation.view_progress import ViewProgress
+from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
 from pipeline.renders import vector_tracer
 from pipeline.renders.camera import PixelCamera
 from pipeline.renders.renderer import SceneRenderer
