@@ -14,8 +14,7 @@ from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.documents.attribution import encode_attribution
 from pipeline.generation import accept_maps as accepting
-from pipeline.generation import frozen_pool, pipeline, restore_object
-from pipeline.generation import object_options as asked_objects
+from pipeline.generation import freeze_objects, frozen_pool, pipeline, restore_object
 from pipeline.generation.accept_maps import AcceptedMaps, MapFolders, accept_maps, map_folders
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
@@ -138,7 +137,7 @@ def test_a_second_start_looks_at_no_object(
     def look(source: str, **more: object) -> None:
         raise LookupError(source)
 
-    monkeypatch.setattr(asked_objects, "list_objects", look)
+    monkeypatch.setattr(freeze_objects, "list_objects", look)
     assert asked(writer).freeze() == accepted
     for source, licence in (("another", None), (SOURCE, "MIT")):
         with pytest.raises(LookupError):
