@@ -44,8 +44,8 @@ def variable(environment: Mapping[str, str], name: str, runner: str) -> str:
     """Return a variable of an array's task; raises TrilightError if it is not set."""
     if name not in environment:
         raise TrilightError(
-            f"--runner {runner}: {name} is not set; expected a task of an array, as `trilight "
-            f"submit {runner}` makes it. Submit one, or choose another --runner."
+            f"--runner {runner}: {name} is not set; expected a task of an array, as trilight "
+            f"submit {runner} makes it. Submit one, or choose another --runner."
         )
     return environment[name]
 
