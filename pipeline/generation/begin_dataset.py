@@ -143,7 +143,12 @@ def _require_same_dataset(
     environment: Mapping[str, Any],
     accept_environment: bool,
 ) -> None:
-    _require_generated(folder, manifest)
+    if derivation := derivation_of(manifest.settings):
+        raise TrilightError(
+            f"{folder.display_name}: this dataset was made by `trilight shards "
+            f"{derivation.operation}` "
+            "and cannot grow; extend its sources and make it again, or choose another --out."
+        )
     require_same_extensions(folder.display_name, manifest.extensions, extension_digests("data"))
     stored = from_record(BuildSettings, manifest.settings).as_json()  # fields may come later
     _require_same(folder, "setting", stored, settings.as_json(), "choose another --out")
@@ -182,15 +187,6 @@ def _require_free(folder: DatasetFolder, store: Store) -> None:
                 "it; "
                 "expected an empty folder or a dataset. Choose another --out."
             )
-
-
-def _require_generated(folder: DatasetFolder, manifest: Manifest) -> None:
-    if derivation := derivation_of(manifest.settings):
-        raise TrilightError(
-            f"{folder.display_name}: this dataset was made by `trilight shards "
-            f"{derivation.operation}` "
-            "and cannot grow; extend its sources and make it again, or choose another --out."
-        )
 
 
 def _require_same(

@@ -339,38 +339,29 @@ class DatasetWriter:
     def _list_shards(self) -> Manifest:
         """List all shards in the manifest of the folder, and clear the notes away."""
         folder = self.folder
-        self._fetch_list()
+        if not self.store.is_here:  # what the bucket's manifest lists is no news
+            merge_failures(folder, self.store)
+            theirs = self._shards.manifest()
+            if self.left_to_others:
+                fetch_lock(folder, self.store, theirs.objects_lock_sha256)
+            else:
+                theirs = dataclasses.replace(self.manifest, shards=theirs.shards)
+            write_manifest(folder.manifest, theirs)
         listed = read_manifest(folder.manifest)
-        if (notes := self._unlisted_notes(listed)) or listed.growing:
-            shards = {entry.name: entry for entry in listed.shards}
+        shards = {entry.name: entry for entry in listed.shards}
+        noted = set(noted_names(folder))  # newer than the list
+        every = (shard_name(index, self._splits) for index in range(self.num_shards))
+        notes = self._shards.notes([name for name in every if name in noted or name not in shards])
+        if notes or listed.growing:
             shards |= {note.shard.name: note.shard for note in notes}
-            every = tuple(sorted(shards.values(), key=number_of_shard))
             self._add_failures(failure for note in notes for failure in note.failures)
-            listed = dataclasses.replace(listed, shards=every, growing=(), documents={})
+            sorted_shards = tuple(sorted(shards.values(), key=number_of_shard))
+            listed = dataclasses.replace(listed, shards=sorted_shards, growing=(), documents={})
             write_manifest(folder.manifest, listed)
         for staged in (folder.staged_entries, folder.staged_failures):
             shutil.rmtree(staged, ignore_errors=True)
         folder.staged_given_up.unlink(missing_ok=True)
         return listed
-
-    def _fetch_list(self) -> None:
-        """Write the folder's manifest with the shards that a bucket's one lists."""
-        if self.store.is_here:
-            return
-        merge_failures(self.folder, self.store)
-        theirs = self._shards.manifest()
-        if self.left_to_others:
-            fetch_lock(self.folder, self.store, theirs.objects_lock_sha256)
-            write_manifest(self.folder.manifest, theirs)
-        else:
-            listed = dataclasses.replace(self.manifest, shards=theirs.shards)
-            write_manifest(self.folder.manifest, listed)
-
-    def _unlisted_notes(self, listed: Manifest) -> list[ShardNote]:
-        """Return the notes of all shards that a manifest does not list, or lists in an old form."""
-        known = {entry.name for entry in listed.shards} - set(noted_names(self.folder))
-        every = (shard_name(index, self._splits) for index in range(self.num_shards))
-        return self._shards.notes([name for name in every if name not in known])
 
     def extend(self, num_scenes: int) -> None:
         """Plan more scenes; call while holding the mutex of the manifest.

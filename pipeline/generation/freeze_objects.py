@@ -31,10 +31,8 @@ from pipeline.generation.object_batches import (
 from pipeline.generation.revisited_scenes import SceneOrigin
 from pipeline.generation.unread_notes import format_unread, write_unread
 from pipeline.isolation import is_transient
-from pipeline.objects.listing import Fetched
 from pipeline.objects.sources import ListedObjects, list_objects
 from storage.conventions import SPLITS
-from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import announce_downloads, announce_objects, count_object
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
 from storage.digests import canonical_json, sha256_hex
@@ -218,7 +216,16 @@ class ObjectLock:
         locked = [*objects, *(entry for entry, _ in maps.rows)]
         if frozen is None:
             self._require_enough(objects)
-            _warn_of_transient(display_name, transient)
+            if transient:
+                counts = (f"{count} x {why}" for _, why, count in count_by_reason(transient))
+                log.warning(
+                    "objects %r: %d could not be prepared this time (%s), each after several "
+                    "tries, and the dataset is begun without them; failures.jsonl names them. A "
+                    "dataset begun later tries them again.",
+                    display_name,
+                    len(transient),
+                    ", ".join(counts),
+                )
             drawn = {each.record.uid: (each.without_own,) for each in prepared if each.without_own}
             unread = {each.record.uid: each.unread for each in prepared if each.unread}
             for name, notes, what in (
@@ -275,11 +282,21 @@ class ObjectLock:
         retry_transient: bool = True,
     ) -> PrepareResult:
         folder = self.writer.folder
-        downloads = _Downloads(listed, folder, len(records))
+        mutex = threading.Lock()
+        num_downloaded = 0
+
+        def announce(done_of_batch: int, batch: int) -> None:
+            nonlocal num_downloaded  # over all batches of this worker
+            with mutex:
+                num_downloaded += done_of_batch > 0
+                announce_downloads(folder, num_downloaded, len(records))
+
         work = ObjectWork(
             settings=self.settings.mesh_settings,
             writer=self.writer,
-            fetch=None if listed.listing.is_local else downloads.fetch,
+            fetch=None
+            if listed.listing.is_local
+            else lambda of_batch: listed.fetch(of_batch, announce),
         )
         return prepare_in_batches(
             sorted(records, key=attrgetter("uid")),
@@ -350,25 +367,6 @@ _DRAWN = (
 )
 
 
-class _Downloads:
-    """Downloads objects and announces the progress over all batches of this worker."""
-
-    def __init__(self, listed: ListedObjects, folder: DatasetFolder, total: int) -> None:
-        self._listed = listed
-        self._folder = folder
-        self._total = total
-        self._mutex = threading.Lock()
-        self._done = 0
-
-    def fetch(self, records: list[ObjectRecord]) -> Fetched:
-        return self._listed.fetch(records, self._announce)
-
-    def _announce(self, done_of_batch: int, batch: int) -> None:
-        with self._mutex:
-            self._done += done_of_batch > 0
-            announce_downloads(self._folder, self._done, self._total)
-
-
 def read_frozen_objects(writer: DatasetWriter) -> dict[str, LockedObject] | None:
     """Return the frozen objects by uid, or None if nothing is frozen yet."""
     if not writer.manifest.objects_lock_sha256:
@@ -392,19 +390,6 @@ def object_changed_error(source: str, uid: str, state: str) -> TrilightError:
         f"objects {source!r}: {uid!r} {state}; expected the objects that the dataset was begun "
         "with (objects.lock.jsonl). Restore it, or choose another --out."
     )
-
-
-def _warn_of_transient(source: str, transient: list[Failure]) -> None:
-    if transient:
-        counts = ", ".join(f"{count} x {why}" for _, why, count in count_by_reason(transient))
-        log.warning(
-            "objects %r: %d could not be prepared this time (%s), each after several tries, and "
-            "the dataset is begun without them; failures.jsonl names them. A dataset begun later "
-            "tries them again.",
-            source,
-            len(transient),
-            counts,
-        )
 
 
 def require_same(source: str, frozen: dict[str, LockedObject], now: list[LockedObject]) -> None:

@@ -212,15 +212,20 @@ def prepare_in_batches(
     def make(number: int) -> bool:
         return not should_stop() and batches[number].make(meshes, done)
 
-    order = _random_order(len(batches))
+    # from a random first one: to find a claimed batch costs a look
+    first = uuid.uuid4().int % max(len(batches), 1)
+    order = [*range(first, len(batches)), *range(first)]
     at_once = 1 + -(-workers // _NUM_OBJECTS)  # no child waits for the last object of a batch
     # children end first: after Ctrl-C no thread waits for the objects that it has in hand
     with ThreadPoolExecutor(at_once) as threads, MeshWork(work.settings, workers) as meshes:
         pause_s = _PAUSES_S[0]
         notice = WaitNotice()
         while True:
-            for number in _collect_results(batches, results) - ours:
-                done(len(batches[number].records))
+            for number, batch in enumerate(batches):
+                if number not in results and (result := batch.result()) is not None:
+                    results[number] = result
+                    if number not in ours:
+                        done(len(batch.records))
             missing = [number for number in order if number not in results]
             if not missing or should_stop():
                 break
@@ -236,22 +241,6 @@ def prepare_in_batches(
                 pause_s = min(2 * pause_s, _PAUSES_S[1])
     ordered = [result for _, result in sorted(results.items())]
     return [one for some, _ in ordered for one in some], [f for _, some in ordered for f in some]
-
-
-def _random_order(count: int) -> list[int]:
-    """Return batch numbers from a random first one: to find a claimed batch costs a look."""
-    first = uuid.uuid4().int % count if count else 0
-    return [*range(first, count), *range(first)]
-
-
-def _collect_results(batches: Sequence[ObjectBatch], results: dict[int, PrepareResult]) -> set[int]:
-    """Add the results that are new to `results`; return the numbers of their batches."""
-    new = set()
-    for number, batch in enumerate(batches):
-        if number not in results and (result := batch.result()) is not None:
-            results[number] = result
-            new.add(number)
-    return new
 
 
 def _may_change(failures: Iterable[Failure]) -> bool:
