@@ -124,7 +124,7 @@ def begin_dataset(
                 extensions=extension_digests("data"),
             )
             write_manifest(folder.manifest, manifest)
-        if is_new and not store.create(folder.manifest.name, folder.manifest):
+        if is_new and not store.create_if_absent(folder.manifest.name, folder.manifest):
             _adopt(folder, store)  # another machine was first
         manifest = read_head(folder.manifest)
         _require_same_dataset(folder, manifest, settings, environment, accept_environment)

@@ -181,7 +181,7 @@ class DatasetWriter:
             if theirs in (None, lock):
                 merge_failures(self.folder, self.store)
                 self.publish(self.folder.failures)
-            if theirs is None and not self.store.create(name, lock):
+            if theirs is None and not self.store.create_if_absent(name, lock):
                 theirs = self.store.get(name)
             if theirs not in (None, lock):
                 raise TrilightError(
@@ -325,7 +325,7 @@ class DatasetWriter:
         waited_s = 0.0
         pause_s = 0.5
         self.left_to_others = False
-        if self.store.is_here or self.store.create(_LISTING + planned, b"\n"):
+        if self.store.is_here or self.store.create_if_absent(_LISTING + planned, b"\n"):
             return
         patience_s = _PATIENCE_S * (1 + self.num_shards / _NOTES_MEANWHILE)
         listed = self.store.get(_LISTED + planned, 1) is not None

@@ -159,13 +159,13 @@ class PublishedShards:
         folder = self._folder
         log = folder.root / log_name(name)
         note = self._folder.name_of(note_of(folder, name))
-        first = self._store.create(name, folder.shard(name))
+        first = self._store.create_if_absent(name, folder.shard(name))
         theirs = None if first else self._read_note(name)
         if not first and theirs is None:
             theirs = dataclasses.replace(made, shard=self._index_remote(name))
             if theirs.shard.num_samples < made.shard.num_samples:
                 theirs = dataclasses.replace(theirs, scenes=0)
-            elif not self._store.create(note, encode_note(theirs)):
+            elif not self._store.create_if_absent(note, encode_note(theirs)):
                 theirs = self._read_note(name)
         if theirs and (theirs.scenes is None or theirs.scenes >= (made.scenes or MOST_SCENES)):
             note_shard(folder, theirs)

@@ -68,7 +68,7 @@ class Store(ABC):
         """
 
     @abstractmethod
-    def create(self, name: str, content: Path | bytes) -> bool:
+    def create_if_absent(self, name: str, content: Path | bytes) -> bool:
         """Write a file unless it exists, and return whether it was written; otherwise as `put`.
 
         A file that stands at its place in a folder counts as written. Where the answer to a
@@ -112,7 +112,7 @@ class LocalStore(Store):
     def put(self, name: str, content: Path | bytes) -> None:
         self._write(name, content, replace=True)
 
-    def create(self, name: str, content: Path | bytes) -> bool:
+    def create_if_absent(self, name: str, content: Path | bytes) -> bool:
         return self._write(name, content, replace=False)
 
     def _write(self, name: str, content: Path | bytes, *, replace: bool) -> bool:
@@ -178,7 +178,7 @@ class BucketStore(Store):
     def put(self, name: str, content: Path | bytes) -> None:
         self._retry(lambda: self._upload(name, content, mode="overwrite"), "written")
 
-    def create(self, name: str, content: Path | bytes) -> bool:
+    def create_if_absent(self, name: str, content: Path | bytes) -> bool:
         def create_file() -> bool:
             try:
                 self._upload(name, content, mode="create")
@@ -237,7 +237,7 @@ class BucketStore(Store):
         """Return the file of our claim, or None where another machine holds one."""
         for number in itertools.count():
             claim = f"{name}.claim-{number}"
-            if self.create(claim, self._worker):
+            if self.create_if_absent(claim, self._worker):
                 return claim
             holder = self.get(claim, len(self._worker))
             if holder == self._worker:
@@ -257,7 +257,7 @@ class BucketStore(Store):
         return path.read_bytes()
 
     def require_create(self) -> None:
-        if self.create(_PROBE, b"\n") and self.create(_PROBE, b"\n"):
+        if self.create_if_absent(_PROBE, b"\n") and self.create_if_absent(_PROBE, b"\n"):
             raise TrilightError(
                 f"{self.url.what} {self.url.display_url!r}: the server does not know conditional "
                 "writes "

@@ -320,7 +320,7 @@ def _ending_together(machines: Machines) -> Iterator[tuple[DatasetWriter, Datase
         first.lock_objects([_locked()])
         make_tiny_shard(first, 0)
         make_tiny_shard(first, 1)
-        assert first.store.create(".staging/listing/000000000008", b"\n")
+        assert first.store.create_if_absent(".staging/listing/000000000008", b"\n")
         machines.use("b")
         second.fetch_lock()
         yield first, second
@@ -362,7 +362,7 @@ def test_of_those_who_end_together_one_reads_the_notes(
     with machines.maker("d", 16) as longer:
         for number in (2, 3):
             make_tiny_shard(longer, number)
-        assert longer.store.create(".staging/listing/000000000016", b"\n")
+        assert longer.store.create_if_absent(".staging/listing/000000000016", b"\n")
         waits.clear()
         assert longer.finish() is not None
         assert 10 <= sum(waits) < 20, "its maker died over it"

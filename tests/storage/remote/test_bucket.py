@@ -153,9 +153,9 @@ def create_once(made: Store, folder: Path) -> None:
     content = bytes(range(256)) * (11 << 12)
     (folder / "large").write_bytes(content)
     for name, first in (("small", b"small"), ("part-0001/large", folder / "large")):
-        assert made.create(name, first), name
-        assert not made.create(name, b"second"), name
-        assert not made.create(name, folder / "large"), name
+        assert made.create_if_absent(name, first), name
+        assert not made.create_if_absent(name, b"second"), name
+        assert not made.create_if_absent(name, folder / "large"), name
     assert (made.get("small"), made.get("small", 3)) == (b"small", b"sma")
     assert made.get("part-0001/large") == content
     assert made.get("large") is made.get("large", 1) is None
@@ -186,7 +186,7 @@ def test_a_file_is_created_once_at_google(gs: Any, conditional: None, tmp_path: 
 def test_a_file_is_created_once_in_a_folder(tmp_path: Path) -> None:
     made = LocalStore(tmp_path / "made")
     create_once(made, tmp_path)
-    for write in (made.create, made.put):  # it is published where it stands
+    for write in (made.create_if_absent, made.put):  # it is published where it stands
         write("small", tmp_path / "made" / "small")
         assert made.get("small") == b"third"
     assert not list((tmp_path / "made").rglob("*.part"))
