@@ -226,8 +226,8 @@ class DatasetWriter:
     def _require_visible(self, name: str) -> None:
         number = int(name.removesuffix(".tar").rpartition("-")[2])
         for look in range(_MAX_LOOKS):
-            here = self.folder.has_shard(name)
-            if here or name in self._finished_shards(range(number, number + 1)):
+            is_here = self.folder.has_shard(name)
+            if is_here or name in self._finished_shards(range(number, number + 1)):
                 return
             time.sleep(2**look if look < _MAX_LOOKS - 1 else 0)
         raise TrilightError(

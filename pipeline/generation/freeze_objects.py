@@ -118,7 +118,7 @@ class ObjectLock:
         maps = tuple(row for row in accepted_maps.rows if lock.find(row[0].uid) == row[0])
         if len(maps) != facts.num_maps:  # the long way says which one has changed
             return None
-        return self._accepted(facts.num_objects, facts.num_found, maps)
+        return self._frozen_inputs(facts.num_objects, facts.num_found, maps)
 
     def prepare(self) -> ListedObjects | None:
         """Prepare objects cooperatively, without holding the objects mutex, unless they are frozen.
@@ -216,39 +216,44 @@ class ObjectLock:
         locked = [*objects, *(entry for entry, _ in maps.rows)]
         if frozen is None:
             self._require_enough(objects)
-            if transient:
-                counts = (f"{count} x {why}" for _, why, count in count_by_reason(transient))
-                log.warning(
-                    "objects %r: %d could not be prepared this time (%s), each after several "
-                    "tries, and the dataset is begun without them; failures.jsonl names them. A "
-                    "dataset begun later tries them again.",
-                    display_name,
-                    len(transient),
-                    ", ".join(counts),
-                )
-            drawn = {each.record.uid: (each.without_own,) for each in prepared if each.without_own}
-            unread = {each.record.uid: each.unread for each in prepared if each.unread}
-            for name, notes, what in (
-                ("drawn_materials", drawn, _DRAWN),
-                ("unread", unread, "have parts that are not read"),
-            ):
-                path = write_unread(writer.folder.logs, notes, name)
-                if notes:
-                    log.warning(
-                        "objects %r: %d of %d %s:\n%s",
-                        display_name,
-                        len(notes),
-                        len(prepared),
-                        what,
-                        "\n".join(format_unread(notes, path)),
-                    )
+            self._warn(prepared, transient)
             writer.lock_objects(locked)
         else:
             require_same(display_name, frozen, locked)
         self._write_index(locked, prepared, num_found)
-        return self._accepted(len(objects), num_found, maps.rows)
+        return self._frozen_inputs(len(objects), num_found, maps.rows)
 
-    def _accepted(
+    def _warn(self, prepared: list[PreparedObject], transient: list[Failure]) -> None:
+        """Log what the accepted objects lack, and which others may be tried again."""
+        display_name = safe_url(self.source)
+        if transient:
+            counts = (f"{count} x {why}" for _, why, count in count_by_reason(transient))
+            log.warning(
+                "objects %r: %d could not be prepared this time (%s), each after several tries, "
+                "and the dataset is begun without them; failures.jsonl names them. A dataset begun "
+                "later tries them again.",
+                display_name,
+                len(transient),
+                ", ".join(counts),
+            )
+        drawn = {each.record.uid: (each.without_own,) for each in prepared if each.without_own}
+        unread = {each.record.uid: each.unread for each in prepared if each.unread}
+        for name, notes, what in (
+            ("drawn_materials", drawn, _DRAWN),
+            ("unread", unread, "have parts that are not read"),
+        ):
+            path = write_unread(self.writer.folder.logs, notes, name)
+            if notes:
+                log.warning(
+                    "objects %r: %d of %d %s:\n%s",
+                    display_name,
+                    len(notes),
+                    len(prepared),
+                    what,
+                    "\n".join(format_unread(notes, path)),
+                )
+
+    def _frozen_inputs(
         self, num_objects: int, num_found: int, maps: tuple[tuple[LockedObject, Path], ...]
     ) -> AcceptedObjects:
         folder = self.writer.folder

@@ -73,11 +73,11 @@ class TaskCutter:
                 "claims on the missing scenes. What was finished is safe: run the same command "
                 "again."
             )
-        for task in self.cut(shards, splits, most=self._tasks_left - self._tasks_left // 10):
+        for task in self.iter_tasks(shards, splits, most=self._tasks_left - self._tasks_left // 10):
             self._tasks_left -= 1
             yield task
 
-    def cut(
+    def iter_tasks(
         self, shards: Sequence[int], splits: SplitSettings, *, most: int = MAX_TASKS
     ) -> Iterator[tuple[Piece, ...]]:
         """Yield at most `most` tasks that make some shards; each is sized when it is requested."""

@@ -106,12 +106,14 @@ class PublishedShards:
     def notes(self, names: Sequence[str]) -> list[ShardNote]:
         """Return the notes on finished shards: from the folder, or else from the bucket."""
         folder = self._folder
-        here = {
+        local_names = {
             name for name in names if note_of(folder, name).exists() or folder.shard(name).exists()
         }
-        others = (self._folder.name_of(note_of(folder, name)) for name in names if name not in here)
-        noted = [noted_shard(folder, name) for name in names if name in here]
-        return noted + fetch_notes(self._store.get, others, folder.display_name)
+        remote_names = (
+            self._folder.name_of(note_of(folder, name)) for name in names if name not in local_names
+        )
+        noted = [noted_shard(folder, name) for name in names if name in local_names]
+        return noted + fetch_notes(self._store.get, remote_names, folder.display_name)
 
     def publish_all(self) -> None:
         """Publish what a killed worker, or another one of this machine, has left to publish."""

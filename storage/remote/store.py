@@ -163,8 +163,8 @@ class BucketStore(Store):
         url = self.url.child(name)
         if num_bytes is None:
             stream = io.BytesIO()
-            found = fetch_if_there(url, stream, max_bytes=MAX_FILE_BYTES)
-            return stream.getvalue() if found else None
+            is_there = fetch_if_there(url, stream, max_bytes=MAX_FILE_BYTES)
+            return stream.getvalue() if is_there else None
 
         def read() -> bytes | None:
             with contextlib.suppress(FileNotFoundError):
