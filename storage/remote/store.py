@@ -101,7 +101,7 @@ class LocalStore(Store):
 
         try:
             with open_plain(self.root / name) as stream:
-                return stream.read(num_bytes)
+                return stream.read(-1 if num_bytes is None else num_bytes)
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
