@@ -9,10 +9,9 @@ from pathlib import Path
 
 from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
-from pipeline.generation.accept_objects import accept_objects
-from pipeline.generation.begin_dataset import begin
+from pipeline.generation.begin_dataset import begin_dataset
 from pipeline.generation.environment import environment
-from pipeline.generation.object_options import ObjectOptions
+from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.renders.variant import Variant, choose_variant
@@ -52,13 +51,12 @@ def composing_child(
     """
     variant = variant or choose_variant()
     workers = threads or available_cores()
-    publication = begin(
+    publication = begin_dataset(
         DatasetFolder(folder), build, environment(variant), 1, accept_environment=False
     )
-    objects_order = ObjectOptions(
+    accepted = ObjectLock(
         source=objects, licence=None, settings=build, writer=publication, workers=workers
-    )
-    accepted = accept_objects(objects_order)
+    ).freeze()
     recipe = SceneRecipe(settings=build, variant=variant, threads=workers, origin=accepted.origin)
     limits = dataclasses.replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
     return IsolatedChild(limits=limits, factory=SceneWorker, args=(recipe,))

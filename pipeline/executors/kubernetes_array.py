@@ -22,7 +22,7 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.extensions import is_reference
 from storage.number_ranges import number_ranges
-from storage.remote.bucket import WRITABLE
+from storage.remote.store import WRITABLE
 from storage.settings.described import checked, from_record
 from storage.settings.ranges import Within
 

@@ -6,13 +6,12 @@ finishes the dataset. It has not run on a real Slurm cluster yet; tests give it 
 Slurm's manual documents.
 """
 
-import dataclasses
 import os
 from collections.abc import Callable, Mapping
 
-from pipeline.executors.threads import ThreadRunner
+from pipeline.executors.threads import make_part, number
 from pipeline.generation.dataset_order import DatasetOrder
-from pipeline.generation.pipeline import make_dataset, prepare_dataset
+from pipeline.generation.pipeline import prepare_dataset
 from pipeline.generation.run import Outcome
 from pipeline.generation.tasks import shard_ranges
 from storage.errors import TrilightError
@@ -22,16 +21,13 @@ def make(order: DatasetOrder, address: str | None) -> Outcome:
     """Make the shards of this array task.
 
     Raises:
-        TrilightError: this is no task of an array, or the options have a range of shards; or as
-            `make_dataset`.
+        TrilightError: this is no task of an array, or as `make_part`.
     """
-    if order.shards is not None:
-        raise TrilightError(
-            f"--shards is {order.shards}; expected none with --runner slurm: the number of the "
-            "array task says which shards are made. Omit one of the two."
-        )
-    shards = shards_of_task(os.environ, lambda: prepare_dataset(order).publication.num_shards)
-    return make_dataset(dataclasses.replace(order, shards=shards), ThreadRunner())
+
+    def shards() -> str:
+        return shards_of_task(os.environ, lambda: prepare_dataset(order).publication.num_shards)
+
+    return make_part(order, "slurm", shards)
 
 
 def shards_of_task(environment: Mapping[str, str], num_shards: Callable[[], int]) -> str:
@@ -48,14 +44,14 @@ def shards_of_task(environment: Mapping[str, str], num_shards: Callable[[], int]
     Raises:
         TrilightError: a variable is missing or not a number, or the array has gaps.
     """
-    task = _number(environment, "SLURM_ARRAY_TASK_ID", least=0)
+    task = number(environment, "SLURM_ARRAY_TASK_ID", "slurm", least=0)
     if environment.get("SHARDS_PER_TASK"):
-        each = _number(environment, "SHARDS_PER_TASK", least=1)
+        each = number(environment, "SHARDS_PER_TASK", "slurm", least=1)
         return f"{task * each}:{(task + 1) * each}"
     first, last = (
-        _number(environment, f"SLURM_ARRAY_TASK_{end}", least=0) for end in ("MIN", "MAX")
+        number(environment, f"SLURM_ARRAY_TASK_{end}", "slurm", least=0) for end in ("MIN", "MAX")
     )
-    count = _number(environment, "SLURM_ARRAY_TASK_COUNT", least=1)
+    count = number(environment, "SLURM_ARRAY_TASK_COUNT", "slurm", least=1)
     step = (last - first) // (count - 1) if count > 1 else 1
     if first + step * (count - 1) != last or (task - first) % max(1, step):
         raise TrilightError(
@@ -65,15 +61,3 @@ def shards_of_task(environment: Mapping[str, str], num_shards: Callable[[], int]
         )
     ranges = shard_ranges(num_shards(), count)
     return ranges[(task - first) // step % len(ranges)]
-
-
-def _number(environment: Mapping[str, str], name: str, *, least: int) -> int:
-    text = environment.get(name)
-    if text is None:
-        raise TrilightError(
-            f"--runner slurm: {name} is not set; expected a task of a Slurm array. Submit "
-            "infra/slurm/generate.sbatch with sbatch --array=0-63, or choose another --runner."
-        )
-    if not (text.isascii() and text.isdecimal()) or int(text) < least:
-        raise TrilightError(f"--runner slurm: {name} is {text!r}; expected a number from {least}.")
-    return int(text)

@@ -1,5 +1,11 @@
-"""`--runner threads`: runs tasks on threads of this process, each with its own render child."""
+"""`--runner threads`: runs tasks on threads of this process, each with its own render child.
 
+Tasks of a scheduler's array (pipeline.executors.slurm, pipeline.executors.kubernetes) make their
+part of the shards so.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 
 from pipeline.generation.dataset_order import DatasetOrder
@@ -7,11 +13,51 @@ from pipeline.generation.pipeline import make_dataset, make_task
 from pipeline.generation.run import Outcome, ShardJob, TaskResult
 from pipeline.generation.runner import Runner
 from pipeline.generation.tasks import Piece
+from storage.errors import TrilightError
 
 
 def make(order: DatasetOrder, address: str | None) -> Outcome:
     """Make a dataset here; raises as `make_dataset`."""
     return make_dataset(order, ThreadRunner())
+
+
+def make_part(order: DatasetOrder, runner: str, shards: Callable[[], str]) -> Outcome:
+    """Make the shards of one task of an array.
+
+    Args:
+        order: options of the dataset.
+        runner: name of the executor, for messages.
+        shards: returns the range A:B of this task.
+
+    Raises:
+        TrilightError: the options have a range of shards; as `shards`, or as `make_dataset`.
+    """
+    if order.shards is not None:
+        raise TrilightError(
+            f"--shards is {order.shards}; expected none with --runner {runner}: the task's place "
+            "in the array says which shards are made. Omit one of the two."
+        )
+    return make_dataset(dataclasses.replace(order, shards=shards()), ThreadRunner())
+
+
+def variable(environment: Mapping[str, str], name: str, runner: str) -> str:
+    """Return a variable of an array's task; raises TrilightError if it is not set."""
+    if name not in environment:
+        raise TrilightError(
+            f"--runner {runner}: {name} is not set; expected a task of an array, as trilight "
+            f"submit {runner} makes it. Submit one, or choose another --runner."
+        )
+    return environment[name]
+
+
+def number(environment: Mapping[str, str], name: str, runner: str, *, least: int) -> int:
+    """Return a number of an array's task; raises TrilightError if it is missing or none."""
+    text = variable(environment, name, runner)
+    if not (text.isascii() and text.isdecimal()) or int(text) < least:
+        raise TrilightError(
+            f"--runner {runner}: {name} is {text!r:.60}; expected a number from {least}."
+        )
+    return int(text)
 
 
 class ThreadRunner(Runner[Future[TaskResult]]):

@@ -7,24 +7,17 @@ TRILIGHT_IMAGE), since a person who may start a run must not choose what runs th
 """
 
 import time
-from typing import Any, cast
-from uuid import UUID
+from collections.abc import Sequence
+from typing import Any
 
 from prefect import flow
-from prefect.artifacts import (
-    create_image_artifact,
-    create_progress_artifact,
-    create_table_artifact,
-    update_progress_artifact,
-)
 from prefect.logging import get_run_logger
 
 from pipeline.executors.array_job import DatasetByArray, array_job
 from pipeline.executors.kubernetes_array import options_from_environment, submit_job
 from pipeline.executors.slurm_array import submit_array
 from pipeline.flows.forms import DATASET_FORMS, order_of, parameters_of, run_name
-from pipeline.flows.run_artifacts import BestEffort, small_picture
-from storage.dataset.layout import dataset_folder
+from pipeline.flows.run_artifacts import ArtifactPage
 from storage.dataset.progress import DatasetStatus, read_status, unfinished_shards
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
@@ -93,15 +86,10 @@ def _status(location: str) -> DatasetStatus | None:
         return None
 
 
-class ArrayArtifacts:
-    """The artifacts of a run on Prefect's page; errors in showing them do not end the run."""
+class ArrayArtifacts(ArtifactPage):
+    """The artifacts of a run that watches an array."""
 
-    def __init__(self, location: str) -> None:
-        self._location = location
-        self._show = BestEffort(get_run_logger())
-        self._rows: list[tuple[str, str]] = []
-        self._progress: UUID | None = None
-        self._show(self._begin)
+    _rows: Sequence[tuple[str, str]] = ()
 
     def show_status(self, status: DatasetStatus) -> None:
         """Show the progress of the dataset, if it has changed."""
@@ -129,26 +117,13 @@ class ArrayArtifacts:
             *_failures(status),
         ]
         self._show(lambda: self._tell(status, "summary", rows))
-        folder = dataset_folder(self._location)
-        if not folder.bucket and folder.contact_sheet.exists():
-            sheet = small_picture(folder.contact_sheet)
-            self._show(lambda: self._picture(sheet))
+        if not self._folder.bucket and self._folder.contact_sheet.exists():
+            self._show(self._tell_sheet)
 
-    def _begin(self) -> None:
-        self._progress = cast(
-            UUID, create_progress_artifact(0.0, key="shards", description=self._location)
-        )
-
-    def _tell(self, status: DatasetStatus, key: str, rows: list[tuple[str, str]]) -> None:
-        if self._progress is not None:
-            over = status.scenes_done + status.scenes_given_up
-            percent = 100.0 * over / max(status.scenes_planned, 1)
-            update_progress_artifact(self._progress, percent)
-        table = [{"what": name, "value": value} for name, value in rows]
-        create_table_artifact(table, key, description=self._location)
-
-    def _picture(self, sheet: str) -> None:
-        create_image_artifact(sheet, key="contact-sheet", description=self._location)
+    def _tell(self, status: DatasetStatus, key: str, rows: Sequence[tuple[str, str]]) -> None:
+        over = status.scenes_done + status.scenes_given_up
+        self._tell_percent(100.0 * over / max(status.scenes_planned, 1))
+        self._tell_table(key, rows)
 
 
 def _failures(status: DatasetStatus) -> list[tuple[str, str]]:

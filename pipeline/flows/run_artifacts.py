@@ -72,7 +72,38 @@ class BestEffort:
                 self._log.warning("what this page shows is not complete (%s)", why)
 
 
-class RunArtifacts:
+class ArtifactPage:
+    """The progress and the tables of a dataset on the page of a run; errors do not end the run."""
+
+    def __init__(self, place: str) -> None:
+        """Create the first artifact of a run, for a dataset of a path or URL."""
+        self._place = place
+        self._folder = dataset_folder(place)
+        self._progress: UUID | None = None
+        self._log = get_run_logger()
+        self._show = BestEffort(self._log)
+        self._show(self._begin)
+
+    def _begin(self) -> None:
+        # Prefect's functions return coroutines only where an event loop runs
+        self._progress = cast(
+            UUID, create_progress_artifact(0.0, key="shards", description=self._place)
+        )
+
+    def _tell_percent(self, percent: float) -> None:
+        if self._progress is not None:
+            update_progress_artifact(self._progress, percent)
+
+    def _tell_table(self, key: str, rows: Sequence[tuple[str, str]]) -> None:
+        table = [{"what": name, "value": value} for name, value in rows]
+        create_table_artifact(table, key, description=self._place)
+
+    def _tell_sheet(self) -> None:
+        sheet = small_picture(self._folder.contact_sheet)
+        create_image_artifact(sheet, key="contact-sheet", description=self._place)
+
+
+class RunArtifacts(ArtifactPage):
     """The artifacts of one flow run."""
 
     def __init__(self, order: DatasetOrder) -> None:
@@ -81,18 +112,13 @@ class RunArtifacts:
         Raises:
             TrilightError: TRILIGHT_USD_PER_CORE_HOUR is not a valid price.
         """
-        self._order = order
         self._price = usd_per_core_hour()
-        self._folder = dataset_folder(order.place)
         self._began: float | None = None  # the first scene; objects are prepared before
         self._shown_s = -_EVERY_S
         self._scenes = 0
         self._core_s = 0.0
         self._run: Run | None = None
-        self._progress: UUID | None = None
-        self._log = get_run_logger()
-        self._show = BestEffort(self._log)
-        self._show(self._begin)
+        super().__init__(order.place)
 
     def record_task(self, run: Run, outcome: TaskResult) -> None:
         """Record a finished task, and show a new table if the last one is old."""
@@ -127,12 +153,6 @@ class RunArtifacts:
         """Return scenes per second since this run's first scene began; 0 before one is made."""
         return self._scenes / (time.monotonic() - self._began) if self._began is not None else 0.0
 
-    def _begin(self) -> None:
-        # Prefect's functions return coroutines only where an event loop runs
-        self._progress = cast(
-            UUID, create_progress_artifact(0.0, key="shards", description=self._order.place)
-        )
-
     def _tell(self, run: Run) -> None:
         writer = run.publication
         of = writer.progress
@@ -140,7 +160,7 @@ class RunArtifacts:
         planned = of.scenes_requested
         per_s = self.scenes_per_s()
         remaining = "unknown" if per_s == 0 else f"{(planned - done) / per_s / 60:.0f} minutes"
-        self._percent(100.0 * done / planned)
+        self._tell_percent(100.0 * done / planned)
         self._table(
             "progress",
             [
@@ -154,22 +174,17 @@ class RunArtifacts:
     def _sum_up(self, outcome: Outcome) -> None:
         done = outcome.num_shards
         planned = outcome.num_shards_planned
-        self._percent(100.0 * done / planned)
+        self._tell_percent(100.0 * done / planned)
         rows = [("shards", f"{done} of {planned}"), ("dataset digest", outcome.digest)]
         rows += outcome.statistics.lines() if outcome.statistics else []
         if outcome.statistics is None:
             self._table("summary", rows)
             return
         # Prefect's page cannot show files of the worker, only their path
-        self._table("summary", [*rows, ("report", f"{self._order.place}/report.html")])
-        if url := report_url(self._order.place):
+        self._table("summary", [*rows, ("report", f"{self._place}/report.html")])
+        if url := report_url(self._place):
             create_link_artifact(url, key="report", link_text="report")
-        sheet = small_picture(self._folder.contact_sheet)
-        create_image_artifact(sheet, key="contact-sheet", description=self._order.place)
-
-    def _percent(self, percent: float) -> None:
-        if self._progress is not None:
-            update_progress_artifact(self._progress, percent)
+        self._tell_sheet()
 
     def _table(self, key: str, rows: Sequence[tuple[str, str]]) -> None:
         rejected = count_by_reason(read_failures(self._folder.failures))
@@ -180,11 +195,7 @@ class RunArtifacts:
             *((f"rejected: {reason} ({stage})", str(count)) for stage, reason, count in rejected),
             ("cost of this run", cost),
         ]
-        create_table_artifact(
-            [{"what": name, "value": value} for name, value in everything],
-            key,
-            description=self._order.place,
-        )
+        self._tell_table(key, everything)
 
 
 def usd_per_core_hour() -> float:

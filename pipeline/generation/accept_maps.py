@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.builds.settings import BuildSettings
-from pipeline.generation.child_pool import ChildPool
 from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.prepare_isolated import ChildPool
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, call_with_retries, reach
 from pipeline.objects.maps.listing import PLURALS, FoundMap, find_maps
 from pipeline.objects.maps.prepared import MapFiles, decode_prepared, map_cache_key, prepare_map

@@ -1,7 +1,14 @@
-"""`DatasetWriter`: publishes shards and writes the manifest of a dataset in a folder."""
+"""`DatasetWriter`: publishes shards and writes the manifest of a dataset, in a folder or a bucket.
+
+A bucket has the same files as a folder, and is written by any number of machines. Manifest, lock
+and shards are each created once; the server refuses a second writer, which then reads the existing
+file. Each machine has a folder before the bucket, for what is not published yet, and with a copy of
+the head of the manifest.
+"""
 
 import contextlib
 import dataclasses
+import io
 import shutil
 import time
 from collections.abc import Iterable, Iterator
@@ -10,43 +17,46 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.shards.pack import unpack_here
+from pipeline.shards.published import PublishedShards
 from storage.atomic import write_atomically
-from storage.claims import hold_claim
-from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.layout import (
-    DatasetFolder,
-    in_parts,
-    parts_of,
-    shard_names_in,
-    shard_names_in_part,
-)
+from storage.dataset.dataset import Dataset, DatasetFiles, LocalFiles, RemoteDatasetFiles
+from storage.dataset.layout import DatasetFolder, in_parts, parts_of, shard_names_in
 from storage.dataset.manifest import (
     Manifest,
     ShardEntry,
+    decode_head,
     number_of_shard,
     read_head,
     read_manifest,
     write_manifest,
 )
 from storage.dataset.settings import SplitSettings
-from storage.dataset.shard_notes import (
-    ShardNote,
-    note_shard,
-    noted_names,
-    noted_shard,
-    rejections_of_shard,
-)
+from storage.dataset.shard_notes import ShardNote, noted_names, rejections_of_shard
 from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, shards_for
-from storage.digests import sha256_hex
+from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.records.objects import (
     Failure,
     LockedObject,
+    decode_failures,
     encode_objects_lock,
     read_failures,
     write_failures,
 )
+from storage.remote.store import BucketStore, Store
 
+PLANNED = ".staging/planned/"
+"""Folder of a bucket with one file for each requested number of scenes; the largest counts."""
+_LISTING = ".staging/listing/"
+_LISTED = ".staging/listed/"
+"""Folders of a bucket with one file for each number of scenes whose shards some machine lists, and
+has listed."""
+_PATIENCE_S = 10.0
+"""Seconds to wait for the machine that lists the shards, and again for each _NOTES_MEANWHILE."""
+_NOTES_MEANWHILE = 5_000
+_LONGEST_PAUSE_S = 8.0
+_HEAD_BYTES = 1 << 18
+"""Bytes of a manifest that are read to get its head, which takes about 6 kB."""
 _MAX_LOOKS = 7
 """Looks for a shard that a worker has packed; network file systems may show it a minute later."""
 
@@ -68,15 +78,20 @@ class DatasetProgress:
 
 
 class DatasetWriter:
-    """Writes the published files of a dataset, together with its other workers.
+    """Writes the published files of a dataset to its store, together with its other workers.
 
-    Until all shards are finished the manifest is a head of a few kilobytes, and each shard has a
-    note: a worker writes notes on its own shards, and reads only those of the requested ones. Every
-    change of the manifest holds its mutex, applies to the file on disk at that moment, and reaches
-    the disk before the call returns.
+    Every file is written in the folder first, and published from there; in a folder of this machine
+    that is one step. Until all shards are finished the manifest is a head of a few kilobytes, and
+    each shard has a note: a worker writes notes on its own shards, and reads only those of the
+    requested ones. Every change of the manifest holds its mutex, applies to the file on disk at
+    that moment, and reaches the disk before the call returns.
     """
 
-    def __init__(self, folder: DatasetFolder, manifest: Manifest, splits: SplitSettings) -> None:
+    def __init__(
+        self, store: Store, folder: DatasetFolder, manifest: Manifest, splits: SplitSettings
+    ) -> None:
+        self.store = store
+        """Where the dataset is published."""
         self.folder = folder
         self.manifest = manifest
         """Manifest of the dataset; it lists shards only once the dataset is finished."""
@@ -87,63 +102,118 @@ class DatasetWriter:
         self.left_to_others = False
         """True if another machine has just listed the shards, and writes the documents."""
         self._splits = splits
+        self._files: DatasetFiles = (
+            RemoteDatasetFiles(store.url)
+            if isinstance(store, BucketStore)
+            else LocalFiles(folder.root)
+        )
+        self._shards = PublishedShards(folder, store, self._files)
+        self._ends: dict[str, range] = {}
+        """Last shards of earlier plans of a bucket, by name, with the scenes that they should hold
+        now."""
 
     @property
     def splits(self) -> SplitSettings:
         """Split settings, cut to the planned scenes: the last shard may hold fewer."""
         return cut_splits(self.manifest.num_scenes, self._splits)
 
-    def dataset(self) -> Dataset:
-        """Return a reader of the published dataset."""
-        return open_dataset(str(self.folder.root))
-
-    def upload_documents(self) -> None:
-        """Upload the documents; no-op for a local folder."""
-
     @property
     def num_shards(self) -> int:
         """Number of shards of the finished dataset."""
         return shards_for(self.manifest.num_scenes, self._splits)
 
-    def lock_objects(self, objects: list[LockedObject]) -> None:
-        """Freeze the objects of the dataset: write their lock file and its digest."""
-        lock = encode_objects_lock(objects)
-        with self._lock_manifest():
-            write_atomically(self.folder.objects_lock, lock)
-            self._write(objects_lock_sha256=sha256_hex(lock))
+    def dataset(self) -> Dataset:
+        """Return a reader of the published dataset."""
+        return Dataset(self._files, read_manifest(self.folder.manifest))
 
-    def fetch_lock(self) -> None:
-        """Download the lock and its index if another machine has frozen the objects."""
+    def publish(self, *paths: Path) -> None:
+        """Publish files of the folder, in this order, replacing existing ones."""
+        for path in paths:
+            self.store.put(self.folder.name_of(path), path)
 
-    def claim(self, path: Path) -> contextlib.AbstractContextManager[bool]:
+    def publish_manifest(self) -> None:
+        """Publish the manifest, after the rejections."""
+        with self.folder.mutex("manifest"):
+            self.publish(self.folder.failures, self.folder.manifest)
+
+    def publish_documents(self) -> None:
+        """Publish the documents, the card last, after the manifest, which holds their digests."""
+        folder = self.folder
+        self.publish_manifest()
+        self.publish(
+            *(folder.attribution, folder.licences, folder.contact_sheet, folder.report),
+            *sorted(path for path in folder.report_pages.rglob("*") if path.is_file()),
+            *(folder.croissant, folder.card),
+        )
+
+    def is_published(self, path: Path) -> bool:
+        """Return True if a file of the folder is published."""
+        return path.exists() or self.store.get(self.folder.name_of(path), 1) is not None
+
+    @contextlib.contextmanager
+    def claim(self, path: Path) -> Iterator[bool]:
         """Hold the claim on a file that one worker makes; yield True if this worker holds it.
 
-        Another worker may have made the file in the meantime.
+        Another worker may have made the file in the meantime: then it is here. The holder publishes
+        it. Only one process of a machine holds a claim at a time.
         """
-        return hold_claim(path.with_suffix(".claim"))
+        fetch(self.folder, self.store, path)
+        if path.exists():
+            yield True
+            return
+        with self.store.hold_claim(self.folder.name_of(path)) as ours:
+            if ours:
+                fetch(self.folder, self.store, path)  # its last holder may have published it
+            yield ours
 
-    def upload(self, path: Path) -> None:
-        """Upload a file of the folder; no-op for a local folder."""
+    def lock_objects(self, objects: list[LockedObject]) -> None:
+        """Freeze the objects of the dataset: write their lock file and its digest.
 
-    def has(self, path: Path) -> bool:
-        """Return True if a file of the folder is published."""
-        return path.exists()
+        The rejections that led to them are published before; those of other workers stay.
+
+        Raises:
+            TrilightError: another worker has frozen other objects in the meantime.
+        """
+        lock = encode_objects_lock(objects)
+        name = self.folder.objects_lock.name
+        theirs = self.store.get(name)
+        with self._lock_manifest():
+            if theirs in (None, lock):
+                merge_failures(self.folder, self.store)
+                self.publish(self.folder.failures)
+            if theirs is None and not self.store.create_if_absent(name, lock):
+                theirs = self.store.get(name)
+            if theirs not in (None, lock):
+                raise TrilightError(
+                    f"{self.folder.display_name}: another worker has frozen other objects in the "
+                    "meantime; expected the same --objects everywhere. Give that, or choose "
+                    "another --out."
+                )
+            write_atomically(self.folder.objects_lock, lock)  # before a bucket, here too
+            self._write(objects_lock_sha256=sha256_hex(lock))
+        self.publish_manifest()
+
+    def fetch_lock(self) -> None:
+        """Take over the lock and its index if another worker has frozen the objects."""
+        if self.manifest.objects_lock_sha256:
+            return
+        head = published_head(self.folder, self.store)
+        if head and head.objects_lock_sha256:
+            fetch_lock(self.folder, self.store, head.objects_lock_sha256)
+            with self._lock_manifest():
+                self._write(objects_lock_sha256=head.objects_lock_sha256)
 
     def add_shard(self, shard: ShardEntry) -> None:
-        """Record a finished shard.
+        """Publish and note a finished shard.
 
         Raises:
             TrilightError: it is not here, so that its worker uses another folder.
         """
         self._require_visible(shard.name)
         failures = read_failures(rejections_of_shard(self.folder, shard.name))
-        self._note(ShardNote(shard=shard, failures=tuple(failures)))
-
-    def _note(self, note: ShardNote) -> None:
-        note_shard(self.folder, note)
-        self._count(note)
-
-    def _count(self, note: ShardNote) -> None:
+        note = self._shards.publish(ShardNote(shard=shard, failures=tuple(failures)))
+        if note is None:
+            return
         num_scenes = self._num_scenes([number_of_shard(note.shard)])
         self.failures += note.failures
         self.progress = dataclasses.replace(
@@ -153,12 +223,27 @@ class DatasetWriter:
             given_up=self.progress.given_up + num_scenes - note.shard.num_samples,
         )
 
+    def _require_visible(self, name: str) -> None:
+        number = int(name.removesuffix(".tar").rpartition("-")[2])
+        for look in range(_MAX_LOOKS):
+            is_here = self.folder.has_shard(name)
+            if is_here or name in self._finished_shards(range(number, number + 1)):
+                return
+            time.sleep(2**look if look < _MAX_LOOKS - 1 else 0)
+        raise TrilightError(
+            f"{self.folder.display_name}: a worker has packed {name}, and it is not here: the "
+            "worker's "
+            "folder is not this one. Expected workers that see the same --out at the same place "
+            "(for a bucket, the same TRILIGHT_CACHE); share it, and run the same command again."
+        )
+
     def unfinished_shards(self, requested: range | None = None) -> list[int]:
         """Return the unfinished or growing shards among the requested ones; by default of all.
 
         The cost depends on the number of requested shards alone.
         """
-        self.refresh()  # another run may have planned more
+        self._shards.publish_all()
+        self.refresh_plan()
         every = range(self.num_shards)
         selected = every if requested is None else every[requested.start : requested.stop]
         missing = self._missing(selected)
@@ -181,17 +266,19 @@ class DatasetWriter:
 
     def _finished_shards(self, shards: range) -> set[str]:
         """Return the names of finished shards: at least all finished ones of a range."""
-        return {
+        published = {
             name
             for part in parts_of(shards)
-            for name in shard_names_in_part(self.folder.root, part)
-            if name not in self.manifest.growing
+            for name in self._shards.names_in_part(part, self._ends)
         }
+        return published.difference(self.manifest.growing if self.store.is_here else ())
 
     def num_finished_shards(self) -> int:
         """Return the number of finished shards, as far as this machine knows."""
-        names = shard_names_in(self.folder.root)
-        return sum(name not in self.manifest.growing for name in names)
+        folder = self.folder
+        if not self.store.is_here:
+            return sum(1 for _ in shard_names_in(folder.staged_sent))
+        return sum(name not in self.manifest.growing for name in shard_names_in(folder.root))
 
     def _is_complete(self) -> bool:
         """Return True if every shard is finished; stops at the first part that is not."""
@@ -204,37 +291,77 @@ class DatasetWriter:
         """List all shards in the manifest if all are finished, and return it; else None.
 
         Raises:
-            TrilightError: a shard is damaged, or the folder cannot be written.
+            TrilightError: a shard is damaged, or the store cannot be written.
         """
-        self.refresh()
-        if not self._is_complete():
-            return None
-        with self._lock_manifest():  # another run may have planned more
+        has_new_plan = True
+        while has_new_plan:  # another run may plan and list more before our manifest is published
+            self.refresh_plan()
             if not self._is_complete():
                 return None
-            listed = read_manifest(self.folder.manifest)
-            if (notes := self._unlisted_notes(listed)) or listed.growing:
-                shards = {entry.name: entry for entry in listed.shards}
-                shards |= {note.shard.name: note.shard for note in notes}
-                every = tuple(sorted(shards.values(), key=number_of_shard))
-                self._add_failures(failure for note in notes for failure in note.failures)
-                listed = dataclasses.replace(listed, shards=every, growing=(), documents={})
-                write_manifest(self.folder.manifest, listed)
-            for staged in (self.folder.staged_entries, self.folder.staged_failures):
-                shutil.rmtree(staged, ignore_errors=True)
-            self.folder.staged_given_up.unlink(missing_ok=True)
-        num_scenes = self._num_scenes(range(self.num_shards))
+            self._wait_for_lister()
+            with self._lock_manifest():
+                if not self._is_complete():  # another run has planned more
+                    return None
+                listed = self._list_shards()
+            if not (self.store.is_here or self.left_to_others):
+                self.publish_manifest()
+                self.store.put(f"{_LISTED}{listed.num_scenes:012d}", b"\n")
+            self.manifest = listed
+            has_new_plan = self.refresh_plan()
         self.failures = []
-        given_up = num_scenes - listed.num_samples
         self.manifest = listed
+        given_up = self._num_scenes(range(self.num_shards)) - listed.num_samples
         self.progress = dataclasses.replace(self.progress, given_up=given_up)
         return listed
 
-    def _unlisted_notes(self, listed: Manifest) -> list[ShardNote]:
-        """Return the notes of all shards that a manifest does not list, or lists in an old form."""
-        known = {entry.name for entry in listed.shards} - set(noted_names(self.folder))
+    def _wait_for_lister(self) -> None:
+        """Wait while another machine lists the shards: listing costs a request for each shard.
+
+        Machines with tasks of one size end together, and all of them find all shards finished. If
+        the listing machine dies, the wait times out, and another machine lists them. In a folder
+        the mutex of the manifest does this.
+        """
+        planned = f"{self.manifest.num_scenes:012d}"
+        waited_s = 0.0
+        pause_s = 0.5
+        self.left_to_others = False
+        if self.store.is_here or self.store.create_if_absent(_LISTING + planned, b"\n"):
+            return
+        patience_s = _PATIENCE_S * (1 + self.num_shards / _NOTES_MEANWHILE)
+        listed = self.store.get(_LISTED + planned, 1) is not None
+        while waited_s < patience_s and not listed:
+            time.sleep(pause_s)
+            waited_s = waited_s + pause_s
+            pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+            listed = self.store.get(_LISTED + planned, 1) is not None
+            self.left_to_others = listed
+
+    def _list_shards(self) -> Manifest:
+        """List all shards in the manifest of the folder, and clear the notes away."""
+        folder = self.folder
+        if not self.store.is_here:  # what the bucket's manifest lists is no news
+            merge_failures(folder, self.store)
+            theirs = self._shards.manifest()
+            if self.left_to_others:
+                fetch_lock(folder, self.store, theirs.objects_lock_sha256)
+            else:
+                theirs = dataclasses.replace(self.manifest, shards=theirs.shards)
+            write_manifest(folder.manifest, theirs)
+        listed = read_manifest(folder.manifest)
+        shards = {entry.name: entry for entry in listed.shards}
+        noted = set(noted_names(folder))  # newer than the list
         every = (shard_name(index, self._splits) for index in range(self.num_shards))
-        return [noted_shard(self.folder, name) for name in every if name not in known]
+        notes = self._shards.notes([name for name in every if name in noted or name not in shards])
+        if notes or listed.growing:
+            shards |= {note.shard.name: note.shard for note in notes}
+            self._add_failures(failure for note in notes for failure in note.failures)
+            sorted_shards = tuple(sorted(shards.values(), key=number_of_shard))
+            listed = dataclasses.replace(listed, shards=sorted_shards, growing=(), documents={})
+            write_manifest(folder.manifest, listed)
+        for staged in (folder.staged_entries, folder.staged_failures):
+            shutil.rmtree(staged, ignore_errors=True)
+        folder.staged_given_up.unlink(missing_ok=True)
+        return listed
 
     def extend(self, num_scenes: int) -> None:
         """Plan more scenes; call while holding the mutex of the manifest.
@@ -253,26 +380,25 @@ class DatasetWriter:
                 growing.add(name)
         self._write(num_scenes=num_scenes, growing=tuple(sorted(growing)), documents={})
 
+    def refresh_plan(self) -> bool:
+        """Read the plans of other workers; return True if more scenes are planned than before."""
+        before = self.manifest.num_scenes
+        names = (name.removeprefix(PLANNED) for name in self.store.list(PLANNED))
+        plans = {int(text) for text in names if text.isdecimal()}
+        self.refresh()
+        if max(plans, default=0) > self.manifest.num_scenes:
+            with self._lock_manifest():
+                self.extend(max(*plans, self.manifest.num_scenes))
+        splits = self.splits
+        each = self._splits.scenes_per_shard
+        last = () if splits.listed_shards else {plan // each for plan in plans if plan % each}
+        self._ends = {shard_name(at, splits): scenes_of_shard(at, splits) for at in last}
+        return self.manifest.num_scenes > before
+
     def add_failures(self, failures: Iterable[Failure]) -> None:
         """Add rows to `failures.jsonl`, without duplicates."""
         with self._lock_manifest():
             self._add_failures(failures)
-
-    def _sees_shard(self, name: str) -> bool:
-        """Return True if a packed shard is visible here."""
-        return self.folder.has_shard(name)
-
-    def _require_visible(self, name: str) -> None:
-        for look in range(_MAX_LOOKS):
-            if self._sees_shard(name):
-                return
-            time.sleep(2**look if look < _MAX_LOOKS - 1 else 0)
-        raise TrilightError(
-            f"{self.folder.display_name}: a worker has packed {name}, and it is not here: the "
-            "worker's "
-            "folder is not this one. Expected workers that see the same --out at the same place "
-            "(for a bucket, the same TRILIGHT_CACHE); share it, and run the same command again."
-        )
 
     def refresh(self) -> None:
         """Read the head of the manifest again, as other workers may have changed it.
@@ -284,8 +410,7 @@ class DatasetWriter:
         if head.settings != self.manifest.settings:
             raise TrilightError(
                 f"{self.folder.display_name}: another dataset has been begun here in the meantime; "
-                "choose "
-                "another --out."
+                "choose another --out."
             )
         self.manifest = head
 
@@ -303,3 +428,41 @@ class DatasetWriter:
         manifest = read_manifest(self.folder.manifest)  # a finished set that grows has shards
         write_manifest(self.folder.manifest, dataclasses.replace(manifest, **changes))
         self.manifest = dataclasses.replace(self.manifest, **changes)
+
+
+def published_head(folder: DatasetFolder, store: Store) -> Manifest | None:
+    """Return the published manifest without its shards, with the digest of the published lock."""
+    place = f"{folder.display_name}/manifest.json"
+    start = store.get("manifest.json", _HEAD_BYTES)
+    if start is None:
+        return None
+    try:
+        head = decode_head(io.BytesIO(start), place)
+    except TrilightError:  # the head is longer, or malformed: read it all
+        head = decode_head(io.BytesIO(store.get("manifest.json") or b""), place)
+    if head.objects_lock_sha256:
+        return head
+    lock = store.get(folder.objects_lock.name)
+    return dataclasses.replace(head, objects_lock_sha256=sha256_hex(lock) if lock else "")
+
+
+def fetch(folder: DatasetFolder, store: Store, path: Path) -> None:
+    """Take over a published file that is not in the folder."""
+    if not path.exists() and (data := store.get(folder.name_of(path))) is not None:
+        write_atomically(path, data)
+
+
+def fetch_lock(folder: DatasetFolder, store: Store, sha256: str) -> None:
+    """Take over the published lock, of a digest, and its index, unless it is here."""
+    lock = folder.objects_lock
+    if not sha256 or (lock.exists() and sha256_of_file(lock) == sha256):
+        return
+    for path in (lock, folder.staged_index):
+        if (data := store.get(folder.name_of(path))) is not None:
+            write_atomically(path, data)
+
+
+def merge_failures(folder: DatasetFolder, store: Store) -> None:
+    """Add the published rejections to the folder's; call while holding the manifest's mutex."""
+    theirs = decode_failures(store.get(folder.failures.name) or b"")
+    write_failures(folder.failures, [*read_failures(folder.failures), *theirs])

@@ -48,7 +48,7 @@ def derive_dataset(
     sources = [open_finished(path) for path in paths]
     work = DatasetFolder(out.with_name(f".{out.name}.part"))
     with work.hold_exclusively():
-        _clear(work)
+        work.clear()  # what a killed run has left
         try:
             derive_shards(sources, derive, work, progress=progress)
             dataset = open_dataset(str(work.root))
@@ -60,14 +60,3 @@ def derive_dataset(
             shutil.rmtree(work.root, ignore_errors=True)
         shutil.rmtree(DatasetFolder(out).staging, ignore_errors=True)
     return dataset.digest, statistics
-
-
-def _clear(work: DatasetFolder) -> None:
-    """Delete the files of a killed run; call only while holding the folder's lock."""
-    for path in work.root.iterdir():
-        if path == work.staging:
-            continue
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink()

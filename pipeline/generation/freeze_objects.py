@@ -1,26 +1,49 @@
-"""Freezes the objects of a dataset: the pool that its scenes draw from, equal for all workers."""
+"""`ObjectLock`: freezes the objects of a dataset, or loads those that are frozen.
+
+The frozen objects are the pool that its scenes draw from, equal for all workers.
+"""
 
 import logging
-from dataclasses import dataclass
+import shutil
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from pathlib import Path
 
 from pipeline.assets.stage import PreparedObject
 from pipeline.builds.settings import BuildSettings
-from pipeline.generation.accept_maps import NO_MAPS, AcceptedMaps
+from pipeline.generation.accept_maps import (
+    NO_FOLDERS,
+    NO_MAPS,
+    AcceptedMaps,
+    MapFolders,
+    accept_maps,
+)
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.object_options import ObjectOptions
-from pipeline.generation.scene_origin import ComposedScenes, SceneOrigin
+from pipeline.generation.frozen_pool import ComposedScenes, FrozenPool
+from pipeline.generation.object_batches import (
+    ObjectWork,
+    PrepareResult,
+    cut_objects,
+    prepare_in_batches,
+)
+from pipeline.generation.revisited_scenes import SceneOrigin
 from pipeline.generation.unread_notes import format_unread, write_unread
 from pipeline.isolation import is_transient
+from pipeline.objects.sources import ListedObjects, list_objects
 from storage.conventions import SPLITS
+from storage.dataset.progress import announce_downloads, announce_objects, count_object
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
+from storage.digests import canonical_json, sha256_hex
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.records.object_index import IndexedObject, write_object_index
+from storage.records.lock_rows import LockRows
+from storage.records.object_index import IndexedObject, ObjectIndex, write_object_index
 from storage.records.objects import (
     OBJECT,
     Failure,
     LockedObject,
+    ObjectRecord,
     count_by_reason,
     read_objects_lock,
 )
@@ -41,89 +64,312 @@ class AcceptedObjects:
     origin: SceneOrigin
 
 
-def freeze_objects(
-    options: ObjectOptions,
-    prepared: list[PreparedObject],
-    rejected: list[Failure],
-    num_found: int,
-    maps: AcceptedMaps = NO_MAPS,
-) -> AcceptedObjects:
-    """Freeze the objects in the first run; in later runs require that they are the same.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectLock:
+    """The objects of a dataset: their source, and what freezes them."""
 
-    Args:
-        options: source, licences and settings of the objects.
-        prepared: objects that the mesh stage accepted; in later runs the frozen ones among them.
-        rejected: rejections by the source and by the mesh stage.
-        num_found: number of objects in the source.
-        maps: the user's textures and maps, which are frozen with the objects.
+    source: str
+    """Source of the objects, as `find_objects` takes it; may hold a secret."""
+    licence: str | None
+    """Licence that the user states for files without one."""
+    settings: BuildSettings
+    """Settings of the build: how objects are prepared and assigned to splits."""
+    writer: DatasetWriter
+    """Writer of the dataset that the objects are frozen for."""
+    workers: int
+    """Number of objects that are prepared at the same time."""
+    user_folders: MapFolders = NO_FOLDERS
+    """Folders of textures and maps, which are frozen with the objects."""
 
-    Raises:
-        TrilightError: no object is accepted, a split has none, or the objects are not those that
-            the dataset was begun with.
-        EnvironmentFailure: a frozen object could not be prepared this time.
-    """
-    writer = options.writer
-    settings = options.settings
-    display_name = safe_url(options.source)
-    frozen = read_frozen_objects(writer)
-    transient = [failure for failure in rejected if is_transient(failure.reason)]
-    if frozen is not None:
-        for failure in transient:
-            require_tried(display_name, failure)
-    writer.add_failures([*rejected, *maps.failures])
-    objects = [_lock_entry(asset, settings) for asset in prepared]
-    locked = [*objects, *(entry for entry, _ in maps.rows)]
-    if frozen is None:
-        _require_enough(objects, settings, writer, display_name)
-        _warn_of_transient(display_name, transient)
-        _warn_of_drawn_materials(display_name, prepared, writer.folder.logs)
-        _warn_of_unread(display_name, prepared, writer.folder.logs)
-        writer.lock_objects(locked)
-    else:
-        require_same(display_name, frozen, locked)
-    _write_index(options, locked, prepared, num_found)
-    return AcceptedObjects(
-        num_objects=len(objects),
-        num_found=num_found,
-        origin=ComposedScenes(pool=options.pool, maps=maps.rows),
-    )
+    def accept(self) -> AcceptedObjects:
+        """Return the frozen objects; prepare and freeze them with the other workers if need be.
 
+        Raises:
+            TrilightError, EnvironmentFailure: as `freeze`.
+        """
+        if trusted := self.load():
+            return trusted
+        listed = self.prepare()
+        with self.writer.folder.mutex("objects"):  # one worker freezes, and the others load it
+            self.writer.refresh()
+            return self.freeze(listed)
 
-def _write_index(
-    options: ObjectOptions,
-    locked: list[LockedObject],
-    prepared: list[PreparedObject],
-    num_found: int,
-) -> None:
-    """Write the index of the lock, by which later workers load it without opening objects."""
-    assets = {asset.record.uid: asset for asset in prepared}
-    writer = options.writer
-    folder = writer.folder
-    objects = list[IndexedObject]()
-    offset = 0
-    with open_plain(folder.objects_lock) as lines:
-        for line, entry in zip(lines, sorted(locked, key=attrgetter("uid")), strict=True):
-            if entry.kind == OBJECT:
-                asset = assets[entry.uid]
-                objects.append(
-                    IndexedObject(
-                        locked=entry,
-                        offset=offset,
-                        asset_name=asset.asset_name,
-                        least_triangles=asset.least_triangles,
-                    )
+    def load(self) -> AcceptedObjects | None:
+        """Return the frozen objects by their index, without opening any of them.
+
+        The lock has their digests, which are checked when a scene draws an object. None if nothing
+        is frozen yet, the lock has no index, or the source differs from the frozen one: then every
+        object has to be checked.
+
+        Raises:
+            TrilightError: as `accept_maps`.
+        """
+        folder = self.writer.folder
+        self.writer.fetch_lock()
+        try:
+            facts = ObjectIndex(folder.staged_index).facts
+            lock = LockRows(folder.objects_lock)
+        except TrilightError:
+            return None
+        known = facts.lock_sha256, facts.lock_bytes, facts.asked
+        if known != (self.writer.manifest.objects_lock_sha256, lock.num_bytes, self._digest):
+            return None
+        accepted_maps = accept_maps(self.user_folders, self.settings, workers=self.workers)
+        maps = tuple(row for row in accepted_maps.rows if lock.find(row[0].uid) == row[0])
+        if len(maps) != facts.num_maps:  # the long way says which one has changed
+            return None
+        return self._frozen_inputs(facts.num_objects, facts.num_found, maps)
+
+    def prepare(self) -> ListedObjects | None:
+        """Prepare objects cooperatively, without holding the objects mutex, unless they are frozen.
+
+        Returns:
+            The listed source, for `freeze`; None if the objects are frozen already.
+
+        Raises:
+            TrilightError: as `list_objects` and `prepare_in_batches`.
+        """
+        folder = self.writer.folder
+        with folder.mutex("objects"):  # one worker writes built-in objects, the others load them
+            self.writer.refresh()
+            self.writer.fetch_lock()
+            if read_frozen_objects(self.writer) is not None:
+                return None
+            listed = self._list_source()
+            announce_objects(folder, len(listed.allowed))
+        self._prepare(
+            listed,
+            listed.allowed,
+            should_stop=lambda: self.writer.is_published(folder.staged_index),
+        )
+        return listed
+
+    def freeze(self, listed: ListedObjects | None = None) -> AcceptedObjects:
+        """Prepare the meshes of the source and freeze them; later, load those that were frozen.
+
+        The user's textures and maps are frozen with them. Call while holding the mutex `objects`.
+
+        Args:
+            listed: the listed source, if it is known.
+
+        Raises:
+            TrilightError, EnvironmentFailure: as `list_objects` and `freeze_prepared`.
+        """
+        folder = self.writer.folder
+        if trusted := self.load():
+            return trusted
+        frozen = read_frozen_objects(self.writer)
+        shared = listed is not None
+        listed = listed or self._list_source()
+        maps = accept_maps(self.user_folders, self.settings, workers=self.workers)
+        selected = listed.allowed
+        if frozen is not None:
+            maps = replace(maps, rows=tuple(row for row in maps.rows if row[0].uid in frozen))
+            of_maps = {uid: entry for uid, entry in frozen.items() if entry.kind != OBJECT}
+            require_same(safe_url(self.source), of_maps, [entry for entry, _ in maps.rows])
+            # whole batches: one that holds a frozen object may be prepared already
+            batches = cut_objects(sorted(selected, key=attrgetter("uid")))
+            batches = [batch for batch in batches if any(one.uid in frozen for one in batch)]
+            selected = [one for batch in batches for one in batch]
+            announce_objects(folder, len(selected))
+        prepared, rejected = self._prepare(listed, selected, retry_transient=not shared)
+        lost = [failure for failure in rejected if failure.stage == "objects"]
+        listed.require_some(len(selected) - len(lost), [*listed.refused, *lost])
+        if frozen is not None:
+            prepared = [one for one in prepared if one.record.uid in frozen]
+            rejected = [failure for failure in rejected if failure.item in frozen]
+        accepted = self.freeze_prepared(
+            prepared, [*listed.refused, *rejected], listed.num_found, maps
+        )
+        shutil.rmtree(folder.staged_batches, ignore_errors=True)
+        return accepted
+
+    def freeze_prepared(
+        self,
+        prepared: list[PreparedObject],
+        rejected: list[Failure],
+        num_found: int,
+        maps: AcceptedMaps = NO_MAPS,
+    ) -> AcceptedObjects:
+        """Freeze the objects in the first run; in later runs require that they are the same.
+
+        Args:
+            prepared: objects that the mesh stage accepted; in later runs the frozen ones of them.
+            rejected: rejections by the source and by the mesh stage.
+            num_found: number of objects in the source.
+            maps: the user's textures and maps, which are frozen with the objects.
+
+        Raises:
+            TrilightError: no object is accepted, a split has none, or the objects are not those
+                that the dataset was begun with.
+            EnvironmentFailure: a frozen object could not be prepared this time.
+        """
+        writer = self.writer
+        display_name = safe_url(self.source)
+        frozen = read_frozen_objects(writer)
+        transient = [failure for failure in rejected if is_transient(failure.reason)]
+        if frozen is not None:
+            for failure in transient:
+                require_tried(display_name, failure)
+        writer.add_failures([*rejected, *maps.failures])
+        objects = [self._lock_entry(asset) for asset in prepared]
+        locked = [*objects, *(entry for entry, _ in maps.rows)]
+        if frozen is None:
+            self._require_enough(objects)
+            self._warn(prepared, transient)
+            writer.lock_objects(locked)
+        else:
+            require_same(display_name, frozen, locked)
+        self._write_index(locked, prepared, num_found)
+        return self._frozen_inputs(len(objects), num_found, maps.rows)
+
+    def _warn(self, prepared: list[PreparedObject], transient: list[Failure]) -> None:
+        """Log what the accepted objects lack, and which others may be tried again."""
+        display_name = safe_url(self.source)
+        if transient:
+            counts = (f"{count} x {why}" for _, why, count in count_by_reason(transient))
+            log.warning(
+                "objects %r: %d could not be prepared this time (%s), each after several tries, "
+                "and the dataset is begun without them; failures.jsonl names them. A dataset begun "
+                "later tries them again.",
+                display_name,
+                len(transient),
+                ", ".join(counts),
+            )
+        drawn = {each.record.uid: (each.without_own,) for each in prepared if each.without_own}
+        unread = {each.record.uid: each.unread for each in prepared if each.unread}
+        for name, notes, what in (
+            ("drawn_materials", drawn, _DRAWN),
+            ("unread", unread, "have parts that are not read"),
+        ):
+            path = write_unread(self.writer.folder.logs, notes, name)
+            if notes:
+                log.warning(
+                    "objects %r: %d of %d %s:\n%s",
+                    display_name,
+                    len(notes),
+                    len(prepared),
+                    what,
+                    "\n".join(format_unread(notes, path)),
                 )
-            offset += len(line)
-    write_object_index(
-        folder.staged_index,
-        objects,
-        lock_sha256=writer.manifest.objects_lock_sha256,
-        lock_bytes=offset,
-        request_digest=options.digest,
-        num_found=num_found,
-        num_maps=len(locked) - len(objects),
-    )
-    writer.upload(folder.staged_index)
+
+    def _frozen_inputs(
+        self, num_objects: int, num_found: int, maps: tuple[tuple[LockedObject, Path], ...]
+    ) -> AcceptedObjects:
+        folder = self.writer.folder
+        pool = FrozenPool(
+            lock=folder.objects_lock,
+            index=folder.staged_index,
+            source=self.source,
+            licence=self.licence,
+        )
+        origin = ComposedScenes(pool=pool, maps=maps)
+        return AcceptedObjects(num_objects=num_objects, num_found=num_found, origin=origin)
+
+    @property
+    def _digest(self) -> str:
+        """Digest of source and licence: with another one, every object is checked again."""
+        return sha256_hex(canonical_json([self.source, self.licence]))
+
+    def _list_source(self) -> ListedObjects:
+        return list_objects(
+            self.source,
+            work_dir=self.writer.folder.staged_objects,
+            allowed_licences=self.settings.allowed_licences,
+            licence=self.licence,
+        )
+
+    def _prepare(
+        self,
+        listed: ListedObjects,
+        records: Sequence[ObjectRecord],
+        should_stop: Callable[[], bool] = lambda: False,
+        retry_transient: bool = True,
+    ) -> PrepareResult:
+        folder = self.writer.folder
+        mutex = threading.Lock()
+        num_downloaded = 0
+
+        def announce(done_of_batch: int, batch: int) -> None:
+            nonlocal num_downloaded  # over all batches of this worker
+            with mutex:
+                num_downloaded += done_of_batch > 0
+                announce_downloads(folder, num_downloaded, len(records))
+
+        work = ObjectWork(
+            settings=self.settings.mesh_settings,
+            writer=self.writer,
+            fetch=None
+            if listed.listing.is_local
+            else lambda of_batch: listed.fetch(of_batch, announce),
+        )
+        return prepare_in_batches(
+            sorted(records, key=attrgetter("uid")),
+            work,
+            workers=self.workers,
+            done=lambda count: count_object(folder, count),
+            should_stop=should_stop,
+            retry_transient=retry_transient,
+        )
+
+    def _lock_entry(self, asset: PreparedObject) -> LockedObject:
+        return LockedObject(
+            **asset.record.identity,
+            asset_sha256=asset.asset_sha256,
+            split=split_of_object(asset.geometry_sha256, self.settings.splits),
+        )
+
+    def _require_enough(self, locked: list[LockedObject]) -> None:
+        if not locked:
+            raise TrilightError(
+                f"objects {safe_url(self.source)!r}: none was accepted; expected at least one "
+                "usable object with an allowed licence. The reasons are in "
+                f"{self.writer.folder.failures}."
+            )
+        shards = range(self.writer.num_shards)
+        splits_in_use = {split_of_shard(index, self.settings.splits) for index in shards}
+        require_objects(
+            {split: sum(entry.split == split for entry in locked) for split in SPLITS},
+            splits_in_use,
+        )
+
+    def _write_index(
+        self, locked: list[LockedObject], prepared: list[PreparedObject], num_found: int
+    ) -> None:
+        """Write the index of the lock, by which later workers load it without opening objects."""
+        assets = {asset.record.uid: asset for asset in prepared}
+        folder = self.writer.folder
+        objects = list[IndexedObject]()
+        offset = 0
+        with open_plain(folder.objects_lock) as lines:
+            for line, entry in zip(lines, sorted(locked, key=attrgetter("uid")), strict=True):
+                if entry.kind == OBJECT:
+                    asset = assets[entry.uid]
+                    objects.append(
+                        IndexedObject(
+                            locked=entry,
+                            offset=offset,
+                            asset_name=asset.asset_name,
+                            least_triangles=asset.least_triangles,
+                        )
+                    )
+                offset += len(line)
+        write_object_index(
+            folder.staged_index,
+            objects,
+            lock_sha256=self.writer.manifest.objects_lock_sha256,
+            lock_bytes=offset,
+            request_digest=self._digest,
+            num_found=num_found,
+            num_maps=len(locked) - len(objects),
+        )
+        self.writer.publish(folder.staged_index)
+
+
+_DRAWN = (
+    "have no materials of their own at every level and get drawn ones there. `trilight assets "
+    "--own-materials` says what was found in each"
+)
 
 
 def read_frozen_objects(writer: DatasetWriter) -> dict[str, LockedObject] | None:
@@ -131,29 +377,6 @@ def read_frozen_objects(writer: DatasetWriter) -> dict[str, LockedObject] | None
     if not writer.manifest.objects_lock_sha256:
         return None
     return {entry.uid: entry for entry in read_objects_lock(writer.folder.objects_lock)}
-
-
-def _lock_entry(asset: PreparedObject, settings: BuildSettings) -> LockedObject:
-    return LockedObject(
-        **asset.record.identity,
-        asset_sha256=asset.asset_sha256,
-        split=split_of_object(asset.geometry_sha256, settings.splits),
-    )
-
-
-def _require_enough(
-    locked: list[LockedObject], settings: BuildSettings, writer: DatasetWriter, source: str
-) -> None:
-    if not locked:
-        raise TrilightError(
-            f"objects {source!r}: none was accepted; expected at least one usable object with an "
-            f"allowed licence. The reasons are in {writer.folder.failures}."
-        )
-    shards = range(writer.num_shards)
-    splits_in_use = {split_of_shard(index, settings.splits) for index in shards}
-    require_objects(
-        {split: sum(entry.split == split for entry in locked) for split in SPLITS}, splits_in_use
-    )
 
 
 def require_tried(source: str, failure: Failure) -> None:
@@ -172,48 +395,6 @@ def object_changed_error(source: str, uid: str, state: str) -> TrilightError:
         f"objects {source!r}: {uid!r} {state}; expected the objects that the dataset was begun "
         "with (objects.lock.jsonl). Restore it, or choose another --out."
     )
-
-
-def _warn_of_transient(source: str, transient: list[Failure]) -> None:
-    if transient:
-        counts = ", ".join(f"{count} x {why}" for _, why, count in count_by_reason(transient))
-        log.warning(
-            "objects %r: %d could not be prepared this time (%s), each after several tries, and "
-            "the dataset is begun without them; failures.jsonl names them. A dataset begun later "
-            "tries them again.",
-            source,
-            len(transient),
-            counts,
-        )
-
-
-def _warn_of_drawn_materials(source: str, prepared: list[PreparedObject], logs: Path) -> None:
-    """Log and record the objects that get drawn materials although their own were requested."""
-    drawn = {each.record.uid: (each.without_own,) for each in prepared if each.without_own}
-    path = write_unread(logs, drawn, "drawn_materials")
-    if drawn:
-        log.warning(
-            "objects %r: %d of %d have no materials of their own at every level and get drawn "
-            "ones there. `trilight assets --own-materials` says what was found in each:\n%s",
-            source,
-            len(drawn),
-            len(prepared),
-            "\n".join(format_unread(drawn, path)),
-        )
-
-
-def _warn_of_unread(source: str, prepared: list[PreparedObject], logs: Path) -> None:
-    """Log and record the parts of the objects' files that no reader supports."""
-    unread = {asset.record.uid: asset.unread for asset in prepared if asset.unread}
-    path = write_unread(logs, unread)
-    if unread:
-        log.warning(
-            "objects %r: %d of %d have parts that are not read:\n%s",
-            source,
-            len(unread),
-            len(prepared),
-            "\n".join(format_unread(unread, path)),
-        )
 
 
 def require_same(source: str, frozen: dict[str, LockedObject], now: list[LockedObject]) -> None:

@@ -7,17 +7,26 @@ open. If an object's file is missing on this machine, the worker prepares it aga
 """
 
 from collections import OrderedDict
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pipeline.assets.store import AssetStore
+from pipeline.objects.maps.prepared import decode_prepared
 from pipeline.scenes.fitting import FitTable, least_triangles
 from pipeline.scenes.pool import IndexedPool, PooledAsset
+from scene_templates.user_maps import OwnMaps, UserMap, UserTexture
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.asset import decode_asset
 from storage.records.lock_rows import LockRows
 from storage.records.object_index import ObjectIndex
+from storage.records.objects import SKY, TEXTURE, LockedObject
+from storage.records.texture import MapSource
 
 _MOST_OPEN = 8
 """Objects that a child keeps open for each split; most scenes have three at most."""
@@ -39,6 +48,15 @@ class FrozenPool:
     def open_split(self, split: str, store: AssetStore) -> "SplitPool":
         """Return the objects of a split, sorted by uid; raises TrilightError without any."""
         return SplitPool(self, split, store)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComposedScenes:
+    """Scenes that layouts compose of frozen objects."""
+
+    pool: FrozenPool
+    maps: tuple[tuple[LockedObject, Path], ...] = ()
+    """The user's textures and skies with their prepared files."""
 
 
 class AssetMissing(Exception):
@@ -112,3 +130,50 @@ class SplitPool(IndexedPool):
                 "made again."
             )
         return pooled
+
+
+def user_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> OwnMaps:
+    """Return the maps that scenes of a split may use, sorted by uid; no file is read yet.
+
+    Args:
+        rows: rows of a lock with the prepared files; objects among them are left out.
+        split: train, validation or test.
+    """
+    of_split = sorted(
+        ((locked, path) for locked, path in rows if locked.split == split),
+        key=lambda pair: pair[0].uid,
+    )
+    return OwnMaps(
+        textures=[
+            UserMap(uid=locked.uid, source=_source(locked), load=partial(_texture, path))
+            for locked, path in of_split
+            if locked.kind == TEXTURE
+        ],
+        skies=[
+            UserMap(uid=locked.uid, source=_source(locked), load=partial(_radiance, path))
+            for locked, path in of_split
+            if locked.kind == SKY
+        ],
+    )
+
+
+def _source(locked: LockedObject) -> MapSource:
+    return MapSource(
+        name=locked.title,
+        licence=locked.licence,
+        attribution=locked.attribution,
+        source_url=locked.source_url,
+    )
+
+
+def _texture(path: Path) -> UserTexture:
+    arrays = decode_prepared(path.read_bytes(), path.name).arrays
+    return UserTexture(
+        diffuse_rgb=arrays["diffuse"],
+        specular_rgb=arrays["specular"],
+        roughness=arrays.get("roughness"),
+    )
+
+
+def _radiance(path: Path) -> NDArray[np.float32]:
+    return decode_prepared(path.read_bytes(), path.name).arrays["radiance"]

@@ -28,6 +28,7 @@ from pipeline.objects.ply import encode_ply
 from pipeline.objects.sources import find_objects
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
+from storage.dataset.layout import Below
 from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.asset import Asset, AssetRow, Level, decode_asset
@@ -46,33 +47,13 @@ class AssetFolder:
     root: Path
     """The folder that `--out` names."""
 
-    @property
-    def summary(self) -> Path:
-        return self.root / "assets.json"
-
-    @property
-    def catalogue(self) -> Path:
-        return self.root / "objects.jsonl"
-
-    @property
-    def failures(self) -> Path:
-        return self.root / "failures.jsonl"
-
-    @property
-    def attribution(self) -> Path:
-        return self.root / "attribution.csv"
-
-    @property
-    def page(self) -> Path:
-        return self.root / "quality.html"
-
-    @property
-    def logs(self) -> Path:
-        return self.root / "logs"
-
-    @property
-    def meshes(self) -> Path:
-        return self.root / "meshes"
+    summary = Below("assets.json")
+    catalogue = Below("objects.jsonl")
+    failures = Below("failures.jsonl")
+    attribution = Below("attribution.csv")
+    page = Below("quality.html")
+    logs = Below("logs")
+    meshes = Below("meshes")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,6 +29,7 @@ from storage.claims import WaitNotice
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
+from storage.remote.store import claim_of
 from storage.typed_json import read_json_lines
 
 _CACHE = "object-batches"
@@ -79,7 +80,7 @@ class ObjectBatch:
         name = work.name(records, are_here=work.fetch is None)
         self._file = work.writer.folder.staged_batches / name
         """Result in the dataset's folder, for its other workers."""
-        self.claim_file = self._file.with_suffix(".claim")  # as Publication.claim has it
+        self.claim_file = claim_of(self._file)
         self._cached = cache_folder(_CACHE) / name if work.fetch is None else None
         """Result in the user's cache; None for remote objects until they have been downloaded."""
         self._by_uid = {record.uid: record for record in records}
@@ -123,7 +124,7 @@ class ObjectBatch:
                 write_atomically(self._cached, data)
             write_atomically(self._file, data)
             if is_final:
-                writer.upload(self._file)
+                writer.publish(self._file)
         return True
 
     def forget_transient(self) -> None:
@@ -211,7 +212,9 @@ def prepare_in_batches(
     def make(number: int) -> bool:
         return not should_stop() and batches[number].make(meshes, done)
 
-    order = _random_order(len(batches))
+    # from a random first one: to find a claimed batch costs a look
+    first = uuid.uuid4().int % max(len(batches), 1)
+    order = [*range(first, len(batches)), *range(first)]
     at_once = 1 + -(-workers // _NUM_OBJECTS)  # no child waits for the last object of a batch
     # children end first: after Ctrl-C no thread waits for the objects that it has in hand
     with ThreadPoolExecutor(at_once) as threads, MeshWork(work.settings, workers) as meshes:
@@ -235,12 +238,6 @@ def prepare_in_batches(
                 pause_s = min(2 * pause_s, _PAUSES_S[1])
     ordered = [result for _, result in sorted(results.items())]
     return [one for some, _ in ordered for one in some], [f for _, some in ordered for f in some]
-
-
-def _random_order(count: int) -> list[int]:
-    """Return batch numbers from a random first one: to find a claimed batch costs a look."""
-    first = uuid.uuid4().int % count if count else 0
-    return [*range(first, count), *range(first)]
 
 
 def _collect_results(batches: Sequence[ObjectBatch], results: dict[int, PrepareResult]) -> set[int]:

@@ -19,7 +19,7 @@ crash costs one attempt.
 The files on disk are the only state, and every step may be killed at any moment. A mesh is kept in
 the asset store, a scene in the staging folder, a shard in the dataset; the next run looks for these
 and makes the rest. Several runs on one folder share the work (storage.claims), and those on one
-bucket share batches of objects (storage.remote.claims) and shards (pipeline.shards.bucket_mirror).
+bucket share batches of objects (storage.remote.store) and shards (pipeline.shards.published).
 """
 
 import contextlib
@@ -30,23 +30,17 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from pipeline.builds.named import object_source
-from pipeline.builds.settings import BuildSettings
+from pipeline.builds.named import BUILDS, object_source
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.sheets import write_first_pictures
-from pipeline.generation.accept_maps import MapFolders, map_folders
-from pipeline.generation.accept_objects import (
-    accept_objects,
-    load_trusted_objects,
-    prepare_unfrozen_objects,
-)
+from pipeline.generation.accept_maps import map_folders
 from pipeline.generation.accept_revisited import accept_revisited
 from pipeline.generation.accept_scene_files import accept_scene_files
-from pipeline.generation.bucket_dataset_writer import hold_membership
+from pipeline.generation.begin_dataset import begin_dataset, hold_membership
 from pipeline.generation.dataset_order import DatasetOrder, generate_words
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.freeze_objects import AcceptedObjects
-from pipeline.generation.object_options import ObjectOptions
+from pipeline.generation.environment import environment
+from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.render_children import (
     close_children,
     cores_of_child,
@@ -60,13 +54,12 @@ from pipeline.generation.run import (
     ShardJob,
     TaskResult,
     Watcher,
-    begin_or_resume_dataset,
     choose_dataset_variant,
     resolve_settings,
 )
 from pipeline.generation.runner import Runner
 from pipeline.generation.scene_worker import MAX_ATTEMPTS, SceneAttempt, SceneWorker
-from pipeline.generation.tasks import Piece, iter_rounds_until_done
+from pipeline.generation.tasks import FIRST_PAUSE_S, Piece, TaskCutter, wait_for_others
 from pipeline.generation.unfinished_shard import UnfinishedShard
 from pipeline.isolation import ChildFailed, IsolatedChild, with_retries
 from storage.dataset.asked import write_asked
@@ -120,7 +113,19 @@ def _begin_run(order: DatasetOrder) -> Iterator[Run]:
     with hold_membership(folder):
         user_folders = map_folders(order, settings)
         variant = choose_dataset_variant(order, folder)
-        writer = begin_or_resume_dataset(order, settings, folder, variant)
+        writer = begin_dataset(
+            folder,
+            settings,
+            environment(variant),
+            BUILDS[order.build].num_scenes if order.scenes is None else order.scenes,
+            accept_environment=order.accept_environment,
+        )
+        requested = order.shard_range()
+        if requested is not None and requested.start >= writer.num_shards:
+            raise TrilightError(
+                f"shards is {order.shards!r}; expected one that begins below {writer.num_shards}, "
+                f"the shards of {writer.manifest.num_scenes} scenes."
+            )
         if listed or order.revisits:
             with folder.mutex("objects"):
                 writer.refresh()
@@ -130,7 +135,14 @@ def _begin_run(order: DatasetOrder) -> Iterator[Run]:
                     else accept_revisited(order.revisits or "", settings, writer)
                 )
         else:
-            accepted = _accept_together(order, settings, writer, user_folders)
+            accepted = ObjectLock(
+                source=object_source(settings, order.objects),
+                licence=order.licence,
+                settings=settings,
+                writer=writer,
+                workers=available_cores(),
+                user_folders=user_folders,
+            ).accept()
         write_asked(folder, generate_words(order))
         yield Run(
             order=order,
@@ -142,38 +154,36 @@ def _begin_run(order: DatasetOrder) -> Iterator[Run]:
         )
 
 
-def _accept_together(
-    order: DatasetOrder, settings: BuildSettings, writer: DatasetWriter, user_folders: MapFolders
-) -> AcceptedObjects:
-    """Return the frozen objects; prepare them with the other workers if they are not frozen."""
-    options = ObjectOptions(
-        source=object_source(settings, order.objects),
-        licence=order.licence,
-        settings=settings,
-        writer=writer,
-        workers=available_cores(),
-        user_folders=user_folders,
-    )
-    if trusted := load_trusted_objects(options):
-        return trusted
-    listed = prepare_unfrozen_objects(options)
-    with writer.folder.mutex("objects"):  # one worker freezes, and the others load the result
-        writer.refresh()
-        return accept_objects(options, listed)
-
-
 def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:
-    """Turn frozen meshes into shards: the runner calls `make_task` for many tasks in parallel."""
+    """Turn frozen meshes into shards: the runner calls `make_task` for many tasks in parallel.
+
+    A round has a task for each scene that is missing now. After it, and where no scene was free,
+    the run waits for the scenes of other workers; a run of a range of shards ends instead.
+
+    Raises:
+        TrilightError: too many scenes failed, or as a task.
+        EnvironmentFailure: the run has submitted its maximum number of tasks.
+    """
     writer = run.publication
     job = run.job(runner.num_at_once or run.num_workers())
+    cutter = TaskCutter(at_once=runner.window or job.num_at_once)
+    pause_s = FIRST_PAUSE_S
     try:
-        for this_round in iter_rounds_until_done(run, at_once=runner.window or job.num_at_once):
-            for outcome in runner.run(this_round.tasks, job):  # parallel from here
-                this_round.record(outcome)
+        while missing := run.unfinished_shards():
+            has_progress = False
+            for outcome in runner.run(cutter.cut_round(missing, writer.splits), job):  # parallel
+                cutter.record(outcome)
+                has_progress |= bool(outcome.scenes or outcome.shards)
                 for shard in outcome.shards:
                     writer.add_shard(shard)
                 watch(run, outcome)
                 run.require_within_budget()
+            if has_progress:
+                pause_s = FIRST_PAUSE_S
+            elif run.order.shards is None:
+                pause_s = wait_for_others(run, pause_s)
+            else:  # others are making all that is left of the range
+                return
     finally:
         close_children()
 
@@ -288,5 +298,5 @@ def make_documents(writer: DatasetWriter) -> Statistics:
     """Write the documents of all shards; one worker at a time."""
     with writer.folder.mutex("documents"):
         statistics = write_documents(writer.dataset(), writer.folder)
-        writer.upload_documents()
+        writer.publish_documents()
         return statistics

@@ -13,9 +13,8 @@ from typing import Any
 from pipeline.assets.settings import AssetSettings
 from pipeline.builds.settings import differences
 from pipeline.exchange.scene_files import SceneFiles
-from pipeline.generation.child_pool import ChildPool
 from pipeline.generation.environment import environment
-from pipeline.generation.prepare_isolated import asset_child
+from pipeline.generation.prepare_isolated import ChildPool, asset_child
 from pipeline.generation.run import ShardJob
 from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
 from pipeline.isolation import ChildLimits, IsolatedChild, call_with_retries, reach

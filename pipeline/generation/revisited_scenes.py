@@ -11,6 +11,8 @@ import numpy as np
 
 from pipeline.builds.revisit import RevisitSettings
 from pipeline.builds.settings import BuildSettings
+from pipeline.exchange.scene_files import SceneFiles
+from pipeline.generation.frozen_pool import ComposedScenes
 from pipeline.generation.render_sample import KeptPictures, RenderInput
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
 from pipeline.scenes.scene_checks import require_valid
@@ -160,3 +162,7 @@ def _kept_pictures(
     names = {f"{view}.{kind}exr" for view in range(count) for kind in ("", "lights.", "parts.")}
     of_views = {suffix: data for suffix, data in members.items() if suffix in names}
     return KeptPictures(num_views=count, sample=sample, members=of_views) if count else None
+
+
+SceneOrigin = ComposedScenes | SceneFiles | RevisitedScenes
+"""Layouts, scene files (then the objects are the files), or the scenes of a finished dataset."""

@@ -7,13 +7,10 @@ from dataclasses import dataclass, field
 
 from pipeline.assets.store import AssetStore
 from pipeline.builds.settings import BuildSettings
-from pipeline.generation.frozen_pool import AssetMissing
+from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, user_maps
 from pipeline.generation.prepare_isolated import asset_store
-from pipeline.generation.render_sample import RenderInput, render_sample
-from pipeline.generation.revisited_scenes import RevisitedScenes
-from pipeline.generation.scene_origin import ComposedScenes, SceneOrigin
-from pipeline.generation.user_maps import user_maps
-from pipeline.generation.view_progress import ViewProgress
+from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
+from pipeline.generation.revisited_scenes import RevisitedScenes, SceneOrigin
 from pipeline.renders.renderer import set_threads
 from pipeline.renders.variant import Variant, activate
 from pipeline.scenes.compose import compose_scene

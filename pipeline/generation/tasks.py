@@ -26,7 +26,7 @@ TASK_S = 240.0
 """Target duration of a task, in seconds."""
 _FIRST_SCENES = 4
 """Scenes of a task until the duration of one has been measured."""
-_FIRST_PAUSE_S = 1.0
+FIRST_PAUSE_S = 1.0
 _LONGEST_PAUSE_S = 60.0
 """Most seconds between two looks at other workers' scenes; the pause doubles while none is free."""
 
@@ -43,19 +43,65 @@ class Piece:
     """Index of the last scene plus 1."""
 
 
-class TaskSizes:
-    """Chooses the number of scenes of the next task by the durations of finished tasks."""
+class TaskCutter:
+    """Cuts missing scenes into tasks, sized by the durations of finished ones."""
 
-    def __init__(self) -> None:
+    def __init__(self, at_once: int = 1) -> None:
+        """Begin; `at_once` is the number of tasks that run at the same time."""
+        self._at_once = at_once
+        self._tasks_left = MAX_TASKS
         self._scenes = 0
         self._seconds = 0.0
 
-    def add_measurement(self, scenes: int, seconds: float) -> None:
+    def record(self, outcome: TaskResult) -> None:
         """Record the duration of a finished task."""
-        self._scenes += scenes
-        self._seconds += seconds
+        if outcome.scenes:
+            self._scenes += outcome.scenes
+            self._seconds += outcome.seconds
 
-    def next_size(self, scenes_left: int, tasks_left: int, at_once: int = 1) -> int:
+    def cut_round(
+        self, shards: Sequence[int], splits: SplitSettings
+    ) -> Iterator[tuple[Piece, ...]]:
+        """Yield the tasks that make some shards, but save a tenth of the tasks for later rounds.
+
+        Raises:
+            EnvironmentFailure: no task is left of the maximum over all rounds.
+        """
+        if self._tasks_left == 0:
+            raise EnvironmentFailure(
+                f"this run has handed out all of its {MAX_TASKS} tasks, and other runs hold "
+                "claims on the missing scenes. What was finished is safe: run the same command "
+                "again."
+            )
+        for task in self.iter_tasks(shards, splits, most=self._tasks_left - self._tasks_left // 10):
+            self._tasks_left -= 1
+            yield task
+
+    def iter_tasks(
+        self, shards: Sequence[int], splits: SplitSettings, *, most: int = MAX_TASKS
+    ) -> Iterator[tuple[Piece, ...]]:
+        """Yield at most `most` tasks that make some shards; each is sized when it is requested."""
+        scenes_left = sum(len(scenes_of_shard(index, splits)) for index in shards)
+        pieces: list[Piece] = []
+        room = self._next_size(scenes_left, most)
+        for index in shards:
+            scenes = scenes_of_shard(index, splits)
+            at = scenes.start
+            while at < scenes.stop:
+                last = min(scenes.stop, at + room)
+                pieces.append(Piece(shard_index=index, first=at, last=last))
+                room -= last - at
+                scenes_left -= last - at
+                at = last
+                if room == 0:
+                    yield tuple(pieces)
+                    pieces = []
+                    most -= 1
+                    room = self._next_size(scenes_left, most)
+        if pieces:
+            yield tuple(pieces)
+
+    def _next_size(self, scenes_left: int, tasks_left: int) -> int:
         """Return the number of scenes of the next task, at least 1.
 
         With several tasks at once, none gets more than half of an equal share of the remaining
@@ -65,120 +111,12 @@ class TaskSizes:
         size: float = _FIRST_SCENES
         if self._scenes:
             size = TASK_S * self._scenes / max(self._seconds, 1e-3)
-        if at_once > 1:
-            size = min(size, scenes_left / (2 * at_once))
+        if self._at_once > 1:
+            size = min(size, scenes_left / (2 * self._at_once))
         return max(1, int(size), -(-scenes_left // max(1, tasks_left)))
 
 
-class TaskBudget:
-    """Counts the tasks that a run may still submit: MAX_TASKS over all its rounds."""
-
-    def __init__(self) -> None:
-        self._left = MAX_TASKS
-
-    def take_tasks(
-        self, shards: Sequence[int], splits: SplitSettings, sizes: TaskSizes, *, at_once: int
-    ) -> Iterator[tuple[Piece, ...]]:
-        """Yield the tasks of `cut_tasks`, but save a tenth of the remaining ones for later rounds.
-
-        Raises:
-            EnvironmentFailure: no task is left.
-        """
-        if self._left == 0:
-            raise EnvironmentFailure(
-                f"this run has handed out all of its {MAX_TASKS} tasks, and other runs hold "
-                "claims on the missing scenes. What was finished is safe: run the same command "
-                "again."
-            )
-        most = self._left - self._left // 10
-        for task in cut_tasks(shards, splits, sizes, most=most, at_once=at_once):
-            self._left -= 1
-            yield task
-
-
-def cut_tasks(
-    shards: Sequence[int],
-    splits: SplitSettings,
-    sizes: TaskSizes,
-    *,
-    most: int = MAX_TASKS,
-    at_once: int = 1,
-) -> Iterator[tuple[Piece, ...]]:
-    """Yield the tasks that make some shards; each is sized when it is requested.
-
-    Args:
-        shards: numbers of the shards.
-        splits: number of scenes of each shard.
-        sizes: durations of the tasks so far.
-        most: maximum number of tasks.
-        at_once: number of tasks that run at the same time.
-    """
-    scenes_left = sum(len(scenes_of_shard(index, splits)) for index in shards)
-    pieces: list[Piece] = []
-    room = sizes.next_size(scenes_left, most, at_once)
-    yielded = 0
-    for index in shards:
-        scenes = scenes_of_shard(index, splits)
-        at = scenes.start
-        while at < scenes.stop:
-            last = min(scenes.stop, at + room)
-            pieces.append(Piece(shard_index=index, first=at, last=last))
-            room = room - (last - at)
-            scenes_left = scenes_left - (last - at)
-            at = last
-            if room == 0:
-                yield tuple(pieces)
-                pieces = []
-                yielded = yielded + 1
-                room = sizes.next_size(scenes_left, most - yielded, at_once)
-    if pieces:
-        yield tuple(pieces)
-
-
-class Round:
-    """Tasks for all scenes that are missing now; each is cut when the executor requests it."""
-
-    def __init__(self, tasks: Iterator[tuple[Piece, ...]], sizes: TaskSizes) -> None:
-        self.tasks = tasks
-        self.made_anything = False
-        self._sizes = sizes
-
-    def record(self, outcome: TaskResult) -> None:
-        """Record a finished task: its speed decides the size of later tasks."""
-        self.made_anything |= bool(outcome.scenes or outcome.shards)
-        if outcome.scenes:
-            self._sizes.add_measurement(outcome.scenes, outcome.seconds)
-
-
-def iter_rounds_until_done(run: Run, at_once: int) -> Iterator[Round]:
-    """Yield rounds of tasks until no requested shard is missing; sleep between two rounds.
-
-    A run of a range of shards ends earlier: when others are making all that is left of the range.
-
-    Args:
-        run: the dataset; its writer must record each shard that a task has packed.
-        at_once: number of tasks that run at the same time.
-
-    Raises:
-        EnvironmentFailure: the run has submitted its maximum number of tasks.
-    """
-    sizes = TaskSizes()
-    tasks = TaskBudget()
-    pause_s = _FIRST_PAUSE_S
-    while missing := run.unfinished_shards():
-        this = Round(
-            tasks.take_tasks(missing, run.publication.splits, sizes, at_once=at_once), sizes
-        )
-        yield this
-        if this.made_anything:
-            pause_s = _FIRST_PAUSE_S
-        elif run.order.shards is None:
-            pause_s = _wait_for_others(run, pause_s)
-        else:
-            return
-
-
-def _wait_for_others(run: Run, pause_s: float) -> float:
+def wait_for_others(run: Run, pause_s: float) -> float:
     """Wait until nothing is missing or a claim is free; return the next pause in seconds.
 
     No tasks are submitted meanwhile: each would be a row of a scheduler's database.

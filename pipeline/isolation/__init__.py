@@ -1,10 +1,10 @@
 """Child processes for native code: a crash, a hang or a memory leak costs one item, not the run.
 
 - `child`: the owner's side: starts, calls, replaces and ends children.
-- `inside`: the child's side: applies its limits and never outlives its owner.
+- `child_main`: the child's side: applies its limits and never outlives its owner.
 - `waiting`: waits for an answer; a pause of the whole command does not count as time.
 - `confinement`: restricts children that read untrusted files, by `landlock` and `seccomp`.
-- `deaths`: the ways a call can fail, the number of retries, and which failures are verdicts.
+- `call_failures`: the ways a call can fail, the number of retries, and which failures are verdicts.
 """
 
 from pipeline.isolation.call_failures import ChildFailed, Result, is_transient, with_retries

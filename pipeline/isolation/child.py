@@ -331,7 +331,7 @@ def preload(modules: list[str]) -> None:
 
 
 def call_with_retries(child: IsolatedChild, function: Callable[..., Result], *args: Any) -> Result:
-    """Call a function in a child; after a failure retry in a fresh one, by `deaths.ENDS`.
+    """Call a function in a child; after a failure retry in a fresh one, by `call_failures.ENDS`.
 
     Raises:
         ChildFailed: the last failure; `is_verdict` is True if the call itself is to blame.

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import os
 import shutil
-from pathlib import Path
 from typing import BinaryIO
 
 from storage.dataset.layout import DatasetFolder
@@ -84,7 +83,7 @@ def _pack(folder: DatasetFolder, name: str, scene_indices: range, *, grows: bool
     write_failures(rejections, failures)
     if not grows:
         write_shard(path, samples)
-        remove_staged(staged_folder)
+        shutil.rmtree(staged_folder, ignore_errors=True)  # leftovers are never read
         return index_shard(path)
     written = folder.staging / path.name
     written.unlink(missing_ok=True)
@@ -94,7 +93,7 @@ def _pack(folder: DatasetFolder, name: str, scene_indices: range, *, grows: bool
     os.replace(written, path)  # the old one can be read
     write_failures(rejections, failures)
     write_manifest(folder.manifest, read_manifest(folder.manifest).with_grown(shard))
-    remove_staged(staged_folder)
+    shutil.rmtree(staged_folder, ignore_errors=True)  # leftovers are never read
     return shard
 
 
@@ -126,8 +125,3 @@ def unpack_shard(folder: DatasetFolder, note: ShardNote, scenes: range, stream: 
         if key not in samples:
             count_given_up(folder, index)
         stage_members(folder.staged_shard(name), index, samples.get(key, {}), failures)
-
-
-def remove_staged(staged_folder: Path) -> None:
-    """Delete the staged scenes of a shard that is packed."""
-    shutil.rmtree(staged_folder, ignore_errors=True)  # leftovers are never read

@@ -12,7 +12,7 @@ from typing import BinaryIO, TypeVar
 
 from storage.conventions import SPLITS
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import MAX_BESIDE_BYTES, Manifest, ShardEntry, decode_manifest
+from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest
 from storage.dataset.shard import ShardContents, contents_of, samples_of
 from storage.digests import sha256_of_stream
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
@@ -26,9 +26,9 @@ from storage.records.sample import (
     decode_scene,
     require_lawful,
 )
-from storage.remote.bucket import WRITABLE
 from storage.remote.cache import shard_cache
-from storage.remote.fetch import download, facts_of, unreadable
+from storage.remote.fetch import facts_of, fetch_if_there, unreadable
+from storage.remote.store import MAX_FILE_BYTES, WRITABLE
 from storage.remote.tries import TransferFailed, is_missing
 from storage.remote.url import RemoteUrl, parse_url
 
@@ -130,16 +130,14 @@ class RemoteDatasetFiles(_Files):
         url = self.url.child(name)
         stream: BinaryIO = TemporaryFile()
         try:
-            download(url, stream, num_bytes=None, max_bytes=MAX_BESIDE_BYTES)
-            stream.seek(0)
-            return stream
-        except BaseException as error:
+            if fetch_if_there(url, stream, max_bytes=MAX_FILE_BYTES):
+                stream.seek(0)
+                return stream
+        except BaseException:
             stream.close()
-            if not isinstance(error, TransferFailed):
-                raise
-            if error.__cause__ is not None and is_missing(error.__cause__):
-                return None
-            raise unreadable(url, error) from error
+            raise
+        stream.close()
+        return None
 
     def num_bytes(self, shard: ShardEntry) -> int | None:
         """Return the size of a shard, or None where the server does not state it.

@@ -17,15 +17,16 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from storage.atomic import remove_leftovers
 from storage.cache import cache_folder
 from storage.claims import hold_claim, open_lock, take_lock
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.remote.bucket import WRITABLE
 from storage.remote.safe_url import printable, safe_url
-from storage.remote.url import parse_url
+from storage.remote.store import WRITABLE, BucketStore, LocalStore, Store
+from storage.remote.url import RemoteUrl, parse_url
 
 _LEFT_S = 3600.0
 """Age at which a temporary file counts as left by a kill. Not all file systems carry locks between
@@ -89,14 +90,14 @@ def _parts_in(root: Path) -> list[int]:
     return []
 
 
-class _Below:
-    """A path below the folder of a dataset."""
+class Below:
+    """A path below the folder that an object names as its `root`."""
 
     def __init__(self, name: str) -> None:
         self._name = name
 
-    def __get__(self, folder: "DatasetFolder", owner: type) -> Path:
-        return folder.root / self._name
+    def __get__(self, folder: Any, owner: type) -> Path:
+        return Path(folder.root, self._name)
 
 
 @dataclass(frozen=True)
@@ -108,51 +109,63 @@ class DatasetFolder:
     bucket: str = ""
     """URL of the bucket that the dataset is made in, where it is; without secrets."""
 
-    manifest = _Below("manifest.json")
-    objects_lock = _Below("objects.lock.jsonl")
-    failures = _Below("failures.jsonl")
-    attribution = _Below("attribution.csv")
-    card = _Below("README.md")
+    manifest = Below("manifest.json")
+    objects_lock = Below("objects.lock.jsonl")
+    failures = Below("failures.jsonl")
+    attribution = Below("attribution.csv")
+    card = Below("README.md")
     """The dataset card, which is what hubs and people open first."""
-    licences = _Below("LICENSE.md")
-    croissant = _Below("croissant.json")
-    contact_sheet = _Below("contact_sheet.png")
-    template_sheet = _Below("templates.png")
-    report = _Below("report.html")
-    report_pages = _Below("report")
+    licences = Below("LICENSE.md")
+    croissant = Below("croissant.json")
+    contact_sheet = Below("contact_sheet.png")
+    template_sheet = Below("templates.png")
+    report = Below("report.html")
+    report_pages = Below("report")
     """Folder of the report's pages, one per scene that it shows."""
-    logs = _Below("logs")
-    staging = _Below(".staging")
-    staged_objects = _Below(".staging/objects")
+    logs = Below("logs")
+    staging = Below(".staging")
+    staged_objects = Below(".staging/objects")
     """Built-in objects, written out as files."""
-    staged_index = _Below(".staging/objects.index")
+    staged_index = Below(".staging/objects.index")
     """The index of the frozen objects (storage.records.object_index)."""
-    staged_batches = _Below(".staging/object_batches")
+    staged_batches = Below(".staging/object_batches")
     """Results of the mesh stage by batch, until the objects are frozen."""
-    staged_failures = _Below(".staging/failures")
+    staged_failures = Below(".staging/failures")
     """Rejections of shards that are packed and not yet noted."""
-    staged_entries = _Below(".staging/entries")
+    staged_entries = Below(".staging/entries")
     """Notes on shards that the manifest does not list yet (storage.dataset.shard_notes)."""
-    staged_samples = _Below(".staging/samples")
+    staged_samples = Below(".staging/samples")
     """Finished samples of unfinished shards, in a folder for each shard."""
-    staged_sent = _Below(".staging/sent")
+    staged_sent = Below(".staging/sent")
     """An empty file for each shard that is known to be in the bucket."""
-    staged_at_work = _Below(".staging/at_work")
+    staged_at_work = Below(".staging/at_work")
     """Notes on how far unfinished scenes are."""
-    staged_plan = _Below(".staging/plan.json")
+    staged_plan = Below(".staging/plan.json")
     """How many objects the asset stage has to do."""
-    staged_downloads = _Below(".staging/downloads.json")
+    staged_downloads = Below(".staging/downloads.json")
     """How many object files are downloaded, and of how many."""
-    staged_done = _Below(".staging/objects_done")
+    staged_done = Below(".staging/objects_done")
     """A byte for each object that is prepared or rejected."""
-    staged_given_up = _Below(".staging/given_up")
+    staged_given_up = Below(".staging/given_up")
     """A line for each scene that was given up and that the manifest does not stand for yet."""
-    _lock = _Below(".staging/lock")
+    _lock = Below(".staging/lock")
 
     @property
     def display_name(self) -> str:
         """The dataset's folder or URL, as messages show it."""
         return self.bucket or str(self.root)
+
+    def store(self) -> Store:
+        """Return where the dataset is published: this folder itself, or its bucket."""
+        if not self.bucket:
+            return LocalStore(self.root)
+        url = parse_url(self.bucket, what="out")
+        assert isinstance(url, RemoteUrl)
+        return BucketStore(url, self.root)
+
+    def name_of(self, path: Path) -> str:
+        """Return the name of a file of the folder, relative to it."""
+        return path.relative_to(self.root).as_posix()
 
     def staged_shard(self, name: str) -> Path:
         """Folder of the finished samples of an unfinished shard."""

@@ -27,6 +27,7 @@ from storage.dataset.shard import scan_samples
 from storage.digests import canonical_json, sha256_hex, sha256_of_stream
 from storage.errors import TrilightError
 from storage.records.safe_read import open_plain
+from storage.remote.store import MAX_FILE_BYTES
 from storage.settings.ranges import Within
 from storage.typed_json import DROPPED, FINITE, Sha256, ShortText, Spelled, read_json
 
@@ -39,8 +40,6 @@ DocumentName = Annotated[
 ]
 """Document that a manifest vouches for: rights hang on it."""
 
-MAX_BESIDE_BYTES = 1 << 30
-"""Largest file next to the shards: a manifest takes 220 bytes a shard, a lock 400 an object."""
 _HEAD_BYTES = 1 << 22
 _ROW_BYTES = 1 << 17
 """Maximum sizes of a manifest without its shards, and of a shard in it."""
@@ -260,7 +259,7 @@ def decode_manifest(stream: BinaryIO, place: str) -> Manifest:
     Raises:
         TrilightError: as `read_manifest`.
     """
-    return _manifest(stream.read(MAX_BESIDE_BYTES), place)
+    return _manifest(stream.read(MAX_FILE_BYTES), place)
 
 
 def decode_head(stream: BinaryIO, place: str) -> Manifest:

@@ -30,7 +30,7 @@ from storage.dataset.shard_notes import note_of, noted_names, noted_shard
 from storage.errors import TrilightError
 from storage.records.objects import Failure, count_by_reason
 from storage.records.safe_read import read_plain
-from storage.remote.bucket import WRITABLE, Bucket
+from storage.remote.store import WRITABLE, BucketStore
 from storage.typed_json import T, read_json
 
 _AT_WORK_S = 600.0
@@ -174,7 +174,7 @@ def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
     """Return the names of the planned shards that are there, listed or not, and do not grow.
 
     A bucket is asked what it holds, where it may be asked and something is not listed yet: a shard
-    is finished there when it and the note on it have come (pipeline.shards.bucket_mirror).
+    is finished there when it and the note on it have come (pipeline.shards.published).
     """
     if isinstance(dataset.files, LocalFiles):
         existing = existing_shards(DatasetFolder(dataset.files.root)) & set(planned)
@@ -184,7 +184,7 @@ def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
     if not unlisted or dataset.files.url.scheme not in WRITABLE:
         return listed
     with contextlib.suppress(TrilightError):  # it may be read and not listed
-        names = Bucket(dataset.files.url).names()
+        names = BucketStore(dataset.files.url).list_all()
         bucket_root = DatasetFolder(Path())
         listed |= {
             name for name in unlisted & names if note_of(bucket_root, name).as_posix() in names

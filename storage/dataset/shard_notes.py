@@ -27,7 +27,7 @@ from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.objects import Failure, decode_failures, encode_failures, read_failures
 from storage.records.safe_read import read_plain
-from storage.remote.bucket import WRITABLE, Bucket
+from storage.remote.store import WRITABLE, BucketStore
 from storage.typed_json import read_json
 
 _SUFFIX = ".json"
@@ -175,7 +175,7 @@ def _notes(dataset: Dataset) -> list[ShardNote]:
     if files.url.scheme not in WRITABLE or len(manifest.shards) >= num_planned(manifest):
         return []
     with contextlib.suppress(TrilightError):  # it may be read and not listed
-        names = Bucket(files.url).names()
+        names = BucketStore(files.url).list_all()
         bucket_root = DatasetFolder(Path())
         listed = {shard.name for shard in manifest.shards}
         unlisted = sorted(filter(SHARD_NAME.fullmatch, names - listed))

@@ -9,7 +9,14 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 from storage.errors import Unreadable
-from storage.remote.tries import PATIENCE, Interrupted, Pace, TransferFailed, with_tries
+from storage.remote.tries import (
+    PATIENCE,
+    Interrupted,
+    Pace,
+    TransferFailed,
+    is_missing,
+    with_tries,
+)
 from storage.remote.url import RemoteUrl, shared_driver, transfer_timeout
 
 PIECE_BYTES = 8 << 20
@@ -179,6 +186,22 @@ async def _stream_http(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: 
 def _start_over(stream: BinaryIO) -> None:
     stream.seek(0)
     stream.truncate()
+
+
+def fetch_if_there(url: RemoteUrl, stream: BinaryIO, *, max_bytes: int) -> bool:
+    """Write a file to an open one as `download`, and return True; False where there is none.
+
+    Raises:
+        Unreadable: it cannot be read.
+        TrilightError: as `download`.
+    """
+    try:
+        download(url, stream, num_bytes=None, max_bytes=max_bytes)
+    except TransferFailed as error:
+        if error.__cause__ is not None and is_missing(error.__cause__):
+            return False
+        raise unreadable(url, error) from error
+    return True
 
 
 def unreadable(url: RemoteUrl, error: TransferFailed) -> Unreadable:

@@ -58,26 +58,36 @@ def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) ->
             the file comes too slowly.
         TrilightError: as the function raised it, or the disk is full (an EnvironmentFailure).
     """
+    from tenacity import Retrying, retry_if_exception, stop_after_attempt  # slow to import
+
     number = 0
-    for _ in range(_MOST_TRIES):
-        try:
-            return function()
-        except (TransferFailed, TrilightError):
-            raise
-        except Exception as error:  # drivers raise what they like
-            cause = root_error(error)
-            if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise EnvironmentFailure(
-                    "the disk is full. What was finished is safe: free some space and run the same "
-                    "command again."
-                ) from error
-            number = 1 if pace is not None and pace.has_moved_on() else number + 1
-            if number == TRIES or not may_pass(cause):
-                raise TransferFailed("download_failed", describe(cause)) from error
-            if pace is not None:
-                pace.require()
-            time.sleep(min(PAUSE_S * 2 ** (number - 1), MAX_PAUSE_S) * (0.5 + _chance()))
-    raise TransferFailed("download_failed", f"it was interrupted {_MOST_TRIES} times")
+
+    def is_worth_a_try(error: BaseException) -> bool:
+        nonlocal number
+        if isinstance(error, TransferFailed | TrilightError) or not isinstance(error, Exception):
+            return False
+        cause = root_error(error)
+        if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise EnvironmentFailure(
+                "the disk is full. What was finished is safe: free some space and run the same "
+                "command again."
+            ) from error
+        number = 1 if pace is not None and pace.has_moved_on() else number + 1
+        if number == TRIES or not may_pass(cause):
+            raise TransferFailed("download_failed", describe(cause)) from error
+        if pace is not None:
+            pace.require()
+        return True
+
+    def give_up(state: object) -> Result:
+        raise TransferFailed("download_failed", f"it was interrupted {_MOST_TRIES} times")
+
+    return Retrying(
+        retry=retry_if_exception(is_worth_a_try),
+        wait=lambda state: min(PAUSE_S * 2 ** (number - 1), MAX_PAUSE_S) * (0.5 + _chance()),
+        stop=stop_after_attempt(_MOST_TRIES),
+        retry_error_callback=give_up,
+    )(function)
 
 
 def root_error(error: BaseException) -> BaseException:

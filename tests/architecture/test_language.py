@@ -21,7 +21,7 @@ MOST_LINES = 60
 
 _IRREGULAR = (
     "begun bought bound brought built caught chosen cut done drawn found given grown held "
-    "kept known laid left lit lost made met paid put seen sent set shown spent stood taken "
+    "kept known laid left lit lost made met paid seen sent set shown spent stood taken "
     "taught thought told worn written"
 )
 _PARTICIPLE = re.compile(rf"_*(?:[a-z]+ed|{'|'.join(_IRREGULAR.split())})")

@@ -20,7 +20,7 @@ from pipeline.generation.accept_scene_files import (
     build_once,
     settings_for_files,
 )
-from pipeline.generation.begin_dataset import begin
+from pipeline.generation.begin_dataset import begin_dataset
 from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
@@ -86,7 +86,7 @@ def _scene(files: SceneFiles, scene_index: int, settings: BuildSettings) -> Scen
 
 def _accept(folder: Path, out: Path, licence: str | None = None) -> None:
     found, settings = find_scene_files(str(folder)), _settings(folder)
-    publication = begin(DatasetFolder(out), settings, {}, 1, accept_environment=False)
+    publication = begin_dataset(DatasetFolder(out), settings, {}, 1, accept_environment=False)
     accept_scene_files(found, licence, settings, publication)
 
 
@@ -272,7 +272,9 @@ def test_a_bad_file_keeps_its_number_and_stops_nobody(folder: Path, tmp_path: Pa
     found, settings = find_scene_files(str(folder)), _settings(folder)
     assert found.names == ("a.json", "aa.json", "b.json", "c.json")
     assert settings.splits.listed_scenes == 4
-    publication = begin(DatasetFolder(tmp_path / "set"), settings, {}, 1, accept_environment=False)
+    publication = begin_dataset(
+        DatasetFolder(tmp_path / "set"), settings, {}, 1, accept_environment=False
+    )
     files = accept_scene_files(found, None, settings, publication).origin
     assert isinstance(files, SceneFiles)
     assert sorted(files.unusable) == ["aa.json", "c.json"]

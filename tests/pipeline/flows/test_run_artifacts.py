@@ -7,7 +7,7 @@ import json
 import logging
 import threading
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -45,39 +45,41 @@ def test_the_link_to_the_report(
 Shown = list[tuple[str, dict[str, str]]]
 
 
-def _shown_by(module: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Shown:
-    """Key and rows of each table that a module shows; there is no server."""
+def _shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
+    """Key and rows of each table that is shown; there is no server."""
     shown: Shown = []
 
     def table(rows: list[dict[str, str]], key: str, description: str) -> None:
         shown.append((key, {row["what"]: row["value"] for row in rows}))
 
+    module = run_artifacts
     monkeypatch.setattr(module, "create_table_artifact", table)
     monkeypatch.setattr(module, "create_progress_artifact", lambda *args, **named: "id")
     monkeypatch.setattr(module, "update_progress_artifact", lambda *args: None)
     monkeypatch.setattr(module, "create_image_artifact", lambda *args, **named: None)
-    monkeypatch.setattr(module, "get_run_logger", lambda: logging.getLogger("trilight.test"))
+    for each in (module, array_flow):
+        monkeypatch.setattr(each, "get_run_logger", lambda: logging.getLogger("trilight.test"))
     return shown
 
 
-def _cannot_show(module: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def _cannot_show(monkeypatch: pytest.MonkeyPatch) -> None:
     def gone(*args: object, **named: object) -> None:
         raise ConnectionError("gone")
 
-    monkeypatch.setattr(module, "create_progress_artifact", gone)
-    monkeypatch.setattr(module, "create_table_artifact", gone)
+    monkeypatch.setattr(run_artifacts, "create_progress_artifact", gone)
+    monkeypatch.setattr(run_artifacts, "create_table_artifact", gone)
 
 
 @pytest.fixture
 def tables(monkeypatch: pytest.MonkeyPatch) -> Shown:
-    return _shown_by(run_artifacts, monkeypatch)
+    return _shown(monkeypatch)
 
 
 @pytest.fixture
 def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
     """The dataset is looked at all the time."""
     monkeypatch.setattr(array_flow, "LOOK_S", 0.01)
-    return _shown_by(array_flow, monkeypatch)
+    return _shown(monkeypatch)
 
 
 def _task(scenes: int, seconds: float) -> TaskResult:
@@ -87,7 +89,7 @@ def _task(scenes: int, seconds: float) -> TaskResult:
 def test_a_page_that_cannot_be_shown_does_not_end_the_run(
     tables: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    _cannot_show(run_artifacts, monkeypatch)
+    _cannot_show(monkeypatch)
     watched = RunArtifacts(DatasetOrder(out=str(tmp_path)))
     watched.record_task(None, _task(1, 1.0))  # type: ignore[arg-type]
     watched.show_failure(ValueError("x"))
@@ -185,7 +187,7 @@ def test_a_price_that_is_none_is_named_at_the_start(
 def cluster(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
     """The tasks of each array; a thread works on them, as a cluster would."""
     without_rendering(monkeypatch)
-    monkeypatch.setattr("pipeline.executors.slurm.ThreadRunner", Undocumented)
+    monkeypatch.setattr("pipeline.executors.threads.ThreadRunner", Undocumented)
     arrays: list[list[int]] = []
 
     def submit(job: ArrayJob) -> str:
@@ -251,7 +253,7 @@ def test_a_page_that_cannot_be_shown_does_not_end_an_array(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    _cannot_show(array_flow, monkeypatch)
+    _cannot_show(monkeypatch)
     run(out=str(tmp_path / "set"), scenes=4)
     assert [record.levelname for record in caplog.records].count("WARNING") == 1
 

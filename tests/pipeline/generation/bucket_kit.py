@@ -10,16 +10,15 @@ from typing import Any
 import pytest
 
 from pipeline.builds.named import named_build
-from pipeline.generation import bucket_dataset_writer
-from pipeline.generation.bucket_dataset_writer import begin_dataset, hold_membership
+from pipeline.generation import dataset_writer
+from pipeline.generation.begin_dataset import begin_dataset, hold_membership
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.shards.pack import pack_shard
 from storage.dataset.layout import dataset_folder
 from storage.dataset.staging import stage_scene
 from storage.records.objects import Failure
 from storage.records.sample import sample_key
-from storage.remote import bucket as remote_bucket
-from storage.remote import tries
+from storage.remote import store, tries
 from storage.remote import url as remote_url
 from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _build, _sample
 from tests.s3_server import CREDENTIALS, control
@@ -41,7 +40,7 @@ def empty_bucket(
     for name, value in {**CREDENTIALS, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(tries, "PAUSE_S", 0.0)
-    monkeypatch.setattr(bucket_dataset_writer, "_PATIENCE_S", 0.0)
+    monkeypatch.setattr(dataset_writer, "_PATIENCE_S", 0.0)
     control(port, "reset")
     if not keep_driver:
         remote_url._driver_of.cache_clear()
@@ -64,7 +63,7 @@ class Writes:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.left = 0
-        put = remote_bucket.Bucket._upload
+        put = store.BucketStore._upload
 
         def put_or_die(bucket: Any, *arguments: Any, **options: Any) -> None:
             self.left -= 1
@@ -72,7 +71,7 @@ class Writes:
                 raise Killed
             put(bucket, *arguments, **options)
 
-        monkeypatch.setattr(remote_bucket.Bucket, "_upload", put_or_die)
+        monkeypatch.setattr(store.BucketStore, "_upload", put_or_die)
 
 
 class Machines:

@@ -13,10 +13,9 @@ from pipeline.assets.stage import PreparedObject
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.generation import object_batches
-from pipeline.generation.begin_dataset import begin
+from pipeline.generation.begin_dataset import begin_dataset
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.freeze_objects import AcceptedObjects, freeze_objects
-from pipeline.generation.object_options import ObjectOptions
+from pipeline.generation.freeze_objects import AcceptedObjects, ObjectLock
 from pipeline.generation.prepare_isolated import asset_store
 from storage.dataset.layout import DatasetFolder
 from storage.digests import sha256_hex
@@ -63,17 +62,17 @@ def prepared(number: int) -> PreparedObject:
 
 def begun(root: Path) -> DatasetWriter:
     """Begin a dataset of four scenes."""
-    return begin(DatasetFolder(root), build(), ENVIRONMENT, 4, accept_environment=False)
+    return begin_dataset(DatasetFolder(root), build(), ENVIRONMENT, 4, accept_environment=False)
 
 
-def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = None) -> ObjectOptions:
+def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = None) -> ObjectLock:
     """Return what is asked for of objects."""
-    return ObjectOptions(source=source, licence=licence, settings=build(), writer=writer, workers=1)
+    return ObjectLock(source=source, licence=licence, settings=build(), writer=writer, workers=1)
 
 
 def frozen(writer: DatasetWriter, objects: Sequence[PreparedObject]) -> AcceptedObjects:
     """Freeze objects, as after the mesh stage."""
-    return freeze_objects(asked(writer), [*objects], [], len(objects))
+    return asked(writer).freeze_prepared([*objects], [], len(objects))
 
 
 class Mesher:

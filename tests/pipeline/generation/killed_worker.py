@@ -17,7 +17,7 @@ import pytest
 
 from infra.cli.app import main
 from pipeline.generation.pipeline import prepare_dataset
-from storage.remote import claims
+from storage.remote import store
 from tests.pipeline.generation.frozen_kit import use_mesher
 from tests.pipeline.generation.tiny_scenes_kit import tiny_order, without_probe, without_rendering
 
@@ -64,6 +64,6 @@ if __name__ == "__main__":
         main()
     else:
         without_probe(pytest.MonkeyPatch())
-        claims.LEASE_S = LEASE_S
+        store.LEASE_S = LEASE_S
         out, objects, notes, *numbers = sys.argv[1:]
         prepare(out, Path(objects), Path(notes), *map(int, numbers))

@@ -1,22 +1,33 @@
-"""A dataset made in a bucket by machines that share nothing else: one digest, whoever dies when."""
+"""A dataset made in a bucket by machines that share nothing else: one digest, whoever dies when.
 
+Nothing that the first has said is lost by one that comes late.
+"""
+
+import contextlib
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pipeline.executors.array_job import array_job
+from pipeline.generation import dataset_writer
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.shards.bucket_mirror import Mirror
+from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes
+from pipeline.generation.pipeline import prepare_dataset
+from pipeline.generation.prepare_isolated import asset_store
+from pipeline.shards import published
 from pipeline.shards.pack import pack_shard
 from storage.dataset.dataset import open_dataset
 from storage.dataset.progress import read_status
 from storage.dataset.staging import is_staged, stage_scene
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from tests.pipeline.generation.bucket_kit import OUT, Machines, other_shard
+from storage.records.objects import Failure, decode_failures
+from tests.pipeline.generation.bucket_kit import OUT, Killed, Machines, other_shard
+from tests.pipeline.generation.frozen_kit import asked, frozen, object_records, prepared, use_mesher
 from tests.pipeline.generation.test_dataset_writer import (
     _build,
     _dataset,
@@ -24,6 +35,7 @@ from tests.pipeline.generation.test_dataset_writer import (
     _sample,
     make_tiny_shard,
 )
+from tests.pipeline.generation.tiny_scenes_kit import tiny_order, without_probe
 from tests.s3_server import control
 from tests.scenes_by_hand import tiny_sample
 
@@ -83,10 +95,10 @@ def test_an_old_list_that_arrives_late_is_mended(
     bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Between two requests of the first maker the second one plans more, and finishes it."""
-    send_manifest = Mirror.upload_manifest
+    send_manifest = DatasetWriter.publish_manifest
 
-    def late(self: Mirror) -> None:
-        monkeypatch.setattr(Mirror, "upload_manifest", send_manifest)
+    def late(self: DatasetWriter) -> None:
+        monkeypatch.setattr(DatasetWriter, "publish_manifest", send_manifest)
         with machines.maker("b", 8) as second:
             make(second, 1)
         machines.use("a")
@@ -97,7 +109,7 @@ def test_an_old_list_that_arrives_late_is_mended(
     with machines.maker("a", 4) as first:
         first.lock_objects([_locked()])
         make_tiny_shard(first, 0)
-        monkeypatch.setattr(Mirror, "upload_manifest", late)
+        monkeypatch.setattr(DatasetWriter, "publish_manifest", late)
         listed = first.finish()
     assert listed is not None and len(listed.shards) == 2
     assert open_dataset(OUT).manifest == listed
@@ -211,7 +223,7 @@ def test_access_that_is_lost_in_the_middle_loses_nothing(
 def test_what_is_lacking_is_said_at_once(bucket: Any, machines: Machines, moto: int) -> None:
     bucket.rm("shards", recursive=True)
     with (
-        pytest.raises(TrilightError, match=rf"out '{OUT}': cannot be listed .*404.*that exists"),
+        pytest.raises(TrilightError, match=rf"out '{OUT}': cannot be written .*404.*that exists"),
         machines.maker("a"),
     ):
         pass
@@ -222,3 +234,198 @@ def test_what_is_lacking_is_said_at_once(bucket: Any, machines: Machines, moto: 
             pass
         bucket.rm_file(f"shards/set/{name}")
     assert names(bucket) == set()
+
+
+def _failures(bucket: Any, name: str) -> list[Failure]:
+    return decode_failures(bucket.cat_file(f"shards/set/{name}"))
+
+
+def test_who_freezes_late_takes_nothing_back(bucket: Any, machines: Machines) -> None:
+    with machines.maker("b") as late, machines.maker("a") as first:
+        first.add_failures([Failure(stage="assets", item="c", reason="no_faces", message="x")])
+        first.lock_objects([_locked()])
+        make_tiny_shard(first, 0)
+        rejected = open_dataset(OUT).failures()
+        assert len(rejected) == 5
+        machines.use("b")
+        late.add_failures([Failure(stage="assets", item="b", reason="no_faces", message="x")])
+        late.lock_objects([_locked()])
+        assert [entry.name for entry in open_dataset(OUT).manifest.shards] == [FIRST]
+        assert set(rejected) < set(open_dataset(OUT).failures())
+
+
+def test_the_rejections_are_those_of_the_shard_that_is_there(
+    bucket: Any, machines: Machines
+) -> None:
+    with machines.maker("a") as first, machines.maker("b") as second:
+        machines.use("a")
+        first.lock_objects([_locked()])
+        machines.use("b")
+        second.lock_objects([_locked()])
+        other = other_shard(second)
+        machines.use("a")
+        make_tiny_shard(first, 0)
+        machines.use("b")
+        second.add_shard(other)
+        assert {row.reason for row in open_dataset(OUT).failures()} == {"no_camera"}
+        make_tiny_shard(second, 1)
+        second.finish()
+    assert {row.reason for row in _failures(bucket, "failures.jsonl")} == {"no_camera"}
+    assert verify_dataset(OUT).problems == []
+
+
+def test_a_shard_whose_maker_died_at_once_gets_the_rejections_of_the_next(
+    bucket: Any, machines: Machines
+) -> None:
+    with machines.maker("a") as writer:
+        writer.lock_objects([_locked()])
+        other = other_shard(writer)
+        bucket.pipe_file(f"shards/set/{FIRST}", writer.folder.shard(FIRST).read_bytes())
+        writer.add_shard(other)
+    assert {row.reason for row in open_dataset(OUT).failures()} == {"other"}
+
+
+def test_a_worker_with_another_cache_is_named(
+    bucket: Any, machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has packed a shard that is neither here nor in the bucket."""
+    monkeypatch.setattr(dataset_writer.time, "sleep", lambda seconds: None)
+    elsewhere = _dataset(tmp_path / "elsewhere").manifest.shards[1]
+    with machines.maker("a") as writer:
+        writer.lock_objects([_locked()])
+        with pytest.raises(TrilightError, match="folder is not this one.*TRILIGHT_CACHE"):
+            writer.add_shard(elsewhere)
+        assert open_dataset(OUT).manifest.shards == ()
+
+
+def test_a_shard_that_another_machine_has_sent_is_listed(bucket: Any, machines: Machines) -> None:
+    with machines.maker("a") as writer:
+        writer.lock_objects([_locked()])
+        with machines.maker("b") as worker:
+            make_tiny_shard(worker, 0)
+            (entry,) = open_dataset(OUT).manifest.shards
+        machines.use("a")
+        writer.add_shard(entry)
+        make_tiny_shard(writer, 1)
+        listed = writer.finish()
+        assert listed is not None and listed.shards[0] == entry
+    assert len(_failures(bucket, "failures.jsonl")) == 8
+
+
+@contextlib.contextmanager
+def _ending_together(machines: Machines) -> Iterator[tuple[DatasetWriter, DatasetWriter]]:
+    """Two makers that find all shards there: the first says that it lists; the second is in use."""
+    with machines.maker("a") as first, machines.maker("b") as second:
+        machines.use("a")
+        first.lock_objects([_locked()])
+        make_tiny_shard(first, 0)
+        make_tiny_shard(first, 1)
+        assert first.store.create_if_absent(".staging/listing/000000000008", b"\n")
+        machines.use("b")
+        second.fetch_lock()
+        yield first, second
+
+
+def test_of_those_who_end_together_one_reads_the_notes(
+    bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The others wait for its list; one that died over its list is waited for in vain."""
+    read: list[str] = []
+    fetched = published.fetch_notes
+    monkeypatch.setattr(
+        published, "fetch_notes", lambda how, names, at: fetched(how, _told(names, read), at)
+    )
+    monkeypatch.setattr(dataset_writer, "_PATIENCE_S", 10.0)
+    with _ending_together(machines) as (first, second):
+        waits: list[float] = []
+        monkeypatch.setattr(dataset_writer.time, "sleep", waits.append)
+
+        def meanwhile(pause_s: float) -> None:
+            waits.append(pause_s)
+            if len(waits) == 3:
+                machines.use("a")
+                with monkeypatch.context() as patch:
+                    patch.setattr(first, "_wait_for_lister", lambda: None)
+                    first.finish()
+                machines.use("b")
+                read.clear()
+
+        with monkeypatch.context() as patch:
+            patch.setattr(dataset_writer.time, "sleep", meanwhile)
+            listed = second.finish()
+        assert listed == first.manifest and len(waits) == 3 and read == []
+        assert second.left_to_others, "documents too: each reads the whole dataset"
+        with machines.maker("c") as third:
+            assert third.finish() == listed
+            assert not third.left_to_others
+            assert read == [] and len(waits) == 3
+    with machines.maker("d", 16) as longer:
+        for number in (2, 3):
+            make_tiny_shard(longer, number)
+        assert longer.store.create_if_absent(".staging/listing/000000000016", b"\n")
+        waits.clear()
+        assert longer.finish() is not None
+        assert 10 <= sum(waits) < 20, "its maker died over it"
+        assert not longer.left_to_others
+
+
+def test_who_waited_and_then_lists_more_writes_the_documents(
+    bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While it waited for the list of 8 scenes, somebody planned 16 and made them."""
+    monkeypatch.setattr(dataset_writer, "_PATIENCE_S", 10.0)
+    with _ending_together(machines) as (first, second):
+
+        def meanwhile(pause_s: float) -> None:
+            machines.use("a")
+            with monkeypatch.context() as patch:
+                patch.setattr(first, "_wait_for_lister", lambda: None)
+                first.finish()
+            with machines.maker("c", 16) as third:
+                make_tiny_shard(third, 2)
+                make_tiny_shard(third, 3)
+            machines.use("b")
+
+        monkeypatch.setattr(dataset_writer.time, "sleep", meanwhile)
+        listed = second.finish()
+        assert listed is not None and len(listed.shards) == 4
+        assert not second.left_to_others
+    assert len(open_dataset(OUT).manifest.shards) == 4
+    assert verify_dataset(OUT).problems == []
+
+
+def _told(names: Any, read: list[str]) -> list[str]:
+    read += (found := list(names))
+    return found
+
+
+def test_what_a_killed_machine_has_prepared_is_not_prepared_again(
+    bucket: Any, machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_probe(monkeypatch)
+    mesher = use_mesher(monkeypatch, batch=8)
+    object_records(tmp_path / "objects")
+    order = tiny_order(out=OUT, objects=str(tmp_path / "objects"), scenes=4)
+
+    def killed(*given: Any) -> None:
+        raise Killed
+
+    for machine in "ab":
+        machines.use(machine)
+        with monkeypatch.context() as patch, pytest.raises(Killed):
+            patch.setattr(DatasetWriter, "lock_objects", killed)
+            prepare_dataset(order)
+    assert len(mesher.made) == 30 == sum(mesher.made.values())
+
+
+def test_who_comes_later_trusts_the_index_of_the_first(bucket: Any, machines: Machines) -> None:
+    """And has no prepared file yet: each is made where a scene draws it."""
+    with machines.maker("a") as first:
+        accepted = frozen(first, [prepared(number) for number in range(30)])
+        assert accepted.num_objects == 30
+    with machines.maker("b") as later:
+        trusted = asked(later).load()
+        assert trusted is not None and isinstance(trusted.origin, ComposedScenes)
+        assert trusted.num_objects == 30
+        with pytest.raises(AssetMissing):
+            trusted.origin.pool.open_split("train", asset_store())[0]

@@ -8,7 +8,7 @@ import pytest
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.generation import dataset_writer
-from pipeline.generation.begin_dataset import begin
+from pipeline.generation.begin_dataset import begin_dataset
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.environment import environment
@@ -43,7 +43,7 @@ def _build() -> BuildSettings:
 
 
 def _begin(root: Path, build: BuildSettings, scenes: int = 4, **environment: str) -> DatasetWriter:
-    return begin(
+    return begin_dataset(
         DatasetFolder(root), build, {**ENVIRONMENT, **environment}, scenes, accept_environment=False
     )
 
@@ -111,7 +111,7 @@ def test_other_settings_and_another_environment_are_refused_by_name(tmp_path: Pa
     with pytest.raises(TrilightError, match="mitsuba_variant was 'llvm_ad_rgb', now 'scalar_rgb'"):
         _begin(tmp_path, _build(), mitsuba_variant="scalar_rgb")
     elsewhere = {**ENVIRONMENT, "mitsuba_variant": "scalar_rgb"}
-    begin(DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True)
+    begin_dataset(DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True)
 
 
 @for_each(
@@ -163,7 +163,7 @@ def test_a_dataset_goes_on_with_another_device_only_where_that_is_accepted(
     with pytest.raises(TrilightError, match=f"{said} {first} or another --out, or .*--accept-env"):
         _begin(tmp_path, _build(), mitsuba_variant=now)
     elsewhere = {**ENVIRONMENT, "mitsuba_variant": now}
-    begin(DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True)
+    begin_dataset(DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True)
 
 
 def test_a_shard_that_missed_the_manifest_is_found(tmp_path: Path) -> None:
@@ -217,6 +217,7 @@ def _make_again(writer: DatasetWriter, samples: list[Sample]) -> None:
 
 def test_an_object_of_another_split_is_named(tmp_path: Path) -> None:
     writer = _dataset(tmp_path, 4)
+    writer.folder.objects_lock.unlink()  # objects are frozen once
     writer.lock_objects([dataclasses.replace(_locked(), split="test")])
     assert verify_dataset(tmp_path).problems == []  # the tiny scenes use no object
     scene = tiny_scene()
@@ -241,6 +242,7 @@ def test_two_share_alike_licences_in_one_scene_are_named(tmp_path: Path) -> None
     writer = _dataset(tmp_path, 4)
     licences = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC-BY-SA-3.0")
     rows = [dataclasses.replace(_locked(), uid=uid) for uid in "abc"]
+    writer.folder.objects_lock.unlink()  # objects are frozen once
     writer.lock_objects(rows)
     scene = tiny_scene()
     floor = scene.objects[0]

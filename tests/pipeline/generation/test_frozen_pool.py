@@ -14,18 +14,14 @@ from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.documents.attribution import encode_attribution
 from pipeline.generation import accept_maps as accepting
-from pipeline.generation import frozen_pool, pipeline, restore_object
-from pipeline.generation import object_options as asked_objects
+from pipeline.generation import freeze_objects, frozen_pool, pipeline, restore_object
 from pipeline.generation.accept_maps import AcceptedMaps, MapFolders, accept_maps, map_folders
-from pipeline.generation.accept_objects import accept_objects, load_trusted_objects
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects, require_same
-from pipeline.generation.frozen_pool import AssetMissing, SplitPool
+from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, SplitPool, user_maps
 from pipeline.generation.prepare_isolated import asset_store
-from pipeline.generation.scene_origin import ComposedScenes
 from pipeline.generation.scene_worker import SceneAttempt
-from pipeline.generation.user_maps import user_maps
 from pipeline.objects.maps.prepared import MapFiles, prepare_map
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.fitting import draw_rows
@@ -141,20 +137,20 @@ def test_a_second_start_looks_at_no_object(
     def look(source: str, **more: object) -> None:
         raise LookupError(source)
 
-    monkeypatch.setattr(asked_objects, "list_objects", look)
-    assert accept_objects(asked(writer)) == accepted
+    monkeypatch.setattr(freeze_objects, "list_objects", look)
+    assert asked(writer).freeze() == accepted
     for source, licence in (("another", None), (SOURCE, "MIT")):
         with pytest.raises(LookupError):
-            accept_objects(asked(writer, source, licence))
+            asked(writer, source, licence).freeze()
     index, lock = writer.folder.staged_index, writer.folder.objects_lock
     for path in (index, lock):
         was = path.read_bytes()
         for damaged in (b"", was[:40], was + b" "):
             path.write_bytes(damaged)
             if (path, damaged) != (index, was + b" "):  # which tells nothing about the lock
-                assert load_trusted_objects(asked(writer)) is None
+                assert asked(writer).load() is None
         path.write_bytes(was)
-    assert load_trusted_objects(asked(writer)) == accepted
+    assert asked(writer).load() == accepted
 
 
 def test_a_file_that_is_not_the_locked_one_is_away(

@@ -17,20 +17,20 @@ from pipeline.executors.array_job import array_job
 from pipeline.executors.kubernetes import PLACE
 from pipeline.executors.kubernetes_array import KubernetesOptions, job_manifest
 from pipeline.executors.registry import find_executor
+from pipeline.generation.dataset_order import generate_words
 from pipeline.generation.object_batches import (
     ObjectWork,
     PrepareResult,
     cut_objects,
     prepare_in_batches,
 )
-from pipeline.generation.pipeline import prepare_dataset
+from pipeline.generation.pipeline import make_dataset, prepare_dataset
 from pipeline.objects.listing import Fetched, failure
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
-from storage.remote import claims
-from storage.remote.bucket import Bucket
+from storage.remote import store
 from storage.remote.url import RemoteUrl, parse_url
 from tests.conftest import ROOT
 from tests.pipeline.generation.bucket_kit import OUT, Killed, Machines, Writes
@@ -273,7 +273,7 @@ def test_a_kill_before_any_write_leaves_the_same_lock(
     lock_of_one: bytes, machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The n-th write of each run never happens; two machines take turns until one gets through."""
-    monkeypatch.setattr(claims, "LEASE_S", 0.0)
+    monkeypatch.setattr(store, "LEASE_S", 0.0)
     monkeypatch.setattr("pipeline.generation.object_batches._NUM_OBJECTS", NUM_OBJECTS // 2)
     order = tiny_order(out=OUT, objects=str(tmp_path / "objects"), scenes=4)
     writes, runs = Writes(monkeypatch), 0
@@ -289,17 +289,17 @@ def test_a_kill_before_any_write_leaves_the_same_lock(
     assert open_dataset(OUT).lock_bytes() == lock_of_one
 
 
-def _claims(tmp_path: Path, name: str) -> claims.BucketClaims:
+def _machine(tmp_path: Path, name: str) -> store.BucketStore:
     url = parse_url(OUT, what="bucket")
     assert isinstance(url, RemoteUrl)
-    return claims.BucketClaims(Bucket(url), tmp_path / name)
+    return store.BucketStore(url, tmp_path / name)
 
 
 def test_a_claim_keeps_other_machines_off_until_it_ends(
     bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It ends with its block, and for a machine that dies when the lease is over."""
-    a, b = _claims(tmp_path, "a"), _claims(tmp_path, "b")
+    a, b = _machine(tmp_path, "a"), _machine(tmp_path, "b")
     for holder, other in ((a, b), (b, a)):
         with (
             holder.hold_claim("x") as ours,
@@ -307,12 +307,13 @@ def test_a_claim_keeps_other_machines_off_until_it_ends(
             other.hold_claim("y") as free,
         ):
             assert (ours, theirs, free) == (True, False, True)
-    monkeypatch.setattr(claims.BucketClaims, "_free", lambda self, claim: None)
-    with a.hold_claim("z") as ours:
-        assert ours
-    with b.hold_claim("z") as theirs, _claims(tmp_path, "a").hold_claim("z") as again:
+    with monkeypatch.context() as patch:
+        patch.setattr(store.BucketStore, "put", lambda *given: None)  # it dies
+        with a.hold_claim("z") as ours:
+            assert ours
+    with b.hold_claim("z") as theirs, _machine(tmp_path, "a").hold_claim("z") as again:
         assert (theirs, again) == (False, True), "a machine that is started again has its claims"
-    monkeypatch.setattr(claims, "LEASE_S", 0.0)
+    monkeypatch.setattr(store, "LEASE_S", 0.0)
     with b.hold_claim("z") as theirs:
         assert theirs
 
@@ -351,3 +352,21 @@ def test_arrays_that_are_killed_end_in_the_digest_of_one_that_was_not(
     assert array_job(order, per_task=2, at_once=None).tasks == []
     assert verify_dataset(OUT).problems == []
     assert open_dataset(OUT).digest == open_dataset(str(tmp_path / "whole")).digest
+
+
+@pytest.mark.slow("kills")
+def test_two_processes_with_a_bucket_alone_between_them_make_the_digest_of_a_folder(
+    bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They begin together; each has a cache of its own."""
+    order = tiny_order(out=OUT, scenes=12)
+    without_rendering(monkeypatch)
+    alone = dataclasses.replace(order, out=str(tmp_path / "whole"))
+    digest = make_dataset(alone, Undocumented()).digest
+    words = [*generate_words(order), "--out", OUT]
+    runs = [_start(words, TRILIGHT_CACHE=str(tmp_path / name)) for name in "ab"]
+    for run in runs:
+        said, _ = run.communicate(timeout=300)
+        assert run.returncode == 0, said
+    assert verify_dataset(OUT).problems == []
+    assert open_dataset(OUT).digest == digest

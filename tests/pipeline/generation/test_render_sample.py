@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.generation import render_sample as module
-from pipeline.generation import view_progress
-from pipeline.generation.begin_dataset import begin
+from pipeline.generation import render_sample as rendering
+from pipeline.generation.begin_dataset import begin_dataset
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.render_sample import RenderInput, render_sample
-from pipeline.generation.view_progress import ViewProgress
+from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
 from pipeline.renders.results import RenderedView
 from pipeline.renders.variant import activate, choose_variant
 from pipeline.scenes.compose import compose_scene
@@ -137,7 +136,7 @@ def build(**changes: object) -> BuildSettings:
 
 
 def begun(root: Path, settings: BuildSettings) -> DatasetWriter:
-    return begin(DatasetFolder(root), settings, ENVIRONMENT, 4, accept_environment=False)
+    return begin_dataset(DatasetFolder(root), settings, ENVIRONMENT, 4, accept_environment=False)
 
 
 def finished(root: Path, settings: BuildSettings) -> DatasetWriter:
@@ -221,8 +220,8 @@ def _told(folder: DatasetFolder) -> list[str]:
 def test_a_view_counts_in_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 128 samples that are expected, and no more than the whole where there are more."""
     folder, told = DatasetFolder(tmp_path), list[float]()
-    monkeypatch.setattr(view_progress, "_EVERY_S", 0.0)
-    monkeypatch.setattr(view_progress, "tell_views", lambda *words: told.append(words[2]))
+    monkeypatch.setattr(rendering, "_EVERY_S", 0.0)
+    monkeypatch.setattr(rendering, "tell_views", lambda *words: told.append(words[2]))
     assert ViewProgress(folder, 5).render_view(2, _steps()) is DONE
     assert told == [2.25, 2.5, 2.75, 3.0]
 

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from infra.cli.changes import parse_changes
 from pipeline.generation.dataset_order import DatasetOrder, generate_words
-from pipeline.generation.machine import children_of_gpu
+from pipeline.generation.run import TaskResult, children_of_gpu
 from pipeline.generation.runner import Runner
-from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece, TaskBudget, TaskSizes, cut_tasks
+from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece, TaskCutter
 from pipeline.renders.visible_gpus import visible_gpus
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard
@@ -29,6 +29,13 @@ def _scenes(tasks: list[tuple[Piece, ...]]) -> list[int]:
     return [scene for task in tasks for piece in task for scene in range(piece.first, piece.last)]
 
 
+def _cutter(scenes: int, seconds: float, at_once: int = 1) -> TaskCutter:
+    """Return a cutter after one task."""
+    cutter = TaskCutter(at_once)
+    cutter.record(TaskResult(shards=(), scenes=scenes, seconds=seconds, core_s=seconds))
+    return cutter
+
+
 @given(
     shards=st.lists(st.integers(0, 5000), unique=True, max_size=60).map(sorted),
     per_shard=st.integers(1, 300),
@@ -38,9 +45,8 @@ def _scenes(tasks: list[tuple[Piece, ...]]) -> list[int]:
 def test_every_scene_is_in_one_task(
     shards: list[int], per_shard: int, seconds: float, most: int
 ) -> None:
-    splits, sizes = SplitSettings(scenes_per_shard=per_shard), TaskSizes()
-    sizes.add_measurement(1, seconds)
-    tasks = list(cut_tasks(shards, splits, sizes, most=most))
+    splits = SplitSettings(scenes_per_shard=per_shard)
+    tasks = list(_cutter(1, seconds).iter_tasks(shards, splits, most=most))
     expected = [scene for shard in shards for scene in scenes_of_shard(shard, splits)]
     assert _scenes(tasks) == expected
     assert len(tasks) <= most
@@ -52,30 +58,27 @@ def test_every_scene_is_in_one_task(
 
 def test_a_task_takes_the_time_that_it_should() -> None:
     """At 10 s a scene 24 of them: half a shard of 48, or six of 4."""
-    sizes = TaskSizes()
-    sizes.add_measurement(3, 30.0)
+    cutter = _cutter(3, 30.0)
     for per_shard, pieces in ((48, 1), (4, 6)):
-        tasks = list(cut_tasks(range(24), SplitSettings(scenes_per_shard=per_shard), sizes))
+        tasks = list(cutter.iter_tasks(range(24), SplitSettings(scenes_per_shard=per_shard)))
         assert len(_scenes(tasks[:1])) == TASK_S / 10
         assert len(tasks[0]) == pieces
 
 
 def test_sizes_follow_what_is_measured_on_the_way() -> None:
-    sizes = TaskSizes()
-    tasks = cut_tasks(range(100), SplitSettings(scenes_per_shard=4), sizes)
+    cutter = TaskCutter()
+    tasks = cutter.iter_tasks(range(100), SplitSettings(scenes_per_shard=4))
     assert len(_scenes([next(tasks)])) == 4
     next(tasks)  # was cut when the first was handed out
-    sizes.add_measurement(4, 4.0)
+    cutter.record(TaskResult(shards=(), scenes=4, seconds=4.0, core_s=4.0))
     assert len(_scenes([next(tasks)])) == TASK_S
 
 
 @for_each("at_once", [2, 8])
 def test_several_at_once_all_have_work_until_the_end(at_once: int) -> None:
     """Fast scenes, of which one task could take all: nobody gets more than half of a share."""
-    sizes = TaskSizes()
-    sizes.add_measurement(4, 1.0)
     left = 256
-    for task in cut_tasks(range(64), SplitSettings(scenes_per_shard=4), sizes, at_once=at_once):
+    for task in _cutter(4, 1.0, at_once).iter_tasks(range(64), SplitSettings(scenes_per_shard=4)):
         size = len(_scenes([task]))
         assert size <= max(1, left / (2 * at_once))
         left -= size
@@ -83,12 +86,10 @@ def test_several_at_once_all_have_work_until_the_end(at_once: int) -> None:
 
 
 def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
-    splits, left, rounds = SplitSettings(scenes_per_shard=1), TaskBudget(), list[int]()
+    splits, cutter, rounds = SplitSettings(scenes_per_shard=1), TaskCutter(), list[int]()
     with pytest.raises(EnvironmentFailure, match="run the same command again"):
         while True:
-            rounds.append(
-                sum(1 for _ in left.take_tasks(range(5000), splits, TaskSizes(), at_once=1))
-            )
+            rounds.append(sum(1 for _ in cutter.cut_round(range(5000), splits)))
     assert rounds[:2] == [900, 90]
     assert sum(rounds) == MAX_TASKS
 

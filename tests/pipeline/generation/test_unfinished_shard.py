@@ -15,9 +15,9 @@ import pytest
 from PIL import Image
 
 from pipeline.generation import pipeline, render_children, tasks, unfinished_shard
-from pipeline.generation.child_pool import ChildPool
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.pipeline import make_dataset, make_piece
+from pipeline.generation.prepare_isolated import ChildPool
 from pipeline.generation.run import Run, ShardJob, TaskResult
 from pipeline.generation.runner import Runner
 from pipeline.generation.scene_worker import SceneAttempt
@@ -132,7 +132,7 @@ def test_who_waits_for_others_says_for_whom(
     )
     _make(tmp_path, 1, 4, Counter())
     with hold_claim(folder.staged_shard(NAME) / f"{sample_key(0)}.claim"):
-        tasks._wait_for_others(run, 0.0)
+        tasks.wait_for_others(run, 0.0)
     assert f"{sample_key(0)}.claim: waiting for 0 s for process {os.getpid()} of" in caplog.text
 
 

@@ -9,11 +9,9 @@ import pytest
 
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation.dataset_order import DatasetOrder
-from pipeline.generation.freeze_objects import AcceptedObjects
-from pipeline.generation.frozen_pool import FrozenPool
-from pipeline.generation.object_options import ObjectOptions
+from pipeline.generation.freeze_objects import AcceptedObjects, ObjectLock
+from pipeline.generation.frozen_pool import ComposedScenes, FrozenPool
 from pipeline.generation.run import ShardJob
-from pipeline.generation.scene_origin import ComposedScenes
 from pipeline.renders.variant import Variant
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.statistics import Statistics
@@ -61,9 +59,9 @@ def without_rendering(
     """
     scenes: list[tuple[str, int]] = []
 
-    def accept(order: ObjectOptions, *more: Any) -> AcceptedObjects:
-        if not order.writer.manifest.objects_lock_sha256:
-            order.writer.lock_objects([_locked()])
+    def freeze(lock: ObjectLock, *more: Any) -> AcceptedObjects:
+        if not lock.writer.manifest.objects_lock_sha256:
+            lock.writer.lock_objects([_locked()])
         return dataclasses.replace(NO_OBJECTS, num_found=1)
 
     def make(split: str, scene: int, *more: Any) -> tuple[Sample, list[Failure]]:
@@ -71,10 +69,8 @@ def without_rendering(
         made(scene)
         return dataclasses.replace(tiny_sample(seed=scene), key=sample_key(scene)), []
 
-    monkeypatch.setattr(
-        "pipeline.generation.pipeline.prepare_unfrozen_objects", lambda *given: None
-    )
-    monkeypatch.setattr("pipeline.generation.pipeline.accept_objects", accept)
+    monkeypatch.setattr(ObjectLock, "prepare", lambda lock: None)
+    monkeypatch.setattr(ObjectLock, "freeze", freeze)
     monkeypatch.setattr("pipeline.generation.pipeline.make_scene", make)
     without_probe(monkeypatch)
     return scenes

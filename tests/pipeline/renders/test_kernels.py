@@ -14,8 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.builds.named import named_build
-from pipeline.generation.render_sample import RenderInput, render_sample
-from pipeline.generation.view_progress import ViewProgress
+from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
 from pipeline.renders import kernel_scene
 from pipeline.renders.device_memory import read_back
 from pipeline.renders.device_pictures import DevicePictures

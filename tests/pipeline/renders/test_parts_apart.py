@@ -8,8 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.builds.named import named_build
-from pipeline.generation.render_sample import RenderInput, render_sample
-from pipeline.generation.view_progress import ViewProgress
+from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings

@@ -400,7 +400,7 @@ def test_only_a_bucket_is_asked_what_it_holds(
     """What a plain server has beyond its manifest nobody can know; asking it would take a while."""
     pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
     asked: list[object] = []
-    monkeypatch.setattr(progress, "Bucket", asked.append)
+    monkeypatch.setattr(progress, "BucketStore", asked.append)
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     begin_tiny(tmp_path, 8)
     with serve(tmp_path) as site:

@@ -10,17 +10,16 @@ from typing import Any
 
 import pytest
 
-from pipeline.generation.bucket_dataset_writer import begin_dataset, hold_membership
+from pipeline.generation.begin_dataset import begin_dataset, hold_membership
 from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import dataset_folder
 from storage.dataset.training_data import open_training_data
 from storage.dataset.verify import verify_dataset
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.remote import bucket as remote_bucket
-from storage.remote import fetch
+from storage.remote import fetch, store
 from storage.remote import url as remote_url
-from storage.remote.bucket import Bucket
+from storage.remote.store import BucketStore, LocalStore, Store
 from storage.remote.tries import with_tries
 from storage.remote.url import RemoteUrl
 from tests.for_each import for_each
@@ -149,31 +148,49 @@ def test_wrong_access_is_named_without_secrets(s3: Line, moto: int) -> None:
     assert "s3cret" not in text and os.environ["AWS_SECRET_ACCESS_KEY"] not in text
 
 
-def create_once(driver: Any, made: Bucket, folder: Path) -> None:
+def create_once(made: Store, folder: Path) -> None:
     """In one request and, from 5 MiB on, in several; what is written otherwise replaces it."""
-    content, root = bytes(range(256)) * (11 << 12), made.url.root
+    content = bytes(range(256)) * (11 << 12)
     (folder / "large").write_bytes(content)
     for name, first in (("small", b"small"), ("part-0001/large", folder / "large")):
-        assert made.create(name, first), name
-        assert not made.create(name, b"second"), name
-        assert not made.create(name, folder / "large"), name
-    assert driver.cat_file(f"{root}/small") == b"small"
-    assert driver.cat_file(f"{root}/part-0001/large") == content
-    made.write("small", b"third")
-    assert driver.cat_file(f"{root}/small") == b"third"
-    assert made.names() == {"small", "part-0001/large"}
+        assert made.create_if_absent(name, first), name
+        assert not made.create_if_absent(name, b"second"), name
+        assert not made.create_if_absent(name, folder / "large"), name
+    assert (made.get("small"), made.get("small", 3)) == (b"small", b"sma")
+    assert made.get("part-0001/large", len(content)) == content
+    assert made.get("large") is made.get("large", 1) is None
+    made.put("small", b"third")
+    made.put("copied/large", folder / "large")
+    assert made.get("small") == b"third"
+    assert made.get("copied/large", len(content)) == content
+    assert made.list() == {"small"}
+    assert made.list("part-0001/") == {"part-0001/large"}
+    assert made.list("elsewhere") == set()
+    with made.hold_claim("small") as ours:
+        assert ours
     made.require_create()
     made.require_create()  # what is left of the first time says nothing
 
 
 def test_a_file_is_created_once(moto: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remote_bucket, "_PART_BYTES", 5 << 20)  # no server takes smaller parts
-    with empty_bucket(moto, monkeypatch) as driver:
-        create_once(driver, Bucket(place("s3://shards/set")), tmp_path)
+    monkeypatch.setattr(store, "_PART_BYTES", 5 << 20)  # no server takes smaller parts
+    with empty_bucket(moto, monkeypatch):
+        made = BucketStore(place("s3://shards/set"), tmp_path / "work")
+        create_once(made, tmp_path)
+        assert {"small", "part-0001/large"} < made.list_all()
 
 
 def test_a_file_is_created_once_at_google(gs: Any, conditional: None, tmp_path: Path) -> None:
-    create_once(gs, Bucket(place("gs://shards/made")), tmp_path)
+    create_once(BucketStore(place("gs://shards/made"), tmp_path / "work"), tmp_path)
+
+
+def test_a_file_is_created_once_in_a_folder(tmp_path: Path) -> None:
+    made = LocalStore(tmp_path / "made")
+    create_once(made, tmp_path)
+    for write in (made.create_if_absent, made.put):  # it is published where it stands
+        write("small", tmp_path / "made" / "small")
+        assert made.get("small") == b"third"
+    assert not list((tmp_path / "made").rglob("*.part"))
 
 
 def test_a_server_that_ignores_the_condition_is_refused_before_anything_is_begun(gs: Any) -> None:
@@ -184,7 +201,7 @@ def test_a_server_that_ignores_the_condition_is_refused_before_anything_is_begun
         hold_membership(folder),
     ):
         begin_dataset(folder, _build(), ENVIRONMENT, 8, accept_environment=False)
-    assert Bucket(place("gs://shards/made")).names() == {".staging/once"}
+    assert BucketStore(place("gs://shards/made")).list_all() == {".staging/once"}
     assert not folder.manifest.exists()
 
 
