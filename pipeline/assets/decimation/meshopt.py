@@ -10,6 +10,7 @@ simplifier is exported since 0.25.
 
 import functools
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import wasmtime
@@ -50,7 +51,7 @@ class _Library:
         config.memory_guard_size = 0
         self._store = wasmtime.Store(wasmtime.Engine(config))
         module = wasmtime.Module.from_file(self._store.engine, str(path))
-        self._exports = wasmtime.Instance(self._store, module, []).exports(self._store)
+        self._exports: Any = wasmtime.Instance(self._store, module, []).exports(self._store)
         self._call("__wasm_call_ctors")
 
     def run(self, function: str, mesh: TriangleMesh, options: tuple[float, ...]) -> TriangleMesh:
