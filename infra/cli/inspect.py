@@ -3,8 +3,9 @@
 import os
 import shlex
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 from infra.cli.console import (
     first_words,
     look_at,
-    note,
     print_json,
+    print_result,
     print_rows,
     progress_bars,
 )
@@ -86,20 +87,21 @@ def inspect(options: InspectOptions, output: OutputOptions) -> None:
 def _inspect_run(root: Path, *, json: bool) -> None:
     """Print the progress of a training run."""
     facts = run_facts(root)
-    if json:
-        print_json(facts)
-        return
-    print_rows(str(root), [(name.replace("_", " "), str(value)) for name, value in facts.items()])
-    look_at(f"Curves and pictures: {tensorboard_command(root)}")
+    print_result(str(root), _fact_rows(facts), facts, as_json=json)
+    if not json:
+        look_at(f"Curves and pictures: {tensorboard_command(root)}")
+
+
+def _fact_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    return [(name.replace("_", " "), str(value)) for name, value in facts.items()]
 
 
 def _require_shards(opened: Dataset) -> None:
     if not opened.manifest.shards:
         raise TrilightError(
             f"{opened.display_name}: the dataset is empty, since none of its shards is finished; "
-            "expected "
-            "at least one. See its progress with `trilight status "
-            f"{shlex.quote(opened.display_name)}`."
+            "expected at least one. See its progress with "
+            f"`trilight status {shlex.quote(opened.display_name)}`."
         )
 
 
@@ -120,15 +122,9 @@ def _inspect_scene(source: str, turntable: Path | None, *, json: bool) -> None:
     from pipeline.generation.inspect_scene import inspect_scene
 
     result = inspect_scene(scene_source(source), turntable)
-    if json:
-        print_json({**result.facts, "notes": list(result.notes)})
-        return
-    for text in result.notes:
-        note(text)
-    print_rows(
-        source, [(name.replace("_", " "), str(value)) for name, value in result.facts.items()]
-    )
-    if turntable is not None:
+    record = {**result.facts, "notes": list(result.notes)}
+    print_result(source, _fact_rows(result.facts), record, notes=result.notes, as_json=json)
+    if turntable is not None and not json:
         look_at(f"Look at {turntable}")
 
 

@@ -1,12 +1,16 @@
-"""Upload of a folder to a repository of the Hugging Face hub, by the package huggingface_hub."""
+"""Upload of a folder to a repository of the Hugging Face hub, by the package huggingface_hub.
+
+The hub's limits are from https://huggingface.co/docs/hub/storage-limits, "Repository limitations"
+(2026-11).
+"""
 
 import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from infra.release.hub_limits import require_within_limits
-from pipeline.documents.sums import SUMS, UNPUBLISHED, stale_sums
+from pipeline.documents.sums import SUMS, UNPUBLISHED, published_files, stale_sums
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
@@ -162,3 +166,36 @@ def _require_sound(folder: Path) -> None:
             f"{folder}: is damaged ({verification.problems[0].rstrip('.')}); expected a whole "
             f"dataset. See trilight verify {folder}."
         )
+
+
+MOST_FILES = 100_000
+"""Maximum number of files of a repository."""
+MOST_ENTRIES = 10_000
+"""Maximum number of entries of a folder."""
+MOST_FILE_BYTES = 20_000_000_000
+"""Maximum size of a file."""
+
+
+def require_within_limits(folder: Path) -> tuple[int, int]:
+    """Return the numbers of files and bytes of a folder's upload.
+
+    Raises:
+        TrilightError: the folder is empty, or exceeds the hub's limits.
+    """
+    files = list(published_files(folder))
+    sizes = {path: path.stat().st_size for path in files}
+    entries = Counter(path.parent for path in files).most_common(1)
+    largest = max(sizes, key=lambda path: sizes[path], default=None)
+    for got, limit, what in (
+        (len(files), MOST_FILES, "files"),
+        (entries[0][1] if entries else 0, MOST_ENTRIES, "entries in one folder"),
+        (sizes[largest] if largest else 0, MOST_FILE_BYTES, f"bytes in one file, {largest}"),
+    ):
+        if got > limit:
+            raise TrilightError(
+                f"{folder}: {got} {what}; the hub advises at most {limit}. Make larger or smaller "
+                "shards: trilight shards reshard."
+            )
+    if not files:
+        raise TrilightError(f"{folder}: holds no file; expected a finished dataset or a network.")
+    return len(files), sum(sizes.values())

@@ -63,9 +63,14 @@ class FixedSamples:
     denoiser: Filtered
     """Filter of Open Image Denoise."""
 
+    @property
+    def count(self) -> str:
+        """The number of samples as text, such as `4 samples`."""
+        return f"{self.spp} sample{'s' if self.spp > 1 else ''}"
+
     def __str__(self) -> str:
         """Return samples and filter as text."""
-        return f"{self.spp} sample{'s' if self.spp > 1 else ''} a pixel, filter {self.denoiser}"
+        return f"{self.count} a pixel, filter {self.denoiser}"
 
     def settings(self, resolution: int) -> PreviewSettings:
         """Return the settings at a width in pixels; raises TrilightError if it is invalid."""

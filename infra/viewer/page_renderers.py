@@ -192,7 +192,7 @@ def samples_on_page(child: RenderChild, spp: int) -> PageRenderer:
     """Return a preview of a number of samples per pixel with one denoise."""
     quality = FixedSamples(spp=spp, denoiser=usual_filter(spp))
     return PageRenderer(
-        title=f"{spp} sample{'s' if spp > 1 else ''}, filtered",
+        title=f"{quality.count}, filtered",
         means=f"{spp} path{'s' if spp > 1 else ''} a pixel, then Open Image Denoise "
         f"({quality.denoiser}).",
         make=lambda options: PathTracer(child, quality, options.resolution),

@@ -18,9 +18,10 @@ from infra.leaderboard import (
     NEAREST_TRAINED,
     Leaderboard,
     make_leaderboard,
+    picture_folder,
+    picture_folders,
     widths_of,
 )
-from infra.picture_folder import picture_folder, picture_folders
 from infra.render.methods import DIRECT_LIGHT, TRACED_LIGHT
 from infra.render.networks import NetworkRenderer
 from model.open import save_published

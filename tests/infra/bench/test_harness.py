@@ -26,10 +26,8 @@ from infra.bench.experiment import (
     every_experiment,
     experiment_of,
 )
-from infra.bench.machine import commit_text, machine_record
-from infra.bench.plot import plot
-from infra.bench.rows import Row, rows_of, table_of
-from infra.bench.run import run
+from infra.bench.rows import Row, plot, rows_of, table_of
+from infra.bench.run import commit_text, machine_record, run
 from infra.bench.store import Run, Store
 from infra.bench_options import BenchOptions
 from storage.errors import Rejected, TrilightError

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from infra.cli.assets_next import generate_from_meshes
+from infra.cli.assets import generate_from_meshes
 from infra.cli.extend_option import load_extensions
 from infra.repair import repair
 from infra.run_record import is_run, run_facts

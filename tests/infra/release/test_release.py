@@ -10,12 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from infra.release import hub_limits
+from infra.release import push as hub_limits
 from infra.release.__main__ import _sum_and_say, _write_network
-from infra.release.hub_limits import require_within_limits
-from infra.release.page import write_page
-from infra.release.pictures import NETWORK, RIVALS, SceneComparison, chosen_scenes
-from infra.release.push import kind_of, planned_upload
+from infra.release.page import NETWORK, RIVALS, SceneComparison, chosen_scenes, write_page
+from infra.release.push import kind_of, planned_upload, require_within_limits
 from model.open import open_network
 from pipeline.documents.sums import SUMS, published_files
 from storage.dataset.dataset import Dataset, open_dataset

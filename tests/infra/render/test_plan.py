@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 from infra.render import plan
-from infra.render.cameras import camera_path, orbit, own_camera, pair_cameras
 from infra.render.networks import NetworkRenderer
 from infra.render.options import RenderOptions
 from infra.render.path_tracer import PathTracer
 from infra.render.plan import plan_render
-from infra.render.sources import scene_sources
+from infra.render.sources import camera_path, orbit, own_camera, pair_cameras, scene_sources
 from pipeline.exchange.open_scene import SceneSource
 from pipeline.exchange.reader import SceneReader
 from pipeline.isolation import Result

@@ -9,13 +9,12 @@ import pytest
 from PIL import Image as Picture
 
 from infra.render import look as look_module
-from infra.render.cameras import orbit, own_camera, pair_cameras
 from infra.render.comparison import comparison_sheet
 from infra.render.look import Look, enlarge, enlargement, tone_mapped
-from infra.render.output_paths import OutputPaths, output_paths
+from infra.render.output_paths import OutputPaths, output_paths, write_video
 from infra.render.plan import RenderPlan, shots
 from infra.render.run import FinishedShot, run_plan
-from infra.render.video import write_video
+from infra.render.sources import orbit, own_camera, pair_cameras
 from pipeline.exchange.open_scene import SceneSource
 from storage.conventions import preview_srgb8
 from storage.errors import TrilightError

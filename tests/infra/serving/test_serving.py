@@ -22,7 +22,7 @@ from prefect.exceptions import ParameterTypeError
 
 from infra.serving import access, local
 from infra.serving.access import grant, next_command, revoke, settings_file, state_folder
-from infra.serving.limits import limits
+from infra.serving.deployments import limits
 from infra.serving.local import running, start, stop
 from infra.serving.train_model import RunChanges, TrainOptions, train_model, train_order
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT

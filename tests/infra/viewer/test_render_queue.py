@@ -13,14 +13,13 @@ import pytest
 from PIL import Image as Picture
 
 from infra.viewer import scene_bytes as module
-from infra.viewer.edits import apply_edits
 from infra.viewer.page_renderers import (
     PageRenderer,
     StoredPictures,
     network_on_page,
     samples_on_page,
 )
-from infra.viewer.picture_options import PictureOptions, parse_picture_options
+from infra.viewer.picture_options import PictureOptions, apply_edits, parse_picture_options
 from infra.viewer.render_queue import RenderJob, RenderQueue, agreement_db
 from infra.viewer.scene_bytes import scene_bytes, sky_bytes, texture_png
 from infra.viewer.scene_handlers import SceneHandlers

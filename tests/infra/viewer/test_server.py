@@ -14,9 +14,18 @@ import pytest
 from infra.setup.sbom import THREE_SHA256, THREE_VERSION
 from infra.viewer import server as viewer_server
 from infra.viewer.deferred_handlers import DeferredHandlers, page_of
-from infra.viewer.guard import MAX_BODY_BYTES, MAX_PATH, refusal
-from infra.viewer.server import NotFound, PageServer, Request, Response, Route, json_response
-from infra.viewer.static_files import STATIC
+from infra.viewer.server import (
+    MAX_BODY_BYTES,
+    MAX_PATH,
+    STATIC,
+    NotFound,
+    PageServer,
+    Request,
+    Response,
+    Route,
+    json_response,
+    refusal,
+)
 from storage.errors import TrilightError
 from tests.for_each import case
 from tests.infra.run_by_hand import write_run
