@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, NoReturn
 
 from rich.progress import Progress as Bars
 from rich.progress import TaskID
-from rich.text import Text
 
 from infra.cli.changes import BaseSettings, all_changes, run_record
-from infra.cli.console import console, look_at, next_step, print_rows, progress_bars
+from infra.cli.console import console, look_at, next_step, note, print_rows, progress_bars
 from infra.cli.options import OutputOptions, command
 from infra.run_record import tensorboard_command
 from infra.torch_library import require_torch
@@ -39,7 +38,7 @@ class _BarProgress(TrainProgress):
         self._first_step = 0
 
     def note(self, text: str) -> None:
-        console.print(Text(f"Note: {text}.", style="yellow"))
+        note(text)
 
     def begin(
         self,

@@ -179,7 +179,7 @@ class _Handler(BaseHTTPRequestHandler):
         refused = refusal(method, self.path, self.headers.items(), port=port, token=token)
         if refused is not None:
             self.close_connection = True
-            self._send_sentence(refused.status, refused.sentence)
+            self._send_sentence(*refused)
             return
         data = self.rfile.read(int(self.headers["Content-Length"])) if method == "POST" else b""
         self.server.note_arrival(self.connection)
@@ -271,13 +271,8 @@ def new_token() -> str:
     return secrets.token_urlsafe(24)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Refusal:
-    """Status and reason of a refused request."""
-
-    status: HTTPStatus
-    sentence: str
-    """Reason as a sentence that the page shows."""
+Refusal = tuple[HTTPStatus, str]
+"""Status of a refused request, and the reason as a sentence that the page shows."""
 
 
 def refusal(
@@ -296,42 +291,30 @@ def refusal(
     pairs = [(name.lower(), value) for name, value in pairs]
     headers = dict(pairs)
     if len(path) > MAX_PATH:
-        return Refusal(status=HTTPStatus.REQUEST_URI_TOO_LONG, sentence="The address is too long.")
+        return HTTPStatus.REQUEST_URI_TOO_LONG, "The address is too long."
     if any([name for name, _ in pairs].count(name) > 1 for name in _ONCE):
-        return Refusal(status=HTTPStatus.BAD_REQUEST, sentence="A header is there twice.")
+        return HTTPStatus.BAD_REQUEST, "A header is there twice."
     if headers.get("host") != server_address:
-        return _forbidden(
-            f"Only http://{server_address} is answered, and no other name of this machine."
-        )
+        only = f"Only http://{server_address} is answered, and no other name of this machine."
+        return HTTPStatus.FORBIDDEN, only
     origin = headers.get("origin")
     site = headers.get("sec-fetch-site", "none")
     # a followed link with the whole address is allowed: the browser leaves the other page
     followed = method == "GET" and headers.get("sec-fetch-dest") == "document"
     near = site in ("none", "same-origin") or followed
     if origin not in (None, f"http://{server_address}") or not near:
-        return _forbidden("Pages of other origins are not answered.")
+        return HTTPStatus.FORBIDDEN, "Pages of other origins are not answered."
     if method == "POST" and origin is None:
-        return _forbidden("The request does not say from which page it comes.")
+        return HTTPStatus.FORBIDDEN, "The request does not say from which page it comes."
     sent_token = path.split("?")[0].removeprefix("/").split("/")[0]
     if not hmac.compare_digest(sent_token.encode(), token.encode()):
-        return _forbidden("Open the whole address that `trilight view` printed.")
-    if method == "POST":
-        return _too_large(headers.get("content-length", ""))
+        return HTTPStatus.FORBIDDEN, "Open the whole address that `trilight view` printed."
+    length = headers.get("content-length", "")
+    if method == "POST" and not (length.isascii() and length.isdecimal()):
+        return HTTPStatus.LENGTH_REQUIRED, "The request has no length."
+    if method == "POST" and (len(length) > 9 or int(length) > MAX_BODY_BYTES):
+        return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "The request is too large."
     return None
-
-
-def _too_large(length: str) -> Refusal | None:
-    if not (length.isascii() and length.isdecimal()):
-        return Refusal(status=HTTPStatus.LENGTH_REQUIRED, sentence="The request has no length.")
-    if len(length) > 9 or int(length) > MAX_BODY_BYTES:
-        return Refusal(
-            status=HTTPStatus.REQUEST_ENTITY_TOO_LARGE, sentence="The request is too large."
-        )
-    return None
-
-
-def _forbidden(sentence: str) -> Refusal:
-    return Refusal(status=HTTPStatus.FORBIDDEN, sentence=sentence)
 
 
 STATIC = Path(__file__).with_name("static")

@@ -14,6 +14,7 @@ import pytest
 
 from infra.cli.process_exit import temporary_folder
 from storage.dataset.manifest import read_manifest
+from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import Trilight, command
 from tests.end_to_end.production_kit import SIXTEEN_SAMPLES
@@ -85,13 +86,8 @@ def test_plan_leaves_no_scenes_behind_at_ctrl_c(tmp_path: Path) -> None:
 
 def test_ctrl_c_while_libraries_are_loaded_leaves_no_traceback(tmp_path: Path) -> None:
     (tmp_path / "cyclopts.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\n")
-    run = subprocess.run(
-        command("doctor"),
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])},
-    )
-    assert (run.returncode, run.stderr) == (130, "")
+    path = os.pathsep.join([str(tmp_path), str(ROOT)])
+    assert run_program(command("doctor"), status=130, PYTHONPATH=path).stderr == ""
 
 
 def test_a_temporary_folder_is_gone_after_its_block() -> None:

@@ -7,9 +7,7 @@ pyzmq) would add what no cell needs: the display of values.
 
 import ast
 import json
-import os
 import re
-import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
@@ -19,6 +17,7 @@ import pytest
 
 import trilight
 from infra.setup.wheel_tree import PACKAGES
+from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from trilight import extend
@@ -62,15 +61,7 @@ def _code(text: str) -> list[str]:
 
 def _require_runs(folder: Path, *words: str) -> None:
     """Run a program as a user does, in a separate folder."""
-    ran = subprocess.run(
-        [sys.executable, *words],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert ran.returncode == 0, ran.stderr
+    run_program([sys.executable, *words], folder, PYTHONPATH=str(ROOT), MPLBACKEND="Agg")
 
 
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))

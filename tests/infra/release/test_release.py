@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from tests.command_line import trilight
+from tests.command_line import run_program, trilight
 from tests.conftest import ROOT
 from tests.infra.release.hub_upload_server import hub_for_uploads, settings_of
 from tests.pipeline.documents.dataset_by_hand import (
@@ -144,11 +143,8 @@ def pushed(
         The exit status, stdout and stderr of each push, and what the hub holds after it.
     """
     command = [sys.executable, "-c", PUSHES, json.dumps(asked), str(there)]
-    done = subprocess.run(
-        command, cwd=ROOT, env=settings, capture_output=True, text=True, timeout=300, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return [tuple(json.loads(line)) for line in done.stdout.splitlines()]
+    said = run_program(command, env=settings).stdout
+    return [tuple(json.loads(line)) for line in said.splitlines()]
 
 
 def test_the_hub_gets_every_file_and_reads_as_it_was(dataset: Dataset, tmp_path: Path) -> None:

@@ -122,8 +122,10 @@ def test_who_asks_for_another_gives_up_the_one_at_hand() -> None:
     slow, quick = GreyRenderer(0.1, waits=True), GreyRenderer(0.5)
     easel = queue_of({"traced": slow, "hits": quick})
     given_up = until_begun(easel, easel.submit(wanted()))
-    never_begun = easel.submit(wanted(fov=50.0))
-    last = over(easel, easel.submit(wanted("hits")))
+    with easel._changed:  # so that the queue sees both at once
+        never_begun = easel.submit(wanted(fov=50.0))
+        next_one = easel.submit(wanted("hits"))
+    last = over(easel, next_one)
     assert (given_up.state, never_begun.state, last.state) == ("cancelled", "cancelled", "done")
     assert slow.rendered == 1
     again = easel.submit(wanted())
