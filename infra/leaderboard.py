@@ -361,19 +361,15 @@ def _picture(data: bytes, path: Path, widths: Sequence[int]) -> NDArray[np.float
             "or choose another width."
         )
     radiance_rgb = np.asarray(pixels[..., :3], np.float32)
-    legal = np.isfinite(radiance_rgb) & (radiance_rgb >= _LEAST)
-    if not legal.all():
-        _refuse(radiance_rgb, legal, path.name)
+    illegal = ~(np.isfinite(radiance_rgb) & (radiance_rgb >= _LEAST))
+    if illegal.any():
+        row, column, channel = (int(place) for place in np.argwhere(illegal)[0])
+        raise TrilightError(
+            f"{path.name}: row {row}, column {column} is {radiance_rgb[row, column].tolist()}, and "
+            f"{int(illegal.any(axis=-1).sum())} pixels are like it; expected finite radiance of at "
+            f"least 0 (channel {'RGB'[channel]}). Make the picture again."
+        )
     return radiance_rgb
-
-
-def _refuse(radiance_rgb: NDArray[np.float32], legal: NDArray[np.bool_], name: str) -> None:
-    row, column, channel = (int(place) for place in np.argwhere(~legal)[0])
-    raise TrilightError(
-        f"{name}: row {row}, column {column} is {radiance_rgb[row, column].tolist()}, and "
-        f"{int((~legal).any(axis=-1).sum())} pixels are like it; expected finite radiance of at "
-        f"least 0 (channel {'RGB'[channel]}). Make the picture again."
-    )
 
 
 def picture_folders(

@@ -148,7 +148,10 @@ def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json
         return
     statistics = outcome.statistics
     used = f"{outcome.num_objects_used} of {outcome.num_objects_found}"
-    rows = [("objects used", used), ("licences", _licences(folder))]
+    counts = Counter(entry.licence for entry in read_objects_lock(folder.objects_lock))
+    licences = ", ".join(f"{name} ({count})" for name, count in counts.most_common())
+    licences = licences.replace(USER_PROVIDED, f"{USER_PROVIDED}, taken as yours to use")
+    rows = [("objects used", used), ("licences", licences)]
     rows += statistics.lines() if statistics else []
     if outcome.num_scenes_given_up:
         rows.append(("scenes given up", str(outcome.num_scenes_given_up)))
@@ -157,14 +160,14 @@ def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json
         looked_at = (folder.contact_sheet, folder.report, folder.card)
         rows.append(("dataset digest", outcome.digest))
         rows.append(("look at", ", ".join(_shown_path(folder, path) for path in looked_at)))
-    rows += [
-        ("wall time", f"{seconds:.0f} s"),
-        ("shards, manifest", folder.display_name),
-    ]
+    rows += [("wall time", f"{seconds:.0f} s"), ("shards, manifest", folder.display_name)]
     if rejected:
         later = "" if statistics else ", once the dataset is finished"
         rows.append(("why rejected", f"{_shown_path(folder, folder.failures)}{later}"))
-    _print_notes(outcome.notes)
+    for text in outcome.notes[:_MAX_NOTES]:
+        note(text)
+    if (more := len(outcome.notes) - _MAX_NOTES) > 0:
+        note(f"{more} more; --json has all")
     if statistics is None and outcome.digest:
         print_rows("Dataset finished by another machine, which writes its documents", rows)
         next_step(["verify", folder.display_name])
@@ -226,16 +229,3 @@ def _print_json(
 def _shown_path(folder: DatasetFolder, path: Path) -> str:
     """Return the path or URL of a file of a dataset, for people."""
     return f"{folder.display_name}/{path.relative_to(folder.root)}"
-
-
-def _print_notes(notes: Sequence[str]) -> None:
-    for text in notes[:_MAX_NOTES]:
-        note(text)
-    if len(notes) > _MAX_NOTES:
-        note(f"{len(notes) - _MAX_NOTES} more; --json has all")
-
-
-def _licences(folder: DatasetFolder) -> str:
-    counts = Counter(entry.licence for entry in read_objects_lock(folder.objects_lock))
-    text = ", ".join(f"{name} ({count})" for name, count in counts.most_common())
-    return text.replace(USER_PROVIDED, f"{USER_PROVIDED}, taken as yours to use")

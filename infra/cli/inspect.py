@@ -66,7 +66,12 @@ def inspect(options: InspectOptions, output: OutputOptions) -> None:
         return
     first_words(f"Reading {safe_url(source)}", silent=output.json)
     opened = open_dataset(source)
-    _require_shards(opened)
+    name = opened.display_name
+    if not opened.manifest.shards:
+        raise TrilightError(
+            f"{name}: the dataset is empty, since none of its shards is finished; expected at "
+            f"least one. See its progress with `trilight status {shlex.quote(name)}`."
+        )
     from pipeline.documents.distributions import dataset_distributions  # slow: matplotlib
 
     with progress_bars() as bars:
@@ -80,7 +85,7 @@ def inspect(options: InspectOptions, output: OutputOptions) -> None:
     if output.json:
         print_json(_as_json(opened, statistics, distributions))
         return
-    _print_summary(opened.display_name, opened, statistics, distributions)
+    _print_summary(name, opened, statistics, distributions)
     look_at(f"Look at {folder.report} and {folder.contact_sheet}" if folder else _READ_ONLY)
 
 
@@ -94,15 +99,6 @@ def _inspect_run(root: Path, *, json: bool) -> None:
 
 def _fact_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [(name.replace("_", " "), str(value)) for name, value in facts.items()]
-
-
-def _require_shards(opened: Dataset) -> None:
-    if not opened.manifest.shards:
-        raise TrilightError(
-            f"{opened.display_name}: the dataset is empty, since none of its shards is finished; "
-            "expected at least one. See its progress with "
-            f"`trilight status {shlex.quote(opened.display_name)}`."
-        )
 
 
 def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | None:

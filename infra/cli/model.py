@@ -60,7 +60,13 @@ def model(options: ModelOptions, files: PublishOptions, output: OutputOptions) -
     )
     network_costs = costs(config, workload)
     if files.publish:
-        _publish(name, network, files.publish)
+        if network is None:
+            raise TrilightError(
+                f"model: --publish needs a checkpoint; {name} is a size without weights."
+            )
+        from model.open import save_published
+
+        save_published(network, files.publish)
     if output.json:
         records = {"config": dataclasses.asdict(config), "workload": dataclasses.asdict(workload)}
         print_json({"name": name, **records, **dataclasses.asdict(network_costs)})
@@ -80,16 +86,6 @@ def _open(name: str) -> "RenderFormer":
         raise TrilightError(
             f"model {name!r}: neither a size nor a checkpoint here; {expected_one_of(name, SIZES)}."
         ) from error
-
-
-def _publish(name: str, network: "RenderFormer | None", folder: Path) -> None:
-    from model.open import save_published
-
-    if network is None:
-        raise TrilightError(
-            f"model: --publish needs a checkpoint; {name} is a size without weights."
-        )
-    save_published(network, folder)
 
 
 def _report(name: str, workload: "Workload", counted: "Costs") -> None:

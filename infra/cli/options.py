@@ -84,7 +84,8 @@ def command(*arguments: str) -> Callable[[Callable[..., None]], Callable[..., No
         parameters = {
             field.name: _parameter(field, group, by_place=field.name in arguments)
             for kind in kinds.values()
-            for group in [Group.create_ordered(_title(kind))]
+            for title in [(inspect.getdoc(kind) or "").split("\n")[0].removesuffix(".")]
+            for group in [Group.create_ordered(title)]
             for field in describe_fields(kind)
         }
         assert len(parameters) == sum(len(describe_fields(kind)) for kind in kinds.values()), (
@@ -102,10 +103,6 @@ def command(*arguments: str) -> Callable[[Callable[..., None]], Callable[..., No
         return run
 
     return decorate
-
-
-def _title(kind: type) -> str:
-    return (inspect.getdoc(kind) or "").split("\n")[0].removesuffix(".")
 
 
 def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> inspect.Parameter:
@@ -132,7 +129,7 @@ def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> insp
         choices=choices or None,
         json_list=False,
         completer=complete,
-        converter=None if kind is bool else _several if several else _word,
+        converter=None if kind is bool else _all_words if several else _first_word,
     )
     return inspect.Parameter(
         field.name,
@@ -164,12 +161,11 @@ def _help(
     return f"{sentence} [{'; '.join(facts)}]" if facts else sentence
 
 
-def _word(_: Any, tokens: tuple[Token, ...]) -> str:
-    """Return the word that was typed, unchanged."""
+def _first_word(_: Any, tokens: tuple[Token, ...]) -> str:
     return tokens[0].value
 
 
-def _several(_: Any, tokens: tuple[Token, ...]) -> list[str]:
+def _all_words(_: Any, tokens: tuple[Token, ...]) -> list[str]:
     return [token.value for token in tokens]
 
 

@@ -65,14 +65,15 @@ def print_outcome(outcome: RenderResult, seconds: float, *, as_json: bool) -> No
 
 def _shot_json(done: FinishedShot, *, timed: bool) -> dict[str, Any]:
     """Return the figures of one shot; those of a single renderer are not nested."""
-    by_renderer: Mapping[str, Any] = {
-        name: {**picture.facts, "exr": str(picture.path), "kept": picture.was_kept}
-        | ({"picture_seconds": _rounded(picture.seconds)} if timed else {})
-        for name, picture in done.pictures.items()
-    }
-    for facts in by_renderer.values():
+    by_renderer: dict[str, Any] = {}
+    for name, picture in done.pictures.items():
+        facts: dict[str, Any] = {**picture.facts}
         if "at_cap" in facts:
             facts["at_cap"] = bool(facts["at_cap"])
+        if timed:
+            seconds = picture.seconds
+            facts["picture_seconds"] = None if seconds is None else float(f"{seconds:.4g}")
+        by_renderer[name] = {**facts, "exr": str(picture.path), "kept": picture.was_kept}
     if len(by_renderer) == 1:
         (by_renderer,) = by_renderer.values()
     else:
@@ -193,10 +194,6 @@ def _time_rows(plan: RenderPlan, shots: Sequence[FinishedShot]) -> Rows:
     which = "" if len(taken) == 1 else f"median of {len(taken)}: "
     text = f"{which}{np.median(taken):.2g} s after start-up"
     return [("picture took", f"{text}; expected {plan.choice.priced.seconds:.2g} s")]
-
-
-def _rounded(seconds: float | None) -> float | None:
-    return None if seconds is None else float(f"{seconds:.4g}")
 
 
 def _spread(name: str, values_db: Sequence[float], metric: str) -> Rows:

@@ -209,7 +209,13 @@ def run_flow(
     with prefect.server() as client:
         run = prefect.submit(client, flow, runs.deployment, parameters)
         if not as_json:
-            _print_run(run, prefect.workers_online(client, run.pool))
+            console.print(f"Run {run.name} of {run.deployment}: {run.page}", soft_wrap=True)
+            ends = f"prefect flow-run cancel {run.id} ends it"
+            console.print(f"Ctrl-C here leaves it running; {ends}", soft_wrap=True)
+            if not prefect.workers_online(client, run.pool):
+                start = f"prefect worker start --pool {run.pool}"
+                text = f"no worker of the pool {run.pool} is online, and the run waits for one"
+                note(f"{text}: {start}")
         if runs.no_watch:
             if as_json:
                 print_json({"flow_run": str(run.id), "deployment": run.deployment})
@@ -217,16 +223,6 @@ def run_flow(
         last = _watch_run(prefect.poll_run(client, run.id), silent=as_json)
     _report(run, last, where, as_json=as_json)
     return True
-
-
-def _print_run(run: "SubmittedRun", workers: int) -> None:
-    console.print(f"Run {run.name} of {run.deployment}: {run.page}", soft_wrap=True)
-    console.print(
-        f"Ctrl-C here leaves it running; prefect flow-run cancel {run.id} ends it", soft_wrap=True
-    )
-    if not workers:
-        start = f"prefect worker start --pool {run.pool}"
-        note(f"no worker of the pool {run.pool} is online, and the run waits for one: {start}")
 
 
 def _watch_run(looks: "Iterable[RunStatus]", *, silent: bool) -> "RunStatus":

@@ -8,15 +8,12 @@ import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pipeline.documents.sums import SUMS, UNPUBLISHED, published_files, stale_sums
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-
-if TYPE_CHECKING:
-    from huggingface_hub import HfApi
 
 RepositoryKind = Literal["dataset", "model", "space"]
 
@@ -111,8 +108,12 @@ def push(upload: Upload, *, private: bool) -> str:
             exist_ok=True,
             space_sdk="static" if upload.kind == "space" else None,
         )
-        if private:
-            _require_private(hub, upload)
+        # an existing repository is never changed
+        if private and not hub.repo_info(upload.repository, repo_type=upload.kind).private:
+            raise TrilightError(
+                f"{upload.repository}: is there already and public; expected a private one. Make "
+                "it private in its settings on the hub, or leave out --private."
+            )
         hub.upload_folder(
             repo_id=upload.repository,
             repo_type=upload.kind,
@@ -131,15 +132,6 @@ def push(upload: Upload, *, private: bool) -> str:
     except Exception as error:  # of whichever HTTP library the package uses
         raise _broken_off(upload, "the upload broke off", error) from error
     return str(made.url)
-
-
-def _require_private(hub: "HfApi", upload: Upload) -> None:
-    """Refuse a public repository if the upload should be private; never change an existing one."""
-    if not hub.repo_info(upload.repository, repo_type=upload.kind).private:
-        raise TrilightError(
-            f"{upload.repository}: is there already and public; expected a private one. Make it "
-            "private in its settings on the hub, or leave out --private."
-        )
 
 
 _NO_TOKEN = (

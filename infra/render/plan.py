@@ -88,7 +88,7 @@ def plan_render(options: RenderOptions, reader: SceneReader) -> RenderPlan:
     if options.out.suffix.lower() == ".exr":
         scene_source(options.source)  # reports a wrong name before any library is loaded
     output = output_paths(options.out)
-    pairs = _pairs(options, reader) if output.is_sequence else _one_pair(options)
+    pairs = _pairs(options, reader, output)
     if isinstance(quality, Budget):
         choice = _choose(quality, pairs, resolution, options.threads)
         renderers = _renderers(options, choice.priced.samples, None, resolution)
@@ -174,13 +174,11 @@ def _choose(budget: Budget, pairs: Pairs, resolution: int, threads: int | None) 
     return choose(budget, candidates, table, known, resolution)
 
 
-def _one_pair(options: RenderOptions) -> Pairs:
-    if options.orbit is not None or options.cameras is not None:
+def _pairs(options: RenderOptions, reader: SceneReader, output: OutputPaths) -> Pairs:
+    if not output.is_sequence:
+        if options.orbit is None and options.cameras is None:
+            return [(scene_source(options.source), options.view)]
         raise TrilightError(f"--out is {options.out}; expected a folder, X.mp4 or X.webp for many.")
-    return [(scene_source(options.source), options.view)]
-
-
-def _pairs(options: RenderOptions, reader: SceneReader) -> Pairs:
     sources = scene_sources(options.source, reader)
     cameras: Sequence[Camera | int] = [options.view]
     if options.cameras is not None:

@@ -4,13 +4,13 @@ import functools
 import importlib.util
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.render.networks import NetworkRenderer, SceneHere
+from infra.render.networks import NetworkRenderer, RendererHere, SceneHere
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import FixedSamples, ToStatedError
 from infra.viewer.picture_options import PictureOptions
@@ -55,13 +55,11 @@ class PassImage(Image):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PassRenderer:
+class PassRenderer(RendererHere):
     """Pass of the visible surfaces, such as depth: a function of scene and camera without light."""
 
     pass_view: PassView
     resolution: int
-    notes: Sequence[str] = ()
-    identity: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -71,9 +69,6 @@ class PassRenderer:
     def load(self, scene: Scene, name: str) -> SceneHere:
         """Return the scene as it is."""
         return SceneHere(render_image=functools.partial(self._render, scene))
-
-    def close(self) -> None:
-        """Do nothing: nothing is held."""
 
     def _render(self, scene: Scene, camera: Camera) -> Image:
         (name,) = pass_names([self.pass_view.word])
@@ -95,7 +90,7 @@ class PassRenderer:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StoredPictures:
+class StoredPictures(RendererHere):
     """Pictures that a dataset or an HDF5 file holds of the scene's own cameras."""
 
     scene: Scene
@@ -104,8 +99,6 @@ class StoredPictures:
     errors_db: Sequence[float] = ()
     """Stated errors as psnr_log_db; may be empty."""
     name: str = "target"
-    notes: Sequence[str] = ()
-    identity: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def resolution(self) -> int:
@@ -117,9 +110,6 @@ class StoredPictures:
         if scene is not self.scene:
             raise Unrenderable("The file's picture shows the scene without your changes.")
         return SceneHere(render_image=self._look_up)
-
-    def close(self) -> None:
-        """Do nothing: nothing is held."""
 
     def _look_up(self, camera: Camera) -> Image:
         if camera.view is None or camera.view >= len(self.radiance_rgb):

@@ -6,12 +6,13 @@ import json
 import struct
 import threading
 from collections.abc import Mapping
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from PIL import Image as Picture
 
+from infra.render.networks import RendererHere
 from infra.viewer import scene_bytes as module
 from infra.viewer.page_renderers import (
     PageRenderer,
@@ -36,11 +37,10 @@ from tests.textured_by_hand import colour_texture, number_texture, textured_scen
 TARGETS = np.full((2, 16, 16, 3), 0.5, np.float32)
 
 
-class GreyRenderer:
+class GreyRenderer(RendererHere):
     """Renders grey at once, or step by step until it is told to end."""
 
-    name, resolution, notes = "grey", 16, ()
-    identity: ClassVar[dict[str, str]] = {}
+    name, resolution = "grey", 16
     seconds, cpu_seconds = 0.0, 0.5
 
     def __init__(self, grey: float, *, floor_db: float | None = None, waits: bool = False) -> None:
@@ -51,9 +51,6 @@ class GreyRenderer:
 
     def load(self, scene: Scene, name: str) -> "GreyRenderer":
         return self
-
-    def close(self) -> None:
-        pass
 
     def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Image:
         self.rendered += 1
