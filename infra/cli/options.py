@@ -21,7 +21,6 @@ from typing import Annotated, Any, get_origin
 from cyclopts import Group, Parameter, Token
 
 from infra.cli.changes import parse_changes
-from infra.cli.completion import NAMES
 from infra.cli.extend_option import resolve_reference
 from storage.errors import TrilightError
 from storage.remote.url import parse_local_path
@@ -237,3 +236,36 @@ def is_repeated(hint: Any) -> bool:
 def takes_names(hint: Any) -> bool:
     """Return whether a field takes names with values."""
     return get_origin(unwrap(hint)[0]) in (Mapping, dict)
+
+
+def _builds() -> list[str]:
+    from pipeline.builds.named import BUILDS
+
+    return list(BUILDS)
+
+
+def _runs() -> list[str]:
+    from train.runs import RUNS
+
+    return list(RUNS)
+
+
+def _sizes() -> list[str]:
+    from model.config import SIZES
+
+    return list(SIZES)
+
+
+def _runners() -> list[str]:
+    from pipeline.executors.registry import EXECUTORS
+
+    return list(EXECUTORS)
+
+
+NAMES: dict[str, Callable[[], list[str]]] = {
+    "build": _builds,
+    "run": _runs,
+    "network": _sizes,
+    "runner": _runners,
+}
+"""Known names by the field that takes one; a field may also take a name that is not listed."""

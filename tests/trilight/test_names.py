@@ -21,6 +21,7 @@ from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from trilight import extend
+from trilight.lazy import offered_names
 
 
 @for_each(("module", "missing"), [(trilight, "rendr"), (extend, "TEMPLATE")])
@@ -116,3 +117,18 @@ def test_the_page_runs(tmp_path: Path) -> None:
     _require_runs(tmp_path, str(program))
     made = {path.name for path in tmp_path.iterdir()}
     assert {"still.usdz", "still.exr", "network.png", "set", "run", "evaluation"} <= made
+
+
+def test_a_name_is_exported_as_its_import_calls_it(tmp_path: Path) -> None:
+    module = tmp_path / "package.py"
+    module.write_text(
+        "from typing import TYPE_CHECKING\n"
+        "if TYPE_CHECKING:\n"
+        "    from json import dumps as dumps\n"
+        "    from os.path import join as joined, split as split\n"
+    )
+    assert offered_names(str(module)) == {
+        "dumps": ("json", "dumps"),
+        "joined": ("os.path", "join"),
+        "split": ("os.path", "split"),
+    }
