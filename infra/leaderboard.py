@@ -66,11 +66,9 @@ class Leaderboard:
     widths: tuple[WidthStandings, ...]
     """Table of each width, ascending."""
     notes: tuple[str, ...]
-    """Notes for the reader, each once."""
     rival: str
     """Name of the row that all others are compared with."""
     out: Path
-    """Folder of the leaderboard's files."""
 
 
 def make_leaderboard(order: LeaderboardOptions, on_progress: OnProgress) -> Leaderboard:

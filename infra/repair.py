@@ -36,9 +36,7 @@ def repair(
     fails, they stay in the dataset with the suffix `.bad`.
 
     Args:
-        dataset: folder of the dataset.
         bad_shards: names of the shards (storage.dataset.verify).
-        objects: source of the objects, as in the `generate` command.
         scenes_from: folder of the scene files, as in the `generate` command; their digests are in
             the lock, so that no other files are accepted.
 

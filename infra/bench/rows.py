@@ -25,7 +25,6 @@ class Row:
     point: Point
     """Declaration of the point, without its settings."""
     values: Mapping[str, float]
-    """Value of each measured column, by name."""
     intervals: Mapping[str, tuple[float, float]]
     """95 % interval of each column over `pair`, by name."""
     cost_range: tuple[float, float] | None

@@ -218,7 +218,6 @@ def generate_from_meshes(
 
     Args:
         geometry_sha256: digests of the meshes, by which objects are assigned to splits.
-        folder: folder of the meshes.
         allow_licences: licences that were allowed in addition to the usual ones.
         own_materials: whether meshes keep the materials of their source.
     """

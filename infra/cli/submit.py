@@ -192,11 +192,7 @@ def run_flow(
     """Run a flow by a worker of the server; print its progress and its summary.
 
     Args:
-        flow: name of the flow.
-        parameters: parameters of the flow by name.
-        runs: deployment, and whether to watch the run.
         where: folder or URL of the dataset, for the summary.
-        as_json: print the result as JSON, and nothing else.
 
     Returns:
         Whether the run has ended; False where it is not watched.

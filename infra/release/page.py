@@ -42,7 +42,6 @@ class SceneComparison:
     """First view of one scene, rendered by all methods."""
 
     key: str
-    """Key of the scene's sample in the dataset."""
     caption: str
     """Split, layout and number of triangles as text."""
     target_rgb: NDArray[np.float32]
@@ -61,11 +60,6 @@ def write_page(
     """Write `index.html`, its pictures and the README of a static space; return the page's path.
 
     Pictures of an earlier page, which would be uploaded, too, are deleted.
-
-    Args:
-        folder: folder of the page.
-        comparisons: scenes, each rendered by the same methods.
-        about: facts of the pictures, as names and values.
 
     Raises:
         TrilightError: the folder cannot be written.
@@ -140,12 +134,6 @@ def compare_scenes(
     dataset: Dataset, chosen: Sequence[ChosenScene], *, checkpoint: str, done: Callable[[], None]
 ) -> Iterator[SceneComparison]:
     """Yield the comparison of each scene's first view.
-
-    Args:
-        dataset: dataset of the scenes.
-        chosen: scenes to compare.
-        checkpoint: network, as in `trilight render --checkpoint`.
-        done: called after each scene.
 
     Raises:
         TrilightError: a sample is unreadable, or the network or the path tracer cannot render it.

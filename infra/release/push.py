@@ -33,11 +33,8 @@ class Upload:
     repository: str
     """Name of the repository as USER/NAME."""
     kind: RepositoryKind
-    """Kind of the repository on the hub."""
     files: int
-    """Number of files to upload."""
     num_bytes: int
-    """Size of all files together."""
 
 
 def kind_of(folder: Path) -> RepositoryKind:

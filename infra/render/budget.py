@@ -98,9 +98,6 @@ def price_all(
     """Return every row of the table with its expected cost and error.
 
     Args:
-        table: numbers of samples and the network, with their errors.
-        costs: costs of the parts of pictures.
-        width: width of a picture in pixels.
         threads: number of threads; no more than there are cores.
         per_scene: pictures that share the loading of a scene, at least 1.
         network: whether the network can run here; it is offered only between the widths at which it

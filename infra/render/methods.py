@@ -82,9 +82,7 @@ def compared_renderers(
     view, as those of `trilight render --orbit`.
 
     Args:
-        resolution: width in pixels.
         networks: networks by the names of their rows.
-        child: render child, which the previews share.
         levels: samples per pixel and filters of the previews.
     """
     compared: list[Renderer] = [DirectLightRenderer(resolution=resolution)]

@@ -25,9 +25,7 @@ class OutputPaths:
     stem: Path | None
     """Path of the only picture without its suffix; None for many pictures."""
     folder: Path
-    """Folder that receives the pictures."""
     video: Path | None
-    """Path of the video; None without one."""
 
     @property
     def is_sequence(self) -> bool:
@@ -91,11 +89,6 @@ def write_video(path: Path, frames: Sequence[Path], fps: int) -> None:
     """Write pictures of equal, even width and height as a video.
 
     A .webp takes all pictures into memory; an .mp4 one after the other.
-
-    Args:
-        path: X.mp4 or X.webp.
-        frames: PNG files in order.
-        fps: frames per second.
 
     Raises:
         TrilightError: the format needs a missing package, or the file cannot be written.

@@ -39,7 +39,6 @@ class Shot:
     exrs: Mapping[str, Path]
     """Paths of the EXR files by the name of their renderer."""
     png: Path
-    """Path of the PNG file for people."""
     keep: bool
     """True to keep existing files of an equal picture."""
 
@@ -59,13 +58,10 @@ class RenderPlan:
     resolution: int
     """Width of every picture in pixels."""
     look: Look
-    """Display options of the PNG files."""
     output: OutputPaths
-    """Paths of pictures and video."""
     shots: Sequence[Shot]
     """Pictures in order; those of one scene are consecutive."""
     fps: int
-    """Frames per second of the video."""
     choice: Choice | None = None
     """Samples or network for a budget, with their expected cost and error; None without one."""
 

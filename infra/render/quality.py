@@ -24,7 +24,6 @@ class ToStatedError:
     targets: NoiseTargets = USUAL_TARGETS
     """Target errors; psnr_log_db of 40 where none is set."""
     max_spp: int = MOST_TRACED_SPP
-    """Maximum number of samples per pixel."""
     split: bool = False
     """True to keep direct and indirect light apart."""
     split_lobes: bool = False
@@ -61,7 +60,6 @@ class FixedSamples:
     spp: int
     """Number of paths through each pixel, from 1."""
     denoiser: Filtered
-    """Filter of Open Image Denoise."""
 
     @property
     def count(self) -> str:

@@ -40,7 +40,6 @@ class FinishedShot:
     scene_sha256: str
     """SHA-256 of the scene by storage.records.scene_file.scene_digest."""
     num_triangles: int
-    """Number of triangles of the scene, emitting ones included."""
     num_lights: int
     """Number of emitter objects of the scene, not of their triangles."""
     pictures: Mapping[str, PictureFile]
@@ -57,7 +56,6 @@ class RenderResult:
 
     plan: RenderPlan
     shots: Sequence[FinishedShot]
-    """Results in the order of the plan's shots."""
     notes: Sequence[str]
     """Warnings about scenes and pictures, each once."""
 

@@ -23,7 +23,6 @@ def scene_sources(text: str, reader: SceneReader) -> list[SceneSource]:
         text: one file; `scenes/{000..119}.json` for numbered ones; or a folder, whose scene files
             are sorted by the numbers in their names. A shard stands for all of its samples, an
             animated USD stage for all of its frames.
-        reader: reader for files that may hold many scenes.
 
     Raises:
         TrilightError: a file is unusable, or there is no scene.
@@ -107,7 +106,6 @@ def camera_path(text: str, reader: SceneReader, view: int) -> list[Camera]:
 
     Args:
         text: JSON file with a list `cameras` as in RenderFormer's scenes, or any scene.
-        reader: reader that opens the file.
         view: row of the camera in each frame.
 
     Raises:

@@ -63,7 +63,6 @@ def start(*, host: str, port: int, workers: int) -> str:
 
     Args:
         host: host name or IPv4 address to bind to.
-        port: port of the server.
         workers: number of workers of the pool; each runs one flow at a time.
 
     Raises:

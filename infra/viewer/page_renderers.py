@@ -41,7 +41,6 @@ class PageRenderer:
     means: str
     """Description on the page, one sentence."""
     make: Callable[[PictureOptions], Renderer]
-    """Function that returns the renderer of a request."""
     words: Sequence[str] = ()
     """Options of `trilight render` for the same picture; without them, path tracing."""
 
@@ -130,9 +129,7 @@ def page_renderers(
     """Return the renderers by name, in the order of the page.
 
     Args:
-        child: render child of this page.
         target: pictures of the file; None where it holds none.
-        checkpoint: network of the user; may be None.
     """
     offered = {
         "traced": PageRenderer(

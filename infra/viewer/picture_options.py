@@ -32,7 +32,6 @@ class PictureOptions:
     """Options of one picture."""
 
     engine: str
-    """Name of the renderer that makes the picture."""
     camera: Camera
     resolution: int
     """Width of the picture in pixels, a multiple of 8."""
@@ -55,11 +54,6 @@ class PictureOptions:
 
 def parse_picture_options(body: Any, engines: Mapping[str, Any], views: int) -> PictureOptions:
     """Return the options in the body of a request.
-
-    Args:
-        body: JSON value of the request.
-        engines: renderers of the page by name.
-        views: number of cameras of the scene.
 
     Raises:
         TrilightError: an option is missing or invalid.

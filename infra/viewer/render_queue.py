@@ -50,7 +50,6 @@ class RenderJob:
     scene_core_s: float | None = None
     """CPU seconds of the scene's preparation; None where they are unknown."""
     notes: Sequence[str] = ()
-    """Warnings about the scene with this renderer."""
     sampling: Sampling | None = None
     """Progress of a path tracer since the last image."""
     error: str = ""

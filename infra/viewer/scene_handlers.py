@@ -68,12 +68,10 @@ class SceneHandlers:
     """Handlers of one scene and its pictures."""
 
     name: str
-    """Title of the scene on the page."""
     scene: Scene
     notes: Sequence[str]
     """Losses of the conversion from the scene's file."""
     renderers: Mapping[str, PageRenderer]
-    """Renderers by name, in the order of the page."""
     target_px: int | None
     """Width in pixels of the pictures in the file; None without such pictures."""
     source: str = ""
@@ -227,8 +225,6 @@ def handlers_of_scene(
     """Return the handlers of a loaded scene; they do not close the render child.
 
     Args:
-        name: title on the page.
-        loaded: scene with its notes, and the pictures that its file holds.
         source: scene as `trilight render` takes it; empty where it cannot.
         child, checkpoint: render child and network of the page.
         errors_db: stated errors of the pictures as psnr_log_db.

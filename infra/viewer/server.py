@@ -281,7 +281,6 @@ def refusal(
     """Return why a request is refused, or None where it is allowed.
 
     Args:
-        method: GET or POST.
         path: path as it was sent, with its query.
         pairs: headers of the request, names in any case.
         port: port of the server.

@@ -352,9 +352,7 @@ def product_figures(device: torch.device, kind: str, width: int) -> dict[str, fl
     """Return the seconds and FLOP/s of a large square matrix product: the best of five.
 
     Args:
-        device: device of the product.
         kind: float32, tf32, bfloat16 or float16.
-        width: width of the matrices.
     """
     dtype = torch.float32 if kind == "tf32" else getattr(torch, kind)
     matrix = torch.randn(width, width, device=device).to(dtype)
@@ -367,9 +365,7 @@ def copy_figures(device: torch.device, kind: str, size: int) -> dict[str, float]
     """Return the seconds and bytes a second of a copy.
 
     Args:
-        device: device of the copy.
         kind: within (bytes read and written count), to_pageable or to_pinned.
-        size: number of bytes to copy.
     """
     target = torch.zeros(size, dtype=torch.uint8, device=device)
     if kind == "within":

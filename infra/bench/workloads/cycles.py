@@ -37,10 +37,8 @@ def render_with_cycles(
     """Render raw pictures of a scene's first view in a separate process.
 
     Args:
-        scene: scene that passes `Scene.check`.
         resolution: width and height in pixels.
         spp: samples per pixel; adaptive sampling is off.
-        seeds: seed of each picture's samples.
         bounces: maximum number of bounces, in sum and of each kind; 8 is Mitsuba's max_depth of 10,
             and 0 direct light.
         threads: threads of Cycles; None for one for each core.
