@@ -224,6 +224,8 @@ def test_a_scene_is_saved_with_its_changes_and_nothing_is_written_here() -> None
                 assert len(changed[1]) > 500 and changed[1] != plain[1]
                 for bad in ("../x.usda", ".exe", "", None, ".json"):
                     assert asker.ask("api/export", {"form": bad})[0] == 422
+    textured = dataclasses.replace(room_of({}), scene=textured_scene())  # in more files than one
+    assert textured._is_offered(".usdz") and not textured._is_offered(".usda")
 
 
 def test_a_lamp_moves_and_shines_brighter_and_all_else_stays() -> None:
@@ -370,9 +372,3 @@ def test_the_page_shows_the_command_of_each_way() -> None:
     network = "--engine neural --checkpoint 'a b.safetensors'"
     assert command("hits", view=None) == f"'a set/x.tar::000000001' {free} {network}"
     assert command("samples-4").endswith("--resolution 16 --spp 4")
-
-
-def test_only_forms_of_one_file_are_offered() -> None:
-    textured = dataclasses.replace(room_of({}), scene=textured_scene())
-    offered = [room._is_offered(".usda") for room in (room_of({}), textured)]
-    assert offered == [True, False] and textured._is_offered(".usdz")
