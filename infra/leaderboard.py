@@ -58,6 +58,12 @@ ALONE = "no picture is looked up: the set has no scene beside the one that is ju
 FEW_SCENES = 10
 """Number of scenes below which intervals over scenes are too narrow."""
 
+_LEAST = -1e-2
+"""Least radiance that still counts as a network's rounding of 0."""
+
+Views = Sequence[tuple[str, int]]
+"""Scene key and camera of every evaluated view."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Leaderboard:
@@ -273,13 +279,6 @@ def _beyond(most_triangles: dict[str, int], tables: Sequence[WidthStandings]) ->
                 f"{larger} of {len(sizes)} scenes have more triangles than any that {name} was "
                 "trained on"
             )
-
-
-_LEAST = -1e-2
-"""Least radiance that still counts as a network's rounding of 0."""
-
-Views = Sequence[tuple[str, int]]
-"""Scene key and camera of every evaluated view."""
 
 
 def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> PictureSource:

@@ -17,6 +17,24 @@ from storage.intervals import mean_interval
 from train.evaluation.cost_charts import SeriesPoint, draw_panels, plain_log
 from train.evaluation.cost_tables import number_text, on_front
 
+_OVER: Mapping[str, Callable[[Sequence[float]], Any]] = {
+    "median": np.median,
+    "mean": np.mean,
+    "pair": np.mean,
+    "least": np.min,
+    "most": np.max,
+    "p5": lambda values: np.percentile(values, 5),
+    "p95": lambda values: np.percentile(values, 95),
+}
+_WIDE = 7.0
+_HIGH = 5.2
+_DPI = 110
+"""Width and height of a panel in inches, and resolution of the file."""
+
+_FONT = 9
+_SPREAD = 20
+"""Ratio of costs above which their axis is logarithmic."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
@@ -89,17 +107,6 @@ def _cell(column: Column, row: Row) -> str:
     return f"{value:.1f}" if "dB" in column.name else number_text(value)
 
 
-_OVER: Mapping[str, Callable[[Sequence[float]], Any]] = {
-    "median": np.median,
-    "mean": np.mean,
-    "pair": np.mean,
-    "least": np.min,
-    "most": np.max,
-    "p5": lambda values: np.percentile(values, 5),
-    "p95": lambda values: np.percentile(values, 95),
-}
-
-
 def _values(
     experiment: Experiment, run: Run, point: Point
 ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
@@ -167,15 +174,6 @@ def _front(
         ]
         front |= dict(zip(names, on_front(figures), strict=True))
     return front
-
-
-_WIDE = 7.0
-_HIGH = 5.2
-_DPI = 110
-"""Width and height of a panel in inches, and resolution of the file."""
-_FONT = 9
-_SPREAD = 20
-"""Ratio of costs above which their axis is logarithmic."""
 
 
 def plot(experiment: Experiment, run: Run, path: Path) -> None:

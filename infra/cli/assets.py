@@ -39,6 +39,7 @@ _EPSILON_BUDGET = 4096
 """Triangles that the largest scene of RenderFormer may hold in all."""
 _SHOWN = 12
 _LEVELS = next(field.within for field in describe_fields(AssetSettings) if field.name == "budgets")
+_BUILD = "smoke"
 
 
 @checked()
@@ -199,9 +200,6 @@ def _print_table(report: "AssetReport") -> None:
     if len(worst) > _SHOWN:
         more = len(worst) - _SHOWN
         console.print(f"and {more} accepted objects with smaller errors\n", style="dim")
-
-
-_BUILD = "smoke"
 
 
 def generate_from_meshes(

@@ -30,6 +30,13 @@ from storage.settings.described import checked
 if TYPE_CHECKING:
     from pipeline.generation.run import Outcome
 
+_POLL_S = 0.5
+_MAX_NOTES = 20
+"""Maximum number of notes that are printed."""
+
+_RUN = "smoke"
+"""Training preset that the next step names."""
+
 
 @checked()
 class ExecutorOptions:
@@ -66,9 +73,6 @@ def make(order: DatasetOrder, runner: ExecutorOptions, output: OutputOptions) ->
     with show_progress(folder, silent=output.json):
         outcome = executor.make(order, runner.address)
     report(folder, outcome, time.monotonic() - started, as_json=output.json)
-
-
-_POLL_S = 0.5
 
 
 @contextlib.contextmanager
@@ -132,12 +136,6 @@ class _Bars:
             total=total,
             note=f"scenes {now.scenes_done} of {now.scenes_planned}{given_up}{earlier}",
         )
-
-
-_MAX_NOTES = 20
-"""Maximum number of notes that are printed."""
-_RUN = "smoke"
-"""Training preset that the next step names."""
 
 
 def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json: bool) -> None:

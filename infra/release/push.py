@@ -23,6 +23,19 @@ _PART = r"(?!\S*(?:--|\.\.))\w(?:[\w.-]{0,94}\w)?"
 _REPOSITORY = re.compile(f"{_PART}/{_PART}", re.ASCII)
 """Names that huggingface_hub accepts; it would refuse others only later."""
 
+_NO_TOKEN = (
+    "{repository}: the hub takes uploads from its owner alone; set HF_TOKEN to a token that may "
+    "write there, or run hf auth login."
+)
+MOST_FILES = 100_000
+"""Maximum number of files of a repository."""
+
+MOST_ENTRIES = 10_000
+"""Maximum number of entries of a folder."""
+
+MOST_FILE_BYTES = 20_000_000_000
+"""Maximum size of a file."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Upload:
@@ -131,12 +144,6 @@ def push(upload: Upload, *, private: bool) -> str:
     return str(made.url)
 
 
-_NO_TOKEN = (
-    "{repository}: the hub takes uploads from its owner alone; set HF_TOKEN to a token that may "
-    "write there, or run hf auth login."
-)
-
-
 def _broken_off(upload: Upload, what: str, error: Exception) -> TrilightError:
     said = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
     return TrilightError(
@@ -155,14 +162,6 @@ def _require_sound(folder: Path) -> None:
             f"{folder}: is damaged ({verification.problems[0].rstrip('.')}); expected a whole "
             f"dataset. See trilight verify {folder}."
         )
-
-
-MOST_FILES = 100_000
-"""Maximum number of files of a repository."""
-MOST_ENTRIES = 10_000
-"""Maximum number of entries of a folder."""
-MOST_FILE_BYTES = 20_000_000_000
-"""Maximum size of a file."""
 
 
 def require_within_limits(folder: Path) -> tuple[int, int]:

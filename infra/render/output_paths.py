@@ -17,6 +17,16 @@ from PIL import Image
 from storage.atomic import write_atomically, write_error
 from storage.errors import TrilightError
 
+SUFFIXES = (".mp4", ".webp")
+_CRF = "16"
+"""Quality of H.264: losses are invisible below about 18, and absent at 0."""
+
+_WEBP_QUALITY = 90
+_BT709 = 1
+_SRGB = 13
+_STUDIO_RANGE = 1
+"""Color properties of the video, by their numbers in ITU-T H.273 and in FFmpeg."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class OutputPaths:
@@ -66,17 +76,6 @@ def _writable(folder: Path, out: Path) -> Path:
     except OSError as error:
         raise write_error(out, error) from error
     return folder
-
-
-SUFFIXES = (".mp4", ".webp")
-
-_CRF = "16"
-"""Quality of H.264: losses are invisible below about 18, and absent at 0."""
-_WEBP_QUALITY = 90
-_BT709 = 1
-_SRGB = 13
-_STUDIO_RANGE = 1
-"""Color properties of the video, by their numbers in ITU-T H.273 and in FFmpeg."""
 
 
 def require_encoder(path: Path) -> None:

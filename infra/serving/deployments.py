@@ -27,6 +27,11 @@ from storage.installation import FILES_ROOT
 _KINDS = {"local": "process"}
 """Kinds of workers, by pools that are not named after theirs."""
 
+_DISK_SLOTS = 2
+"""Number of runs that may write documents at the same time: each reads its whole dataset."""
+
+_MOST_CARDS = 100_000
+
 
 def deploy(name: str, template: Path) -> None:
     """Make the pool, the limits and the deployments of a name.
@@ -80,11 +85,6 @@ def _deploy_flow(row: dict[str, Any]) -> None:
     deployment.storage = LocalStorage(folder["directory"])
     deployment.entrypoint = row["entrypoint"]
     deployment.apply()
-
-
-_DISK_SLOTS = 2
-"""Number of runs that may write documents at the same time: each reads its whole dataset."""
-_MOST_CARDS = 100_000
 
 
 def limits(environment: Mapping[str, str]) -> dict[str, int]:

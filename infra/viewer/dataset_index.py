@@ -33,6 +33,14 @@ _MOST_HEADER = 1 << 20
 _PATIENCE_S = 20.0
 """Seconds to wait for a scene that is not read yet."""
 
+_WHERE = {
+    "triangles": "triangles_per_scene",
+    "lights": "lights_per_scene",
+    "coverage": "min(coverage)",
+    "floor": "min(noise_floor_db)",
+}
+"""Columns with limits, by their quantity in `trilight shards select --where`."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SceneRow:
@@ -160,15 +168,6 @@ def _num_triangles(stream: BinaryIO, members: Mapping[str, Member]) -> int:
 def _single(value: Any) -> float:
     """Return a number as `trilight shards select` compares it."""
     return float(np.float32(value))
-
-
-_WHERE = {
-    "triangles": "triangles_per_scene",
-    "lights": "lights_per_scene",
-    "coverage": "min(coverage)",
-    "floor": "min(noise_floor_db)",
-}
-"""Columns with limits, by their quantity in `trilight shards select --where`."""
 
 
 @dataclass(frozen=True, kw_only=True)

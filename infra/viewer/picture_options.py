@@ -25,6 +25,10 @@ MOST_PX = 1024
 """Maximum width in pixels of a requested picture."""
 
 _POSE_LENGTH = 16
+MOST_GAIN = 1000.0
+"""Maximum factor by which a lamp may become brighter."""
+
+_COLUMNS = {"diffuse": DIFFUSE, "specular": SPECULAR}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,12 +120,6 @@ def _number(value: Any, name: str, low: float, high: float) -> float:
 def short_digest(value: Any) -> str:
     """Return a digest of JSON values, by which edits and cameras are compared."""
     return sha256_hex(canonical_json(value))[:24]
-
-
-MOST_GAIN = 1000.0
-"""Maximum factor by which a lamp may become brighter."""
-
-_COLUMNS = {"diffuse": DIFFUSE, "specular": SPECULAR}
 
 
 def apply_edits(scene: Scene, edits: Mapping[str, Any]) -> Scene:

@@ -61,6 +61,10 @@ MOST_THUMBNAILS = 1000
 """Maximum number of small pictures that a page keeps."""
 
 _OCTETS = "application/octet-stream"
+MOST_OPEN = 3
+"""Maximum number of scenes whose pages stay open."""
+
+_BELOW = re.compile(r"scene/([^/]+)/(.*)", re.DOTALL)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -287,12 +291,6 @@ def _tone_map(radiance_rgb: NDArray[np.float32], query: Mapping[str, str]) -> ND
     if not -32 <= exposure_ev <= 32:
         raise TrilightError(f"ev is {exposure_ev}; expected -32 to 32.")
     return tone_mapped(radiance_rgb * np.float32(2.0**exposure_ev), tone_map)
-
-
-MOST_OPEN = 3
-"""Maximum number of scenes whose pages stay open."""
-
-_BELOW = re.compile(r"scene/([^/]+)/(.*)", re.DOTALL)
 
 
 class OpenScenes:

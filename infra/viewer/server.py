@@ -36,6 +36,42 @@ _MOST_AWAITED = 64
 _STALLED_S = 30.0
 """Seconds without progress after which a connection is dropped."""
 
+HOST = "127.0.0.1"
+"""Address of the server, which only this machine reaches."""
+
+_ONCE = ("host", "origin", "sec-fetch-site", "sec-fetch-dest", "content-length")
+"""Headers that may stand only once, since another program might read the other one of two."""
+
+MAX_PATH = 4096
+"""Maximum number of characters of a path with its query."""
+
+MAX_BODY_BYTES = 1 << 18
+"""Maximum size of a request's body in bytes."""
+
+SAFE_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}
+"""Headers of every response; none lets another origin read it."""
+
+Refusal = tuple[HTTPStatus, str]
+"""Status of a refused request, and the reason as a sentence that the page shows."""
+
+STATIC = Path(__file__).with_name("static")
+_KINDS = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".svg": "image/svg+xml",
+    "": "text/plain; charset=utf-8",
+}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Response:
@@ -241,38 +277,9 @@ def _parse_number(text: str) -> float:
     return int(text) if text.removeprefix("-").isdecimal() else value
 
 
-HOST = "127.0.0.1"
-"""Address of the server, which only this machine reaches."""
-
-_ONCE = ("host", "origin", "sec-fetch-site", "sec-fetch-dest", "content-length")
-"""Headers that may stand only once, since another program might read the other one of two."""
-
-MAX_PATH = 4096
-"""Maximum number of characters of a path with its query."""
-
-MAX_BODY_BYTES = 1 << 18
-"""Maximum size of a request's body in bytes."""
-
-SAFE_HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
-    "img-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors 'none'",
-    "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-    "Cache-Control": "no-store",
-}
-"""Headers of every response; none lets another origin read it."""
-
-
 def new_token() -> str:
     """Return a new secret token for an address."""
     return secrets.token_urlsafe(24)
-
-
-Refusal = tuple[HTTPStatus, str]
-"""Status of a refused request, and the reason as a sentence that the page shows."""
 
 
 def refusal(
@@ -314,17 +321,6 @@ def refusal(
     if method == "POST" and (len(length) > 9 or int(length) > MAX_BODY_BYTES):
         return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "The request is too large."
     return None
-
-
-STATIC = Path(__file__).with_name("static")
-
-_KINDS = {
-    ".html": "text/html; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".svg": "image/svg+xml",
-    "": "text/plain; charset=utf-8",
-}
 
 
 def static_routes(page: str) -> dict[str, Route]:

@@ -40,6 +40,25 @@ if TYPE_CHECKING:
 MARK = "trilight: "
 """Prefix of the names of parts in a trace."""
 REST = "backward and rest"
+SHRUNK_PX = 32
+SHRUNK_TRIANGLES = 64
+SHRUNK_SCENES = 2
+THIN = (4, 8, 16, 16, 16)
+"""Channels of LPIPS for shrunk presets."""
+
+_WARM_STEPS = 3
+_LIGHTS = 4
+UNSTATED_TRIANGLES = 1024
+"""Triangles of the longest scene if a preset sets no limit."""
+
+SPREAD = 0.06
+"""Fraction by which the shortest scene of a pass is shorter than the longest, as in the buckets of
+`pretrain`. Half of it is padding on average, so that attention has a mask."""
+
+VGG16_WIDTHS = (64, 128, 256, 512, 512)
+"""Channels of VGG16's blocks, as in the published LPIPS."""
+
+REPEATS = 5
 
 
 @contextmanager
@@ -140,14 +159,6 @@ def _kernel_us(event: Any) -> float:
     return float(event.self_device_time_total if on_gpu else event.self_cpu_time_total)
 
 
-SHRUNK_PX = 32
-SHRUNK_TRIANGLES = 64
-SHRUNK_SCENES = 2
-THIN = (4, 8, 16, 16, 16)
-"""Channels of LPIPS for shrunk presets."""
-_WARM_STEPS = 3
-
-
 def step_settings(run: str, device: torch.device) -> TrainSettings:
     """Return a preset with random initial weights; without a GPU a small one of its form."""
     settings = dataclasses.replace(named_run(run), from_weights=False)
@@ -236,18 +247,6 @@ def _measure_steps(
     return {**figures, "kernels": float(kernels)}, parts
 
 
-_LIGHTS = 4
-UNSTATED_TRIANGLES = 1024
-"""Triangles of the longest scene if a preset sets no limit."""
-
-SPREAD = 0.06
-"""Fraction by which the shortest scene of a pass is shorter than the longest, as in the buckets of
-`pretrain`. Half of it is padding on average, so that attention has a mask."""
-
-VGG16_WIDTHS = (64, 128, 256, 512, 512)
-"""Channels of VGG16's blocks, as in the published LPIPS."""
-
-
 def workloads(settings: TrainSettings, scenes: int) -> list[Workload]:
     """Return the scenes of a pass, longest first."""
     longest = settings.most_triangles or UNSTATED_TRIANGLES
@@ -331,9 +330,6 @@ def drawn_lpips(settings: TrainSettings, widths: tuple[int, ...] = VGG16_WIDTHS)
             channels = width
         linear[f"lin{block}.model.1.weight"] = torch.rand(1, width, 1, 1, generator=generator)
     return Lpips(vgg16, linear)
-
-
-REPEATS = 5
 
 
 def device_facts(device: torch.device) -> str:

@@ -23,6 +23,19 @@ from storage.errors import TrilightError
 from storage.records.scene import Scene
 
 _SCRIPT = Path(__file__).with_name("blender_process.py")
+BLENDER = "4.5.15"
+"""Version of Blender and of its wheel, with which the reference pictures were made."""
+
+LOCK = Path(__file__).with_name("blender.txt")
+"""Lock file of the environment, with the digests of all files (infra/setup/lock.sh)."""
+
+PYTHON = "3.11"
+"""Only version of Python that the wheel supports."""
+
+_INSTALL_S = 1800
+_RENDER_S = 4 * 3600
+_PROBE = f"import bpy; assert bpy.app.version_string.startswith({BLENDER!r})"
+_READY = "ready"
 
 
 def render_with_cycles(
@@ -69,21 +82,6 @@ def render_with_cycles(
             for number in range(len(seeds))
         ]
         return pictures, json.loads((folder / "timing.json").read_text())["core_s"]
-
-
-BLENDER = "4.5.15"
-"""Version of Blender and of its wheel, with which the reference pictures were made."""
-
-LOCK = Path(__file__).with_name("blender.txt")
-"""Lock file of the environment, with the digests of all files (infra/setup/lock.sh)."""
-
-PYTHON = "3.11"
-"""Only version of Python that the wheel supports."""
-
-_INSTALL_S = 1800
-_RENDER_S = 4 * 3600
-_PROBE = f"import bpy; assert bpy.app.version_string.startswith({BLENDER!r})"
-_READY = "ready"
 
 
 def installed_python() -> Path | None:
