@@ -61,7 +61,7 @@ def render_with_cycles(
         the file and building the tree of triangles.
 
     Raises:
-        TrilightError: Blender cannot be installed (blender_environment), or it failed.
+        TrilightError: Blender cannot be installed (`blender_python`), or it failed.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from infra.release import push as hub_limits
+from infra.release import push as pushing
 from infra.release.__main__ import _sum_and_say, _write_network
 from infra.release.page import NETWORK, RIVALS, SceneComparison, chosen_scenes, write_page
 from infra.release.push import kind_of, planned_upload, require_within_limits
@@ -208,7 +208,7 @@ def test_the_limits_of_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         ("MOST_FILE_BYTES", 29, "30 bytes in one file"),
     ):
         with monkeypatch.context() as patched:
-            patched.setattr(hub_limits, limit, value)
+            patched.setattr(pushing, limit, value)
             with pytest.raises(TrilightError, match=message):
                 require_within_limits(tmp_path)
 
