@@ -128,10 +128,17 @@ def judge_network(
         judged = dataclasses.replace(contest, tracer=tracer)
         views = judge_views(judged, lambda: done(next(numbers), total))
     about = _about(Path(checkpoint).name, opened, contest, split, views)
-    every, first = spread_views(contest.tracer_views, contest.num_scenes)
-    spread = spread_text(every, first, 1 + max(view.view for view in views))
-    figures = record(views, about, equal_time(views, times, spread))
+    figures = record(views, about, _beside_tracer(contest, views, times))
     return Judgement(record=figures, views=tuple(views), contest=contest)
+
+
+def _beside_tracer(
+    contest: EvalConfig, views: Sequence[JudgedView], times: EqualTimeResult
+) -> dict[str, Any]:
+    """Return the comparison with the path tracer as JSON values."""
+    every, first = spread_views(contest.tracer_views, contest.num_scenes)
+    most_views = 1 + max(view.view for view in views)
+    return equal_time(views, times, spread_text(every, first, most_views))
 
 
 def _time_tracer(

@@ -13,6 +13,7 @@ from train.runs import changed_run
 if TYPE_CHECKING:
     from train.progress import TrainProgress
     from train.result import TrainResult
+    from train.settings import TrainSettings
 
 
 def train_network(
@@ -66,19 +67,25 @@ def train_network(
         lpips=lpips,
     )
     start.check(settings)
-    from train.loop.distributed import DistributedContext, choose_device
-    from train.run import train_run
-
     roots = [data] if isinstance(data, str | os.PathLike) else data
-    result = train_run(
+    return _train_alone(
         settings,
+        device=device,
         data=[os.fspath(root) for root in roots],
         out=Path(out),
         start=start,
-        dist_context=DistributedContext(device=choose_device(device)),
         workers=workers,
         watched=watched,
         progress=progress,
     )
+
+
+def _train_alone(settings: "TrainSettings", *, device: str | None, **options: Any) -> "TrainResult":
+    """Run `train.run.train_run` in this process as the only rank."""
+    from train.loop.distributed import DistributedContext, choose_device
+    from train.run import train_run
+
+    dist_context = DistributedContext(device=choose_device(device))
+    result = train_run(settings, dist_context=dist_context, **options)
     assert result is not None  # rank 0 returns a result
     return result

@@ -100,8 +100,8 @@ def _report(name: str, workload: "Workload", counted: "Costs") -> None:
         scene_mb = counted.scene_bytes[precision] / 1e6
         text = f"weights {size / 1e6:.0f} MB, encoded scene {scene_mb:.0f} MB"
         rows.append((f"memory, {precision}", text))
-    kept = "float32 weights, gradients, AdamW; without activations"
-    rows.append(("memory, training", f"{counted.training_bytes / 1e6:.0f} MB: {kept}"))
+    parts = "float32 weights, gradients, AdamW; without activations"
+    rows.append(("memory, training", f"{counted.training_bytes / 1e6:.0f} MB: {parts}"))
     views = f"{workload.views} view{'s' if workload.views > 1 else ''}"
     print_rows(
         f"{name}: {workload.triangles} triangles, {views} of {workload.resolution} pixels", rows
