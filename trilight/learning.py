@@ -67,11 +67,10 @@ def train_network(
         lpips=lpips,
     )
     start.check(settings)
-    roots = [data] if isinstance(data, str | os.PathLike) else data
     return _train_alone(
         settings,
+        [data] if isinstance(data, str | os.PathLike) else data,
         device=device,
-        data=[os.fspath(root) for root in roots],
         out=Path(out),
         start=start,
         workers=workers,
@@ -80,12 +79,19 @@ def train_network(
     )
 
 
-def _train_alone(settings: "TrainSettings", *, device: str | None, **options: Any) -> "TrainResult":
+def _train_alone(
+    settings: "TrainSettings",
+    roots: Sequence[str | os.PathLike[str]],
+    *,
+    device: str | None,
+    **options: Any,
+) -> "TrainResult":
     """Run `train.run.train_run` in this process as the only rank."""
     from train.loop.distributed import DistributedContext, choose_device
     from train.run import train_run
 
+    data = [os.fspath(root) for root in roots]
     dist_context = DistributedContext(device=choose_device(device))
-    result = train_run(settings, dist_context=dist_context, **options)
+    result = train_run(settings, data=data, dist_context=dist_context, **options)
     assert result is not None  # rank 0 returns a result
     return result
