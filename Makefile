@@ -55,7 +55,7 @@ release: setup-all  ## dataset, network and pictures to publish, in $(RELEASE); 
 	trilight generate smoke --objects builtin: --out '$(RELEASE)/dataset' --scenes $(RELEASE_SCENES) --resolution $(RELEASE_PIXELS) \
 		--set splits.scenes_per_shard=$(RELEASE_SHARD) --set 'storage.passes=[depth,normal,object]'
 	python -m infra.release '$(RELEASE)'
-	python -m infra.setup.sbom '$(RELEASE)/sbom.cdx.json'
+	cyclonedx-py environment --output-reproducible --of JSON -o '$(RELEASE)/sbom.cdx.json'
 	pip-licenses --from=mixed --with-urls --format=markdown --output-file='$(RELEASE)/third-party.md'
 
 serve: setup  ## Prefect's server, a pool, a worker and the flows as deployments, on this machine
@@ -79,9 +79,8 @@ docs: $(VENV)/.docs-ready  ## the documentation as a site that opens from disk: 
 clean:  ## everything that make has made, except data/ and runs/
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache *.egg-info site
 
-$(VENV)/.dataset-ready: requirements/dataset.txt requirements/build.txt pyproject.toml infra/setup/system_libraries.sh infra/setup/install.sh
+$(VENV)/.dataset-ready: requirements/dataset.txt requirements/build.txt pyproject.toml infra/setup/install.sh
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	PYTHON=$(BIN)/python infra/setup/system_libraries.sh
 	infra/setup/install.sh $(BIN)/python dataset
 	$(if $(WITHOUT_GPL),infra/setup/without_gpl.sh $(BIN)/python)
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .

@@ -117,7 +117,7 @@ def _limits() -> Finding:
 def _renderer() -> Finding:
     cache_folder("")  # raises where there is neither a cache nor a home
     text = f"mitsuba {metadata.version('mitsuba')}"
-    code = "import mitsuba; mitsuba.set_variant('scalar_rgb')"
+    code = f"import {module_name('pipeline.renders')}, mitsuba; mitsuba.set_variant('scalar_rgb')"
     finding = _probe(code, text, "nothing can be rendered", f"{_APT} libatomic1")
     if finding.state == "missing":
         return finding
@@ -126,7 +126,8 @@ def _renderer() -> Finding:
     except EnvironmentFailure:
         raise
     except TrilightError as error:
-        return Finding("missing", str(error), "nothing can be rendered", f"{_APT} libllvm19")
+        mend = "pip install karellen-llvm-core"
+        return Finding("missing", str(error), "nothing can be rendered", mend)
     return Finding("ok", ", ".join(filter(None, (text, variant.name, variant.libllvm))))
 
 
@@ -147,14 +148,14 @@ def _denoiser() -> Finding:
 
 
 def _mesh_decimation() -> Finding:
-    text = f"meshoptimizer {metadata.version('meshoptimizer')}"
+    code = f"import {module_name('pipeline.assets.decimation.meshopt')}"
     problem = "meshes cannot be decimated where pymeshlab fails"
-    return _probe("import meshoptimizer", text, problem, "make setup")
+    return _probe(code, f"wasmtime {metadata.version('wasmtime')}", problem, "make setup")
 
 
 def _mesh_filters() -> Finding:
     if importlib.util.find_spec("pymeshlab") is None:
-        problem = "decimated meshes have twice the error, and the profile uniform is missing"
+        problem = "libigl decimates: other meshes, other digests, and no profile uniform"
         return Finding("slower", "no pymeshlab (GPL)", problem, "make setup")
     code = (
         f"from {module_name('pipeline.assets.environment')} import missing_filters; "
@@ -162,8 +163,7 @@ def _mesh_filters() -> Finding:
         "raise SystemExit(', '.join(m) if m else 0)"
     )
     text = f"pymeshlab {metadata.version('pymeshlab')}"
-    problem = "every object is rejected, or decimated by meshoptimizer with twice the error"
-    return _probe(code, text, problem, f"{_APT} libgl1 libopengl0")
+    return _probe(code, text, "no mesh can be made by pymeshlab", f"{_APT} libgl1 libopengl0")
 
 
 def _confinement() -> Finding:

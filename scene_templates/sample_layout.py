@@ -12,14 +12,14 @@ from typing import Literal
 import numpy as np
 
 from scene_templates.families import Family
-from scene_templates.layout import Layout, ObjectPlacement, SurfaceLook
+from scene_templates.layout import Layout, ObjectPlacement, ShellPart, SurfaceLook
 from scene_templates.lights import sample_emitters
 from scene_templates.materials import sample_material
 from scene_templates.placement import ObjectSpace, PlaceableShape, sample_poses
-from scene_templates.rooms import SIDES, patch, plane_of
+from scene_templates.rooms import PATCH_FACES, SIDES, patch, plane_of
 from scene_templates.separate_sides import SeparateSides
 from scene_templates.settings import SceneSettings
-from scene_templates.templates import TEMPLATES, LayoutParams
+from scene_templates.templates import TEMPLATES
 from storage.seeds import rng_for
 
 
@@ -86,11 +86,8 @@ def sample_layout(
     template = TEMPLATES[family.template]
     room = family.shell.sample_room(rng, template.parts)
     placed = zip(template.parts, room.patches, strict=True)
-    space = ObjectSpace(
-        room=room,
-        parts=template.parts,
-        planes=tuple(plane_of(patch(SIDES[name], placement)) for name, placement in placed),
-    )
+    positions = [patch(SIDES[name], placement) for name, placement in placed]
+    space = ObjectSpace(room=room, parts=template.parts, planes=tuple(map(plane_of, positions)))
     poses = sample_poses(
         rng,
         settings.placement,
@@ -106,16 +103,17 @@ def sample_layout(
     )
     centres = [pose.centre for pose in poses]
     emitters = sample_emitters(rng, settings.lights, template.lights, plan.num_lights, centres)
-    shell = family.shell
-    return template.layout(
-        LayoutParams(
-            patches=room.patches,
-            surfaces=surfaces,
-            objects=objects,
-            emitters=emitters,
-            wall2_faces_out=isinstance(shell, SeparateSides) and shell.wall2_faces_out,
+    wall2_faces_out = isinstance(family.shell, SeparateSides) and family.shell.wall2_faces_out
+    shell = tuple(
+        ShellPart(
+            name=name,
+            positions=vertices,
+            faces=PATCH_FACES[:, ::-1] if name == "wall2" and wall2_faces_out else PATCH_FACES,
+            surface=surface,
         )
+        for name, vertices, surface in zip(template.parts, positions, surfaces, strict=True)
     )
+    return Layout(shell=shell, objects=objects, emitters=emitters)
 
 
 def _sample_surface(

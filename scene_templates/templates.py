@@ -1,7 +1,6 @@
 """Layouts as data: which walls they have, and from where they are seen and lit.
 
-Following infinigen's convention, `Template.layout(params)` builds and draws nothing, while
-`sample_layout(rng, ...)` in the file of that name draws the parameters and builds.
+`sample_layout` in the file of that name draws one.
 """
 
 from dataclasses import dataclass
@@ -10,31 +9,9 @@ import numpy as np
 
 from scene_templates.cameras import CameraSettings, Sector, sample_camera
 from scene_templates.checks import require
-from scene_templates.layout import (
-    CameraPose,
-    Emitter,
-    Layout,
-    ObjectPlacement,
-    ShellPart,
-    SurfaceLook,
-)
-from scene_templates.rooms import PATCH_FACES, SIDES, PatchPlacement, patch
+from scene_templates.layout import CameraPose
+from scene_templates.rooms import PATCH_FACES, SIDES
 from storage.registry import Registry
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LayoutParams:
-    """All that a layout is built from; its shell parts in the order of the template."""
-
-    patches: tuple[PatchPlacement, ...]
-    """Where each shell part stands."""
-    surfaces: tuple[SurfaceLook, ...]
-    """One look for each shell part."""
-    objects: tuple[ObjectPlacement, ...]
-    """Where the objects are, and what they are made of."""
-    emitters: tuple[Emitter, ...]
-    wall2_faces_out: bool = False
-    """The second wall faces outward; see SeparateSides."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,22 +38,6 @@ class Template:
     def shell_triangles(self) -> int:
         """Triangles of floor and walls: 128 each."""
         return len(PATCH_FACES) * len(self.parts)
-
-    def layout(self, params: LayoutParams) -> Layout:
-        """Build a layout; a pure function of its parameters."""
-        rows = zip(self.parts, params.patches, params.surfaces, strict=True)
-        shell = tuple(
-            ShellPart(
-                name=name,
-                positions=patch(SIDES[name], placement),
-                faces=PATCH_FACES[:, ::-1]
-                if name == "wall2" and params.wall2_faces_out
-                else PATCH_FACES,
-                surface=surface,
-            )
-            for name, placement, surface in rows
-        )
-        return Layout(shell=shell, objects=params.objects, emitters=params.emitters)
 
     def sample_camera(self, rng: np.random.Generator, settings: CameraSettings) -> CameraPose:
         """Draw one camera."""

@@ -37,7 +37,7 @@ ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results" / "bench"
 
 _LIBRARIES = ("trilight", "mitsuba", "drjit", "pyoidn", "numpy", "torch", "pymeshlab",
-              "meshoptimizer", "libigl", "OpenEXR", "h5py")  # fmt: skip
+              "wasmtime", "libigl", "OpenEXR", "h5py")  # fmt: skip
 
 TrialDone = Callable[[int, int], None]
 """Callback with the number of finished trials and of all trials."""

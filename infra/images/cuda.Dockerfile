@@ -9,11 +9,6 @@
 FROM python:3.11.13-slim-bookworm@sha256:86adf8dbadc3d6e82ee5dd2c74bec2e1c2467cdad47886280501df722372d2e1 AS build
 WORKDIR /opt/trilight
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
-# meshoptimizer comes as source
-# hadolint ignore=DL3008
-RUN apt-get update \
-    && apt-get install --yes --no-install-recommends g++ \
-    && rm -rf /var/lib/apt/lists/*
 COPY requirements/ requirements/
 COPY infra/setup/install.sh infra/setup/install.sh
 RUN python -m venv /opt/venv \
@@ -25,11 +20,7 @@ FROM python:3.11.13-slim-bookworm@sha256:86adf8dbadc3d6e82ee5dd2c74bec2e1c2467cd
 LABEL org.opencontainers.image.title="trilight-cuda" \
       org.opencontainers.image.description="Makes the data for, trains and judges neural renderers" \
       org.opencontainers.image.licenses="MIT AND GPL-3.0-only"
-# hadolint ignore=DL3008
-RUN apt-get update \
-    && apt-get install --yes --no-install-recommends libopengl0 libgl1 libatomic1 libllvm19 \
-    && rm -rf /var/lib/apt/lists/* \
-    && useradd --uid 10001 --create-home trilight \
+RUN useradd --uid 10001 --create-home trilight \
     && install --directory --owner trilight /data /cache
 COPY --from=build --chown=root:root /opt/venv /opt/venv
 COPY --from=build --chown=root:root /opt/trilight /opt/trilight

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Takes what is under the GPL, or not free, out of an environment; meshes are then made by
-# meshoptimizer, with about twice the error, and without the profile `uniform`; videos are .webp.
+# Takes what is under the GPL, or not free, out of an environment; meshes are then made by libigl,
+# without the profile `uniform`; videos are .webp.
 set -eu
 python=$1
 

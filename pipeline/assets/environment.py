@@ -16,9 +16,7 @@ def missing_filters() -> list[str]:
     """
     if find_spec("pymeshlab") is None:
         return []
-    import pymeshlab
-
-    from pipeline.assets.decimation.pymeshlab_filters import REQUIRED_FILTERS
+    from pipeline.assets.decimation.pymeshlab_filters import REQUIRED_FILTERS, pymeshlab
 
     present = set(pymeshlab.filter_list())
     return [name for name in REQUIRED_FILTERS if name not in present]

@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pipeline.assets.settings import Profile
 from storage.errors import TrilightError
 
-_LIBRARIES = ("embreex", "libigl", "meshoptimizer", "numpy", "pymeshlab", "trimesh")
+_LIBRARIES = ("embreex", "libigl", "numpy", "pymeshlab", "trimesh", "wasmtime")
 
 
 def library_versions() -> dict[str, str]:
@@ -31,16 +31,14 @@ Raise the number (`assets-3`, without versions) when a change here or in a libra
 another result. `tests/pipeline/assets/test_recipe.py` fails until it does.
 """
 
-RECIPE = (
-    _WITH_PYMESHLAB
-    if _installed_version("pymeshlab") != "absent"
-    else _WITH_PYMESHLAB.replace("pymeshlab=2025.7.post1", "pymeshlab=absent")
-)
+RECIPE = _WITH_PYMESHLAB if _installed_version("pymeshlab") != "absent" else "assets-3 libigl"
 """Recipe name in asset files; it is part of their keys in the asset store."""
 
 READERS = 4
 """Version of the readers' results: part of cache keys and of no asset, so that a fixed reader reads
 its files again."""
+
+_WITHOUT_GPL = ("libigl_qslim", "meshoptimizer", "meshoptimizer_sloppy")
 
 _METHODS: Mapping[Profile, tuple[str, ...]] = {
     "faithful": ("pymeshlab_collapse", "meshoptimizer", "meshoptimizer_sloppy"),
@@ -67,4 +65,4 @@ def methods_of(profile: Profile) -> tuple[str, ...]:
         raise TrilightError(
             "profile uniform: pymeshlab is not installed; run `make setup`, or use faithful."
         )
-    return tuple(name for name in _METHODS[profile] if not name.startswith("pymeshlab"))
+    return _WITHOUT_GPL

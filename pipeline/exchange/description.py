@@ -1,12 +1,25 @@
 """Records of a scene file: objects with mesh paths and materials, and cameras.
 
-Values are as the file states them; `pipeline.exchange.from_description` interprets them.
+Values are as the file states them; `pipeline.exchange.from_description` interprets them. Types,
+ranges and defaults are those of the file, which `pipeline.exchange.renderformer_json` reads.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from storage.settings.ranges import Within
 
 Vector = tuple[float, float, float]
+
+_Length = Annotated[float, Within(-1e6, 1e6)]
+Lengths = tuple[_Length, _Length, _Length]
+"""Coordinates or factors; beyond 1e6 float32 positions are off by centimeters."""
+_Angle = Annotated[float, Within(-1e6, 1e6, unit="degrees")]
+Angles = tuple[_Angle, _Angle, _Angle]
+Fraction = Annotated[float, Within(0, 1)]
+Albedo = tuple[Fraction, Fraction, Fraction]
+_Radiance = Annotated[float, Within(0, 1e9)]
+Radiance = tuple[_Radiance, _Radiance, _Radiance]
 
 ColorGroups = Literal["per-triangle", "per-shading-group"]
 
@@ -15,10 +28,10 @@ ColorGroups = Literal["per-triangle", "per-shading-group"]
 class DescribedTransform:
     """Transform of a mesh into world space."""
 
-    translation: Vector  # world units, the last step
-    rotation_deg: Vector  # angles about the world's X, then Y, then Z
-    scale: Vector  # factors along the world's axes, after the rotation; a negative one mirrors
-    normalize: bool
+    translation: Lengths  # world units, the last step
+    rotation_deg: Angles  # angles about the world's X, then Y, then Z
+    scale: Lengths  # factors along the world's axes, after the rotation; a negative one mirrors
+    normalize: bool = True
     """True brings the mesh into a sphere of diameter 1 around the origin first."""
 
 
@@ -26,16 +39,16 @@ class DescribedTransform:
 class DescribedMaterial:
     """Reflectance and emission of an object; colors are linear."""
 
-    diffuse: Vector  # diffuse albedo, unless the object has random colors
-    specular: Vector  # specular albedo
-    roughness: float  # in [0, 1]; the GGX width is its square
-    emissive: Vector
+    diffuse: Albedo  # diffuse albedo, unless the object has random colors
+    specular: Albedo  # specular albedo
+    roughness: Fraction  # the GGX width is its square
+    emissive: Radiance
     """Radiance of every triangle, to both sides; the object is an emitter where one is above 0."""
     smooth_shading: bool
     """True interpolates normals across edges of up to 30 degrees; False shades flat."""
-    random_diffuse_max: float  # upper bound of the random colors
-    random_diffuse_type: ColorGroups  # triangles that share one random color
-    rand_tri_diffuse_seed: int | None
+    random_diffuse_max: Fraction = 1.0  # upper bound of the random colors
+    random_diffuse_type: ColorGroups = "per-shading-group"  # triangles that share a random color
+    rand_tri_diffuse_seed: Annotated[int, Within(0, 2**32 - 1)] | None = None
     """Seed of random colors that replace `diffuse`; None keeps `diffuse`."""
 
     @property
@@ -52,8 +65,9 @@ class DescribedObject:
     mesh_path: str  # relative to the scene file
     transform: DescribedTransform  # from mesh to world space
     material: DescribedMaterial  # reflectance and emission
-    remesh: bool  # True replaces the mesh by one of even triangles
-    remesh_target_face_num: int  # maximum number of triangles of the remeshed mesh
+    remesh: bool = False  # True replaces the mesh by one of even triangles
+    remesh_target_face_num: Annotated[int, Within(4, 1_000_000, unit="triangles")] = 2048
+    """Maximum number of triangles of the remeshed mesh."""
 
     @property
     def remesh_faces(self) -> int | None:
@@ -65,10 +79,11 @@ class DescribedObject:
 class DescribedCamera:
     """One entry of `cameras`."""
 
-    position: Vector  # world units
-    look_at: Vector  # the point in the middle of the picture
-    up: Vector  # roughly upwards in the picture; neither unit nor orthogonal
-    fov_deg: float  # full field of view, horizontal and vertical
+    position: Lengths  # world units
+    look_at: Lengths  # the point in the middle of the picture
+    up: Lengths  # roughly upwards in the picture; neither unit nor orthogonal
+    fov_deg: Annotated[float, Within(0.001, 179, unit="degrees")]
+    """Full field of view, horizontal and vertical."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,6 +22,8 @@ from pipeline.exchange import renderformer_h5, renderformer_json
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
 from pipeline.exchange.gltf import write as gltf
 from pipeline.exchange.gltf.read import read_gltf
+from pipeline.exchange.loaded_scene import LoadedScene as LoadedScene
+from pipeline.exchange.loaded_scene import Pictures as Pictures
 from pipeline.exchange.renderformer_cells import textured_triangles
 from pipeline.exchange.renderformer_h5 import (
     note_reflecting_emitters,
@@ -52,9 +54,6 @@ SEPARATOR = "::"
 
 _MEMBERS = ("json", PLAIN, PACKED)
 
-Pictures = NDArray[np.float32] | None
-"""[V, R, R, 3] linear radiance of all views, or None."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSource:
@@ -73,18 +72,6 @@ class SceneSource:
     def name(self) -> str:
         """Name for messages and notes: the file without its folders, and the key."""
         return self.path.name if self.key is None else f"{self.path.name}{SEPARATOR}{self.key}"
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LoadedScene:
-    """A scene that was read, with notes on what it lacks."""
-
-    scene: Scene
-    """The scene, which passes `Scene.check`."""
-    notes: tuple[str, ...]
-    """Sentences about unknown fields of the file and what could not be read."""
-    radiance_rgb: Pictures = None
-    """Pictures of all views, where they were requested and the source has them."""
 
 
 Cameras = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -125,11 +112,15 @@ def writable_suffixes() -> list[str]:
     return [suffix for suffix, form in FORMATS.items() if form.write]
 
 
+def _with_name(source: SceneSource, loaded: LoadedScene) -> LoadedScene:
+    """Return a scene whose notes begin with the name of its source."""
+    notes = tuple(f"{source.name}: {text}" for text in loaded.notes)
+    return dataclasses.replace(loaded, notes=notes)
+
+
 def _read_usd(source: SceneSource, pictures: bool) -> LoadedScene:
     loaded = read_usd(source.path, source.key, source.usd_folder, USER_PROVIDED)
-    return LoadedScene(
-        scene=loaded.scene, notes=tuple(f"{source.name}: {text}" for text in loaded.lost)
-    )
+    return _with_name(source, loaded)
 
 
 def _usd_keys(source: SceneSource) -> list[str | None]:
@@ -158,10 +149,7 @@ def _write_many_usd(target: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
 
 
 def _read_gltf(source: SceneSource, pictures: bool) -> LoadedScene:
-    loaded = read_gltf(source.path, USER_PROVIDED)
-    return LoadedScene(
-        scene=loaded.scene, notes=tuple(f"{source.name}: {text}" for text in loaded.lost)
-    )
+    return _with_name(source, read_gltf(source.path, USER_PROVIDED))
 
 
 def _write_glb(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
@@ -185,7 +173,7 @@ def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
         notes=unread,
     )
     texts = (*(f"unknown field {field}" for field in unknown), *unread, *scaled_albedo_notes(scene))
-    return LoadedScene(scene=scene, notes=tuple(f"{name}: {text}" for text in texts))
+    return _with_name(source, LoadedScene(scene=scene, notes=texts))
 
 
 def _json_cameras(source: SceneSource) -> Cameras:
@@ -201,12 +189,8 @@ def _write_json(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ..
 
 
 def _read_h5(source: SceneSource, pictures: bool) -> LoadedScene:
-    loaded = read_renderformer_h5(source.path)
-    return LoadedScene(
-        scene=loaded.scene,
-        notes=tuple(f"{source.path.name}: {text}" for text in loaded.lost),
-        radiance_rgb=loaded.radiance_rgb if pictures else None,
-    )
+    loaded = _with_name(source, read_renderformer_h5(source.path))
+    return loaded if pictures else dataclasses.replace(loaded, radiance_rgb=None)
 
 
 def _write_h5(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:

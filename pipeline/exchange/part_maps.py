@@ -20,7 +20,7 @@ from pipeline.foreign.picture import Picture, Wrap
 from storage.records.exr import MAX_RESOLUTION
 from storage.records.scene_maps import MAX_UV
 
-SLOTS: Mapping[str, str] = {
+_SLOTS: Mapping[str, str] = {
     "base": "base",
     "metallic": "metallic_map",
     "roughness": "roughness_map",
@@ -86,7 +86,7 @@ def place_slots(part: Part, lost: list[str]) -> PlacedSlots:
 
     `lost` receives a sentence for each loss.
     """
-    stated = {name: getattr(part.material, field) for name, field in SLOTS.items()}
+    stated = {name: getattr(part.material, field) for name, field in _SLOTS.items()}
     slots: dict[str, Slot] = {name: slot for name, slot in stated.items() if slot is not None}
     first = next(iter(slots.values()), None)
     plain = None if first is None else part.coordinates(first.uv_set)

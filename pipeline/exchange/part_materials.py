@@ -16,7 +16,7 @@ from pipeline.exchange.linear_maps import (
     number_texture,
     resample_to_largest,
 )
-from pipeline.exchange.part_maps import SLOTS, PlacedSlots, place_slots
+from pipeline.exchange.part_maps import PlacedSlots, place_slots
 from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles, TextureSet
 from pipeline.foreign.material import MaterialSamples, SourceMaterial, source_columns
 from pipeline.foreign.part import Part
@@ -142,8 +142,9 @@ def _columns(
         texel_values["base"] = (
             texel_values["base"][:, :3] * colors if "base" in texel_values else colors
         )
-        known = MaterialSamples(**{name: texel_values.get(name) for name in SLOTS})
-        rows = source_columns(material, known, size * width, least_roughness=0)
+        rows = source_columns(
+            material, MaterialSamples(**texel_values), size * width, least_roughness=0
+        )
         values[first : first + size] = rows.reshape(size, width, 7)
     return values
 

@@ -4,7 +4,6 @@ import dataclasses
 import logging
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from pipeline.assets.settings import AssetSettings
@@ -87,12 +86,7 @@ class SceneReader:
     def __enter__(self) -> "SceneReader":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _call(self, name: str, function: Callable[..., Result], *args: Any) -> Result:

@@ -27,13 +27,13 @@ or shared vertices. The reader does not trust the file (pipeline.exchange.safe_h
 """
 
 import io
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.renderformer_cells import (
     CELLS,
     compute_cells,
@@ -44,12 +44,15 @@ from pipeline.exchange.renderformer_stored import (
     CHANNELS,
     FLAT_NORMAL,
     MAX_TRIANGLES,
+    SECOND_VERSION,
     TEXTURE_EMISSION,
     TEXTURE_NORMAL,
+    is_second_version,
+    read_grey_textures,
+    read_sky,
     read_textures,
     with_cells,
 )
-from pipeline.exchange.renderformer_v2 import KNOWN, is_second_version, read_grey_textures, read_sky
 from pipeline.exchange.safe_h5 import (
     list_names,
     open_h5,
@@ -69,7 +72,13 @@ from storage.records.material import (
     default_rows,
     distinct_rows,
 )
-from storage.records.scene import ALBEDO_SUM_TOLERANCE, UNIT_NORMAL_TOLERANCE, Scene, SceneObject
+from storage.records.scene import (
+    ALBEDO_SUM_TOLERANCE,
+    UNIT_NORMAL_TOLERANCE,
+    ObjectKind,
+    Scene,
+    SceneObject,
+)
 
 CARRIED = frozenset(
     {"vertex_positions", "vertex_normals", "faces", "material_index", "c2w", "fov_deg", "textures"}
@@ -112,7 +121,8 @@ def write_renderformer_h5(
         _write(file, "c2w", scene.c2w)
         _write(file, "fov", scene.fov_deg)
         if radiance_rgb is not None:
-            _write(file, "img", _rgba(radiance_rgb))
+            opaque = np.ones((*radiance_rgb.shape[:3], 1), np.float16)
+            _write(file, "img", np.concatenate([to_half(radiance_rgb), opaque], axis=3))
             _write(file, "mvp", _mvp(scene))
     write_atomically(path, stream.getvalue())
 
@@ -180,11 +190,6 @@ def _write_texture(file: Any, rows: NDArray[np.floating], scene: Scene) -> None:
         texture[start : start + step] = cells
 
 
-def _rgba(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float16]:
-    opaque = np.ones((*radiance_rgb.shape[:3], 1), np.float16)
-    return np.concatenate([to_half(radiance_rgb), opaque], axis=3)
-
-
 def _mvp(scene: Scene) -> NDArray[np.float32]:
     focal = 1 / np.tan(np.radians(scene.fov_deg.astype(np.float64)) / 2)
     clip = np.zeros((len(focal), 4, 4))
@@ -211,19 +216,7 @@ _ROUNDING = 2.0**-10
 _PUBLISHED_EMITTER = np.array([1, 1, 1, 0, 0, 0, 1], np.float32)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RenderFormerFile:
-    """A scene that was read, with its pictures and losses."""
-
-    scene: Scene
-    """A checked scene: one object of everything that reflects, one for each emitting triangle."""
-    radiance_rgb: NDArray[np.float32] | None
-    """[V, H, W, 3] linear radiance; None where the file has no pictures."""
-    lost: tuple[str, ...]
-    """Sentences about parts of the file that were lost."""
-
-
-def read_renderformer_h5(path: Path) -> RenderFormerFile:
+def read_renderformer_h5(path: Path) -> LoadedScene:
     """Read a file of the published layout.
 
     Corners with equal position and normal become one vertex, so that flat and smooth shading stay
@@ -258,11 +251,11 @@ def read_renderformer_h5(path: Path) -> RenderFormerFile:
         )
         scene = with_cells(scene, stored, UNKNOWN_LICENCE)
         scene.check()
-    return RenderFormerFile(scene=scene, radiance_rgb=pictures, lost=tuple(lost))
+    return LoadedScene(scene=scene, radiance_rgb=pictures, notes=tuple(lost))
 
 
 def _list_unknown(file: Any) -> list[str]:
-    known = (*_KNOWN, *KNOWN) if is_second_version(file) else _KNOWN
+    known = (*_KNOWN, *SECOND_VERSION) if is_second_version(file) else _KNOWN
     names = [f"array or group {name!r:.60}" for name in list_names(file) if name not in known]
     names += [f"attribute {name!r:.60}" for name in sorted(file.attrs)]
     return names if len(names) <= 10 else [*names[:10], f"and {len(names) - 10} more"]
@@ -325,19 +318,18 @@ def _palette(
             f"texture: {len(first)} materials and {emits.sum()} emitters; expected at most "
             f"{MAX_PALETTE} of each."
         )
-    surface = () if emits.all() else (SceneObject(name="surfaces", kind="object"),)
-    emitters = tuple(SceneObject(name=f"emitter{i}", kind="emitter") for i in range(emits.sum()))
-    entries = [_with_unknown_licence(entry) for entry in (*surface, *emitters)]
+    kinds: dict[str, ObjectKind] = {} if emits.all() else {"surfaces": "object"}
+    first_emitter = len(kinds)
+    kinds |= {f"emitter{row}": "emitter" for row in range(emits.sum())}
     return {
         "materials": materials[first],
         "material_index": index.astype(np.uint16),
-        "object_index": (np.where(emits, order - 1 + len(surface), 0)).astype(np.uint16),
-        "objects": tuple(entries),
+        "object_index": (np.where(emits, order - 1 + first_emitter, 0)).astype(np.uint16),
+        "objects": tuple(
+            SceneObject(name=name, kind=kind, licence=UNKNOWN_LICENCE)
+            for name, kind in kinds.items()
+        ),
     }
-
-
-def _with_unknown_licence(entry: SceneObject) -> SceneObject:
-    return SceneObject(name=entry.name, kind=entry.kind, licence=UNKNOWN_LICENCE)
 
 
 def _limit_rounded_albedos(materials: NDArray[np.float32], lost: list[str]) -> None:

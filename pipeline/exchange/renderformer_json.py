@@ -11,11 +11,14 @@ restore: objects of several materials; shading normals other than flat ones and 
 compute (smooth across edges of up to 30 degrees).
 """
 
+import dataclasses
+import functools
 import json
 import re
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Annotated, Any, NoReturn, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +26,11 @@ from numpy.typing import NDArray
 from pipeline.exchange.description import (
     ColorGroups,
     DescribedCamera,
-    DescribedMaterial,
     DescribedObject,
-    DescribedTransform,
     SceneDescription,
 )
 from pipeline.exchange.from_description import SHELL_FOLDER, SMOOTH_ANGLE_DEG
-from pipeline.exchange.json_fields import Fields
+from pipeline.exchange.textured_triangles import group_triangles
 from pipeline.foreign.numbers import Malformed
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import face_normals, smooth_shaded
@@ -48,13 +49,12 @@ MAX_CAMERAS = 1000
 """Maximum number of cameras in a file."""
 
 _VERSION = "1.0"
-_MAX_LENGTH = 1e6
-"""Maximum coordinate or factor; beyond it float32 positions are off by centimeters."""
-_MAX_ANGLE_DEG = 1e6
-_MAX_EMISSION = 1e9
-_MAX_SEED = 2**32 - 1
-_MAX_REMESH_FACES = 1_000_000
-_COLOUR_GROUPS = ("per-triangle", "per-shading-group")
+_MAX_TEXT = 200
+"""Maximum number of characters of a text, such as the name of an object."""
+_MAX_SHOWN = 120
+"""Maximum number of characters of a value in a message."""
+_OUR_NAMES = {"rotation": "rotation_deg", "fov": "fov_deg"}
+"""Our names of fields, by those of the file, where they differ."""
 
 
 def read_description(data: bytes, name: str) -> SceneDescription:
@@ -69,28 +69,27 @@ def read_description(data: bytes, name: str) -> SceneDescription:
             field is missing, of the wrong type, not finite or out of range. The message names file,
             field (with the object's name), value and expected value.
     """
-    if len(data) > MAX_BYTES:
-        raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_BYTES}.")
-    unknown: list[str] = []
-    fields = Fields(_parse_json(data, name), file=name, where="", unknown=unknown)
-    scene_name = fields.text("scene_name")
-    version = fields.text("version")
+    reader = _Reader(name)
+    tree = reader.read_tree(data)
+    scene_name = reader.text(reader.field(tree, "scene_name"), "scene_name")
+    version = reader.text(reader.field(tree, "version"), "version")
     if version != _VERSION:
         raise TrilightError(f"{name}: version is {version!r}; expected {_VERSION!r}.")
-    objects = fields.group("objects")
-    cameras = fields.groups("cameras", MAX_CAMERAS)
-    names = list(objects.keys())
-    if not 1 <= len(names) <= MAX_OBJECTS:
-        raise TrilightError(f"{name}: {len(names)} objects; expected 1 to {MAX_OBJECTS}.")
-    described = tuple(_object(key, objects.group(key)) for key in names)
-    described_cameras = tuple(_camera(camera) for camera in cameras)
-    fields.end()
+    objects = reader.field(tree, "objects")
+    if not isinstance(objects, dict):
+        reader.refuse("objects", objects, "a JSON object")
+    if not 1 <= len(objects) <= MAX_OBJECTS:
+        raise TrilightError(f"{name}: {len(objects)} objects; expected 1 to {MAX_OBJECTS}.")
+    described = tuple(reader.object(key, entry) for key, entry in objects.items())
+    cameras = reader.cameras(tree)
+    known = ("scene_name", "version", "objects", "cameras")
+    reader.unknown += [_to_text(key) for key in tree if key not in known]
     return SceneDescription(
         file=name,
         scene_name=scene_name,
         objects=described,
-        cameras=described_cameras,
-        unknown_fields=tuple(unknown),
+        cameras=cameras,
+        unknown_fields=tuple(reader.unknown),
     )
 
 
@@ -100,10 +99,149 @@ def read_cameras(data: bytes, name: str) -> tuple[DescribedCamera, ...]:
     Raises:
         TrilightError: as `read_description`, for the cameras alone.
     """
-    if len(data) > MAX_BYTES:
-        raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_BYTES}.")
-    fields = Fields(_parse_json(data, name), file=name, where="", unknown=[])
-    return tuple(_camera(camera) for camera in fields.groups("cameras", MAX_CAMERAS))
+    reader = _Reader(name)
+    return reader.cameras(reader.read_tree(data))
+
+
+class _Reader:
+    """Reads the records of one file; `unknown` collects fields that none of them has.
+
+    So a misspelt option is reported instead of ignored.
+    """
+
+    def __init__(self, file: str) -> None:
+        self._file = file
+        self.unknown: list[str] = []
+
+    def read_tree(self, data: bytes) -> dict[str, Any]:
+        """Return the JSON object of the whole file."""
+        if len(data) > MAX_BYTES:
+            raise TrilightError(f"{self._file}: {len(data)} bytes; expected at most {MAX_BYTES}.")
+        tree = _parse_json(data, self._file)
+        if not isinstance(tree, dict):
+            self.refuse("the file", tree, "a JSON object")
+        return tree
+
+    def field(self, tree: dict[str, Any], name: str) -> Any:
+        """Return a field of the file, which must exist."""
+        return tree[name] if name in tree else self._refuse_missing(name)
+
+    def cameras(self, tree: dict[str, Any]) -> tuple[DescribedCamera, ...]:
+        rows = self.field(tree, "cameras")
+        if not isinstance(rows, list) or not 1 <= len(rows) <= MAX_CAMERAS:
+            self.refuse("cameras", rows, f"a list of 1 to {MAX_CAMERAS} JSON objects")
+        return tuple(
+            self._record(DescribedCamera, row, f"cameras[{at}]") for at, row in enumerate(rows)
+        )
+
+    def object(self, key: str, entry: Any) -> DescribedObject:
+        where = f"objects.{key}"
+        if not key or len(key) > _MAX_TEXT or not key.isprintable():
+            self.refuse(where, key, f"a printable name of 1 to {_MAX_TEXT} letters")
+        described: DescribedObject = self._record(DescribedObject, entry, where, name=key)
+        self.text(described.mesh_path, f"{where}.mesh_path")
+        return described
+
+    def text(self, value: Any, where: str) -> str:
+        if not isinstance(value, str) or len(value) > _MAX_TEXT or not value.isprintable():
+            self.refuse(where, value, f"printable text of up to {_MAX_TEXT} letters")
+        return value
+
+    def _record(self, kind: Any, value: Any, where: str, **more: str) -> Any:
+        """Return a JSON object as a record; `more` are fields that the file states elsewhere."""
+        from pydantic import ValidationError  # takes time to import
+
+        if not isinstance(value, dict):
+            self.refuse(where, value, "a JSON object")
+        known = self._take_known(kind, value, where, more)
+        first: Any = {"type": "json_invalid"}
+        try:
+            return _adapter(kind).validate_json(json.dumps(known))
+        except RecursionError:
+            pass
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+        if first["type"] == "json_invalid":
+            raise TrilightError(
+                f"{self._file}: {_to_text(where)} is nested too deeply, or holds half a character; "
+                "expected the fields of a scene."
+            )
+        theirs = {ours: name for name, ours in _OUR_NAMES.items()}
+        steps = [step for step in first["loc"] if step != kind.__name__]
+        is_short = first["type"] == "missing" and isinstance(steps[-1], int)
+        for step in steps[:-1] if is_short else steps:
+            where += f"[{step}]" if isinstance(step, int) else f".{theirs.get(step, step)}"
+        if first["type"] == "missing" and not is_short:
+            self._refuse_missing(where)
+        expected = _EXPECTED.get(first["type"]) or _expected_number(kind, steps)
+        self.refuse(where, first["input"], expected)
+
+    def _take_known(self, kind: Any, value: Any, where: str, more: dict[str, str]) -> Any:
+        """Return the fields of a record, renamed, and those of records in it; note the others."""
+        is_record = dataclasses.is_dataclass(kind) and isinstance(value, dict)
+        if not is_record:
+            return value
+        hints = {name: hint for name, hint in _field_types(kind).items() if name not in more}
+        known: dict[str, Any] = dict(more)
+        for key, inner in value.items():
+            name = _OUR_NAMES.get(key, key)
+            if name not in hints or key in _OUR_NAMES.values():
+                self.unknown.append(_to_text(f"{where}.{key}"))
+            else:
+                known[name] = self._take_known(hints[name], inner, f"{where}.{key}", {})
+        return known
+
+    def _refuse_missing(self, where: str) -> NoReturn:
+        raise TrilightError(f"{self._file}: {_to_text(where)} is missing; add it.")
+
+    def refuse(self, where: str, value: Any, expected: str) -> NoReturn:
+        """Raise TrilightError about a value."""
+        raise TrilightError(
+            f"{self._file}: {_to_text(where)} is {_to_text(value)}; expected {expected}."
+        )
+
+
+@functools.cache
+def _field_types(kind: Any) -> Mapping[str, Any]:
+    return get_type_hints(kind, include_extras=True)
+
+
+@functools.cache
+def _adapter(kind: Any) -> Any:
+    from pydantic import ConfigDict, TypeAdapter
+
+    # pydantic takes rules for a union, and hands them on to the plain dataclasses in it
+    return TypeAdapter(kind | None, config=ConfigDict(strict=True, allow_inf_nan=False))
+
+
+_LIST = "a list of three numbers"
+_EXPECTED = {
+    "bool_type": "true or false",
+    "dataclass_type": "a JSON object",
+    "literal_error": f"one of {', '.join(get_args(ColorGroups))}",
+    "missing": _LIST,
+    "string_type": f"printable text of up to {_MAX_TEXT} letters",
+    "too_long": _LIST,
+    "tuple_type": _LIST,
+}
+"""Expected values by pydantic's types of errors; all others are about numbers."""
+
+
+def _expected_number(hint: Any, steps: Sequence[str | int]) -> str:
+    """Return the number that a record expects at a place, with its range."""
+    for step in steps:
+        hints = _field_types(hint) if isinstance(step, str) else {}
+        hint = hints.get(str(step)) or get_args(hint)[0]
+    if get_origin(hint) is not Annotated:  # a number or None
+        hint = get_args(hint)[0]
+    number, within = get_args(hint)
+    return f"a {'whole ' if number is int else ''}number {within}"
+
+
+def _to_text(value: Any) -> str:
+    """Return a value as short text for a message, on one line without control characters."""
+    text = value if isinstance(value, str) and value.isprintable() else repr(value)
+    return text if len(text) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN - 3]}..."
 
 
 def _parse_json(data: bytes, name: str) -> Any:
@@ -134,57 +272,6 @@ def _refuse_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _refuse_constant(text: str) -> float:
     raise Malformed(f"{text} is no JSON number")
-
-
-def _object(name: str, fields: Fields) -> DescribedObject:
-    described = DescribedObject(
-        name=name,
-        mesh_path=fields.text("mesh_path"),
-        transform=_transform(fields.group("transform")),
-        material=_material(fields.group("material")),
-        remesh=fields.flag("remesh", default=False),
-        remesh_target_face_num=fields.integer("remesh_target_face_num", 4, _MAX_REMESH_FACES, 2048),
-    )
-    fields.end()
-    return described
-
-
-def _transform(fields: Fields) -> DescribedTransform:
-    transform = DescribedTransform(
-        translation=fields.vector("translation", -_MAX_LENGTH, _MAX_LENGTH),
-        rotation_deg=fields.vector("rotation", -_MAX_ANGLE_DEG, _MAX_ANGLE_DEG),
-        scale=fields.vector("scale", -_MAX_LENGTH, _MAX_LENGTH),
-        normalize=fields.flag("normalize", default=True),
-    )
-    fields.end()
-    return transform
-
-
-def _material(fields: Fields) -> DescribedMaterial:
-    groups = fields.choice("random_diffuse_type", _COLOUR_GROUPS, "per-shading-group")
-    material = DescribedMaterial(
-        diffuse=fields.vector("diffuse", 0, 1),
-        specular=fields.vector("specular", 0, 1),
-        roughness=fields.number("roughness", 0, 1),
-        emissive=fields.vector("emissive", 0, _MAX_EMISSION),
-        smooth_shading=fields.flag("smooth_shading"),
-        random_diffuse_max=fields.number("random_diffuse_max", 0, 1, default=1.0),
-        random_diffuse_type=cast(ColorGroups, groups),
-        rand_tri_diffuse_seed=fields.optional_integer("rand_tri_diffuse_seed", 0, _MAX_SEED),
-    )
-    fields.end()
-    return material
-
-
-def _camera(fields: Fields) -> DescribedCamera:
-    camera = DescribedCamera(
-        position=fields.vector("position", -_MAX_LENGTH, _MAX_LENGTH),
-        look_at=fields.vector("look_at", -_MAX_LENGTH, _MAX_LENGTH),
-        up=fields.vector("up", -_MAX_LENGTH, _MAX_LENGTH),
-        fov_deg=fields.number("fov", 0.001, 179),
-    )
-    fields.end()
-    return camera
 
 
 CARRIED = frozenset(
@@ -228,7 +315,7 @@ def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
     meshes: dict[str, bytes] = {}
     objects: dict[str, Any] = {}
     taken: set[str] = set()
-    for row, material, faces in _group_triangles(scene):
+    for row, material, faces in group_triangles(scene):
         if len(without_slivers(scene.vertex_positions, scene.faces[faces])) == 0:
             continue  # readers refuse a mesh without an area
         name = _unique(_name(scene, row, material), taken)
@@ -252,17 +339,6 @@ def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
     _require_size(scene, data, len(objects))
     read_description(data, f"{stem}.json")  # raises for anything that readers would refuse
     return DescribedFiles(json=data, meshes=meshes, lost=(*_losses(scene), *lost))
-
-
-def _group_triangles(scene: Scene) -> list[tuple[int, int, NDArray[np.intp]]]:
-    """Return (object, material, triangles), sorted by object and then by material."""
-    keys = scene.object_index.astype(np.int64) * len(scene.materials) + scene.material_index
-    order = np.argsort(keys, kind="stable")
-    distinct, starts = np.unique(keys[order], return_index=True)
-    return [
-        (*divmod(int(key), len(scene.materials)), faces)
-        for key, faces in zip(distinct, np.split(order, starts[1:]), strict=True)
-    ]
 
 
 def _name(scene: Scene, row: int, material: int) -> str:
@@ -355,7 +431,7 @@ def _is_reproduced(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.fl
 
 def _losses(scene: Scene) -> list[str]:
     losses: list[str] = []
-    parts = np.bincount([row for row, _, _ in _group_triangles(scene)])
+    parts = np.bincount([row for row, _, _ in group_triangles(scene)])
     num_objects = int((parts > 1).sum())
     num_parts = int(parts[parts > 1].sum())
     if num_objects:

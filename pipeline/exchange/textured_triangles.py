@@ -102,16 +102,6 @@ class TexturedPiece:
     """Texture set of each material row of `piece`."""
 
 
-def split_by_kind(triangles: TexturedTriangles) -> list[tuple[ObjectKind, TexturedTriangles]]:
-    """Split triangles into those that reflect and those that emit; empty kinds are left out."""
-    emits = (triangles.rows[:, EMISSION] > 0).any(axis=1)
-    kinds: list[tuple[ObjectKind, NDArray[np.bool_]]] = [
-        ("object", np.logical_not(emits)),
-        ("emitter", np.asarray(emits)),
-    ]
-    return [(kind, triangles.select(mask)) for kind, mask in kinds if mask.any()]
-
-
 def build_piece(entry: SceneObject, triangles: TexturedTriangles) -> TexturedPiece:
     """Build an object of a scene from its triangles."""
     corners = np.concatenate([triangles.positions, triangles.normals], axis=2).reshape(-1, 6)
@@ -162,16 +152,11 @@ def build_lamp(
 def with_texture_sets(scene: AnyScene, pieces: Sequence[TexturedPiece]) -> AnyScene:
     """Return the scene of these pieces, in their order, with their textures."""
     textures: dict[str, Texture] = {}
-    index: list[list[int]] = []
-    order: dict[str, int] = {}
-    for texture_set in (row for each in pieces for row in each.texture_sets):
-        for texture in texture_set:
-            if texture is not None and texture.sha256 not in textures:
-                order[texture.sha256] = len(textures)
-                textures[texture.sha256] = texture
-        index.append(
-            [CONSTANT if texture is None else order[texture.sha256] for texture in texture_set]
-        )
+    sets = [texture_set for each in pieces for texture_set in each.texture_sets]
+    for texture in (texture for texture_set in sets for texture in texture_set if texture):
+        textures.setdefault(texture.sha256, texture)
+    order = {sha256: row for row, sha256 in enumerate(textures)}
+    index = [[order[each.sha256] if each else CONSTANT for each in row] for row in sets]
     if not textures:
         return scene
     uv = np.concatenate([each.uv.reshape(-1, 2) for each in pieces]).astype(np.float32)
@@ -200,6 +185,17 @@ def _drop_constant_textures(textures: TextureSet) -> TextureSet:
     return one, two, three
 
 
+def group_triangles(scene: Scene) -> list[tuple[int, int, NDArray[np.intp]]]:
+    """Return (object, material, triangles), sorted by object and then by material."""
+    keys = scene.object_index.astype(np.int64) * len(scene.materials) + scene.material_index
+    order = np.argsort(keys, kind="stable")
+    distinct, starts = np.unique(keys[order], return_index=True)
+    return [
+        (*divmod(int(key), len(scene.materials)), triangles)
+        for key, triangles in zip(distinct, np.split(order, starts[1:]), strict=True)
+    ]
+
+
 class SceneParts:
     """Collects the objects of a scene under unique names, within limits."""
 
@@ -218,10 +214,14 @@ class SceneParts:
         Raises:
             TrilightError: more than MAX_TRIANGLES triangles, or MAX_ROWS objects or materials.
         """
-        for kind, part in split_by_kind(triangles):
-            new_kind = entry.kind if kind == "object" and entry.kind == "shell" else kind
-            unique = dataclasses.replace(entry, name=self._make_unique(entry.name), kind=new_kind)
-            piece = build_piece(unique, part)
+        emits = (triangles.rows[:, EMISSION] > 0).any(axis=1)
+        surface_kind: ObjectKind = "shell" if entry.kind == "shell" else "object"
+        kinds: tuple[tuple[ObjectKind, Any], ...] = ((surface_kind, ~emits), ("emitter", emits))
+        for kind, mask in kinds:
+            if not mask.any():
+                continue
+            unique = dataclasses.replace(entry, name=self._make_unique(entry.name), kind=kind)
+            piece = build_piece(unique, triangles.select(mask))
             self._pieces.append(piece)
             self._surfaces += [] if is_lamp else [piece]
             self._counts["triangles"] += len(piece.piece.mesh.faces)

@@ -31,6 +31,14 @@ class LinearPicture:
     """Short sentences on contents of the file that are not read."""
 
 
+def require_pixels(width: int, height: int, most: int) -> None:
+    """Raise Rejected `too_many_pixels` for a picture of more pixels than `most`, or of none."""
+    if not 0 < width * height <= most:
+        raise Rejected(
+            "too_many_pixels", f"{width} x {height}; expected at most {most} pixels: scale it down"
+        )
+
+
 def are_rec709(primaries: Sequence[float]) -> bool:
     """Return whether primaries [8] are those of Rec.709 within rounding."""
     return bool(np.allclose(primaries, REC709, rtol=0, atol=_SAME))

@@ -91,12 +91,12 @@ class SourceMaterial:
 class MaterialSamples:
     """Values [N, 4] of the pictures of a material at N places; None without such a picture."""
 
-    base: NDArray[np.float32] | None
-    metallic: NDArray[np.float32] | None
-    roughness: NDArray[np.float32] | None
-    specular_colour: NDArray[np.float32] | None
-    specular_strength: NDArray[np.float32] | None
-    glossiness: NDArray[np.float32] | None
+    base: NDArray[np.float32] | None = None
+    metallic: NDArray[np.float32] | None = None
+    roughness: NDArray[np.float32] | None = None
+    specular_colour: NDArray[np.float32] | None = None
+    specular_strength: NDArray[np.float32] | None = None
+    glossiness: NDArray[np.float32] | None = None
 
 
 def source_columns(

@@ -71,10 +71,10 @@ class SourceFolder:
             root: no file outside of it is read; `folder` itself where that lies elsewhere.
             read: function that reads a regular file of at most so many bytes.
         """
-        self._folder = folder.resolve()
+        self.folder = folder.resolve()
         root = root.resolve()
-        self._root = root if self._folder.is_relative_to(root) else self._folder
-        self._read = read
+        self._root = root if self.folder.is_relative_to(root) else self.folder
+        self.read = read
 
     def read_all(
         self,
@@ -89,7 +89,7 @@ class SourceFolder:
         refused: dict[str, Rejected] = {}
         for name in dict.fromkeys(names):
             try:
-                data[name] = self._read(self._find(name, extra_folders, is_uri=is_uri), bytes_left)
+                data[name] = self.read(self._find(name, extra_folders, is_uri=is_uri), bytes_left)
                 bytes_left -= len(data[name])
             except Rejected as error:
                 code = {"too_large_bytes": "texture_too_large", "missing_file": "texture_missing"}
@@ -111,7 +111,7 @@ class SourceFolder:
         extra_spellings = (f"{folder}/{plain}" for folder in extra_folders)
         for spelling in (plain, *extra_spellings, *_list_spellings(plain)):
             with contextlib.suppress(OSError):  # such as a name that is too long
-                target = find_in_any_case(self._folder, spelling, self._root)
+                target = find_in_any_case(self.folder, spelling, self._root)
                 is_inside = target.is_relative_to(self._root)
                 if is_inside and target.is_file():
                     return target

@@ -1,12 +1,26 @@
-"""Materials of single-mesh files: the MTL of an OBJ, the pictures of a PLY, or colors."""
+"""Materials of single-mesh files: the MTL of an OBJ, the pictures of a PLY, or colors.
+
+An MTL is read with its extension for metal and roughness (Pm, Pr, their maps). A map is read from
+the first channel of its picture and multiplied with its number, which is 1 where only the map is
+stated. Without those, `Ks` and `Ns` are read as today's exporters write them: Ks is half of white
+for an ordinary dielectric, F0 = 0.08 Ks, and Ns is 1000 (1 - roughness)^2. `illum` 0 and 1 mean
+that there is no highlight.
+"""
 
 import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
 
-from pipeline.foreign.material import Slot, SourceMaterial
-from pipeline.foreign.obj_materials import obj_materials
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.foreign.material import RGB, WHITE, Slot, SourceMaterial
+from pipeline.foreign.material_files import READ_MAPS, MaterialFiles
+from pipeline.foreign.mesh import FileMesh
+from pipeline.foreign.mtl import Fields, read_mtl, split_map
+from pipeline.foreign.numbers import Malformed, parse_number
 from pipeline.foreign.picture import Decode, Picture
 from pipeline.foreign.source_file import SourceFile
-from pipeline.foreign.textured_mesh import TexturedMesh, build_textured_mesh
+from pipeline.foreign.textured_mesh import TexturedMesh
 from storage.errors import Rejected
 
 
@@ -22,7 +36,7 @@ def read_textured_mesh(source: SourceFile, decode: Decode, *, emission: bool) ->
     files = source.materials
     names = contents.material_names
     if source.kind == "obj" and (names or contents.color is None):
-        materials, unread = obj_materials(names, files, decode, emission=emission)
+        materials, unread = _obj_materials(names, files, decode, emission=emission)
         source.notes.extend(unread)
     elif (
         names
@@ -36,14 +50,208 @@ def read_textured_mesh(source: SourceFile, decode: Decode, *, emission: bool) ->
     elif contents.color is not None:
         why = "without texture coordinates" if contents.uv is None else "it is not there"
         source.notes.extend(f"picture {name[:60]!r}: {why}" for name in names)
-        return build_textured_mesh(
-            dataclasses.replace(contents, material=None), [], SourceMaterial()
-        )
+        return _build_textured_mesh(dataclasses.replace(contents, material=None), [])
     else:
         of_ply = " and no picture with texture coordinates" if source.kind == "ply" else ""
         raise Rejected("no_materials", f"the {source.kind.upper()} has no colors{of_ply}")
     if contents.color is not None:
         source.notes.append("colors, where materials or pictures are read")
-    return build_textured_mesh(
-        dataclasses.replace(contents, color=None), materials, SourceMaterial()
+    return _build_textured_mesh(dataclasses.replace(contents, color=None), materials)
+
+
+def _build_textured_mesh(contents: FileMesh, materials: Sequence[SourceMaterial]) -> TexturedMesh:
+    count = len(contents.mesh.faces)
+    rows = np.full(count, -1) if contents.material is None else contents.material
+    uv = np.full((count, 3, 2), np.nan) if contents.uv is None else contents.uv
+    return TexturedMesh(
+        mesh=contents.mesh,
+        material=np.where(rows < 0, len(materials), rows),
+        materials=(*materials, SourceMaterial()),
+        uv=uv[:, None],
+        color=contents.color,
     )
+
+
+_F0_OF_KS = 0.08
+_MOST_NS = 1000.0
+_PHYSICAL = {"pm", "pr", "map_pm", "map_pr"}
+"""Statements of which one makes a material a metallic-roughness one."""
+_READ = {*_PHYSICAL, "kd", "ks", "ns", "ke", "illum", "map_kd", "map_ks", "map_ke"}
+_LOST = {"norm", "bump", "map_bump", "disp", "d", "tr", "map_d"}
+"""Statements that `SourceMaterial.lost` names in words."""
+_MEANINGLESS = {"ka", "map_ka", "ni", "sharpness", "map_aat"}
+"""Statements about ambient light, the inside of what is opaque, and antialiasing."""
+_CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}
+_SILENT_OPTIONS = {"-s", "-o", "-clamp", "-imfchan", "-blendu", "-blendv", "-cc", "-texres"}
+_RGB_OF_XYZ = np.array(
+    [[3.2404542, -1.5371385, -0.4985314], [-0.969266, 1.8760108, 0.041556],
+     [0.0556434, -0.2040259, 1.0572252]]
+)  # fmt: skip
+"""Matrix from XYZ to linear Rec.709."""
+
+
+def _obj_materials(
+    names: Sequence[str], files: MaterialFiles, decode: Decode, *, emission: bool
+) -> tuple[list[SourceMaterial], list[str]]:
+    """Return the materials of these names, and sentences on statements that are not read."""
+    if not names or not files.libraries:
+        # records hold these words, and digests hold records
+        why = "names no file of its materials (mtllib)" if names else "names no materials"
+        raise Rejected("no_materials", f"the OBJ {why}")
+    known: dict[str, Fields] = {}
+    for library in files.libraries:
+        if library in files.data:
+            known = {**read_mtl(files.data[library]), **known}
+    absent = [name for name in files.libraries if name not in files.data]
+    if not known.keys() & set(names):
+        if absent:
+            files.require(absent[0])
+        raise Rejected("materials_unreadable", f"no library has the material {names[0]!r:.80}")
+    reader = _Reader(files, decode)
+    chosen = [known.get(name, {}) for name in names]
+    try:
+        materials = [reader.material(fields) for fields in chosen]
+        if emission:
+            materials = list(map(reader.add_emission, materials, chosen))
+    except Malformed as error:
+        raise Rejected("materials_unreadable", f"the MTL is malformed ({error!s:.200})") from error
+    unread = [f"library {name[:60]!r}: it is not there" for name in absent]
+    unread += [
+        f"material {name[:60]!r}: no library has it; its faces have MTL's defaults"
+        for name in names
+        if name not in known
+    ]
+    unread += [text for fields in chosen for text in _list_unread(fields)]
+    return materials, list(dict.fromkeys(unread))
+
+
+class _Reader:
+    """Converts the materials of one MTL, decoding each picture once."""
+
+    def __init__(self, files: MaterialFiles, decode: Decode) -> None:
+        self._files = files
+        self._decode = decode
+        self._values: dict[str, NDArray] = {}
+
+    def material(self, fields: Fields) -> SourceMaterial:
+        lost = _list_unsupported(fields)
+        base = self._slot(fields.get("map_kd"), is_srgb=True)
+        base_rgb = WHITE if base is not None and "kd" not in fields else _rgb(fields, "kd", 0.8)
+        if _PHYSICAL & set(fields):
+            metallic, roughness = (self._slot(fields.get(name)) for name in ("map_pm", "map_pr"))
+            return SourceMaterial(
+                base_rgb=base_rgb,
+                base=base,
+                metallic=_number(fields, "pm", 0.0 if metallic is None else 1.0),
+                metallic_map=metallic,
+                roughness=_number(fields, "pr", 0.5 if roughness is None else 1.0),
+                roughness_map=roughness,
+                lost=lost,
+            )
+        shiny = _number(fields, "illum", 2.0) not in (0, 1)
+        smooth = np.sqrt(np.clip(_number(fields, "ns", 250.0), 0, _MOST_NS) / _MOST_NS)
+        return SourceMaterial(
+            base_rgb=base_rgb,
+            base=base,
+            roughness=float(1 - smooth),
+            f0=_F0_OF_KS,
+            specular_rgb=_rgb(fields, "ks", 0.5),
+            specular_colour=self._slot(fields.get("map_ks"), is_srgb=True),
+            specular_strength=float(shiny),
+            lost=lost,
+        )
+
+    def add_emission(self, material: SourceMaterial, fields: Fields) -> SourceMaterial:
+        """Return a material with its emission; a map without `Ke` has the factor 1."""
+        picture = self._slot(fields.get("map_ke"), is_srgb=True)
+        factor = _rgb(fields, "ke", 0.0 if picture is None else 1.0)
+        red, green, blue = (max(value, 0.0) for value in factor)
+        if picture is not None and not any(factor):  # some exporters write it so
+            red, green, blue = WHITE
+        return dataclasses.replace(material, emission_rgb=(red, green, blue), emission=picture)
+
+    def _slot(self, text: str | None, *, is_srgb: bool = False) -> Slot | None:
+        if text is None:
+            return None
+        options, name = split_map(text)
+        if name not in self._values:
+            self._values[name] = self._decode(self._files.require(name), name)
+        clamp = options.get("-clamp") == ["on"]
+        picture = Picture(
+            values=self._values[name],
+            is_srgb=is_srgb and self._values[name].dtype != np.float16,  # floats are linear
+            wrap=("clamp", "clamp") if clamp else ("repeat", "repeat"),
+        )
+        return Slot(
+            picture=picture,
+            uv_matrix=np.diag(_pair(options, "-s", 1.0)),
+            uv_offset=np.array(_pair(options, "-o", 0.0)),
+            channel=_CHANNELS.get("".join(options.get("-imfchan", ["r"])), 0),
+        )
+
+
+def _list_unsupported(fields: Fields) -> tuple[str, ...]:
+    unsupported = {
+        "emission": _is_over(fields.get("ke", "0"), 0) or "map_ke" in fields,
+        "normal map": bool({"norm", "bump", "map_bump", "disp"} & set(fields)),
+        "transparency": not _is_over(fields.get("d", "1"), 1 - 1e-9)
+        or _is_over(fields.get("tr", "0"), 0)
+        or "map_d" in fields,
+    }
+    return tuple(word for word, is_there in unsupported.items() if is_there)
+
+
+def _is_over(text: str, bound: float) -> bool:
+    """Return whether any number of a statement exceeds a bound; words that are none are ignored."""
+    try:
+        return any(value > bound for value in _numbers(text.removeprefix("-halo"), ""))
+    except ValueError:
+        return bound > 0
+
+
+def _list_unread(fields: Fields) -> Iterator[str]:
+    """Yield names of statements of a material that no code reads."""
+    for key, value in fields.items():
+        if key not in _READ | _LOST | _MEANINGLESS:
+            yield f"statement {key[:24]!r}"
+        elif key in READ_MAPS:
+            options = split_map(value)[0]
+            unknown = [name for name in options if name not in _SILENT_OPTIONS]
+            if options.get("-imfchan", ["r"])[0] not in _CHANNELS:
+                unknown.append("-imfchan")
+            yield from (f"option {name[:24]!r} of {key}" for name in unknown)
+        elif value.startswith("spectral"):
+            yield f"spectral curve of {key}"
+        elif key in ("kd", "ks") and _is_over(value.removeprefix("xyz"), 1.001):
+            yield f"{key} above 1"
+
+
+def _rgb(fields: Fields, name: str, default: float) -> RGB:
+    text = fields.get(name, str(default))
+    if text.startswith("spectral"):  # a file of a curve, which `_list_unread` names
+        text = str(default)
+    is_xyz = text.startswith("xyz")
+    values = _numbers(text.removeprefix("xyz"), name)
+    if len(values) == 1:
+        values = values * 3
+    if len(values) != 3:
+        raise Malformed(f"{name} is {fields.get(name)!r:.60}; expected three numbers")
+    if is_xyz:
+        values = np.maximum(_RGB_OF_XYZ @ values, 0).tolist()
+    return values[0], values[1], values[2]
+
+
+def _number(fields: Fields, name: str, default: float) -> float:
+    return _numbers(fields.get(name, str(default)), name)[0]
+
+
+def _numbers(text: str, field: str) -> list[float]:
+    values = [parse_number(word, field) for word in text.partition("#")[0].split()]
+    if not values:
+        raise Malformed(f"{field} is empty; expected numbers")
+    return values
+
+
+def _pair(options: Mapping[str, list[str]], name: str, default: float) -> list[float]:
+    numbers = [parse_number(value, f"option {name}") for value in options.get(name, ())[:2]]
+    return numbers + [default] * (2 - len(numbers))

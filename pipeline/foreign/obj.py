@@ -70,12 +70,15 @@ def read_obj(data: bytes) -> FileMesh:
     if (used >= len(coordinates)).any() or (used < -1).any():
         unread["texture coordinates that the file does not hold"] = 1
         used = np.where((used < 0) | (used >= len(coordinates)), -1, used)
+    uv = coordinates[used, :2] if len(coordinates) else None
+    if uv is not None:
+        uv[used < 0] = np.nan
     colors = _decode_colors(text, points, width, unread)
     return FileMesh(
         mesh=TriangleMesh(positions=points[chosen[first, 0], :3], faces=vertex.reshape(-1, 3)),
         material=material[polygon],
         material_names=names,
-        uv=_pick(coordinates[:, :2], used).reshape(-1, 3, 2) if len(coordinates) else None,
+        uv=None if uv is None else uv.reshape(-1, 3, 2),
         color=None if colors is None else colors[chosen[:, 0]].reshape(-1, 3, 3),
         unread=list_some(unread),
     )
@@ -206,7 +209,7 @@ def _read_materials(
     named = [
         (row, name)
         for row in np.flatnonzero(kinds == _OTHER).tolist()
-        if (name := _read_value(lines.line(row), b"usemtl")) is not None
+        if (name := _read_material(lines.line(row))) is not None
     ]
     rows: dict[str, int] = {}
     known = [-1, *(rows.setdefault(name, len(rows)) if name else -1 for _, name in named)]
@@ -249,10 +252,10 @@ def _read_polypaint(text: bytes, count: int) -> NDArray[np.float64] | None:
     )
 
 
-def _read_value(line: bytes, key: bytes) -> str | None:
-    """Return the value of a statement, or None for another key word."""
+def _read_material(line: bytes) -> str | None:
+    """Return the name of a material, or None for another statement."""
     word = line.split(maxsplit=1)[0]
-    if word.lower() != key:
+    if word.lower() != b"usemtl":
         return None
     return unquote_name(decode_name(line[len(word) :]))
 
@@ -300,12 +303,6 @@ def _unique_rows(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
     else:
         _, first, number = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     return first, number.ravel()
-
-
-def _pick(values: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    picked = values[rows]
-    picked[rows < 0] = np.nan
-    return picked
 
 
 def list_libraries(data: bytes) -> list[Sequence[str]]:

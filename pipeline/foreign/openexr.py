@@ -24,6 +24,7 @@ from pipeline.foreign.linear_picture import (
     are_rec709,
     as_rec709,
     luminance_weights,
+    require_pixels,
 )
 from storage.errors import Rejected, TrilightError
 from storage.records.exr import MANY_PARTS, find_header_end
@@ -71,13 +72,8 @@ class _Choice:
     """Names of the channels in the file, one for each letter."""
 
 
-def read_openexr(data: bytes, max_pixels: int, *, is_color: bool = True) -> LinearPicture:
-    """Return the picture of an OpenEXR file.
-
-    Args:
-        data: the file.
-        max_pixels: maximum number of pixels, checked before memory is allocated.
-        is_color: whether its numbers are colors, which its primaries apply to.
+def read_openexr(data: bytes, max_pixels: int, *, is_color: bool) -> LinearPicture:
+    """Return the picture of an OpenEXR file; arguments as for `read_linear_picture`.
 
     Raises:
         Rejected: load_error or too_many_pixels.
@@ -220,12 +216,7 @@ def _picture_window(header: Mapping[str, Any]) -> tuple[int, int, int, int]:
 def _require_size(
     headers: Sequence[Mapping[str, Any]], window: tuple[int, int, int, int], max_pixels: int
 ) -> None:
-    _, _, width, height = window
-    if not 0 < width * height <= max_pixels:
-        raise Rejected(
-            "too_many_pixels",
-            f"{width} x {height}; expected at most {max_pixels} pixels: scale it down",
-        )
+    require_pixels(*window[2:], max_pixels)
     stored = sum(
         4 * len(header["channels"]) * math.prod(_box(header, "dataWindow")[2:])
         for header in headers

@@ -105,6 +105,16 @@ def read_ply(data: bytes) -> FileMesh:
     )
 
 
+def check_face_count(data: bytes, max_faces: int) -> None:
+    """Raise Rejected for a header that counts too many faces, or as `read_ply` for a malformed one.
+
+    A count that the file cannot hold is left to `read_ply`.
+    """
+    for element in _read_header(data).elements:
+        if element.name == "face" and max_faces < element.rows <= len(data):
+            raise Rejected("too_many_faces", f"{element.rows} faces; expected <= {max_faces}")
+
+
 def list_ply_pictures(data: bytes) -> Sequence[str]:
     """Return the names of the pictures of a PLY; none where its header is malformed."""
     try:
@@ -137,7 +147,10 @@ def _read_header(data: bytes) -> _Header:
         elif key in (b"comment", b"obj_info"):
             if picture := re.match(rb"(?i)\w+\s+TextureFile\s+(.+)", line):
                 pictures.append(decode_name(picture[1]))
-        elif key == b"element" and len(words) == 3 and re.fullmatch(rb"\d{1,18}", words[2]):
+        elif key == b"element" and len(words) == 3:
+            if not re.fullmatch(rb"\d{1,18}", words[2]):
+                counted = words[2][:24]
+                raise Rejected("header_size_mismatch", f"the PLY header counts {counted!r}")
             elements.append(_Element(name=decode_name(words[1]), rows=int(words[2])))
         elif key == b"property" and elements and len(words) in (3, 5):
             elements[-1].properties.append(_read_property(words))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.linear_picture import LinearPicture, are_rec709, as_rec709
+from pipeline.foreign.linear_picture import LinearPicture, are_rec709, as_rec709, require_pixels
 from pipeline.foreign.numbers import Malformed, parse_number
 from storage.errors import Rejected
 
@@ -50,13 +50,8 @@ class _Header:
     unread: tuple[str, ...]
 
 
-def read_radiance_hdr(data: bytes, max_pixels: int, *, is_color: bool = True) -> LinearPicture:
-    """Return the picture of a file, RGB.
-
-    Args:
-        data: the file.
-        max_pixels: maximum number of pixels, checked before memory is allocated.
-        is_color: whether its numbers are colors, which its primaries apply to.
+def read_radiance_hdr(data: bytes, max_pixels: int, *, is_color: bool) -> LinearPicture:
+    """Return the picture of a file, RGB; arguments as for `read_linear_picture`.
 
     Raises:
         Rejected: not_hdr, too_many_pixels, load_error.
@@ -64,11 +59,7 @@ def read_radiance_hdr(data: bytes, max_pixels: int, *, is_color: bool = True) ->
     header = _read_header(data)
     rows = header.rows
     columns = header.columns
-    if not 0 < rows * columns <= max_pixels:
-        raise Rejected(
-            "too_many_pixels",
-            f"{columns} x {rows}; expected at most {max_pixels} pixels: scale it down",
-        )
+    require_pixels(columns, rows, max_pixels)
     if len(data) - header.start < 4 * rows:  # no row is shorter, with or without runs
         raise _damage_error("it is cut off")
     texels = _decode_texels(data, header.start, rows, columns)

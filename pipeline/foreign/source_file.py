@@ -15,14 +15,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.foreign.gltf.document import GltfDocument, open_gltf
-from pipeline.foreign.headers import check_header
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material_files import MaterialFiles, SourceFolder, obj_files, ply_files
 from pipeline.foreign.mesh import FileMesh
 from pipeline.foreign.obj import read_obj
 from pipeline.foreign.off import read_off
-from pipeline.foreign.ply import read_ply
-from pipeline.foreign.stl import read_stl
+from pipeline.foreign.ply import check_face_count, read_ply
+from pipeline.foreign.stl import count_facets, read_stl
 from pipeline.foreign.usd.stage import SUFFIXES as USD_SUFFIXES
 from storage.errors import Rejected
 
@@ -40,6 +39,18 @@ _READERS: Mapping[str, Callable[[bytes], FileMesh]] = {
     "stl": read_stl,
 }
 """Readers of the formats with one mesh a file."""
+
+_ARCHIVES = {
+    b"PK\x03\x04": "zip",
+    b"PK\x05\x06": "zip",
+    b"\x1f\x8b": "gzip",
+    b"BZh": "bzip2",
+    b"\xfd7zXZ\x00": "xz",
+    b"7z\xbc\xaf\x27\x1c": "7z",
+    b"Rar!": "rar",
+    b"\x28\xb5\x2f\xfd": "zstandard",
+}
+"""Names of archives by their first bytes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,13 +132,13 @@ def read_source(path: Path, limits: ReadLimits, root: Path | None = None) -> Sou
     data = _read_regular(path, limits.max_bytes)
     if needs_child(path):
         return _usd_file(path, limits)
-    check_header(data, suffix, limits.max_faces)
+    _check_start(data, suffix, limits.max_faces)
     gltf: GltfDocument | None = None
     materials = MaterialFiles()
     keep = limits.with_materials
     folder = SourceFolder(path.parent, root or path.parent, _read_regular)
     if suffix in (".glb", ".gltf"):
-        gltf = open_gltf(data, suffix, path.parent, folder, limits, _read_regular)
+        gltf = open_gltf(data, suffix, folder, limits)
         materials = gltf.pictures
     elif suffix in (".obj", ".ply") and keep:
         list_files = obj_files if suffix == ".obj" else ply_files
@@ -144,6 +155,21 @@ def read_source(path: Path, limits: ReadLimits, root: Path | None = None) -> Sou
         materials=materials,
         gltf=gltf,
     )
+
+
+def _check_start(data: bytes, suffix: str, max_faces: int) -> None:
+    """Raise Rejected for an archive, and for a header that counts too many faces."""
+    for magic, name in _ARCHIVES.items():
+        if data.startswith(magic):
+            raise Rejected("archive_refused", f"the file is a {name} archive; unpack it first")
+    if data[257:262] == b"ustar":
+        raise Rejected("archive_refused", "the file is a tar archive; unpack it first")
+    if suffix == ".stl":
+        count = count_facets(data)
+        if count is not None and count > max_faces:
+            raise Rejected("too_many_faces", f"{count} faces; expected <= {max_faces}")
+    elif suffix == ".ply":
+        check_face_count(data, max_faces)
 
 
 def _usd_file(path: Path, limits: ReadLimits) -> SourceFile:

@@ -21,6 +21,12 @@ _MOST_INDENT = 4096
 """Bytes that are searched before the word that begins or ends a solid."""
 
 
+def count_facets(data: bytes) -> int | None:
+    """Return the number of facets that a binary STL of the stated length has; None for others."""
+    count = int.from_bytes(data[80:_HEADER_BYTES], "little")
+    return count if len(data) == _HEADER_BYTES + _FACET.itemsize * count else None
+
+
 def read_stl(data: bytes) -> FileMesh:
     """Return the triangles of an STL.
 

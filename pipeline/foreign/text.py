@@ -18,19 +18,16 @@ T = TypeVar("T", bound=np.generic)
 
 _SPACE = 32
 """Bytes up to this value separate words."""
+_MOST_LISTED = 12
 
 
 def plain_text(data: bytes) -> bytes:
     """Return a text without byte order mark, with line feeds as line ends."""
     for mark, encoding in _MARKS.items():
         if data.startswith(mark):
-            data = data[len(mark) :] if not encoding else _from_utf16(data)
+            data = data.decode("utf-16", "replace").encode() if encoding else data[len(mark) :]
             break
     return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in data else data
-
-
-def _from_utf16(data: bytes) -> bytes:
-    return data.decode("utf-16", "replace").encode()
 
 
 def decode_name(data: bytes) -> str:
@@ -130,8 +127,8 @@ def _is_number(word: bytes, kind: type) -> bool:
     return b"_" not in word
 
 
-def list_some(sentences: dict[str, int], most: int = 12) -> tuple[str, ...]:
+def list_some(sentences: dict[str, int]) -> tuple[str, ...]:
     """Return the first sentences of a file, and the number of further ones."""
     listed = [text if count == 1 else f"{count} x {text}" for text, count in sentences.items()]
-    more = len(listed) - most
-    return (*listed[:most], *([f"{more} other things"] if more > 0 else []))
+    more = len(listed) - _MOST_LISTED
+    return (*listed[:_MOST_LISTED], *([f"{more} other things"] if more > 0 else []))

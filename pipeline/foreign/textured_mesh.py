@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.material import SourceMaterial
-from pipeline.foreign.mesh import FileMesh, TriangleMesh
+from pipeline.foreign.mesh import TriangleMesh
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -22,19 +22,3 @@ class TexturedMesh:
     """[F, S, 3, 2] texture coordinates of corners by set S, v up; NaN where there are none."""
     color: NDArray[np.float64] | None = None
     """[F, 3, 3] linear tint of each corner, multiplied with the base color; None for white."""
-
-
-def build_textured_mesh(
-    contents: FileMesh, materials: Sequence[SourceMaterial], default: SourceMaterial
-) -> TexturedMesh:
-    """Return the triangles of a file with its materials; `default` is that of faces without one."""
-    count = len(contents.mesh.faces)
-    rows = np.full(count, -1) if contents.material is None else contents.material
-    uv = np.full((count, 3, 2), np.nan) if contents.uv is None else contents.uv
-    return TexturedMesh(
-        mesh=contents.mesh,
-        material=np.where(rows < 0, len(materials), rows),
-        materials=(*materials, default),
-        uv=uv[:, None],
-        color=contents.color,
-    )

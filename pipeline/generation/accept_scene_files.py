@@ -8,8 +8,7 @@ from pathlib import Path
 from pipeline.assets.settings import AssetSettings
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
-from pipeline.exchange.scene_files import SceneFiles, build_scene
-from pipeline.exchange.scene_folder import SceneFolder, require_usable
+from pipeline.exchange.scene_files import SceneFiles, SceneFolder, build_scene, require_usable
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects, read_frozen_objects
 from pipeline.generation.prepare_isolated import asset_child

@@ -6,8 +6,7 @@ from typing import Any
 
 from pipeline.builds.named import BUILDS, frozen_note, named_build, object_source
 from pipeline.builds.settings import BuildSettings
-from pipeline.exchange.scene_files import SceneFiles
-from pipeline.exchange.scene_folder import SceneFolder, find_scene_files
+from pipeline.exchange.scene_files import SceneFiles, SceneFolder, find_scene_files
 from pipeline.generation.accept_revisited import settings_for_revisit
 from pipeline.generation.accept_scene_files import settings_for_files
 from pipeline.generation.bucket_dataset_writer import begin_dataset

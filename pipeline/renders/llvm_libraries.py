@@ -1,10 +1,14 @@
-"""Finds candidates for LLVM's shared library on this machine, newest first."""
+"""Finds candidates for LLVM's shared library: the wheel's, then the system's, newest first.
+
+The wheel comes first, so that the bits of pictures don't depend on the distribution's LLVM.
+"""
 
 import os
 import re
 import shutil
 import subprocess
 from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
 _FOLDERS = (
@@ -18,10 +22,11 @@ _FOLDERS = (
 )
 _NAME = re.compile(r"libLLVM(?:-(\d+))?(?:\.so|\.dylib)?(?:\.(\d+))?[\d.]*(?:\.so|\.dylib)?[\d.]*$")
 _LDCONFIG_S = 20
+_WHEEL = "karellen-llvm-core"
 
 
 def llvm_libraries() -> list[Path]:
-    """Return what may be LLVM: DRJIT_LIBLLVM_PATH first, then by falling version.
+    """Return what may be LLVM: DRJIT_LIBLLVM_PATH, the wheel's, the others by falling version.
 
     Symbolic links are resolved, so that one library is named once.
     """
@@ -29,7 +34,15 @@ def llvm_libraries() -> list[Path]:
     candidates = {path.resolve() for path in (*_known_to_loader(), *_in_usual_folders())}
     ordered = sorted(candidates, key=lambda path: (-_major_version(path), str(path)))
     first = [Path(named).resolve()] if named else []
-    return [path for path in dict.fromkeys([*first, *ordered]) if path.is_file()]
+    return [path for path in dict.fromkeys([*first, *_of_wheel(), *ordered]) if path.is_file()]
+
+
+def _of_wheel() -> list[Path]:
+    try:
+        members = files(_WHEEL) or []
+    except PackageNotFoundError:
+        return []
+    return [Path(str(file.locate())).resolve() for file in members if _NAME.match(file.name)]
 
 
 def _major_version(path: Path) -> int:

@@ -154,7 +154,7 @@ def _on_processor() -> Variant:
     reason = f"of {', '.join(tried)} none works with Mitsuba" if tried else "no LLVM library found"
     raise TrilightError(
         f"rendering: {reason}; expected LLVM, by which Mitsuba compiles. Install it: "
-        "apt-get install libllvm19."
+        "pip install karellen-llvm-core."
     )
 
 

@@ -1,7 +1,7 @@
 """`SurfaceMaps`: what a textured surface is, and `Finish`, what its parts are mixed from."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -50,28 +50,16 @@ class Finish:
     def toned(self, tone: ArrayLike) -> "Finish":
         """Return it with its diffuse albedo times a number in [0, 1], one or [N, N]."""
         factor = np.clip(np.asarray(tone, np.float64), 0, 1)
-        return Finish(
-            diffuse_rgb=self.diffuse_rgb * factor[..., None],
-            specular_rgb=self.specular_rgb,
-            roughness=self.roughness,
-        )
+        return replace(self, diffuse_rgb=self.diffuse_rgb * factor[..., None])
 
     def dimmed(self, tone: ArrayLike) -> "Finish":
         """Return it with both albedos times a number in [0, 1], one or [N, N]."""
         factor = np.clip(np.asarray(tone, np.float64), 0, 1)
-        return Finish(
-            diffuse_rgb=self.diffuse_rgb * factor[..., None],
-            specular_rgb=self.specular_rgb * factor[..., None],
-            roughness=self.roughness,
-        )
+        return replace(self.toned(tone), specular_rgb=self.specular_rgb * factor[..., None])
 
     def rougher(self, by: ArrayLike) -> "Finish":
         """Return it with a number, one or [N, N], added to the roughness."""
-        return Finish(
-            diffuse_rgb=self.diffuse_rgb,
-            specular_rgb=self.specular_rgb,
-            roughness=self.roughness + np.asarray(by, np.float64),
-        )
+        return replace(self, roughness=self.roughness + np.asarray(by, np.float64))
 
     def covered(self, other: "Finish", share: ArrayLike) -> "Finish":
         """Return it with `share` of its area, one or [N, N], covered by another one.

@@ -5,10 +5,10 @@ import os
 import shlex
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 from storage.conventions import SPLITS
 from storage.dataset.layout import DatasetFolder
@@ -19,12 +19,20 @@ from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unre
 from storage.records.held_maps import HeldMaps
 from storage.records.objects import Failure, LockedObject, decode_failures, decode_objects_lock
 from storage.records.safe_read import open_plain
-from storage.records.sample import Sample, SceneRecord, decode_sample, decode_scene
+from storage.records.sample import (
+    Sample,
+    SceneRecord,
+    decode_sample,
+    decode_scene,
+    require_lawful,
+)
 from storage.remote.bucket import WRITABLE
 from storage.remote.cache import shard_cache
 from storage.remote.fetch import download, facts_of, unreadable
 from storage.remote.tries import TransferFailed, is_missing
 from storage.remote.url import RemoteUrl, parse_url
+
+Record = TypeVar("Record", bound=SceneRecord)
 
 
 def _open_error(path: Path, error: OSError) -> TrilightError:
@@ -286,31 +294,31 @@ class Dataset:
             TrilightError: the shard is missing or damaged, or a scene in it is unreadable or breaks
                 a law.
         """
-        held = HeldMaps()
-        with self.files.open(shard, checked=False) as stream:
-            contents = self._contents(stream, shard)
-            for key in contents.samples:
-                with reading(self.display_name, shard.name):
-                    members = contents.read(stream, key, lambda name: not name.endswith("exr"))
-                    record = decode_scene(key, members, held)
-                    _require_lawful(record)
-                yield record
+        yield from self._read(shard, None, decode_scene, lambda name: not name.endswith("exr"))
 
     def read_samples(self, shard: ShardEntry, keys: Iterable[str]) -> Iterator[Sample]:
         """Yield some samples of a shard with their pictures; otherwise as `read_scenes`."""
+        yield from self._read(shard, keys, decode_sample)
+
+    def _read(
+        self,
+        shard: ShardEntry,
+        keys: Iterable[str] | None,
+        decode: Callable[[str, Mapping[str, bytes], HeldMaps], Record],
+        accepts: Callable[[str], bool] = lambda suffix: True,
+    ) -> Iterator[Record]:
         held = HeldMaps()
-        with self.files.open(shard, checked=False) as stream:
-            contents = self._contents(stream, shard)
-            for key in keys:
+        with self._open_unchecked(shard) as (stream, contents):
+            for key in contents.samples if keys is None else keys:
                 with reading(self.display_name, shard.name):
-                    sample = decode_sample(key, contents.read(stream, key), held)
-                    _require_lawful(sample)
-                yield sample
+                    record = decode(key, contents.read(stream, key, accepts), held)
+                    require_lawful(record)
+                yield record
 
     def keys(self, shard: ShardEntry) -> list[str]:
         """Return the keys of a shard's samples in the order of the file; as `read_scenes`."""
-        with self.files.open(shard, checked=False) as stream:
-            keys = list(self._contents(stream, shard).samples)
+        with self._open_unchecked(shard) as (_, contents):
+            keys = list(contents.samples)
         if len(keys) != shard.num_samples:
             raise TrilightError(
                 f"{shard.name}: {len(keys)} samples; expected {shard.num_samples}, as the manifest "
@@ -320,13 +328,15 @@ class Dataset:
 
     def suffixes(self, shard: ShardEntry) -> set[str]:
         """Return the suffixes of all members of a shard's samples; as `read_scenes`."""
-        with self.files.open(shard, checked=False) as stream:
-            samples = self._contents(stream, shard).samples
-        return {suffix for members in samples.values() for suffix in members}
+        with self._open_unchecked(shard) as (_, contents):
+            return {suffix for members in contents.samples.values() for suffix in members}
 
-    def _contents(self, stream: BinaryIO, shard: ShardEntry) -> ShardContents:
-        with reading(self.display_name, shard.name):
-            return contents_of(stream, shard.name)
+    @contextlib.contextmanager
+    def _open_unchecked(self, shard: ShardEntry) -> Iterator[tuple[BinaryIO, ShardContents]]:
+        with self.files.open(shard, checked=False) as stream:
+            with reading(self.display_name, shard.name):
+                contents = contents_of(stream, shard.name)
+            yield stream, contents
 
     def lock_bytes(self) -> bytes | None:
         """Return the file of the objects that were used, or None where the dataset has none."""
@@ -342,18 +352,6 @@ class Dataset:
         return [*decode_failures(self.files.read("failures.jsonl") or b""), *self._noted]
 
 
-def _require_lawful(record: SceneRecord | Sample) -> None:
-    try:
-        record.scene.check()
-    except TrilightError as error:
-        raise TrilightError(f"sample {record.key}: {error}") from error
-    if record.scene.num_views != len(record.views):
-        raise TrilightError(
-            f"sample {record.key}: {len(record.views)} view records; expected "
-            f"{record.scene.num_views}, one for each camera."
-        )
-
-
 def open_dataset(url: str) -> Dataset:
     """Open the dataset in a local folder, or below a URL of http, https, s3, gs or hf.
 
@@ -367,9 +365,8 @@ def open_dataset(url: str) -> Dataset:
     dataset = open_listed(url)
     if not _may_be_growing(dataset.files):
         return dataset
-    from storage.dataset.unlisted import (
-        with_unlisted,  # slow, and not needed to stream a whole set
-    )
+    # slow, and not needed to stream a whole set
+    from storage.dataset.shard_notes import with_unlisted
 
     return with_unlisted(dataset)
 

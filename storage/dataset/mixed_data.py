@@ -63,8 +63,7 @@ def open_mixture(data: Sequence[str]) -> TrainingData:
         if before is not None:
             raise TrilightError(
                 f"data: {each.display_name} holds the same dataset as {before.display_name}; "
-                "expected each once. "
-                "How often its scenes are drawn, data_weights says."
+                "expected each once. How often its scenes are drawn, data_weights says."
             )
         each.split("train")
     return TrainingData(

@@ -168,7 +168,7 @@ class ShardContents:
         Args:
             stream: the shard.
             key: of the sample.
-            wanted: says of a suffix whether it is read.
+            accepts: says of a suffix whether it is read.
 
         Raises:
             TrilightError: the shard has become shorter.
@@ -196,8 +196,7 @@ def samples_of(stream: BinaryIO, name: str) -> Iterator[tuple[str, dict[str, byt
     """
     maps: dict[str, Member] = {}
     for key, members in scan_samples(stream, name, maps):
-        contents = {suffix: read_member(stream, member) for suffix, member in members.items()}
-        yield key, with_maps(contents, maps, lambda member: read_member(stream, member))
+        yield key, ShardContents(samples={key: members}, maps=maps).read(stream, key)
 
 
 def with_maps(
@@ -269,7 +268,8 @@ def _parse_header(name: str, block: bytes, offset: int) -> Member:
     stated = _number(block[148:156])
     if num_bytes is None or stated != sum(block) - sum(block[148:156]) + 8 * ord(" "):
         raise TrilightError(f"{name}: not a readable shard (a header at byte {offset - 512}).")
-    text = b"/".join(filter(None, map(_text, (block[345:500], block[:100]))))
+    fields = (field.partition(b"\0")[0] for field in (block[345:500], block[:100]))
+    text = b"/".join(filter(None, fields))
     member_name = text.decode("utf-8", "replace")
     match = MEMBER_NAME.fullmatch(member_name)
     is_map = MAP_NAME.fullmatch(member_name) is not None
@@ -285,10 +285,6 @@ def _parse_header(name: str, block: bytes, offset: int) -> Member:
         )
     key, suffix = ("", member_name) if match is None else match.groups()
     return Member(key, suffix, offset, num_bytes)
-
-
-def _text(field: bytes) -> bytes:
-    return field.partition(b"\0")[0]
 
 
 def _number(field: bytes) -> int | None:

@@ -3,7 +3,7 @@
 import itertools
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -33,11 +33,9 @@ class ShardPlace:
     @property
     def display_name(self) -> str:
         """The path or URL without secrets, for messages."""
-        return (
-            self.place.display_url
-            if isinstance(self.place, RemoteUrl)
-            else printable(str(self.place))
-        )
+        if isinstance(self.place, RemoteUrl):
+            return self.place.display_url
+        return printable(str(self.place))
 
     @property
     def split(self) -> str:
@@ -88,7 +86,7 @@ def expand_pattern(pattern: str, what: str = "shards") -> list[str]:
     """
     if "://" not in pattern and os.path.exists(parse_local_path(pattern)):
         return [pattern]
-    named = f"{what} {_quote_safe(pattern)}"
+    named = f"{what} {printable(safe_text(pattern))!r}"
     groups = [_alternatives(group[1], named) for group in _GROUP.finditer(pattern)]
     fixed = _GROUP.split(pattern)[::2]
     if any("{" in text or "}" in text for text in fixed):
@@ -121,12 +119,5 @@ def _alternatives(group: str, named: str) -> Sequence[str]:
             f"{named}: the range {group} is backwards or longer than {MAX_SHARDS}; expected such "
             "as 000000..000007."
         )
-    return list(_numbers(first, last, len(match[1])))
-
-
-def _numbers(first: int, last: int, width: int) -> Iterator[str]:
-    return (f"{number:0{width}d}" for number in range(first, last + 1))
-
-
-def _quote_safe(pattern: str) -> str:
-    return repr(printable(safe_text(pattern)))
+    width = len(match[1])
+    return [f"{number:0{width}d}" for number in range(first, last + 1)]

@@ -60,6 +60,7 @@ class Statistics:
         excursions = _counts(self.scenes_by_excursion)
         beyond = [("beyond the range", excursions)] if excursions else []
         sample = of_how_many(self.num_scenes_read, self.num_scenes)
+        kb_per_scene = self.num_bytes / max(self.num_scenes, 1) / 1e3
         return [
             ("scenes", f"{self.num_scenes} ({_counts(self.scenes_by_split)})"),
             ("templates", _counts(self.scenes_by_template)),
@@ -76,12 +77,8 @@ class Statistics:
             ("views at the cap", f"{100 * self.at_cap.mean():.1f} %"),
             ("samples per pixel", f"median {np.median(self.spp):.0f}, most {self.spp.max()}"),
             *([("scene digest", self.scene_digest)] if self.scene_digest else []),
-            ("size", f"{self.num_bytes / 1e6:.1f} MB, {self.bytes_per_scene / 1e3:.0f} kB a scene"),
+            ("size", f"{self.num_bytes / 1e6:.1f} MB, {kb_per_scene:.0f} kB a scene"),
         ]
-
-    @property
-    def bytes_per_scene(self) -> float:
-        return self.num_bytes / max(self.num_scenes, 1)
 
 
 def dataset_statistics(dataset: Dataset) -> Statistics:

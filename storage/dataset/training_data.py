@@ -59,9 +59,8 @@ class TrainingData:
             names = ", ".join(self.splits) or "no split"
             raise TrilightError(
                 f"{self.display_name}: the {name} split holds no scene; expected at least one. "
-                "There is "
-                f"{names}: choose it, or generate the dataset with more scenes; in a list, name "
-                f"shards {name}-....tar too."
+                f"There is {names}: choose it, or generate the dataset with more scenes; in a "
+                f"list, name shards {name}-....tar too."
             )
         return self.splits[name]
 

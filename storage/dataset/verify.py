@@ -224,7 +224,11 @@ def _check_shard(
             return findings
         with _open_shard(dataset, shard) as stream:
             if fast:
-                _check_members(stream, shard, findings)
+                findings.keys += contents_of(stream, shard.name).samples
+                if len(findings.keys) != shard.num_samples:
+                    findings.faults.append(
+                        f"{len(findings.keys)} samples; expected {shard.num_samples}"
+                    )
             else:
                 _check_content(stream, shard, dataset.manifest, locked, findings)
     except EnvironmentFailure:
@@ -251,12 +255,6 @@ def _open_shard(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
         stream.close()
         raise
     return stream
-
-
-def _check_members(stream: BinaryIO, shard: ShardEntry, findings: _ShardFindings) -> None:
-    findings.keys += contents_of(stream, shard.name).samples
-    if len(findings.keys) != shard.num_samples:
-        findings.faults.append(f"{len(findings.keys)} samples; expected {shard.num_samples}")
 
 
 def _check_content(

@@ -11,7 +11,7 @@ catalogue (`objects.jsonl`), so that the output folder is itself a source of obj
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,17 +21,9 @@ from safetensors.numpy import save
 
 from storage.errors import TrilightError
 from storage.records.objects import NamedObject
-from storage.records.safe_read import (
-    read_safetensors,
-)
-from storage.records.skin import (
-    LevelSkin,
-    OwnMaterials,
-    SkinQuality,
-    as_record,
-    read_skin,
-    skin_arrays,
-)
+from storage.records.safe_read import read_safetensors
+from storage.records.skin import LevelSkin, OwnMaterials, SkinQuality, read_skin, skin_arrays
+from storage.typed_json import read_json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,9 +143,9 @@ def encode_asset(asset: Asset) -> bytes:
         "levels": [dataclasses.asdict(level.record) for level in asset.levels],
     }
     if asset.materials is not None:
-        header["materials"] = as_record(asset.materials)
+        header["materials"] = dataclasses.asdict(asset.materials)
         header["skins"] = {
-            str(level.record.budget): as_record(level.skin.quality)
+            str(level.record.budget): dataclasses.asdict(level.skin.quality)
             for level in asset.levels
             if level.skin is not None
         }
@@ -168,39 +160,41 @@ def decode_asset(data: bytes) -> Asset:
     """
     arrays, metadata = read_safetensors(data)
     try:
-        return _asset(arrays, metadata)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        header = read_json(metadata.get("asset", ""), _Header, "its header")
+        levels = tuple(_level(record, header.skins, arrays) for record in header.levels)
+    except (KeyError, TrilightError) as error:
         raise TrilightError(
             f"asset: a safetensors file with arrays {', '.join(arrays) or 'none'} does not hold "
-            f"one ({type(error).__name__}: {error}); expected a file of the asset store. Delete "
+            f"one ({error}); expected a file of the asset store. Delete "
             "it, and it is made again."
         ) from error
+    fields = {name: value for name, value in vars(header).items() if name != "skins"}
+    return Asset(**{**fields, "levels": levels})
 
 
-def _asset(arrays: Mapping[str, NDArray], metadata: Mapping[str, str]) -> Asset:
-    header = json.loads(metadata["asset"])
-    records: Sequence[LevelRecord] = [
-        LevelRecord(**{**row, "quality": LevelQuality(**row["quality"])})
-        for row in header.pop("levels")
-    ]
-    skins = header.pop("skins", {})
-    levels = []
-    for record in records:
-        name = str(record.budget)
-        level = Level(
-            record=record,
-            positions=arrays[f"positions_{name}"],
-            faces=arrays[f"faces_{name}"],
-            skin=read_skin(arrays, skins[name], name) if name in skins else None,
-        )
-        levels.append(level)
-    if (materials := header.pop("materials", None)) is not None:
-        materials = OwnMaterials(**{**materials, "lost": tuple(materials["lost"])})
-    return Asset(
-        levels=tuple(levels),
-        source=SourceFacts(**header.pop("source")),
-        materials=materials,
-        **header,
+@dataclass(frozen=True, kw_only=True)
+class _Header:
+    """Metadata of the file; the fields are those of `Asset`."""
+
+    geometry_sha256: str
+    source_sha256: str
+    recipe: str
+    source: SourceFacts
+    levels: tuple[LevelRecord, ...]
+    materials: OwnMaterials | None = None
+    skins: Mapping[str, SkinQuality] = dataclasses.field(default_factory=dict)
+    """Quality of the skin of each level that has one, by its budget."""
+
+
+def _level(
+    record: LevelRecord, skins: Mapping[str, SkinQuality], arrays: Mapping[str, NDArray]
+) -> Level:
+    name = str(record.budget)
+    return Level(
+        record=record,
+        positions=arrays[f"positions_{name}"],
+        faces=arrays[f"faces_{name}"],
+        skin=read_skin(arrays, skins[name], name) if name in skins else None,
     )
 
 

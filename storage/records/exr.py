@@ -196,8 +196,10 @@ def decode_stored(data: bytes) -> Stored:
 def decode_channels(
     data: bytes,
     names: Collection[str],
-    check: Callable[[Header], None],
+    check: Callable[[Header], None] = lambda header: None,
     *,
+    size: tuple[int, int] | None = None,
+    what: str = "picture",
     separate: bool = False,
 ) -> dict[str, NDArray]:
     """Return the channels of an OpenEXR file by name, R, G and B as one unless `separate`.
@@ -209,18 +211,26 @@ def decode_channels(
         data: the file.
         names: of the channels that it must have.
         check: called with the header before any pixel is read; raises TrilightError.
+        size: height and width as they must be; None for any.
+        what: the file in messages about its size.
         separate: keep R, G and B apart.
 
     Raises:
         TrilightError: not an EXR file, truncated, of several parts, with other channels, larger
-            than MAX_RESOLUTION, of more than 3 GiB, or refused by `check`.
+            than MAX_RESOLUTION, of more than 3 GiB, of another size, or refused by `check`.
     """
     with _readable():
         header = read_header(data)
         check(header)
+        stored_size = window_size(header)
+        if size is not None and stored_size != size:
+            raise TrilightError(f"{what}: {list(stored_size)} pixels; expected {list(size)}.")
         _check_pixels(header, names)
         file = OpenEXR.File(io.BytesIO(data), num_threads=0, separate_channels=separate)
-        return {name: channel.pixels for name, channel in file.channels().items()}
+        pixels = {name: channel.pixels for name, channel in file.channels().items()}
+    if size is not None and any(channel.shape[:2] != size for channel in pixels.values()):
+        raise TrilightError(f"{what}: a channel has other pixels than {list(size)}; expected none.")
+    return pixels
 
 
 def read_header(data: bytes) -> Header:

@@ -5,16 +5,13 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.errors import TrilightError
 from storage.records.exr import (
     Attributes,
-    Header,
     decode_channels,
     decode_exr,
     encode_channels,
     encode_exr,
     to_half,
-    window_size,
 )
 
 
@@ -52,7 +49,7 @@ def decode_picture(data: bytes, layers: Collection[str]) -> NDArray[np.float32]:
     if not layers:
         return decode_exr(data)
     names = ["R", "G", "B", *(f"{layer}.{channel}" for layer in layers for channel in "RGB")]
-    by_channel = decode_channels(data, names, lambda header: None, separate=True)
+    by_channel = decode_channels(data, names, separate=True)
     return np.stack([by_channel[channel] for channel in "RGB"], axis=-1).astype(np.float32)
 
 
@@ -81,14 +78,6 @@ def decode_layers(
         TrilightError: not an EXR file, truncated, or with other channels or another size.
     """
     channels = [f"{name}.{channel}" for name in names for channel in "RGB"]
-
-    def check(header: Header) -> None:
-        if window_size(header) != size:
-            stored_size = list(window_size(header))
-            raise TrilightError(f"{what}: {stored_size} pixels; expected {list(size)}.")
-
-    by_channel = decode_channels(data, channels, check, separate=True)
-    if any(channel.shape != size for channel in by_channel.values()):
-        raise TrilightError(f"{what}: a channel has other pixels than {list(size)}; expected none.")
+    by_channel = decode_channels(data, channels, size=size, what=what, separate=True)
     planes = np.stack([np.asarray(by_channel[name], np.float32) for name in channels])
     return np.moveaxis(planes.reshape(len(names), 3, *size), 1, -1).copy()

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from storage.records.environment import Environment
 from storage.records.scene import Scene
+from storage.records.sky_texels import row_solid_angles
 from storage.records.texture import CONSTANT, TEXTURED
 
 
@@ -26,9 +27,7 @@ class SkyFacts:
 def sky_facts(sky: Environment) -> SkyFacts:
     """Return the facts of a lawful map."""
     grey = sky.radiance_rgb.mean(axis=-1, dtype=np.float64)
-    edges = np.cos(np.pi * np.arange(len(grey) + 1) / len(grey))
-    angles = (edges[:-1] - edges[1:]) * np.pi / len(grey)
-    angle = np.broadcast_to(angles[:, None], grey.shape).ravel()
+    angle = np.broadcast_to(row_solid_angles(len(grey))[:, None], grey.shape).ravel()
     light = grey.ravel() * angle
     total = float(light.sum())
     if not total > 0:

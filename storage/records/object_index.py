@@ -28,6 +28,7 @@ from storage.errors import TrilightError
 from storage.licences import share_alike_camp
 from storage.records.objects import LockedObject
 from storage.records.safe_read import MAX_HEADER_BYTES, open_plain, safetensors_header
+from storage.typed_json import read_json
 
 _FORMAT = 1
 _TYPES: Mapping[str, np.dtype[Any]] = {
@@ -90,6 +91,8 @@ class IndexFacts:
     """Camps by their number in the column."""
     splits: Mapping[str, SplitRows]
     """Range of index rows of each split."""
+    format: int = _FORMAT
+    """Version of the file's form."""
 
     @property
     def num_objects(self) -> int:
@@ -132,7 +135,7 @@ def write_object_index(
         camps=tuple(camps),
         splits=_split_rows(rows, arrays["least"], camp, camps),
     )
-    header = json.dumps({"format": _FORMAT, **dataclasses.asdict(facts)}, sort_keys=True)
+    header = json.dumps(dataclasses.asdict(facts), sort_keys=True)
     write_atomically(path, save(arrays, metadata={"objects": header}))
     return facts
 
@@ -200,10 +203,10 @@ class ObjectIndex:
             self._stream = open_plain(path)
             head = self._stream.read(8 + MAX_HEADER_BYTES)
             header = safetensors_header(head, name=str(path))
-            facts = json.loads(header["__metadata__"]["objects"])
-            if facts.pop("format") != _FORMAT:
+            facts = read_json(header["__metadata__"]["objects"], IndexFacts, "its header")
+            if facts.format != _FORMAT:
                 raise ValueError("another format")
-            self.facts = _facts(facts)
+            self.facts = facts
             self._arrays = {
                 name: (_TYPES[entry["dtype"]], int(entry["data_offsets"][0]))
                 for name, entry in header.items()
@@ -225,15 +228,3 @@ class ObjectIndex:
         """Return the name of the prepared file of a row of the whole index."""
         begin = self._data + self._arrays["name"][1] + row * _NAME_BYTES
         return os.pread(self._stream.fileno(), _NAME_BYTES, begin).hex()
-
-
-def _facts(record: dict[str, Any]) -> IndexFacts:
-    splits = {
-        split: SplitRows(
-            start=rows["start"],
-            stop=rows["stop"],
-            camps={camp: CampSizes(**sizes) for camp, sizes in rows["camps"].items()},
-        )
-        for split, rows in record.pop("splits").items()
-    }
-    return IndexFacts(camps=tuple(record.pop("camps")), splits=splits, **record)

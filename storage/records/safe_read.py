@@ -49,7 +49,8 @@ def read_safetensors(
     header = safetensors_header(data, max_header_bytes, name=name)
     try:
         arrays = load(data)
-    except (SafetensorError, ValueError) as error:
+    except (SafetensorError, ValueError, LookupError) as error:
+        # the last one of a type that numpy has not, such as BF16
         raise TrilightError(f"{name}: unreadable; expected a safetensors file.") from error
     metadata = header.get("__metadata__", {})
     return {name: np.asarray(array) for name, array in arrays.items()}, metadata

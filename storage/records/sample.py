@@ -13,12 +13,13 @@ How both are packed is `storage.records.profiles`. The key is everything before 
 WebDataset reads names.
 """
 
+import contextlib
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,26 +45,22 @@ from storage.records.scene_file import (
     scene_provenance,
     scene_record,
 )
+from storage.settings.ranges import Within
+from storage.typed_json import read_json
 
-_FAR = 1000.0
-"""A bound beyond any noise floor in dB and any share."""
-
-_EXPECTED: Mapping[Any, str] = {
-    int: "a whole number",
-    bool: "true or false",
-    float: f"a number between {-_FAR:.0f} and {_FAR:.0f}",
-}
+Plausible = Annotated[float, Within(-1000, 1000, low_open=True, high_open=True)]
+"""Number within bounds beyond any noise floor in dB and any share."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PartFloor:
     """Stated errors of one layer of a picture, for all lights together."""
 
-    noise_floor_db: float
+    noise_floor_db: Plausible
     """Stated error in dB, as psnr_log_db."""
-    noise_floor_linear_db: float
+    noise_floor_linear_db: Plausible
     """The same error as psnr_linear_db."""
-    object_noise_floor_db: float
+    object_noise_floor_db: Plausible
     """The same error as object_psnr_log_db."""
 
 
@@ -73,14 +70,14 @@ class ViewRecord:
 
     spp: int
     """Samples per pixel that were spent; on each light where they are apart."""
-    noise_floor_db: float
+    noise_floor_db: Plausible
     """Measured error of the picture as psnr_log_db (storage.metrics), before it was packed; the
     profile `compact` adds at most a tenth to its mean square (storage.records.profiles)."""
-    noise_floor_linear_db: float
+    noise_floor_linear_db: Plausible
     """The same error as psnr_linear_db."""
-    object_noise_floor_db: float
+    object_noise_floor_db: Plausible
     """The same error as object_psnr_log_db: over pixels that show geometry."""
-    coverage: float
+    coverage: Plausible
     """Share of the picture in which an object is seen first, from a coarse grid of rays."""
     at_cap: bool
     """True: sampling hit the sample limit before the target error."""
@@ -105,16 +102,11 @@ class SceneRecord:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sample:
+class Sample(SceneRecord):
     """One scene with its views."""
 
-    key: str
-    """The scene's index, nine digits."""
-    scene: Scene
     radiance_rgb: NDArray[np.float32]
     """[C, R, R, 3] linear radiance, one picture per camera of the scene."""
-    views: tuple[ViewRecord, ...]
-    """One record per camera, in their order."""
     lights_rgb: NDArray[np.float32] | None = None
     """[C, L, R, R, 3] radiance of each emitter object alone, in the order of `scene.objects`; their
     sum is the picture (storage.records.lights). None where the build keeps lights together."""
@@ -146,7 +138,7 @@ class Sample:
             TrilightError: there is no such pass or view, or what is stored is unreadable.
         """
         require_row("view", view, self.scene.num_views)
-        try:
+        with name_errors(f"{self.key}: view {view}"):
             return picture_passes(
                 self.scene,
                 names,
@@ -154,8 +146,6 @@ class Sample:
                 resolution=self.radiance_rgb.shape[2],
                 stored=None if self.passes_exr is None else self.passes_exr[view],
             )
-        except TrilightError as error:
-            raise TrilightError(f"sample {self.key}: view {view}: {error}") from error
 
     def check(self) -> None:
         """Raise TrilightError at the first broken law of what can be learnt from, named by key.
@@ -163,21 +153,17 @@ class Sample:
         Scene.check, as many square pictures and records as cameras, and radiance that is finite
         and not negative: one value that is not would reach every weight in one step.
         """
-        try:
-            self.scene.check()
-        except TrilightError as error:
-            raise TrilightError(f"sample {self.key}: {error}") from error
+        require_lawful(self)
         count, height, width = self.radiance_rgb.shape[:3]
         views = self.scene.num_views
-        if not (count == len(self.views) == views and height == width > 0):
+        if not (count == views and height == width > 0):
             raise TrilightError(
-                f"sample {self.key}: {count} pictures of {height} x {width} pixels and "
-                f"{len(self.views)} records; expected {views} of both, as many as cameras, square."
+                f"sample {self.key}: {count} pictures of {height} x {width} pixels; expected "
+                f"{views}, as many as cameras, square."
             )
         check_radiance(self.key, "", self.radiance_rgb)
-        light_pictures = () if self.lights_rgb is None else np.moveaxis(self.lights_rgb, 1, 0)
-        for light, radiance_rgb in enumerate(light_pictures):
-            check_radiance(self.key, f" light {light}", radiance_rgb)
+        if self.lights_rgb is not None:
+            check_lights(self.key, self.lights_rgb)
         for part, pictures in (self.parts_rgb or {}).items():
             for radiance_rgb in np.moveaxis(pictures, 1, 0) if pictures.ndim == 5 else [pictures]:
                 check_radiance(self.key, f" {part} light", radiance_rgb)
@@ -229,58 +215,56 @@ def decode_sample(key: str, members: Mapping[str, bytes], held: HeldMaps | None 
             checked here; `Sample.check` does that before a network learns from it.
     """
     record = decode_scene(key, members, held)
-    try:
+    with name_errors(key):
         pictures = [decode_exr(members[f"{view}.exr"]) for view in range(len(record.views))]
         radiance_rgb = np.stack(pictures)
-        lights_rgb = _decode_lights(record.scene, radiance_rgb, members)
+        lights_rgb = decode_lights(record.scene, range(len(pictures)), pictures[0].shape, members)
         parts_rgb = _decode_parts(record, radiance_rgb, members)
-        passes_exr = _packed_passes(len(record.views), members)
-    except KeyError as error:
-        raise TrilightError(f"sample {key}: {error} is missing.") from error
-    except ValueError as error:
-        raise TrilightError(f"sample {key}: {error}") from error
+        passes_exr = _of_views("passes", range(len(pictures)), members)
     return Sample(
-        key=key,
-        scene=record.scene,
+        **vars(record),
         radiance_rgb=radiance_rgb,
-        views=record.views,
         lights_rgb=lights_rgb,
         parts_rgb=parts_rgb,
         passes_exr=passes_exr,
     )
 
 
-def _packed_passes(num_views: int, members: Mapping[str, bytes]) -> tuple[bytes, ...] | None:
-    if not any(suffix.endswith(".passes.exr") for suffix in members):
+def _of_views(
+    what: str, views: Sequence[int], members: Mapping[str, bytes]
+) -> tuple[bytes, ...] | None:
+    """Return the members `<view>.<what>.exr`; None where the sample has none of any view."""
+    if not any(suffix.endswith(f".{what}.exr") for suffix in members):
         return None
-    return tuple(members[f"{view}.passes.exr"] for view in range(num_views))
+    return tuple(members[f"{view}.{what}.exr"] for view in views)
 
 
-def _decode_lights(
-    scene: Scene, radiance_rgb: NDArray[np.float32], members: Mapping[str, bytes]
+def decode_lights(
+    scene: Scene, views: Sequence[int], size: Sequence[int], members: Mapping[str, bytes]
 ) -> NDArray[np.float32] | None:
-    if not any(suffix.endswith(".lights.exr") for suffix in members):
+    """Return the lights [V, L, R, R, 3] of some views; None where they are together.
+
+    Raises KeyError for a member that is missing, and as `decode_lights_exr`. `size` begins with the
+    height and the width of the pictures.
+    """
+    packed = _of_views("lights", views, members)
+    if packed is None:
         return None
-    views, height, width, _ = radiance_rgb.shape
-    shape = (num_lights(scene), height, width)
-    return np.stack(
-        [decode_lights_exr(members[f"{view}.lights.exr"], shape) for view in range(views)]
-    )
+    shape = (num_lights(scene), size[0], size[1])
+    return np.stack([decode_lights_exr(data, shape) for data in packed])
 
 
 def _decode_parts(
     record: SceneRecord, radiance_rgb: NDArray[np.float32], members: Mapping[str, bytes]
 ) -> dict[str, NDArray[np.float32]] | None:
-    if not any(suffix.endswith(".parts.exr") for suffix in members):
+    packed = _of_views("parts", range(len(radiance_rgb)), members)
+    if packed is None:
         return None
     lights_apart = any(suffix.endswith(".lights.exr") for suffix in members)
     num = num_lights(record.scene) if lights_apart else None
     names = list(record.views[0].parts or ())
     size = radiance_rgb.shape[1], radiance_rgb.shape[2]
-    by_view = [
-        decode_parts_exr(members[f"{view}.parts.exr"], names, size, num)
-        for view in range(len(radiance_rgb))
-    ]
+    by_view = [decode_parts_exr(data, names, size, num) for data in packed]
     return {name: np.stack([of_view[name] for of_view in by_view]) for name in names}
 
 
@@ -298,8 +282,8 @@ def decode_scene(
     if "json" not in members:
         raise TrilightError(f"sample {key}: member {key}.json is missing.")
     record = _decode_record(key, members["json"])
-    try:
-        views = tuple(_view(view, row) for row, view in enumerate(record["views"]))
+    with name_errors(key):
+        views = _views(record["views"])
         objects = scene_objects(record["objects"])
         require_version_of_maps(record)
         maps = record.get("maps")
@@ -307,10 +291,6 @@ def decode_scene(
         fields |= decode_arrays(unpack_arrays(members), maps)
         provenance = scene_provenance(record["provenance"])
         scene = Scene(objects=objects, provenance=provenance, **fields)
-    except KeyError as error:
-        raise TrilightError(f"sample {key}: {error} is missing.") from error
-    except (TypeError, ValueError) as error:
-        raise TrilightError(f"sample {key}: {error}") from error
     return SceneRecord(key=key, scene=scene, views=views)
 
 
@@ -329,38 +309,42 @@ def _view_record(view: ViewRecord) -> dict[str, Any]:
     return {name: value for name, value in record.items() if value is not None}
 
 
-def _view(value: Any, row: int) -> ViewRecord:
-    """Return the record of a view; raises ValueError for a field that is no usable number."""
-    if not isinstance(value, Mapping):
-        raise ValueError(f"views[{row}] is {value!r:.40}; expected a JSON object.")
-    numbers = {name: entry for name, entry in value.items() if name != "parts"}
-    record = ViewRecord(**numbers, parts=_part_floors(value, row))
-    _check_numbers(record, f"views[{row}]")
-    return record
+@dataclass(frozen=True, kw_only=True)
+class _Views:
+    views: tuple[ViewRecord, ...]
 
 
-def _part_floors(value: Mapping[str, Any], row: int) -> dict[str, PartFloor] | None:
-    if "parts" not in value:
-        return None
-    parts = value["parts"]
-    if not isinstance(parts, Mapping) or tuple(sorted(parts)) not in KNOWN_PARTS:
-        known = "; ".join(", ".join(names) for names in KNOWN_PARTS)
-        raise ValueError(f"views[{row}].parts is {parts!r:.60}; expected floors of {known}.")
-    floors = {name: PartFloor(**parts[name]) for name in sorted(parts)}
-    for name, floor in floors.items():
-        _check_numbers(floor, f"views[{row}].parts.{name}")
-    return floors
+def _views(value: Any) -> tuple[ViewRecord, ...]:
+    """Return the records of views; sorted, since parts are summed in the order of their names."""
+    views = read_json(json.dumps({"views": value}, sort_keys=True), _Views, "record").views
+    for row, view in enumerate(views):
+        if view.parts is not None and tuple(view.parts) not in KNOWN_PARTS:
+            known = "; ".join(", ".join(names) for names in KNOWN_PARTS)
+            named = ", ".join(view.parts) or "none"
+            raise TrilightError(f"views.{row}.parts are {named:.60}; expected floors of {known}.")
+    return views
 
 
-def _check_numbers(record: ViewRecord | PartFloor, where: str) -> None:
-    for field in dataclasses.fields(record):
-        number = getattr(record, field.name)
-        if field.name == "parts" or (type(number) is field.type and field.type is not float):
-            continue
-        if field.type is not float or type(number) not in (int, float) or not -_FAR < number < _FAR:
-            raise ValueError(
-                f"{where}.{field.name} is {number!r:.40}; expected {_EXPECTED[field.type]}."
-            )
+@contextlib.contextmanager
+def name_errors(key: str) -> Iterator[None]:
+    """Name the sample in what the block raises of its members: each is a TrilightError then."""
+    try:
+        yield
+    except KeyError as error:
+        raise TrilightError(f"sample {key}: {error} is missing.") from error
+    except (TypeError, ValueError) as error:
+        raise TrilightError(f"sample {key}: {error}") from error
+
+
+def require_lawful(record: SceneRecord) -> None:
+    """Raise TrilightError, which names the sample, for a broken law or a view without record."""
+    with name_errors(record.key):
+        record.scene.check()
+    if record.scene.num_views != len(record.views):
+        raise TrilightError(
+            f"sample {record.key}: {len(record.views)} records of views; expected "
+            f"{record.scene.num_views}, one for each camera."
+        )
 
 
 def check_radiance(
@@ -383,3 +367,9 @@ def check_radiance(
         f"sample {key}: view {first_view + view}{which} has radiance {value} at pixel ({row}, "
         f"{column}); expected finite values from 0. Run `trilight verify` on the dataset."
     )
+
+
+def check_lights(key: str, lights_rgb: NDArray[np.float32], *, first_view: int = 0) -> None:
+    """Check lights [C, L, R, R, 3] as `check_radiance` does."""
+    for light, radiance_rgb in enumerate(np.moveaxis(lights_rgb, 1, 0)):
+        check_radiance(key, f" light {light}", radiance_rgb, first_view=first_view)

@@ -13,6 +13,10 @@ from storage.records.scene import Scene
 
 Values = NDArray[np.float32]
 
+_OF_VIEWS = ("coverage", "noise_floor_db", "noise_floor_linear_db", "object_noise_floor_db", "spp",
+             "camera_attempt")  # fmt: skip
+"""Quantities that the record of a view states under their names."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceFacts:
@@ -162,10 +166,6 @@ def scene_values(record: SceneRecord) -> Mapping[str, Values]:
         "objects_per_scene": [len(objects)],
         "triangles_per_scene": [scene.num_triangles],
         "triangles_per_object": [surface.num_triangles for surface in objects],
-        "diffuse": [surface.diffuse for surface in reflecting],
-        "specular": [surface.specular for surface in reflecting],
-        "albedo_sum": [surface.albedo_sum for surface in reflecting],
-        "roughness": [surface.roughness for surface in reflecting],
         "textures_per_scene": [len(scene.textures)],
         "texture_width": [texture.texels.shape[1] for texture in scene.textures],
         "lights_per_scene": [len(emitting)],
@@ -177,15 +177,15 @@ def scene_values(record: SceneRecord) -> Mapping[str, Values]:
         "sky_peak": [sky.peak for sky in skies],
         "sky_half_light_deg": [sky.half_light_deg for sky in skies],
         "camera_distance": [camera.distance for camera in seen_from],
-        "elevation_deg": [camera.elevation_deg for camera in seen_from],
-        "azimuth_deg": [camera.azimuth_deg for camera in seen_from],
-        "fov_deg": [camera.fov_deg for camera in seen_from],
-        "coverage": [view.coverage for view in record.views],
-        "noise_floor_db": [view.noise_floor_db for view in record.views],
-        "noise_floor_linear_db": [view.noise_floor_linear_db for view in record.views],
-        "object_noise_floor_db": [view.object_noise_floor_db for view in record.views],
-        "spp": [view.spp for view in record.views],
-        "camera_attempt": [view.camera_attempt for view in record.views],
+        **{
+            name: [getattr(one, name) for one in things]
+            for things, names in (
+                (reflecting, ("diffuse", "specular", "albedo_sum", "roughness")),
+                (seen_from, ("elevation_deg", "azimuth_deg", "fov_deg")),
+                (record.views, _OF_VIEWS),
+            )
+            for name in names
+        },
     }
     return {name: np.asarray(entries, np.float32) for name, entries in values.items()}
 

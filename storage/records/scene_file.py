@@ -5,16 +5,15 @@ A `.safetensors` scene holds the arrays of `Scene` under their names, and one me
 writes several in any order.) Equal scenes give equal bytes. Of a textured scene, the textures stand
 among the arrays as `texture.0`, `texture.1`, ..., and the map of an environment as `environment`.
 
-Such a file comes from anywhere. Its size, its header and every shape are checked before an array is
-made, names and types must be exactly those of a scene, and the laws of `Scene.check` hold for
-every scene that is returned.
+Such a file comes from anywhere. Its size and its header are checked before an array is made, of
+which none takes more than its part of the file; names must be exactly those of a scene, and the
+laws of `Scene.check`, types and shapes among them, hold for every scene that is returned.
 """
 
 import dataclasses
 import json
-import math
 import stat
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -38,7 +37,7 @@ from storage.records.map_references import (
 from storage.records.material import chosen_columns, completed_rows, stored_columns, stored_names
 from storage.records.packed_maps import held_values, stored_values
 from storage.records.retextured import without_constant_textures
-from storage.records.safe_read import read_safetensors, safetensors_header
+from storage.records.safe_read import read_safetensors
 from storage.records.scene import ARRAY_FIELDS, OBJECT_KINDS, Scene, SceneObject
 from storage.records.scene_maps import MAP_ARRAYS, MAX_TEXTURES
 from storage.records.texture import MAX_MAPS_BYTES
@@ -59,13 +58,6 @@ _MAPS_DIGEST = "maps_sha256"
 _TEXTURE = "texture."
 _ENVIRONMENT = "environment"
 _IS_SRGB = "is_srgb"
-_DTYPE_NAMES: Mapping[type, str] = {
-    np.float32: "F32",
-    np.uint32: "U32",
-    np.uint16: "U16",
-    np.int32: "I32",
-}
-_MAP_DTYPES = ("U8", "F16", "F32")
 
 
 def encode_arrays(scene: Scene) -> bytes:
@@ -173,8 +165,8 @@ def decode_scene_file(data: bytes, name: str) -> Scene:
     if len(data) > MAX_FILE_BYTES:
         raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_FILE_BYTES}.")
     try:
-        _check_header(safetensors_header(data, MAX_HEADER_BYTES))
         arrays, metadata = read_safetensors(data, MAX_HEADER_BYTES)
+        _check_names(arrays)
         record = _metadata_record(metadata)
         arrays["materials"] = completed_rows(arrays["materials"], record.get(_COLUMNS))
         fields = _maps(record, arrays)
@@ -295,51 +287,15 @@ def _map_values(arrays: Mapping[str, NDArray], name: str) -> NDArray:
     return held_values(arrays[name])
 
 
-def _check_header(header: Mapping[str, Any]) -> None:
-    """Refuse arrays that are not a scene's, before any of them is made."""
-    names = set(header) - {"__metadata__"}
-    maps = {name for name in names if name == _ENVIRONMENT or name.startswith(_TEXTURE)}
-    array_names = names - maps - set(MAP_ARRAYS)
-    if array_names != set(ARRAY_FIELDS) or len(maps) > MAX_TEXTURES + 1:
-        unexpected = ", ".join(
-            f"{name!r:.60}" for name in sorted(array_names ^ set(ARRAY_FIELDS))[:3]
-        )
-        raise TrilightError(f"scene: arrays missing or not expected: {unexpected}.")
-    for name, (dtype, expected_shape) in {**ARRAY_FIELDS, **MAP_ARRAYS}.items():
-        if name in names:
-            _check_entry(header, name, (_DTYPE_NAMES[dtype],), expected_shape)
-    for name in maps:
-        _check_entry(header, name, _MAP_DTYPES, (None, None, None))
-    _check_total(header, maps)
-
-
-def _check_entry(
-    header: Mapping[str, Any],
-    name: str,
-    dtypes: Sequence[str],
-    expected_shape: tuple[int | None, ...],
-) -> None:
-    entry = header[name] if isinstance(header[name], dict) else {}
-    shape = entry.get("shape")
-    fits = (
-        entry.get("dtype") in dtypes
-        and isinstance(shape, list)
-        and len(shape) == len(expected_shape)
-        and all(type(got) is int and got >= 0 for got in shape)
-        and all(want in (None, got) for want, got in zip(expected_shape, shape, strict=True))
-        and math.prod(shape) <= MAX_FILE_BYTES
-    )
-    if not fits:
-        expected = f"{' or '.join(dtypes)} of shape {expected_shape}"
-        _broken(name, [entry.get("dtype"), shape], expected)
-
-
-def _check_total(header: Mapping[str, Any], maps: Collection[str]) -> None:
-    """Refuse maps that would take too much memory; half floats take twice their size there."""
-    total = sum(
-        math.prod(header[name]["shape"]) * (1 if header[name]["dtype"] == "U8" else 4)
-        for name in maps
-    )
+def _check_names(arrays: Mapping[str, NDArray]) -> None:
+    """Refuse arrays that are not a scene's, and maps that would take too much memory."""
+    maps = {name for name in arrays if name == _ENVIRONMENT or name.startswith(_TEXTURE)}
+    unexpected = (arrays.keys() - maps - MAP_ARRAYS.keys()) ^ ARRAY_FIELDS.keys()
+    if unexpected or len(maps) > MAX_TEXTURES + 1:
+        names = ", ".join(f"{name!r:.60}" for name in sorted(unexpected)[:3])
+        raise TrilightError(f"scene: arrays missing or not expected: {names}.")
+    # half floats take twice their size in memory
+    total = sum(arrays[name].size * (1 if arrays[name].dtype == np.uint8 else 4) for name in maps)
     if total > MAX_MAPS_BYTES:
         _broken("textures and environment", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
 

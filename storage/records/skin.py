@@ -6,12 +6,9 @@ triangles. Each is packed as in a shard (storage.records.packed_maps), since a r
 objects and shows few of them at a time.
 """
 
-import dataclasses
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,18 +89,12 @@ def skin_arrays(skin: LevelSkin, name: str) -> dict[str, NDArray]:
     return {f"uv_{name}": np.ascontiguousarray(skin.uv), **maps}
 
 
-def read_skin(arrays: Mapping[str, NDArray], quality: Mapping[str, Any], name: str) -> LevelSkin:
-    """Return the skin of `skin_arrays`; raises KeyError or TypeError where there is none."""
+def read_skin(arrays: Mapping[str, NDArray], quality: SkinQuality, name: str) -> LevelSkin:
+    """Return the skin of `skin_arrays`; raises KeyError where there is none."""
     first, second, third = (arrays[f"{column}_{name}"].tobytes() for column in TEXTURED)
     return LevelSkin(
         uv=arrays[f"uv_{name}"],
         packed=(first, second, third),
-        quality=SkinQuality(**quality),
+        quality=quality,
         emission=arrays.get(f"emission_{name}"),
     )
-
-
-def as_record(quality: SkinQuality | OwnMaterials) -> dict[str, Any]:
-    """Return it as JSON values."""
-    record: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(quality)))
-    return record

@@ -5,9 +5,8 @@ than all else that is done to it. What is asked for obeys the same laws as a who
 (`Sample.check`); of the other pictures nothing is said.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,22 +14,21 @@ from numpy.typing import NDArray
 from storage.errors import TrilightError
 from storage.records.exr import FIRST_ILLEGAL, Stored, decode_stored, to_float32
 from storage.records.held_maps import HeldMaps
-from storage.records.lights import decode_lights_exr, num_lights
-from storage.records.sample import ViewRecord, check_radiance, decode_scene
-from storage.records.scene import Scene
-
-Picture = TypeVar("Picture")
+from storage.records.sample import (
+    SceneRecord,
+    check_lights,
+    check_radiance,
+    decode_lights,
+    decode_scene,
+    name_errors,
+    require_lawful,
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StoredSample:
+class StoredSample(SceneRecord):
     """One scene, which passes `Scene.check`, with its packed pictures."""
 
-    key: str
-    """The scene's index, nine digits."""
-    scene: Scene
-    views: tuple[ViewRecord, ...]
-    """One record per camera, in their order."""
     members: Mapping[str, bytes]
     """Bytes of the sample's members in the shard, by suffix."""
 
@@ -43,7 +41,8 @@ class StoredSample:
             TrilightError: one is missing, unreadable, not square, of another size than the others,
                 or holds a radiance that is not finite or below 0.
         """
-        pictures: list[Stored] = [self._read(f"{view}.exr", decode_stored) for view in views]
+        with name_errors(self.key):
+            pictures = [decode_stored(self.members[f"{view}.exr"]) for view in views]
         if any(picture.dtype == np.float32 for picture in pictures):
             pictures = [to_float32(picture) for picture in pictures]
         shapes = {picture.shape for picture in pictures}
@@ -70,26 +69,13 @@ class StoredSample:
         Raises:
             TrilightError: as `pictures`.
         """
-        if not any(suffix.endswith(".lights.exr") for suffix in self.members):
-            return None
-        shape = (num_lights(self.scene), resolution, resolution)
-        by_view = []
-        for view in views:
-            suffix = f"{view}.lights.exr"
-            lights = self._read(suffix, lambda data: decode_lights_exr(data, shape))
-            for light, radiance_rgb in enumerate(lights):
-                which = f" light {light}"
-                check_radiance(self.key, which, radiance_rgb[None], first_view=view)
-            by_view.append(lights)
-        return np.stack(by_view)
-
-    def _read(self, suffix: str, decode: Callable[[bytes], Picture]) -> Picture:
-        if suffix not in self.members:
-            raise TrilightError(f"sample {self.key}: {suffix!r} is missing.")
-        try:
-            return decode(self.members[suffix])
-        except ValueError as error:
-            raise TrilightError(f"sample {self.key}: {error}") from error
+        with name_errors(self.key):
+            size = (resolution, resolution)
+            lights_rgb = decode_lights(self.scene, views, size, self.members)
+        if lights_rgb is not None:
+            for view, lights in zip(views, lights_rgb, strict=True):
+                check_lights(self.key, lights[None], first_view=view)
+        return lights_rgb
 
 
 def stored_sample(
@@ -102,16 +88,8 @@ def stored_sample(
             many records of views, and pictures, as cameras.
     """
     record = decode_scene(key, members, held)
-    try:
-        record.scene.check()
-    except TrilightError as error:
-        raise TrilightError(f"sample {key}: {error}") from error
-    if len(record.views) != record.scene.num_views:
-        raise TrilightError(
-            f"sample {key}: {len(record.views)} records of views; expected "
-            f"{record.scene.num_views}, as many as cameras."
-        )
+    require_lawful(record)
     suffixes = (f"{view}.exr" for view in range(len(record.views)))
     if missing := [suffix for suffix in suffixes if suffix not in members]:
         raise TrilightError(f"sample {key}: {missing[0]!r} is missing.")
-    return StoredSample(key=key, scene=record.scene, views=record.views, members=members)
+    return StoredSample(**vars(record), members=members)

@@ -123,8 +123,7 @@ def open_driver(url: RemoteUrl) -> Any:
     except ImportError as error:
         raise TrilightError(
             f"{url.what} {url.display_url!r}: {url.scheme}:// needs the package {package}; "
-            "expected it "
-            f"to be installed. Run pip install {package}."
+            f"expected it to be installed. Run pip install {package}."
         ) from error
     # Drivers log whole requests, with their secrets, on the way to an error that we report anyway.
     logging.getLogger(package).setLevel(logging.CRITICAL)
@@ -147,16 +146,16 @@ def _driver_of(access: RemoteUrl, process: int) -> Any:
     return open_driver(access)
 
 
-def transfer_timeout() -> Any:
-    """Return the limits of a request for a file, which storage.remote.tries bounds as a whole."""
+def transfer_timeout(total_s: float | None = None) -> Any:
+    """Return the limits of a request; storage.remote.tries bounds one for a file as a whole."""
     import aiohttp
 
-    return aiohttp.ClientTimeout(connect=_CONNECT_S, sock_connect=_CONNECT_S, sock_read=_SILENCE_S)
+    return aiohttp.ClientTimeout(
+        total=total_s, connect=_CONNECT_S, sock_connect=_CONNECT_S, sock_read=_SILENCE_S
+    )
 
 
 def _http_options(url: RemoteUrl) -> dict[str, Any]:
-    import aiohttp
-
     # Sizes are compared with what the server announced, so nothing may be packed on the way.
     headers = {"Accept-Encoding": "identity"}
     if url.user or url.password:
@@ -164,16 +163,7 @@ def _http_options(url: RemoteUrl) -> dict[str, Any]:
         # `auth` would go along.
         access = base64.b64encode(f"{url.user}:{url.password}".encode()).decode()
         headers["Authorization"] = f"Basic {access}"
-    client = {
-        "timeout": aiohttp.ClientTimeout(
-            total=_ANSWER_S,
-            connect=_CONNECT_S,
-            sock_connect=_CONNECT_S,
-            sock_read=_SILENCE_S,
-        ),
-        "headers": headers,
-        "trust_env": True,
-    }
+    client = {"timeout": transfer_timeout(_ANSWER_S), "headers": headers, "trust_env": True}
     options: dict[str, Any] = {"client_kwargs": client, "simple_links": False}
     if url.query:
         options["params"] = list(url.query)

@@ -1,12 +1,10 @@
 """How work is divided, at its ends: one range, too many workers, empty and broken ranges.
 
-And the smallest and largest things that a training run may be made to read; and hundreds of scenes
-from end to end: nothing of composing, packing or publishing piles up. That is one `generate` as a
-user starts it, watched from outside: memory, open files and processes of everything that it
-started, and what is left when it has ended.
+And hundreds of scenes from end to end: nothing of composing, packing or publishing piles up. That
+is one `generate` as a user starts it, watched from outside: memory, open files and processes of
+everything that it started, and what is left when it has ended.
 """
 
-import itertools
 import os
 import shutil
 import signal
@@ -28,16 +26,11 @@ from pipeline.generation.tasks import Piece
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.scene_logs import decode_scene_log
-from storage.dataset.training_data import open_training_data
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.records.sample import sample_key
 from tests.for_each import case
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
-from tests.train.kit import keys_of, take
-from tests.train.toy import write_toy_dataset
 from train.data.order import OrderSettings, batch_visits, visits_from, windows_from
-from train.data.stream import StreamSettings
 
 
 @pytest.fixture
@@ -133,53 +126,11 @@ def test_a_range_beyond_the_end_is_refused_and_one_that_reaches_beyond_makes_wha
     assert [scene for _, scene in scenes] == [4, 5, 6, 7]
 
 
-def keys(
-    root: Path, batch_size: int, count: int, *, first: int = 0, window: int = 4, ranks: int = 1
-) -> list[list[str]]:
-    """Return the keys of the batches first, first + 1, ... of a dataset, sorted."""
-    settings = StreamSettings(
-        seed=0, window=window, batch_size=batch_size, resolution=8, views_per_scene=1
-    )
-    data = open_training_data([str(root)])
-    shares = [take(data, settings, count, first=first, rank=rank, world_size=ranks)
-              for rank in range(ranks)]  # fmt: skip
-    return [sorted(itertools.chain(*keys_of(parts))) for parts in zip(*shares, strict=True)]
-
-
-@pytest.mark.parametrize(
-    ("train", "per_shard", "views"),
-    [(1, 1, 1), (5, 1, 1), (5, 99, 2)],
-    ids=["one sample of one view", "one sample a shard", "one shard"],
-)
-def test_small_splits_are_shown_whole_in_every_epoch(
-    tmp_path: Path, train: int, per_shard: int, views: int
-) -> None:
-    write_toy_dataset(
-        tmp_path, train=train, validation=1, per_shard=per_shard, resolution=8, views=views
-    )
-    for window in (1, 1000):
-        assert keys(tmp_path, train, 3, window=window) == [[*map(sample_key, range(train))]] * 3, (
-            window
-        )
-
-
-def test_batches_may_exceed_the_split_and_stand_in_distant_epochs(tmp_path: Path) -> None:
-    """It then holds scenes of several epochs, each as often as there are epochs, one more or less;
-    and a rank for every scene of it changes nothing."""
-    write_toy_dataset(tmp_path, train=3, validation=1, per_shard=2, resolution=8)
-    (batch, other) = keys(tmp_path, 8, 2)
-    assert len(batch) == len(other) == 8
-    counts = [(batch + other).count(key) for key in map(sample_key, range(3))]
-    assert sorted(counts) == [5, 5, 6]
-    assert keys(tmp_path, 8, 2, ranks=8) == [batch, other]
-    five, first = tmp_path / "five", 10**12  # 5 x 10^12 begins an epoch
-    five.mkdir()
-    write_toy_dataset(five, train=5, validation=1, per_shard=2, resolution=8)
-    assert keys(five, 5, 2, first=first) == [[*map(sample_key, range(5))]] * 2
-    order = OrderSettings(seed=2**63, window=2)
-    windows = windows_from(3, lambda shard: 7, order, 3 * first)
-    far = next(batch_visits(visits_from(windows, 3 * first), 64))
-    assert [place.position for place in far] == list(range(3 * first, 3 * first + 64))
+def test_batches_stand_in_distant_epochs() -> None:
+    first, order = 3 * 10**12, OrderSettings(seed=2**63, window=2)
+    windows = windows_from(3, lambda shard: 7, order, first)
+    far = next(batch_visits(visits_from(windows, first), 64))
+    assert [place.position for place in far] == list(range(first, first + 64))
 
 
 SCENES = 400

@@ -24,16 +24,16 @@ from pipeline.foreign.source_file import read_source
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from storage.errors import Rejected, TrilightError
 from tests.for_each import with_folders
-from tests.hostile import array_cases, json_cases, tar_cases, usd_cases
+from tests.hostile import file_cases, usd_cases
 from tests.scenes_by_hand import tiny_scene
 
 LIMITS = ChildLimits(memory_bytes=8 << 30, wall_s=300, cpu_s=30, calls_per_child=1000)
 CASES: dict[str, Callable[[], Iterator[tuple[str, usd_cases.Make, str]]]] = {
     "usd": usd_cases.cases,
-    "json": json_cases.cases,
-    "safetensors": array_cases.safetensors_cases,
-    "h5": array_cases.h5_cases,
-    "tar": tar_cases.cases,
+    "json": file_cases.json_cases,
+    "safetensors": file_cases.safetensors_cases,
+    "h5": file_cases.h5_cases,
+    "tar": file_cases.tar_cases,
 }
 FILES = ("s.usda", "s.usdz", "s.json", "s.safetensors", "s.h5", "s.tar")
 
@@ -63,7 +63,7 @@ def outcome(path: str) -> Outcome:
     """Read the first scene of a file; only children come here."""
     source = scene_source(path, many=True)
     if source.path.suffix == ".tar":
-        source = scene_source(f"{path}::{tar_cases.KEY}")
+        source = scene_source(f"{path}::{file_cases.KEY}")
     else:
         source_keys(source)
     found = load_source(source)
@@ -95,7 +95,7 @@ def lay_out(folder: Path) -> Path:
     outside.mkdir()
     inner.mkdir()
     (outside / "secret.usda").write_text(usd_cases.SECRET)
-    (outside / "secret.obj").write_text(json_cases.LEAK_OBJ)
+    (outside / "secret.obj").write_text(file_cases.LEAK_OBJ)
     Image.fromarray(np.full((4, 4, 3), 77, np.uint8)).save(outside / "secret.png")
     (outside / "secret.h5").write_bytes(_secret_h5())
     for suffix in ("usda", "obj"):

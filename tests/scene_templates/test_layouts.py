@@ -1,16 +1,31 @@
-"""Laws of every layout: objects, emitters, surfaces and cameras lie in their stated ranges."""
+"""Laws of every layout: objects, emitters, surfaces and cameras lie in their stated ranges.
 
+Shells are flat, closed at their seams, and in the published families as published.
+"""
+
+import dataclasses
+import itertools
 import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from scene_templates.layout import Pose
+from scene_templates.families import DEFAULT_FAMILIES, Family
+from scene_templates.layout import Pose, ShellPart
 from scene_templates.materials import MaterialSettings, sample_material
 from scene_templates.placement import TOUCHING
-from scene_templates.renderformer_v1 import stage_1_families
-from scene_templates.rooms import plane_of
+from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
+from scene_templates.rooms import (
+    PATCH_FACES,
+    SIDES,
+    Room,
+    SharedRoom,
+    patch,
+    plane_of,
+)
 from scene_templates.sample_layout import sample_layout, scene_plan
+from scene_templates.separate_sides import SeparateSides
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
@@ -18,6 +33,7 @@ from storage.seeds import rng_for
 from tests.for_each import for_each
 from tests.scene_templates.balls import (
     BALL,
+    STILL,
     Ball,
     Drawn,
     drawn,
@@ -25,6 +41,7 @@ from tests.scene_templates.balls import (
     one_drawn,
     template_settings,
 )
+from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row, side_row
 
 ROUNDING = 1e-9
 """Far above the 1e-15 of float64 sums of numbers about 1, far below anything that matters."""
@@ -169,3 +186,193 @@ def test_surfaces_keep_their_energy() -> None:
             tinted += 1
     # Five standard deviations of a share of one half among 4000: 160.
     assert abs(tinted - 2000) < 160
+
+
+SUM_ROUNDING = 1e-12
+"""Coordinates about 1 after ten float64 operations are good to 1e-15; a thousand times that."""
+
+SQUARE = SharedRoom(square_share=1.0)
+LOOSE = SharedRoom(square_share=0.0)
+
+
+def _corner_normals(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    corners = positions[PATCH_FACES]
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def _room(ranges: SharedRoom, name: str, seed: int) -> tuple[Room, list[NDArray[np.float64]]]:
+    """Draw a room, and return it with the vertices of its parts."""
+    parts = TEMPLATES[name].parts
+    room = ranges.sample_room(np.random.default_rng(seed), parts)
+    return room, [patch(SIDES[part], at) for part, at in zip(parts, room.patches, strict=True)]
+
+
+def _shells(ranges: SharedRoom, name: str, count: int) -> list[tuple[ShellPart, ...]]:
+    """Draw whole layouts without objects."""
+    settings = template_settings(name, {"families.num_objects": [0, 0]})
+    family = dataclasses.replace(settings.families[0], shell=ranges)
+    settings = dataclasses.replace(settings, families=(family,))
+    return [one.layout.shell for one in drawn(settings, count)]
+
+
+@for_each(("ranges", "name"), itertools.product([SQUARE, LOOSE], list(TEMPLATES)))
+def test_parts_are_flat_patches_of_128_faces_that_face_the_room(
+    ranges: SharedRoom, name: str
+) -> None:
+    for shell in _shells(ranges, name, 20):
+        assert [part.name for part in shell] == list(TEMPLATES[name].parts)
+        for part in shell:
+            assert part.positions.shape == (81, 3)
+            assert part.faces.shape == (128, 3)
+            normals = _corner_normals(part.positions)
+            plane = plane_of(part.positions)
+            assert np.abs(plane.height(part.positions)).max() < SUM_ROUNDING
+            assert (np.einsum("ti,i->t", normals, plane.normal) > 0).all()
+            # The room's middle is at most 0.125 from the origin, its sides at least 0.375.
+            assert plane.height(np.zeros(3)) > 0.2
+
+
+def test_the_nominal_room_is_the_unit_cube_and_a_quarter_spin_swaps_the_diagonals() -> None:
+    for side in SIDES.values():
+        positions = patch(side, STILL)
+        assert np.array_equal(positions[:, side.axis], np.full(81, 0.5 * side.sign))
+        for axis in {0, 1, 2} - {side.axis}:
+            assert (positions[:, axis].min(), positions[:, axis].max()) == (-0.5, 0.5)
+    plain = patch(SIDES["floor"], STILL)
+    spun = patch(SIDES["floor"], dataclasses.replace(STILL, rotation_deg=(0, 0, 90)))
+    order, spun_order = np.lexsort(plain.round(9).T), np.lexsort(spun.round(9).T)
+    assert np.abs(plain[order] - spun[spun_order]).max() < SUM_ROUNDING
+
+    def diagonals(positions: NDArray[np.float64]) -> set[tuple[float, ...]]:
+        middle = (positions[PATCH_FACES[:, 0]] + positions[PATCH_FACES[:, 2]]) / 2
+        along = positions[PATCH_FACES[:, 2]] - positions[PATCH_FACES[:, 0]]
+        # Of the edges from corner 0 to corner 2 only the diagonals are oblique.
+        oblique = np.abs(along[:, 0] * along[:, 1]) > SUM_ROUNDING
+        signed = np.sign(along[:, 0] * along[:, 1])
+        rows = np.column_stack([middle, signed])[oblique].round(9) + 0.0
+        return {tuple(row) for row in rows.tolist()}
+
+    assert not diagonals(plain) & diagonals(spun)
+
+
+@pytest.mark.parametrize("name", ["wall", "corner", "open_box"])
+def test_in_square_rooms_walls_stand_exactly_on_the_floors_edge(name: str) -> None:
+    for shell in _shells(SQUARE, name, 20):
+        floor = shell[0].positions
+        for wall in shell[1:]:
+            foot = wall.positions[wall.positions[:, 2] < floor[:, 2].max() + SUM_ROUNDING]
+            assert len(foot) == 9
+            gaps = np.abs(foot[:, None] - floor[None]).max(axis=-1).min(axis=1)
+            assert gaps.max() < SUM_ROUNDING
+
+
+@for_each(("ranges", "name"), itertools.product([SQUARE, LOOSE], ["wall", "corner", "open_box"]))
+def test_nothing_shines_through_the_seams(ranges: SharedRoom, name: str) -> None:
+    """From the middle of the room, a look at any point near a seam meets a floor or wall."""
+    for seed in range(60):
+        room, patches = _room(ranges, name, seed)
+        rng = np.random.default_rng([seed, 1])
+        middle = (room.low + room.high) / 2
+        for part in TEMPLATES[name].parts[1:]:
+            points = _near_seam(rng, room.low, room.high, part)
+            hit = np.any([_meets(middle, points - middle, one) for one in patches], axis=0)
+            assert hit.all(), (seed, part)
+
+
+def _near_seam(
+    rng: np.random.Generator, low: NDArray[np.float64], high: NDArray[np.float64], part: str
+) -> NDArray[np.float64]:
+    """Points on the foot of a wall, up to 1 cm above it, inside the ends of the seam."""
+    points = rng.uniform(low, high, size=(200, 3))
+    side = SIDES[part]
+    points[:, side.axis] = (high if side.sign > 0 else low)[side.axis]
+    points[:, 2] = low[2] + rng.uniform(0, 0.01, size=len(points))
+    along = 1 - side.axis
+    # A seam's open end belongs to no second part; a tilt may take 2 tan(3 deg) of it away.
+    inset = 0.9 * (high - low)[along] / 2
+    points[:, along] = np.clip(points[:, along], -inset, inset)
+    return points
+
+
+def _meets(
+    eye: NDArray[np.float64], toward: NDArray[np.float64], positions: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Whether rays meet the parallelogram of a patch."""
+    origin, u, v = positions[0], positions[-9] - positions[0], positions[8] - positions[0]
+    solved = np.linalg.solve(
+        np.stack([np.broadcast_to(u, toward.shape), np.broadcast_to(v, toward.shape), -toward], -1),
+        np.broadcast_to(eye - origin, toward.shape)[..., None],
+    )[..., 0]
+    inside = (solved[:, :2] >= -SUM_ROUNDING) & (solved[:, :2] <= 1 + SUM_ROUNDING)
+    return inside.all(axis=1) & (solved[:, 2] > 0)
+
+
+POLICIES: tuple[Policy, ...] = ("original", "de-biased")
+
+STAGES = {1: (stage_1_families, STAGE_1), 2: (stage_2_families, STAGE_2)}
+
+
+def _as_rows(families: tuple[Family, ...]) -> tuple[Row, ...]:
+    for family in families:
+        assert family.template == family.name.split("-")[0]
+    return tuple(
+        (one.name, one.weight, one.num_objects, one.object_scale, one.smooth_share)
+        for one in families
+    )
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_families_are_the_published_ones(policy: Policy) -> None:
+    first, second = stage_1_families(policy), stage_2_families(policy)
+    assert _as_rows(first) == STAGE_1
+    assert _as_rows(second) == STAGE_2
+    assert (len(first), sum(family.weight for family in first)) == (21, 46)
+    assert (len(second), sum(family.weight for family in second)) == (14, 42)
+
+
+def test_our_families_are_the_stated_ones() -> None:
+    assert _as_rows(DEFAULT_FAMILIES) == DEFAULT
+
+
+@for_each(("policy", "stage"), itertools.product(POLICIES, STAGES))
+def test_every_side_has_its_published_ranges(policy: Policy, stage: int) -> None:
+    for family in STAGES[stage][0](policy):
+        assert isinstance(family.shell, SeparateSides)
+        for part in TEMPLATES[family.template].parts:
+            side = getattr(family.shell, part)
+            moves = (side.shift_x, side.shift_y, side.shift_z)
+            found = (side.spin_deg, side.tilt_deg, side.scale, *moves)
+            assert found == side_row(family.name, part, policy, stage), (family.name, part)
+        assert family.shell.wall2_faces_out == (
+            policy == "original" and ("open_box" in family.name or "patch" in family.name)
+        )
+
+
+def _shell(family: Family) -> tuple[ShellPart, ...]:
+    return one_drawn(SceneSettings(families=(family,)), 0).layout.shell
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_only_the_original_box_turns_one_wall_away(policy: Policy) -> None:
+    """The normal of each face, against the direction to the middle of the nominal room."""
+    for family in (*stage_1_families(policy), *stage_2_families(policy)):
+        if family.template != "open_box":
+            continue
+        for part in _shell(family):
+            corners = part.positions[part.faces]
+            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            inward = np.einsum("tk,k->t", normals, plane_of(part.positions).normal)
+            turned_away = part.name == "wall2" and policy == "original"
+            assert ((inward < 0) == turned_away).all()
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_patch_families_are_the_exact_unit_box(policy: Policy) -> None:
+    seen = set()
+    for family in (*stage_1_families(policy), *stage_2_families(policy)):
+        if "patch" in family.name:
+            for part in _shell(family):
+                assert np.array_equal(part.positions, patch(SIDES[part.name], STILL))
+                assert (np.abs(part.positions[:, SIDES[part.name].axis]) == 0.5).all()
+                seen.add((family.template, part.name))
+    assert len(seen) == 3 + 4 + 2  # parts of corner, box and wall

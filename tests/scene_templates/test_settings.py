@@ -1,30 +1,45 @@
-"""Settings refuse contradictions, and name the field."""
+"""Settings refuse contradictions, and name the field.
 
+Draws: named ones, rotations, layouts by index, and exact operations alone.
+"""
+
+import ast
 import dataclasses
-import itertools
 import json
+import math
+from collections import Counter
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from pipeline.builds.named import named_build
 from scene_templates.cameras import CameraSettings
+from scene_templates.exact import cosine, dot, lerp, ramp, sine, smoothstep
 from scene_templates.families import Family
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH
 from scene_templates.lights import LightSettings
 from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
+from scene_templates.recorded_sampler import RecordedSampler
 from scene_templates.rooms import SharedRoom
+from scene_templates.rotations import rotate_points, rotation_xyz, uniform_rotation
+from scene_templates.sample_layout import scene_plan
 from scene_templates.separate_sides import SideRanges
 from scene_templates.settings import Excursion, SceneSettings, ViewLaws
 from scene_templates.skies.draw import SkyMapSettings
 from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import TrilightError
+from storage.seeds import rng_for
 from storage.settings.changes import changed
 from storage.settings.described import from_record, settings_record
 from storage.settings.fields import describe_fields
+from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.scene_templates.balls import DEFAULTS, template_settings
+from tests.scene_templates.statistics import implausible, require_plausible, stated_table
 
 GROUPS: dict[type, Any] = {
     CameraSettings: CameraSettings(),
@@ -86,24 +101,6 @@ def test_a_family_of_maps_that_is_unknown_is_named(kind: type, name: str) -> Non
         assert field.expected
 
 
-RANGES = [
-    f"{group.name}.{field.name}"
-    for group in dataclasses.fields(DEFAULTS)
-    if dataclasses.is_dataclass(settings := getattr(DEFAULTS, group.name))
-    for field in dataclasses.fields(settings)
-    if isinstance(getattr(settings, field.name), tuple)
-]
-
-
-def test_a_range_that_is_named_is_two_numbers() -> None:
-    """A single number would silently take the other end from a default further down."""
-    assert len(RANGES) == 12
-    wrongs: list[list[Any]] = [[], [0.5], [1, 2, 3], [True, True], ["a", "b"]]
-    for name, wrong in itertools.product(RANGES, wrongs):
-        with pytest.raises(TrilightError, match=name.split(".")[1]):
-            changed(DEFAULTS, {name: wrong})
-
-
 def test_the_least_triangle_limit_depends_on_the_layouts_in_use() -> None:
     """Shell, eight emitters, and four triangles - a tetrahedron - for each of three objects."""
     for name, template in TEMPLATES.items():
@@ -115,22 +112,10 @@ def test_the_least_triangle_limit_depends_on_the_layouts_in_use() -> None:
 
 def test_settings_are_plain_values_for_a_manifest() -> None:
     """Through JSON and back, every number is the same, and the settings are as they were."""
-    stored = json.loads(json.dumps(dataclasses.asdict(DEFAULTS)))
-    assert _rebuilt(DEFAULTS, stored) == DEFAULTS
+    stored = json.loads(json.dumps(settings_record(DEFAULTS)))
+    assert from_record(SceneSettings, stored) == DEFAULTS
     stored["lights"]["count"] = [2, 2]
-    assert _rebuilt(DEFAULTS, stored) != DEFAULTS
-
-
-def _rebuilt(like: Any, stored: Any) -> Any:
-    """Settings of the kind of `like` from JSON values."""
-    if dataclasses.is_dataclass(like) and not isinstance(like, type):
-        names = [field.name for field in dataclasses.fields(like)]
-        return dataclasses.replace(
-            like, **{name: _rebuilt(getattr(like, name), stored[name]) for name in names}
-        )
-    if isinstance(like, tuple):
-        return tuple(_rebuilt(old, new) for old, new in zip(like, stored, strict=True))
-    return stored
+    assert from_record(SceneSettings, stored) != DEFAULTS
 
 
 def test_an_excursion_that_contradicts_the_settings_is_refused_at_once() -> None:
@@ -150,3 +135,183 @@ def test_strata_are_refused_in_one_sentence() -> None:
         changed(DEFAULTS, {"strata": strata})
     with pytest.raises(TrilightError, match=r"setting 'strata': removed since, and commit"):
         from_record(SceneSettings, {**settings_record(DEFAULTS), "strata": strata})
+
+
+MANY = 1000
+
+
+def _drawn() -> RecordedSampler:
+    draws = RecordedSampler(rng_for(0, "named draws"))
+    for _ in range(MANY):
+        draws.uniform("number", -2.0, 5.0)
+        draws.whole("count", 3, 9)
+        draws.holds("it holds", 0.3)
+        draws.choice("word", ("a", "b", "c"))
+        draws.colour("colour", (0.1, 0.2, 0.3), (0.2, 0.9, 0.3))
+        draws.shade("shade", (0, 0, 0), (1, 0.5, 0.1))
+        draws.direction("direction", -30, 60)
+    return draws
+
+
+def test_each_is_distributed_as_stated_and_another_statement_would_be_noticed() -> None:
+    made = _drawn().made
+    table = stated_table(made)
+    require_plausible(table)
+    # a colour has three numbers, a direction a height and an azimuth
+    assert len(table) == 4 + 3 + 1 + 2
+    assert not implausible({"nothing": 1.0})
+    wrong = {"number": (-2.0, 6.0), "count": (3, 10), "it holds": 0.45, "word": ("a", "b")}
+    for name, stated in wrong.items():
+        made = _drawn().made
+        object.__setattr__(made[name], "stated", stated)
+        assert implausible(stated_table(made)), name
+
+
+def test_directions_are_unit_vectors_between_the_elevations() -> None:
+    found = np.array(_drawn().made["direction"].values)
+    # one square root and two sines, each to a few units of 2e-16
+    assert np.abs(np.square(found).sum(axis=1) - 1).max() < 4e-15
+    elevation = np.degrees(np.arcsin(found[:, 2]))
+    assert -30 <= elevation.min() < -28 and 58 < elevation.max() <= 60
+
+
+def test_a_name_has_one_statement() -> None:
+    draws = RecordedSampler(rng_for(0, "x"))
+    draws.uniform("number", 0, 1)
+    with pytest.raises(ValueError, match="number"):
+        draws.uniform("number", 0, 2)
+
+
+def test_a_stream_leaves_what_is_drawn_after_it() -> None:
+    def rest(taken: int) -> float:
+        draws = RecordedSampler(rng_for(0, "x"))
+        draws.stream().random(taken)
+        return draws.uniform("number", 0, 1)
+
+    assert rest(0) == rest(1000)
+
+
+def test_parameters_are_plain_values() -> None:
+    draws = RecordedSampler(rng_for(0, "x"))
+    draws.colour("colour", (0, 0, 0), (1, 1, 1))
+    draws.whole("count", 1, 1)
+    found = draws.parameters()
+    assert found["count"] == (1,)
+    (colour,) = found["colour"]
+    assert isinstance(colour, list) and len(colour) == 3
+
+
+def test_uniform_rotations_are_proper_and_follow_the_haar_measure() -> None:
+    rng = np.random.default_rng(0)
+    matrices = np.stack([uniform_rotation(rng) for _ in range(200)])
+    gram = np.einsum("nij,nkj->nik", matrices, matrices)
+    # A handful of float64 operations: a few units of 2e-16.
+    assert np.abs(gram - np.eye(3)).max() < 1e-14
+    assert np.abs(np.linalg.det(matrices) - 1).max() < 1e-14
+    # The turning angle has density (1 - cos a) / pi, hence the mean pi/2 + 2/pi.
+    rng = np.random.default_rng(1)
+    matrices = np.stack([uniform_rotation(rng) for _ in range(20000)])
+    angles = np.arccos(np.clip((np.trace(matrices, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    standard_error = angles.std() / math.sqrt(len(angles))
+    # Five standard errors: one false alarm in two million seeds.
+    assert abs(angles.mean() - (math.pi / 2 + 2 / math.pi)) < 5 * standard_error
+    # The scalar part w of a uniform unit quaternion has E[w^4] = 1/8; trace = 4 w^2 - 1. A
+    # quaternion normalised from a cube instead of a Gaussian fails here and nowhere else.
+    fourth = np.square((np.trace(matrices, axis1=1, axis2=2) + 1) / 4)
+    assert abs(fourth.mean() - 1 / 8) < 5 * fourth.std() / math.sqrt(len(fourth))
+    # Each entry has mean 0 and variance 1/3 on SO(3); nine entries share the bound.
+    assert np.abs(matrices.mean(axis=0)).max() < 5 * math.sqrt(1 / 3 / len(matrices))
+
+
+def test_rotations_turn_about_x_then_y_then_z_and_to_the_left() -> None:
+    rng = np.random.default_rng(2)
+    for angles in rng.uniform(-180, 180, size=(50, 3)):
+        x, y, z = (rotation_xyz(np.where(np.arange(3) == axis, angles, 0)) for axis in range(3))
+        assert np.abs(rotation_xyz(angles) - z @ y @ x).max() < 1e-14
+    turned = rotate_points(np.array([[1.0, 0, 0]]), rotation_xyz([0, 0, 90]))
+    assert np.abs(turned - [[0, 1, 0]]).max() < 1e-15
+
+
+def test_a_plan_depends_on_seed_and_index_alone() -> None:
+    one = [scene_plan(DEFAULTS, seed=0, scene_index=index) for index in range(40)]
+    again = [scene_plan(DEFAULTS, seed=0, scene_index=index) for index in reversed(range(40))]
+    assert one == again[::-1]
+    other = [scene_plan(DEFAULTS, seed=1, scene_index=index) for index in range(40)]
+    assert sum(a == b for a, b in zip(one, other, strict=True)) < 10
+    # What is not of the plan does not move it.
+    finer = dataclasses.replace(DEFAULTS, max_triangles=4096, num_views=1, enough_error=0.0)
+    assert [scene_plan(finer, seed=0, scene_index=index) for index in range(40)] == one
+
+
+def test_families_in_turn_have_exactly_their_share() -> None:
+    settings = SceneSettings(families=ONE_FAMILY_EACH, families_in_turn=True)
+    names = [scene_plan(settings, seed=5, scene_index=i).family.name for i in range(200)]
+    assert names[:4] == ["plane", "wall", "corner", "open_box"]
+    assert set(Counter(names).values()) == {50}
+    drawn = dataclasses.replace(settings, families_in_turn=False)
+    names = [scene_plan(drawn, seed=5, scene_index=i).family.name for i in range(200)]
+    assert set(Counter(names).values()) != {50}
+
+
+@pytest.mark.parametrize("turns", [1, 3])
+def test_every_excursion_meets_every_family_equally_often(turns: int) -> None:
+    """Were both to turn with the index, 37 and 4 would still meet; 36 and 4 would not."""
+    settings = named_build("out-of-range").scenes
+    for count in (37, 36):
+        chosen = dataclasses.replace(settings, excursions=settings.excursions[:count])
+        found = Counter(
+            (chosen.excursion_of(i), scene_plan(chosen, seed=0, scene_index=i).family.name)
+            for i in range(4 * count * turns)
+        )
+        assert len(found) == 4 * count
+        assert set(found.values()) == {turns}
+
+
+ANGLES = np.linspace(-math.pi, math.pi, 20001)
+
+
+def test_sine_and_cosine_are_those_of_the_library() -> None:
+    # a folded angle is off by half an ulp of pi, 2.2e-16, and a dozen products round as much again
+    assert np.abs(sine(ANGLES) - np.sin(ANGLES)).max() < 1e-15
+    assert np.abs(cosine(ANGLES) - np.cos(ANGLES)).max() < 1e-15
+    assert float(sine(0.0)) == 0
+
+
+def test_easing_and_ramps() -> None:
+    assert smoothstep([-1, 0, 0.5, 1, 2]).tolist() == [0, 0, 0.5, 1, 1]
+    slope = np.diff(smoothstep(np.linspace(0, 1, 1001)))
+    # 3 s^2 of a first step of a thousandth: no kink at either end
+    assert slope[0] < 4e-6 and slope[-1] < 4e-6 and (slope > 0).all()
+    assert ramp([-2, -0.5, 0, 0.25, 0.5, 2]).tolist() == [0, 0, 0.5, 0.75, 1, 1]
+    assert lerp([0.0, 2.0], [1.0, 4.0], 0.5).tolist() == [0.5, 3.0]
+    assert float(dot(np.array([1.0, 2, 3]), np.array([4.0, 5, 6]))) == 32
+
+
+INEXACT = set(
+    "sin cos tan exp log log2 log10 power float_power arctan2 arccos arcsin hypot cbrt einsum "
+    "matmul linalg uniform normal standard_normal exponential pow fsum exp2 expm1 log1p".split()
+)
+"""Functions whose last bit depends on the processor or on the order in which a library sums."""
+
+
+def _sources() -> list[Path]:
+    folder = ROOT / "scene_templates"
+    found = [*(folder / "surfaces").glob("*.py"), *(folder / "skies").glob("*.py")]
+    drawn = [path for path in found if path.name != "drawn_scene.py"]  # turns and scales a map
+    return [*drawn, folder / "exact.py", folder / "recorded_sampler.py"]
+
+
+def test_maps_are_made_of_exact_operations_alone() -> None:
+    """`draws.uniform`, of ours, is exact; everything else of that name belongs to numpy."""
+    assert len(_sources()) > 12
+    found = []
+    for path in _sources():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow | ast.MatMult):
+                whole = isinstance(node.left, ast.Constant) or ast.unparse(node.left).isupper()
+                if isinstance(node.op, ast.MatMult) or not whole:
+                    found.append(f"{path.name}:{node.lineno} {ast.unparse(node)}")
+            if isinstance(node, ast.Attribute) and node.attr in INEXACT:
+                if ast.unparse(node.value) not in ("draws", "self"):
+                    found.append(f"{path.name}:{node.lineno} {ast.unparse(node)}")
+    assert not found

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.assets.cleaning.clean import clean
-from pipeline.assets.decimation import meshopt
+from pipeline.assets.decimation import meshopt, qslim
 from pipeline.assets.quality.triangles import count_edges
 from pipeline.foreign.mesh import TriangleMesh
 
@@ -48,9 +48,14 @@ def _collapse(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     return pymeshlab_filters.collapse(_simplify_first(mesh, budget), budget)
 
 
+def _qslim(mesh: TriangleMesh, budget: int) -> TriangleMesh:
+    return qslim.collapse(_simplify_first(mesh, budget), budget)
+
+
 DECIMATIONS: Mapping[str, Decimation] = {
     "pymeshlab_uniform": Decimation(run=_remesh_evenly, always_ends=False),
     "pymeshlab_collapse": Decimation(run=_collapse, always_ends=False),
+    "libigl_qslim": Decimation(run=_qslim, always_ends=True),
     "meshoptimizer": Decimation(run=meshopt.simplify, always_ends=True),
     "meshoptimizer_sloppy": Decimation(run=meshopt.simplify_sloppily, always_ends=True),
 }

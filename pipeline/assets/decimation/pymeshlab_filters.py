@@ -4,11 +4,35 @@ pymeshlab takes a missing parameter from the previous call in the same process, 
 would depend on history. It may crash or hang: these functions run in child processes only.
 """
 
+import os
+import sys
+from types import ModuleType
+
 import numpy as np
-import pymeshlab
 
 from pipeline.foreign.mesh import TriangleMesh
+from pipeline.isolation.stand_in_library import load_library
 from storage.errors import Rejected
+
+
+def _import_pymeshlab() -> ModuleType:
+    """Return pymeshlab, also where the system has no OpenGL.
+
+    OpenGL's functions are then looked up when they are called, which never happens here.
+    """
+    for name in ("libGL.so.1", "libOpenGL.so.0"):
+        load_library(name)
+    flags = sys.getdlopenflags()
+    sys.setdlopenflags(os.RTLD_LAZY)
+    try:
+        import pymeshlab
+
+        return pymeshlab
+    finally:
+        sys.setdlopenflags(flags)
+
+
+pymeshlab = _import_pymeshlab()
 
 REQUIRED_FILTERS = (
     "meshing_decimation_quadric_edge_collapse",

@@ -3,8 +3,6 @@
 Only child processes with limits import this (pipeline.isolation), since the file is untrusted.
 """
 
-from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,7 @@ from pipeline.exchange.gltf.cameras_and_lights import (
     light_triangles,
     read_camera,
 )
+from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.part_materials import PartConverter
 from pipeline.exchange.pictures import decode_values
 from pipeline.exchange.textured_triangles import SceneParts, TexturedTriangles
@@ -30,24 +29,14 @@ from pipeline.foreign.material import SourceMaterial
 from pipeline.foreign.part import Part, drop_empty, unit_normals
 from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected, TrilightError
-from storage.records.scene import Scene, SceneObject
+from storage.records.scene import SceneObject
 from storage.records.texture import MapSource
 
 SUFFIXES = (".glb", ".gltf")
 _LIMITS = ReadLimits(max_bytes=1 << 30, with_materials=True)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class GltfScene:
-    """A scene that was read, with its losses."""
-
-    scene: Scene
-    """The scene, which passes `Scene.check`."""
-    lost: tuple[str, ...]
-    """Sentences about parts of the file that were lost."""
-
-
-def read_gltf(path: Path, licence: str) -> GltfScene:
+def read_gltf(path: Path, licence: str) -> LoadedScene:
     """Read the default scene of a file.
 
     Args:
@@ -61,21 +50,28 @@ def read_gltf(path: Path, licence: str) -> GltfScene:
         with refuse_malformed("load_error", "the glTF tree is"):
             document = read_source(path, _LIMITS).gltf
             assert document is not None
-            return _GltfReader(document=document, name=path.name, licence=licence).scene()
+            return _GltfReader(document, path.name, licence).scene()
     except Rejected as error:
         raise TrilightError(f"{path.name}: {error}") from error
 
 
-@dataclass(kw_only=True, eq=False)
 class _GltfReader:
-    """State of reading one file: the document and losses."""
+    """Reads the scene of one file."""
 
-    document: GltfDocument
-    name: str
-    licence: str
-    lost: list[str] = field(default_factory=list)
+    def __init__(self, document: GltfDocument, name: str, licence: str) -> None:
+        self.document = document
+        self.name = name
+        self.licence = licence
+        self.lost: list[str] = []
+        self._converter = PartConverter(self.lost)
+        self._materials = GltfMaterials(
+            document,
+            lambda data, name: decode_values(data, name, self.lost),
+            emission=True,
+            notes=self.lost,
+        )
 
-    def scene(self) -> GltfScene:
+    def scene(self) -> LoadedScene:
         """Build the scene of the file."""
         tree = self.document.tree
         nodes = list(placed_nodes(tree))
@@ -102,8 +98,8 @@ class _GltfReader:
             sky = even_sky()
         usable = [camera for camera in cameras if camera is not None]
         scene = parts.build(usable, sky, {"template": "gltf", "file": self.name}, self.lost)
-        lost = dict.fromkeys([*self.document.unread, *self.lost])
-        return GltfScene(scene=scene, lost=tuple(lost))
+        notes = dict.fromkeys([*self.document.unread, *self.lost])
+        return LoadedScene(scene=scene, notes=tuple(notes))
 
     def _add_mesh(self, placed: PlacedNode, parts: SceneParts) -> None:
         if "mesh" not in placed.node:
@@ -112,17 +108,6 @@ class _GltfReader:
         name = placed.node.get("name") or mesh.get("name") or "object"
         for primitive in placed_primitives(self.document, placed):
             parts.add(self._entry(name), self._triangles(primitive))
-
-    @cached_property
-    def _materials(self) -> GltfMaterials:
-        def decode(data: bytes, name: str) -> NDArray:
-            return decode_values(data, name, self.lost)
-
-        return GltfMaterials(self.document, decode, emission=True, notes=self.lost)
-
-    @cached_property
-    def _converter(self) -> PartConverter:
-        return PartConverter(self.lost)
 
     def _material(self, number: int | None) -> SourceMaterial:
         material = DEFAULT if number is None else self._materials.material(number)
@@ -146,7 +131,7 @@ class _GltfReader:
                 raise Rejected("texture_coordinates_not_finite", f"TEXCOORD_{number} is not finite")
             return uv
 
-        number = primitive.primitive.material
+        number = primitive.material
         row = {} if number is None else entry(self.document.tree, "materials", number)
         part = Part(
             where="",

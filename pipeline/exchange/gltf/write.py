@@ -10,7 +10,7 @@ diffuse / (1 - F). Lamps are surfaces that emit (KHR_materials_emissive_strength
 import io
 import json
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from pipeline.exchange.linear_maps import (
     linear_map,
     resample_to_largest,
 )
+from pipeline.exchange.textured_triangles import group_triangles
 from storage.atomic import write_atomically
 from storage.conventions import srgb8
 from storage.records.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, ROUGHNESS, SPECULAR
@@ -73,7 +74,7 @@ def write_gltf(path: Path, scene: Scene) -> tuple[str, ...]:
 def encode_scene_glb(scene: Scene) -> bytes:
     """Return a scene as the bytes of a GLB file; its environment and rights are left out."""
     file = GlbFile()
-    parts = list(_group_triangles(scene))
+    parts = group_triangles(scene)
     nodes: list[dict[str, Any]] = [{"rotation": list(_TO_Y_UP), "children": []}]
     meshes = list[dict[str, Any]]()
     for row, entry in enumerate(scene.objects):
@@ -132,17 +133,8 @@ def encode_mesh_glb(
     return file.encode()
 
 
-def _group_triangles(scene: Scene) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
-    """Yield object, material and triangles of each pair of the two."""
-    pair = scene.object_index.astype(np.int64) << 16 | scene.material_index
-    order = np.argsort(pair, kind="stable")
-    values, first = np.unique(pair[order], return_index=True)
-    for value, triangles in zip(values, np.split(order, first[1:]), strict=True):
-        yield int(value) >> 16, int(value) & 0xFFFF, triangles
-
-
 def _primitive(
-    file: "GlbFile", scene: Scene, material: int, triangles: NDArray[np.int64]
+    file: "GlbFile", scene: Scene, material: int, triangles: NDArray[np.intp]
 ) -> dict[str, Any]:
     corners = scene.faces[triangles].reshape(-1)
     if scene.uv is None:

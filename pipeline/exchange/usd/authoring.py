@@ -105,14 +105,10 @@ def _converter(kind: str) -> Callable[[Any], Any]:
         "double3": lambda value: Gf.Vec3d(*value),
     }
     plain = kind.removeprefix(UNIFORM)
-    return known.get(plain, _vectors if plain.endswith("[]") else _identity)
+    return known.get(plain, _vectors if plain.endswith("[]") else lambda value: value)
 
 
 def _vectors(values: NDArray[np.float32]) -> Any:
     from pxr import Vt
 
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values))
-
-
-def _identity(value: Any) -> Any:
-    return value

@@ -4,13 +4,16 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.cameras import rigid_pose
 from pipeline.exchange.textured_triangles import SceneParts, TexturedTriangles, build_lamp
 from pipeline.exchange.usd.dome import read_foreign_dome
-from pipeline.exchange.usd.foreign_cameras import read_stage_camera
 from pipeline.exchange.usd.foreign_lights import compute_radiance, light_triangles
-from pipeline.exchange.usd.foreign_materials import StageSurfaces
-from pipeline.exchange.usd.foreign_meshes import read_mesh
+from pipeline.exchange.usd.foreign_materials import StageSurfaces, read_mesh
 from pipeline.exchange.usd.names import FOV_DEG, INDEX, OBJECT_TEXTS, parse_camera_row
+from pipeline.foreign.numbers import read_number
 from pipeline.foreign.usd.object_stage import UsdStage
 from pipeline.foreign.usd.placed import DOMES, PlacedPrim, placed_prims
 from pipeline.foreign.usd.solids import SOLIDS
@@ -43,7 +46,7 @@ def build_stage_scene(stage: Any, time: Any, opened: OpenedStage, licence: str) 
             if mesh is not None:
                 parts.add(_entry(each.prim, licence), mesh)
         elif kind == "Camera":
-            cameras.append(read_stage_camera(each, time, opened.lost))
+            cameras.append(_read_camera(each, time, opened.lost))
         elif kind not in DOMES and (lamp := light_triangles(each, time, opened.lost)) is not None:
             radiance = compute_radiance(each, lamp, time, opened.lost)
             parts.add(_entry(each.prim, licence), build_lamp(lamp, radiance), is_lamp=True)
@@ -119,3 +122,39 @@ def _entry(prim: Any, licence: str) -> SceneObject:
         attribution=known.get("attribution", ""),
         source_url=known.get("source_url", ""),
     )
+
+
+_SAME_LENS = 1e-5
+"""Relative tolerance for a lens that Trilight wrote."""
+
+
+def _read_camera(
+    placed: PlacedPrim, time: Any, lost: list[str]
+) -> tuple[NDArray[np.float64], float] | None:
+    """Return pose [4, 4] and full angle in degrees of a camera; None for an unusable one."""
+    from pxr import UsdGeom
+
+    camera = UsdGeom.Camera(placed.prim)
+    where = placed.prim.GetPath()
+    lens = (
+        camera.GetFocalLengthAttr(),
+        camera.GetHorizontalApertureAttr(),
+        camera.GetVerticalApertureAttr(),
+    )
+    focal, wide, high = (read_number(each.Get(time), str(each.GetPath())) for each in lens)
+    pose = rigid_pose(placed.to_world)
+    if camera.GetProjectionAttr().Get(time) != "perspective" or pose is None or not focal > 0:
+        lost.append(f"{where}: no perspective camera with a focal length")
+        return None
+    angle = math.degrees(2 * math.atan(wide / (2 * focal)))
+    held = placed.prim.GetAttribute(FOV_DEG).Get(time)
+    is_held = isinstance(held, float) and math.isclose(held, angle, rel_tol=_SAME_LENS)
+    if not is_held and not math.isclose(wide, high, rel_tol=1e-4):
+        lost.append(f"{where}: pictures are square; its horizontal angle was used")
+    if any(a.Get(time) for a in (camera.GetHorizontalApertureOffsetAttr(),
+                                 camera.GetVerticalApertureOffsetAttr())):  # fmt: skip
+        lost.append(f"{where}: its shift has no place here")
+    if camera.GetFStopAttr().Get(time):
+        lost.append(f"{where}: depth of field has no place here")
+    angle = held if is_held else angle
+    return (pose, angle) if 0 < angle < 180 else None

@@ -28,8 +28,7 @@ from pipeline.exchange.usd.names import (
     column_attribute,
     texture_attribute,
 )
-from pipeline.exchange.usd.texture_files import decode_texture
-from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS
+from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, decode_texture
 from pipeline.foreign.picture import decode_image
 from pipeline.foreign.usd.shaders import (
     DEFAULTS,
@@ -40,7 +39,6 @@ from pipeline.foreign.usd.shaders import (
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import (
     TextureNode,
-    UvChart,
     asset_bytes,
     find_sources,
     is_output,
@@ -188,7 +186,8 @@ def _read_exact_texture(
     """Return the texture of a column; None where its file or its use differs."""
     is_used_alike = all(
         each.wrap == ("repeat", "repeat")
-        and each.chart == UvChart(primvar=node.chart.primvar, transforms=())
+        and each.chart.primvar == node.chart.primvar
+        and not each.chart.is_moved
         and (each.scale == 1).all()
         and not each.bias.any()
         for each in nodes

@@ -46,12 +46,7 @@ OBJECT_TEXTS = {
 }
 """Attributes of a mesh: row of its object, rows of vertices and faces, fields of SceneObject."""
 
-MAP_TEXTS = {
-    "name": NAMESPACE + "name",
-    "licence": NAMESPACE + "licence",
-    "attribution": NAMESPACE + "attribution",
-    "source_url": NAMESPACE + "sourceUrl",
-}
+MAP_TEXTS = {name: OBJECT_TEXTS[name] for name in ("name", "licence", "attribution", "source_url")}
 """Attributes of a dome and of a texture: fields of MapSource."""
 
 SKY_ROWS = tuple(f"{NAMESPACE}skyRotationRow{row}" for row in range(3))

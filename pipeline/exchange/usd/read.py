@@ -4,30 +4,19 @@ Only child processes with limits import this (pipeline.isolation): native code p
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.usd.foreign_scene import build_stage_scene
 from pipeline.exchange.usd.read_exact_scene import is_marked, read_exact, scene_keys
 from pipeline.foreign.usd.stage import OpenedStage, read_quietly
 from storage.errors import Rejected, TrilightError
-from storage.records.scene import Scene
 
 MAX_FRAMES = 10_000
 """Maximum number of scenes in a stage with time samples."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class UsdScene:
-    """A scene that was read, with its losses."""
-
-    key: str  # key in a shard, or time code of a frame; empty for a single scene
-    scene: Scene  # passes `Scene.check`
-    lost: tuple[str, ...]  # sentences about parts of the file that were lost
-    exact: bool  # True where Trilight wrote the file and it is unchanged
 
 
 def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
@@ -39,7 +28,7 @@ def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
     return read_quietly(path, lambda: _keys(OpenedStage(path, folder)))
 
 
-def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> UsdScene:
+def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> LoadedScene:
     """Return one scene of a file.
 
     Args:
@@ -54,15 +43,17 @@ def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> 
     return read_quietly(path, lambda: _read(path, key, folder, licence))
 
 
-def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> UsdScene:
+def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> LoadedScene:
+    from pxr import Usd
+
     opened = OpenedStage(path, folder)
     shard = scene_keys(opened.root)
     if shard is not None:
         return _read_shard_scene(opened, shard, key or shard[0])
     if key is None:
-        scene = read_exact(opened.root, opened=opened)
+        scene = read_exact(opened)
         if scene is not None:
-            return UsdScene(key="", scene=scene, lost=(), exact=True)
+            return LoadedScene(scene=scene, notes=())
     stage = opened.compose()
     frames = list(_frames(stage))
     if is_marked(opened.root):
@@ -73,33 +64,34 @@ def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> Usd
     chosen = key or (frames[0] if frames else "")
     if frames and key is None:
         opened.lost.append(f"time codes other than {chosen} of {len(frames)}")
+    time = Usd.TimeCode(float(chosen)) if chosen else Usd.TimeCode.EarliestTime()
     try:
-        scene = build_stage_scene(stage, _time(chosen), opened, licence)
+        scene = build_stage_scene(stage, time, opened, licence)
     except (TrilightError, Rejected) as error:
         message = error.message if isinstance(error, Rejected) else str(error)
         text = message.removeprefix(f"{path.name}: ")
         raise TrilightError(f"{path.name}: {text}") from error
-    return UsdScene(key=chosen, scene=scene, lost=opened.notes, exact=False)
+    return LoadedScene(scene=scene, notes=opened.notes)
 
 
-def _read_shard_scene(opened: OpenedStage, keys: list[str], key: str) -> UsdScene:
+def _read_shard_scene(opened: OpenedStage, keys: list[str], key: str) -> LoadedScene:
     name = opened.path.name
     if key not in keys:
         raise TrilightError(f"{name}: no scene {key}; expected one of {keys[0]} to {keys[-1]}.")
-    scene = read_exact(opened.root, key, opened)
+    scene = read_exact(opened, key)
     if scene is None:
         raise TrilightError(
             f"{name}: scene {key} has been changed since Trilight wrote it; save it as a file of "
             "its own and read that."
         )
-    return UsdScene(key=key, scene=scene, lost=(), exact=True)
+    return LoadedScene(scene=scene, notes=())
 
 
 def _keys(opened: OpenedStage) -> list[str]:
     shard = scene_keys(opened.root)
     if shard is not None:
         return shard
-    if read_exact(opened.root, opened=opened) is not None:
+    if read_exact(opened) is not None:
         return [""]
     return list(_frames(opened.compose())) or [""]
 
@@ -109,7 +101,7 @@ def _frames(stage: Any) -> Iterator[str]:
     if len({t for layer in stage.GetUsedLayers() for t in layer.ListAllTimeSamples()}) < 2:
         return
     if not stage.HasAuthoredTimeCodeRange():
-        times = np.unique([code for prim in _list_prims(stage) for code in _list_samples(prim)])
+        times = np.unique(list(_list_samples(stage)))
     else:
         first = stage.GetStartTimeCode()
         last = stage.GetEndTimeCode()
@@ -124,20 +116,11 @@ def _frames(stage: Any) -> Iterator[str]:
         yield f"{time:g}"
 
 
-def _list_prims(stage: Any) -> Iterator[Any]:
+def _list_samples(stage: Any) -> Iterator[float]:
+    """Yield the time codes of all samples, in the time of the stage."""
     from pxr import Usd
 
     for root in (stage.GetPseudoRoot(), *stage.GetPrototypes()):
-        yield from Usd.PrimRange.AllPrims(root)
-
-
-def _list_samples(prim: Any) -> Iterator[float]:
-    """Yield the time codes of a prim's samples, in the time of the stage."""
-    for attribute in prim.GetAuthoredAttributes():
-        yield from attribute.GetTimeSamples()
-
-
-def _time(code: str) -> Any:
-    from pxr import Usd
-
-    return Usd.TimeCode(float(code)) if code else Usd.TimeCode.EarliestTime()
+        for prim in Usd.PrimRange.AllPrims(root):
+            for attribute in prim.GetAuthoredAttributes():
+                yield from attribute.GetTimeSamples()

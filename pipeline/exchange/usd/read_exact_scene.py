@@ -3,10 +3,12 @@
 After an edit (a mesh moved, a color changed, a light added) the exact attributes of a file are
 stale. So this reader compares the scene with its digest, and the file with what export writes of
 it. Where anything differs, it returns None and the file is read as a foreign one
-(pipeline.exchange.usd.foreign_scene).
+(pipeline.exchange.usd.foreign_scene). `_Changed`, LookupError, TypeError or ValueError inside this
+module mean that a layer is not as export writes it.
 """
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,18 +19,9 @@ from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import MAX_ROWS
 from pipeline.exchange.usd import names
 from pipeline.exchange.usd.dome import read_exact_dome
-from pipeline.exchange.usd.exact_layer import (
-    Changed,
-    list_by_row,
-    read_integers,
-    read_vectors,
-    require,
-    require_same,
-)
-from pipeline.exchange.usd.texture_files import decode_texture
 from pipeline.exchange.usd.write import ENVIRONMENT, author_scene, new_layer
 from pipeline.exchange.usd.write_meshes import CENTER, sum_positions
-from pipeline.exchange.usd.write_textures import SHADERS, ST
+from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, SHADERS, ST, decode_texture
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.conventions import require_readable
@@ -57,25 +50,23 @@ def scene_keys(layer: Any) -> list[str] | None:
     return keys if all_marked and keys else None
 
 
-def is_marked(layer: Any, key: str | None = None) -> bool:
+def is_marked(layer: Any) -> bool:
     """Return whether a layer has the marks of a scene that Trilight wrote."""
-    return _find_root(layer, key) is not None
+    return _find_root(layer, None) is not None
 
 
-def read_exact(
-    layer: Any, key: str | None = None, opened: OpenedStage | None = None
-) -> Scene | None:
-    """Read the scene of a layer or of a shard's key; return None where it was changed.
+def read_exact(opened: OpenedStage, key: str | None = None) -> Scene | None:
+    """Read the scene of a file or of a shard's key; return None where it was changed.
 
     Args:
-        layer: the layer of one scene or of a shard.
+        opened: the open file of one scene or of a shard.
         key: key of the scene in a shard.
-        opened: the open file, which resolves map files; None refuses scenes with maps.
 
     Raises:
         TrilightError: the file has an unsupported version or an undeclared material column, or the
             scene breaks a law (`Scene.check`).
     """
+    layer = opened.root
     root = _find_root(layer, key)
     if root is None or len(layer.subLayerPaths) or len(layer.rootPrims) != 1:
         return None
@@ -85,7 +76,7 @@ def read_exact(
         scene = _read_scene(root, opened)
     except UndeclaredColumn as error:
         raise TrilightError(f"{name}: {error}") from error
-    except (Changed, LookupError, TypeError, ValueError, AttributeError):
+    except (_Changed, LookupError, TypeError, ValueError, AttributeError):
         return None
     if scene_digest(scene) != root.attributes[names.DIGEST].default:
         return None
@@ -95,8 +86,9 @@ def read_exact(
         raise TrilightError(f"{name}: {error}") from error
     expected = new_layer(".usdc", names.ROOT)
     try:
-        require_same(root, author_scene(expected, names.ROOT, scene))
-    except (Changed, LookupError, TypeError, ValueError, AttributeError):
+        written = author_scene(expected, names.ROOT, scene)
+        _require_same(root, written, (_plain_path(root), _plain_path(written)))
+    except (_Changed, LookupError, TypeError, ValueError, AttributeError):
         return None
     return scene
 
@@ -110,12 +102,10 @@ def _find_root(layer: Any, key: str | None) -> Any:
     return root if root and all(mark in root.attributes for mark in marks) else None
 
 
-def _read_scene(root: Any, opened: OpenedStage | None) -> Scene:
+def _read_scene(root: Any, opened: OpenedStage) -> Scene:
     folders = root.nameChildren
     sky = None
     if ENVIRONMENT in folders:
-        require(opened is not None)
-        assert opened is not None
         sky = read_exact_dome(folders[ENVIRONMENT], root.layer, opened)
     materials = _read_materials(folders["Materials"], opened)
     prims = sorted(folders["Objects"].nameChildren, key=lambda p: p.attributes[names.INDEX].default)
@@ -144,7 +134,7 @@ def _read_scene(root: Any, opened: OpenedStage | None) -> Scene:
 
 def _read_object(prim: Any) -> SceneObject:
     texts = {field: prim.attributes[name].default for field, name in names.OBJECT_TEXTS.items()}
-    require(texts["kind"] in OBJECT_KINDS)
+    _require(texts["kind"] in OBJECT_KINDS)
     return SceneObject(**texts)
 
 
@@ -152,47 +142,47 @@ def _read_vertices(root: Any, meshes: list[Any]) -> tuple[NDArray[np.float32], N
     """Return positions and normals [V, 3], placed by the vertex rows of meshes and root."""
     kinds = [(root, names.UNUSED_ROWS, names.UNUSED_NORMALS)]
     kinds += [(mesh, names.VERTEX_ROWS, "normals") for mesh in meshes]
-    rows = np.concatenate([read_integers(prim, name) for prim, name, _ in kinds])
-    require(len(rows) > 0 and rows.min() >= 0)
+    rows = np.concatenate([_read_integers(prim, name) for prim, name, _ in kinds])
+    _require(len(rows) > 0 and rows.min() >= 0)
     count = int(rows.max()) + 1
-    require(count <= len(rows) and len(np.unique(rows)) == count)
+    _require(count <= len(rows) and len(np.unique(rows)) == count)
     positions = np.zeros((count, 3), np.float32)
     normals = np.zeros((count, 3), np.float32)
-    unused = read_vectors(root, names.UNUSED_POSITIONS)
+    unused = _read_vectors(root, names.UNUSED_POSITIONS)
     positions[rows] = np.concatenate([unused, *(_read_positions(mesh) for mesh in meshes)])
-    normals[rows] = np.concatenate([read_vectors(prim, name) for prim, _, name in kinds])
+    normals[rows] = np.concatenate([_read_vectors(prim, name) for prim, _, name in kinds])
     return positions, normals
 
 
 def _read_positions(mesh: Any) -> NDArray[np.float32]:
     """Return the positions [V, 3] of a mesh's vertices; meshes of old files have no center."""
-    points = read_vectors(mesh, "points")
+    points = _read_vectors(mesh, "points")
     if CENTER not in mesh.attributes:
         return points
     center = np.array(mesh.attributes[CENTER].default, np.float64)
     positions = sum_positions(center, points)
-    positions[read_integers(mesh, names.EXACT_ROWS)] = read_vectors(mesh, names.EXACT_POSITIONS)
+    positions[_read_integers(mesh, names.EXACT_ROWS)] = _read_vectors(mesh, names.EXACT_POSITIONS)
     return positions
 
 
 def _read_faces(
     meshes: list[Any],
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint16], NDArray[np.uint16]]:
-    rows = np.concatenate([read_integers(mesh, names.FACE_ROWS) for mesh in meshes])
+    rows = np.concatenate([_read_integers(mesh, names.FACE_ROWS) for mesh in meshes])
     count = len(rows)
-    require(np.array_equal(np.sort(rows), np.arange(count)))
+    _require(np.array_equal(np.sort(rows), np.arange(count)))
     faces = np.zeros((count, 3), np.uint32)
     material_index = np.zeros(count, np.uint16)
     object_index = np.zeros(count, np.uint16)
     for mesh in meshes:
-        face_rows = read_integers(mesh, names.FACE_ROWS)
-        vertex_rows = read_integers(mesh, names.VERTEX_ROWS)
-        faces[face_rows] = vertex_rows[read_integers(mesh, "faceVertexIndices").reshape(-1, 3)]
+        face_rows = _read_integers(mesh, names.FACE_ROWS)
+        vertex_rows = _read_integers(mesh, names.VERTEX_ROWS)
+        faces[face_rows] = vertex_rows[_read_integers(mesh, "faceVertexIndices").reshape(-1, 3)]
         object_index[face_rows] = mesh.attributes[names.INDEX].default
         index = np.full(len(face_rows), -1)
         for subset in mesh.nameChildren:
-            index[read_integers(subset, "indices")] = int(subset.name.rpartition("_")[2])
-        require(len(index) > 0 and index.min() >= 0 and index.max() < MAX_ROWS)
+            index[_read_integers(subset, "indices")] = int(subset.name.rpartition("_")[2])
+        _require(len(index) > 0 and index.min() >= 0 and index.max() < MAX_ROWS)
         material_index[face_rows] = index
     return faces, material_index, object_index
 
@@ -202,12 +192,12 @@ def _read_coordinates(meshes: list[Any], count: int) -> NDArray[np.float32]:
     uv = np.zeros((count, 3, 2), np.float32)
     for mesh in meshes:
         corner_uv = np.array(mesh.attributes[ST].default, np.float32)
-        uv[read_integers(mesh, names.FACE_ROWS)] = corner_uv.reshape(-1, 3, 2)
+        uv[_read_integers(mesh, names.FACE_ROWS)] = corner_uv.reshape(-1, 3, 2)
     return uv.reshape(-1, 2)
 
 
 def _read_cameras(folder: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    prims = list_by_row(folder, names.camera_name)
+    prims = _list_by_row(folder, names.camera_name)
     c2w = np.zeros((len(prims), 4, 4), np.float32)
     fov_deg = np.zeros(len(prims), np.float32)
     for row, prim in enumerate(prims):
@@ -228,9 +218,9 @@ class _Materials:
     """[M, 3] the value of `Scene.material_textures`; None without textures."""
 
 
-def _read_materials(folder: Any, opened: OpenedStage | None) -> _Materials:
+def _read_materials(folder: Any, opened: OpenedStage) -> _Materials:
     """Read the materials below a prim; raises UndeclaredColumn."""
-    prims = list_by_row(folder, names.material_name)
+    prims = _list_by_row(folder, names.material_name)
     rows = default_rows(len(prims))
     columns = _list_columns(prims[0])
     index = np.full((len(prims), len(TEXTURED)), CONSTANT, np.int32)
@@ -249,16 +239,12 @@ def _read_materials(folder: Any, opened: OpenedStage | None) -> _Materials:
     )
 
 
-def _read_textures(
-    prim: Any, textures: dict[int, Texture], opened: OpenedStage | None
-) -> dict[str, int]:
+def _read_textures(prim: Any, textures: dict[int, Texture], opened: OpenedStage) -> dict[str, int]:
     """Return the texture rows of a material's columns, and add new ones to `textures`."""
     used = {}
     for name, shader in SHADERS.items():
         if shader not in prim.nameChildren:
             continue
-        require(opened is not None)
-        assert opened is not None
         attributes = prim.nameChildren[shader].attributes
         row = attributes[names.TEXTURE_ROW].default
         if row not in textures:
@@ -287,3 +273,74 @@ def _list_columns(prim: Any) -> tuple[str, ...]:
     added_or_none = (names.added_column(attribute.name) for attribute in prim.attributes)
     added = [name for name in added_or_none if name is not None]
     return (*PUBLISHED_COLUMNS, *(declared_column(name).name for name in added))
+
+
+_PLAIN_INFO = {"specifier", "typeName", "apiSchemas", "documentation", "comment", "displayName"}
+"""Metadata that does not change how a prim looks."""
+_PLACED = {CENTER, "xformOpOrder", names.EXACT_ROWS, names.EXACT_POSITIONS}
+_ADDED = {"inputs:ior", COAT_ROUGHNESS, "outputs:r", *map(names.texture_attribute, TEXTURED)}
+_ADDED |= {names.SKY_SOURCE, names.SKY_VISIBLE, *names.SKY_ROWS, *_PLACED}
+"""Properties that older Trilights did not write; their roughness textures have `outputs:r`."""
+
+
+class _Changed(Exception):
+    """The layer is not as export wrote it."""
+
+
+def _require_same(stored: Any, expected: Any, roots: tuple[str, str]) -> None:
+    """Require that a prim and all below it, at two root paths, are as export writes them."""
+    properties = {each.name: each for each in stored.properties}
+    expected_properties = {each.name: each for each in expected.properties}
+    missing = expected_properties.keys() - properties.keys()
+    _require(properties.keys() <= expected_properties.keys() and missing <= _ADDED)
+    _require(stored.typeName == expected.typeName and set(stored.ListInfoKeys()) <= _PLAIN_INFO)
+    is_old = CENTER in missing  # its points are positions
+    for name, each in properties.items():
+        if not is_old or name not in ("points", "extent"):
+            _require_same_property(each, expected_properties[name], roots)
+    prims = {prim.name: prim for prim in stored.nameChildren}
+    _require(prims.keys() == {prim.name for prim in expected.nameChildren})
+    for prim in expected.nameChildren:
+        _require_same(prims[prim.name], prim, roots)
+
+
+def _require_same_property(stored: Any, expected: Any, roots: tuple[str, str]) -> None:
+    _require(type(stored) is type(expected))
+    links = "targetPathList"
+    if hasattr(expected, "connectionPathList"):
+        links = "connectionPathList"
+        _require(stored.typeName == expected.typeName and stored.default == expected.default)
+        _require(not stored.HasInfo("timeSamples"))
+        _require(stored.GetInfo("interpolation") == expected.GetInfo("interpolation"))
+        if not (stored.HasInfo("connectionPaths") or expected.HasInfo("connectionPaths")):
+            return
+    paths, expected_paths = (
+        [str(path).removeprefix(root) for path in getattr(each, links).explicitItems]
+        for each, root in zip((stored, expected), roots, strict=True)
+    )
+    _require(paths == expected_paths)
+
+
+def _plain_path(prim: Any) -> str:
+    return str(prim.path.StripAllVariantSelections())
+
+
+def _list_by_row(folder: Any, name: Callable[[int], str]) -> list[Any]:
+    """Return the children of a prim in the order of their rows; look-ups by name are quadratic."""
+    prims = {prim.name: prim for prim in folder.nameChildren}
+    return [prims[name(row)] for row in range(len(prims))]
+
+
+def _read_integers(prim: Any, name: str) -> NDArray[np.int64]:
+    values = np.array(prim.attributes[name].default, np.int64)
+    _require(values.ndim == 1)
+    return values
+
+
+def _read_vectors(prim: Any, name: str) -> NDArray[np.float32]:
+    return np.array(prim.attributes[name].default, np.float32).reshape(-1, 3)
+
+
+def _require(condition: Any) -> None:
+    if not condition:
+        raise _Changed

@@ -5,17 +5,25 @@ which reads the coordinates `st` of the meshes. Coordinates need no conversion: 
 bottom row of a picture is at v = 0. A textured material has no OpenPBR shader, so that MaterialX
 renderers use the preview with its textures instead of one color. A specular texture is also
 connected to the roughness of an absent coat: Blender drops specular textures, but keeps this one.
+
+The file of a texture is lossless: PNG for 8 bits, OpenEXR for float32, with one channel or three.
+Picture files begin with the top row, textures of a scene with the bottom row. Equal textures share
+a file.
 """
 
+import io
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.exchange.usd.authoring import Attributes
 from pipeline.exchange.usd.names import MAP_TEXTS, TEXTURE_ROW, format_map, texture_attribute
-from pipeline.exchange.usd.texture_files import encode_texture, texture_file
+from storage.errors import TrilightError
+from storage.records.exr import MAX_RESOLUTION, decode_channels, encode_channels
 from storage.records.scene import Scene
-from storage.records.texture import CONSTANT, TEXTURED, Texture
+from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
 
 PREVIEW = "Preview"
 OPENPBR = "OpenPBR"
@@ -129,3 +137,70 @@ def _texture_table(row: int, texture: Texture) -> Attributes:
         TEXTURE_ROW: ("int", row),
         **{name: ("string", getattr(texture.source, field)) for field, name in MAP_TEXTS.items()},
     }
+
+
+_CHANNELS = {1: "Y", 3: "RGB"}
+"""OpenEXR channel names by channel count: a number or a color."""
+
+
+def texture_file(texture: Texture) -> str:
+    """Return the file name of a texture."""
+    suffix = "png" if texture.texels.dtype == np.uint8 else "exr"
+    return f"texture-{texture.sha256[:16]}.{suffix}"
+
+
+def encode_texture(texture: Texture) -> bytes:
+    """Return the bytes of a texture's file; they contain no time stamp.
+
+    Raises:
+        TrilightError: the texture is larger than the USD reader accepts.
+    """
+    from PIL import Image
+
+    height, width, channels = texture.texels.shape
+    if max(height, width) > MAX_RESOLUTION:
+        raise TrilightError(
+            f"texture: {width} x {height} texels; expected at most {MAX_RESOLUTION} each way in "
+            "USD. Write it as .safetensors, or make it smaller."
+        )
+    picture = np.ascontiguousarray(texture.texels[::-1])
+    if picture.dtype == np.float32:
+        values = picture if channels == 3 else picture[..., 0]
+        return encode_channels({_CHANNELS[channels]: np.ascontiguousarray(values)})
+    stream = io.BytesIO()
+    Image.fromarray(picture if channels == 3 else picture[..., 0]).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def decode_texture(data: bytes, *, is_exr: bool, is_srgb: bool, source: MapSource) -> Texture:
+    """Decode a file of `encode_texture`.
+
+    Raises:
+        LookupError: `encode_texture` did not write the file.
+    """
+    try:
+        texels: NDArray[Any] = _exr_texels(data) if is_exr else _png_texels(data)
+        texture = Texture(texels=np.ascontiguousarray(texels), is_srgb=is_srgb, source=source)
+        texture.check("texture")
+    except (TrilightError, OSError, SyntaxError, ValueError) as error:
+        raise LookupError("it is no texture that was written here") from error
+    return texture
+
+
+def _exr_texels(data: bytes) -> NDArray[np.float32]:
+    from storage.records.exr import channel_names
+
+    name = "Y" if channel_names(data) == ["Y"] else "RGB"
+    pixels = decode_channels(data, name, lambda header: None)[name]
+    texels: NDArray[np.float32] = pixels.reshape(*pixels.shape[:2], -1)[::-1]
+    return texels
+
+
+def _png_texels(data: bytes) -> NDArray[np.uint8]:
+    from PIL import Image
+
+    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        if max(image.size) > MAX_RESOLUTION or image.mode not in ("L", "RGB"):
+            raise ValueError(f"{image.size} in mode {image.mode}")
+        pixels: NDArray[np.uint8] = np.asarray(image, np.uint8)
+    return pixels.reshape(*pixels.shape[:2], -1)[::-1]

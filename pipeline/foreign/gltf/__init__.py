@@ -1,8 +1,7 @@
 """Reader of glTF 2.0, `.glb` and `.gltf`, for objects and for scenes.
 
 - `container`, `document`: chunks, JSON and version; buffers, accessors and pictures.
-- `check`: refusals, and counts within limits, before any buffer is read.
+- `check`: refusals, counts within limits, and names of unread contents, before any buffer is read.
 - `nodes`, `primitives`: the placed meshes, and their triangles.
 - `materials`, `objects`: materials, and an object of triangles and materials.
-- `unread`: names of contents that no code here reads.
 """

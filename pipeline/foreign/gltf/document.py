@@ -3,13 +3,12 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.gltf.check import check_tree
+from pipeline.foreign.gltf.check import check_tree, list_unread_parts
 from pipeline.foreign.gltf.container import (
     data_uri_bytes,
     is_data_uri,
@@ -17,9 +16,8 @@ from pipeline.foreign.gltf.container import (
     read_container,
 )
 from pipeline.foreign.gltf.nodes import INSTANCING, PlacedNode, entry, extension, transforms
-from pipeline.foreign.gltf.unread import list_unread_parts
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.material_files import MaterialFiles, ReadFile, SourceFolder, gltf_files
+from pipeline.foreign.material_files import MaterialFiles, SourceFolder, gltf_files
 from pipeline.foreign.numbers import Malformed, read_count
 from storage.errors import Rejected, TrilightError
 
@@ -204,23 +202,14 @@ class GltfDocument:
         return memoryview(data)[start : start + length]
 
 
-def open_gltf(
-    data: bytes,
-    suffix: str,
-    folder: Path,
-    files: SourceFolder,
-    limits: ReadLimits,
-    read: ReadFile,
-) -> GltfDocument:
+def open_gltf(data: bytes, suffix: str, files: SourceFolder, limits: ReadLimits) -> GltfDocument:
     """Return a glTF with its buffers, and with its pictures where the limits include materials.
 
     Args:
         data: the file.
         suffix: suffix of its name, `.glb` or `.gltf`.
-        folder: folder of the file; no buffer outside of it is read.
-        files: reader of picture files.
+        files: the folder of the file; no buffer outside of it is read.
         limits: bounds of what is read.
-        read: function that reads a regular file of at most so many bytes.
 
     Raises:
         Rejected: as `read_container`, `check_tree`, and of a buffer external_uri or missing_file.
@@ -230,11 +219,11 @@ def open_gltf(
         check_tree(tree, limits)
         unread = list_unread_parts(tree)
         uris = [row["uri"] for row in tree.get("buffers", ()) if "uri" in row]
-        named = {uri: local_path(uri, folder) for uri in uris if not is_data_uri(uri)}
+        named = {uri: local_path(uri, files.folder) for uri in uris if not is_data_uri(uri)}
     buffers: dict[str, bytes] = {}
     bytes_left = limits.max_bytes - len(data)
     for uri, path in named.items():
-        buffers[uri] = read(path, bytes_left)
+        buffers[uri] = files.read(path, bytes_left)
         bytes_left -= len(buffers[uri])
     has_pictures = limits.with_materials and isinstance(tree.get("images"), list)
     return GltfDocument(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from pipeline.foreign.numbers import Malformed, read_count
 from storage.errors import Rejected
@@ -112,19 +112,16 @@ def transforms(
     x, y, z, w = rotation.T
     length = x * x + y * y + z * z + w * w
     twice = np.divide(2, length, out=np.zeros_like(length), where=length > 0)
-    rotations = _rows(
+    rows: Any = [
         [1 - twice * (y * y + z * z), twice * (x * y - z * w), twice * (x * z + y * w)],
         [twice * (x * y + z * w), 1 - twice * (x * x + z * z), twice * (y * z - x * w)],
         [twice * (x * z - y * w), twice * (y * z + x * w), 1 - twice * (x * x + y * y)],
-    )
+    ]
+    rotations = np.moveaxis(np.array(rows, np.float64), 2, 0)
     matrices = np.tile(np.eye(4), (len(x), 1, 1))
     matrices[:, :3, :3] = rotations * scale[:, None]
     matrices[:, :3, 3] = translation
     return matrices
-
-
-def _rows(*rows: list[ArrayLike]) -> NDArray[np.float64]:
-    return np.moveaxis(np.array(rows, np.float64), 2, 0)
 
 
 def num_instances(tree: Mapping[str, Any], node: Mapping[str, Any]) -> int:

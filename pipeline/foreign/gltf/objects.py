@@ -32,12 +32,12 @@ def gltf_textured_mesh(document: GltfDocument, materials: GltfMaterials) -> Text
     """
     with refuse_malformed("materials_unreadable", "the materials are"):
         primitives = _list_primitives(document)
-        has_colors = any(instance.primitive.colors is not None for instance in primitives)
+        has_colors = any(instance.colors is not None for instance in primitives)
         if not document.tree.get("materials") and not has_colors:
             raise Rejected("no_materials", "the glTF has no materials")
         known = materials.used_materials()
         rows: dict[int | None, int] = {number: row for row, number in enumerate(known)}
-        numbers = [rows.get(instance.primitive.material, len(rows)) for instance in primitives]
+        numbers = [rows.get(instance.material, len(rows)) for instance in primitives]
         counts = [len(instance.faces) for instance in primitives]
         color = np.ones((sum(counts), 3, 3))
         uv = np.full((sum(counts), MOST_UV_SETS, 3, 2), np.nan)

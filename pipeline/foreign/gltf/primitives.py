@@ -1,5 +1,6 @@
-"""The triangles of a glTF primitive, in the space of its node or of the world."""
+"""The triangles of glTF primitives in the space of the world."""
 
+import copy
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -13,7 +14,7 @@ from pipeline.foreign.numbers import read_number
 from storage.errors import Rejected
 
 
-class GltfPrimitive:
+class PlacedPrimitive:
     """The triangles of a primitive, deformed by its weighted morph targets."""
 
     def __init__(
@@ -37,13 +38,23 @@ class GltfPrimitive:
         self.faces = _faces(order, primitive.get("mode", TRIANGLES))
         """[T, 3] rows of `positions`."""
         self._rows: Rows = slice(None)
-        if (
-            count > self.faces.size
-        ):  # primitives that share a large accessor each read only their own rows
+        if count > self.faces.size:  # of a large accessor, each primitive reads its own rows
             self._rows, faces = np.unique(self.faces, return_inverse=True)
             self.faces = faces.reshape(-1, 3)
         self.positions = self._read_attribute("POSITION", (3,))
-        """[V, 3] in the space of the node."""
+        """[V, 3] in the space of the node, or of the world."""
+        self._normal_matrix = np.eye(3)
+
+    def place(self, to_world: NDArray[np.float64]) -> "PlacedPrimitive":
+        """Return an instance in the world by a matrix [4, 4]; mirrored corners change order."""
+        instance = copy.copy(self)
+        linear = to_world[:3, :3]
+        with np.errstate(invalid="ignore", over="ignore"):
+            winding = -1 if np.linalg.det(linear) < 0 else 1
+            instance.positions = np.einsum("ij,vj->vi", linear, self.positions) + to_world[:3, 3]
+            instance._normal_matrix = np.cross(linear[[1, 2, 0]], linear[[2, 0, 1]]) * winding
+        instance.faces = self.faces[:, ::winding]
+        return instance
 
     @property
     def material(self) -> int | None:
@@ -71,10 +82,11 @@ class GltfPrimitive:
 
     @property
     def normals(self) -> NDArray[np.float64] | None:
-        """Normals [T, 3, 3] of the corners; None where there are none."""
+        """Normals [T, 3, 3] of the corners, of any length; None where there are none."""
         if "NORMAL" not in self._primitive["attributes"]:
             return None
-        return self._read_attribute("NORMAL", (3,))[self.faces]
+        normals = self._read_attribute("NORMAL", (3,))[self.faces]
+        return np.einsum("ij,tcj->tci", self._normal_matrix, normals)
 
     def _read_attribute(
         self, name: str, widths: tuple[int, ...], *, is_unit: bool | None = None
@@ -91,55 +103,18 @@ class GltfPrimitive:
         return values
 
 
-class PlacedPrimitive:
-    """An instance of a primitive; corners of a mirrored one have the reverse order."""
-
-    def __init__(self, primitive: GltfPrimitive, to_world: NDArray[np.float64]) -> None:
-        """Transform its vertices by a matrix [4, 4]."""
-        self.primitive = primitive
-        linear = to_world[:3, :3]
-        with np.errstate(invalid="ignore", over="ignore"):
-            self._winding = -1 if np.linalg.det(linear) < 0 else 1
-            world = np.einsum("ij,vj->vi", linear, primitive.positions) + to_world[:3, 3]
-            self._cofactors = np.cross(linear[[1, 2, 0]], linear[[2, 0, 1]]) * self._winding
-        self.positions: NDArray[np.float64] = world
-        """[V, 3] in world space."""
-        self.faces = primitive.faces[:, :: self._winding]
-        """[T, 3] rows of `positions`."""
-
-    @property
-    def colors(self) -> NDArray[np.float64] | None:
-        """Linear colors [T, 3, 3] of the corners; None where there are none."""
-        return self._orient_corners(self.primitive.colors)
-
-    @property
-    def normals(self) -> NDArray[np.float64] | None:
-        """Normals [T, 3, 3] of the corners, of any length; None where there are none."""
-        normals = self._orient_corners(self.primitive.normals)
-        return None if normals is None else np.einsum("ij,tcj->tci", self._cofactors, normals)
-
-    def coordinates(self, number: int) -> NDArray[np.float64] | None:
-        """Return a set of texture coordinates [T, 3, 2], v up; None where there is none."""
-        return self._orient_corners(self.primitive.coordinates(number))
-
-    def _orient_corners(
-        self, corner_values: NDArray[np.float64] | None
-    ) -> NDArray[np.float64] | None:
-        return None if corner_values is None else corner_values[:, :: self._winding]
-
-
 def placed_primitives(document: GltfDocument, placed: PlacedNode) -> Iterator[PlacedPrimitive]:
     """Yield the primitives of a node's mesh that have triangles, once for each instance."""
     mesh = entry(document.tree, "meshes", placed.node["mesh"])
     weights = placed.node.get("weights", mesh.get("weights", ()))
     primitives = [
-        GltfPrimitive(document, primitive, list(weights))
+        PlacedPrimitive(document, primitive, list(weights))
         for primitive in mesh["primitives"]
         if primitive.get("mode", TRIANGLES) not in POINTS_AND_LINES
         and "POSITION" in primitive["attributes"]
     ]
     for to_world in document.instances(placed):
-        yield from (PlacedPrimitive(primitive, to_world) for primitive in primitives)
+        yield from (primitive.place(to_world) for primitive in primitives)
 
 
 def _faces(order: NDArray[np.int64], mode: int) -> NDArray[np.int64]:

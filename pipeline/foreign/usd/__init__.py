@@ -4,7 +4,7 @@ Scenes (pipeline.exchange.usd) and objects (pipeline.assets) both use it. Native
 bytes, so only processes with limits import this (pipeline.isolation).
 
 - `stage`, `composition`: a file and the files that it names, bounded before it is composed.
-- `placed`, `schemas`: the visible prims with their transforms; names of unread contents.
+- `placed`: the visible prims with their transforms; names of unread contents.
 - `polygons`, `solids`, `skins`: a mesh as triangles, posed by its skeleton.
 - `shaders`, `texture_nodes`, `colors`: the inputs of a material.
 - `stage_materials`, `materials`: all materials of a stage, and those of a mesh's triangles.

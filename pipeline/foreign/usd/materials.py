@@ -5,13 +5,12 @@ defines, and metadata of the picture are ignored.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.material import MOST_UV_SETS, RGB, WHITE, Slot, SourceMaterial
-from pipeline.foreign.material_files import MaterialFiles
 from pipeline.foreign.picture import Decode, Picture, has_colors
 from pipeline.foreign.textured_mesh import TexturedMesh
 from pipeline.foreign.usd.object_source import UsdSource
@@ -24,7 +23,7 @@ from pipeline.foreign.usd.shaders import (
     reflect_head_on,
 )
 from pipeline.foreign.usd.stage_materials import StageMaterials, name_unsupported
-from pipeline.foreign.usd.texture_nodes import TextureNode, UvChart
+from pipeline.foreign.usd.texture_nodes import TextureNode
 from storage.errors import Rejected
 
 _CHANNELS = {"rgb": 0, "r": 0, "g": 1, "b": 2, "a": 3}
@@ -90,14 +89,15 @@ class MeshMaterials:
         self._bindings = stage_materials.bindings
         self._time = time
         self._emission = emission
+        self._files = stage_materials.pictures
+        self._decode = decode
+        self._notes = notes
+        self._values: dict[str, NDArray] = {}
         self._known: dict[tuple[int, bytes], int] = {}
         nodes = [node for stated in self._stated for node in stated.textures.values()]
         self.primvars = list(dict.fromkeys(node.chart.primvar for node in nodes))
         """Names of the sets of texture coordinates, by the numbers in slots."""
-        reader = _Reader(
-            stage_materials.pictures, self.primvars, decode, emission=emission, notes=notes
-        )
-        self.materials = [reader.material(stated) for stated in self._stated]
+        self.materials = [self._convert(stated) for stated in self._stated]
         """Materials by row; those of primvars are added when they are met."""
         self.plain = len(self.materials)
         """Row of triangles without a material."""
@@ -169,48 +169,7 @@ class MeshMaterials:
             rows.append(self._known[key])
         return np.array(rows, np.int64)[index.reshape(-1)]
 
-
-def _replace_values(
-    material: SourceMaterial, values: Mapping[str, NDArray[np.float64]]
-) -> SourceMaterial:
-    """Return a material with some inputs replaced by values [3]."""
-
-    def number(name: str, old: float) -> float:
-        return float(values[name][0]) if name in values else old
-
-    specular = values.get("specularColor")
-    glow = values.get("emissiveColor")
-    f0 = float(reflect_head_on(values["ior"])[0]) if "ior" in values else material.f0
-    return dataclasses.replace(
-        material,
-        metallic=number("metallic", material.metallic),
-        roughness=number("roughness", material.roughness),
-        f0=f0,
-        specular_rgb=material.specular_rgb if specular is None else _drop_negative(specular),
-        emission_rgb=material.emission_rgb if glow is None else _drop_negative(glow),
-    )
-
-
-class _Reader:
-    """Converts the materials of one stage, decoding each picture once."""
-
-    def __init__(
-        self,
-        files: MaterialFiles,
-        primvars: Sequence[str],
-        decode: Decode,
-        *,
-        emission: bool,
-        notes: list[str] | None,
-    ) -> None:
-        self._files = files
-        self._primvars = primvars
-        self._decode = decode
-        self._emission = emission
-        self._notes = notes
-        self._values: dict[str, NDArray] = {}
-
-    def material(self, stated: StatedMaterial) -> SourceMaterial:
+    def _convert(self, stated: StatedMaterial) -> SourceMaterial:
         base = self._color_slot(stated, "diffuseColor")
         is_tint = base is not None or "diffuseColor" in stated.primvars
         roughness = self._slot(stated, "roughness")
@@ -266,7 +225,9 @@ class _Reader:
 
     def _read_slot(self, node: TextureNode, where: str, *, is_grey: bool) -> Slot:
         values = self._picture(node)
-        is_srgb = self._is_srgb(node)
+        is_srgb = node.color_space == "sRGB"
+        if node.color_space not in ("sRGB", "raw"):
+            is_srgb = has_colors(self._files.require(node.resolved or node.named))
         channel = _CHANNELS[node.output]
         if is_grey:
             values = np.ascontiguousarray(values[..., [channel] * 3 + [3]])
@@ -281,12 +242,11 @@ class _Reader:
             picture = _scale_picture(picture, scale, bias)
             if self._notes is not None and picture.values[..., :3].max() > 1:
                 self._notes.append(f"{where}: texels above 1 are clamped, but for emission")
-        uv_matrix, uv_offset = _chart_transform(node.chart)
         return Slot(
             picture=picture,
-            uv_set=self._primvars.index(node.chart.primvar),
-            uv_matrix=uv_matrix,
-            uv_offset=uv_offset,
+            uv_set=self.primvars.index(node.chart.primvar),
+            uv_matrix=node.chart.matrix,
+            uv_offset=node.chart.offset,
             channel=channel,
         )
 
@@ -296,10 +256,26 @@ class _Reader:
             self._values[path] = self._decode(self._files.require(path), node.named)
         return self._values[path]
 
-    def _is_srgb(self, node: TextureNode) -> bool:
-        if node.color_space in ("sRGB", "raw"):
-            return node.color_space == "sRGB"
-        return has_colors(self._files.require(node.resolved or node.named))
+
+def _replace_values(
+    material: SourceMaterial, values: Mapping[str, NDArray[np.float64]]
+) -> SourceMaterial:
+    """Return a material with some inputs replaced by values [3]."""
+
+    def number(name: str, old: float) -> float:
+        return float(values[name][0]) if name in values else old
+
+    specular = values.get("specularColor")
+    glow = values.get("emissiveColor")
+    f0 = float(reflect_head_on(values["ior"])[0]) if "ior" in values else material.f0
+    return dataclasses.replace(
+        material,
+        metallic=number("metallic", material.metallic),
+        roughness=number("roughness", material.roughness),
+        f0=f0,
+        specular_rgb=material.specular_rgb if specular is None else _drop_negative(specular),
+        emission_rgb=material.emission_rgb if glow is None else _drop_negative(glow),
+    )
 
 
 def _scale_picture(
@@ -311,17 +287,6 @@ def _scale_picture(
         strip = slice(row, row + _STRIP)
         values[strip] = np.maximum(picture.linear(picture.values[strip]) * scale + bias, 0)
     return Picture(values=values, is_srgb=False, wrap=picture.wrap)
-
-
-def _chart_transform(chart: UvChart) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    matrix = np.eye(2)
-    offset = np.zeros(2)
-    for transform in chart.transforms:
-        matrix = transform.matrix @ matrix
-        offset = transform.matrix @ offset + transform.translation
-    if not (np.isfinite(matrix).all() and np.isfinite(offset).all()):
-        raise Rejected("materials_unreadable", "coordinates are moved by what is no number")
-    return matrix, offset
 
 
 def _rgb(stated: StatedMaterial, name: str) -> RGB:

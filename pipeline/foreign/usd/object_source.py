@@ -69,15 +69,6 @@ def place_meshes(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedMesh, ...]:
     return tuple(meshes)
 
 
-def join_meshes(meshes: Sequence[PlacedMesh]) -> TriangleMesh:
-    """Return all parts as one mesh, unwelded."""
-    starts = np.cumsum([0, *(len(part.points) for part in meshes)])
-    faces = [p.cut.indices[p.cut.corners] + k for p, k in zip(meshes, starts[:-1], strict=True)]
-    return TriangleMesh(
-        positions=np.concatenate([part.points for part in meshes]), faces=np.concatenate(faces)
-    )
-
-
 def _require_precision(meshes: Sequence[PlacedMesh], farthest: float) -> None:
     used = np.concatenate([p.points[p.cut.indices[p.cut.corners.ravel()]] for p in meshes])
     extent = float(np.ptp(used, axis=0).max())
@@ -132,8 +123,14 @@ class UsdSource:
 
     @cached_property
     def mesh(self) -> TriangleMesh:
-        """Return all meshes as one, in meters, +Z up; raises Rejected as `meshes`."""
-        return join_meshes(self.meshes)
+        """Return all meshes as one, unwelded, in meters, +Z up; raises Rejected as `meshes`."""
+        starts = np.cumsum([0, *(len(part.points) for part in self.meshes)])
+        faces = [
+            part.cut.indices[part.cut.corners] + start
+            for part, start in zip(self.meshes, starts[:-1], strict=True)
+        ]
+        positions = np.concatenate([part.points for part in self.meshes])
+        return TriangleMesh(positions=positions, faces=np.concatenate(faces))
 
     def materials(self) -> StageMaterials:
         """Return the materials; raises Rejected as `read_stage_materials`, or no_materials."""

@@ -8,7 +8,7 @@ from typing import Any, cast, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.numbers import read_number, read_numbers
+from pipeline.foreign.numbers import Malformed, read_number, read_numbers
 from pipeline.foreign.picture import Wrap
 from pipeline.foreign.usd.stage import OpenedStage, file_and_member
 from storage.errors import TrilightError
@@ -19,30 +19,21 @@ _MOST_NODES = 8
 _WRAPS = get_args(Wrap)
 
 
-@dataclass(frozen=True, kw_only=True)
-class UvTransform:
-    """A UsdTransform2d: scale, counter-clockwise rotation, and translation, in this order."""
-
-    scale: tuple[float, ...]
-    rotation_deg: float
-    translation: tuple[float, ...]
-
-    @property
-    def matrix(self) -> NDArray[np.float64]:
-        """Return the matrix [2, 2] of scale and rotation, for column vectors."""
-        cos = np.cos(np.radians(self.rotation_deg))
-        sin = np.sin(np.radians(self.rotation_deg))
-        return np.array([[cos, -sin], [sin, cos]]) * self.scale
-
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class UvChart:
-    """The texture coordinates of a texture."""
+    """The texture coordinates of a texture: matrix x primvar + offset."""
 
     primvar: str
     """Name of the mesh's primvar of coordinates."""
-    transforms: tuple[UvTransform, ...]
-    """Transforms of the coordinates, in the order of application."""
+    matrix: NDArray[np.float64]
+    """[2, 2] factors for column vectors: scales and rotations."""
+    offset: NDArray[np.float64]
+    """[2] offset that is added after the matrix."""
+
+    @property
+    def is_moved(self) -> bool:
+        """Return whether coordinates differ from the primvar."""
+        return bool((self.matrix != np.eye(2)).any() or self.offset.any())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,29 +104,38 @@ def read_chart(shader: Any, time: Any, lost: list[str]) -> UvChart:
     from pxr import UsdShade
 
     sources = find_sources(shader, "st")
-    moves: list[UvTransform] = []
+    moves: list[tuple[NDArray[np.float64], tuple[float, ...]]] = []
     primvar = "st"
     for _ in range(_MOST_NODES):
         if not sources or not is_output(sources[0]):
             break
         node = UsdShade.Shader(sources[0].GetPrim())
         if node.GetIdAttr().Get() == "UsdTransform2d":
-            moves.append(
-                UvTransform(
-                    scale=_vector(node, "scale", time, (1, 1)),
-                    rotation_deg=read_number(
-                        read_input(node, "rotation", time, 0), f"{node.GetPath()}.rotation"
-                    ),
-                    translation=_vector(node, "translation", time, (0, 0)),
-                )
-            )
+            moves.append(_read_transform(node, time))
             sources = find_sources(node, "in")
             continue
         primvar = str(read_input(node, "varname", time, primvar))
         if node.GetIdAttr().Get() != "UsdPrimvarReader_float2":
             lost.append(f"{node.GetPath()}: not read; texture coordinates {primvar!r:.60} taken")
         break
-    return UvChart(primvar=primvar, transforms=tuple(reversed(moves)))
+    matrix = np.eye(2)
+    offset = np.zeros(2)
+    for move, translation in reversed(moves):
+        matrix = move @ matrix
+        offset = move @ offset + translation
+    if not (np.isfinite(matrix).all() and np.isfinite(offset).all()):
+        raise Malformed(f"{shader.GetPath()}: coordinates are moved by what is no number")
+    return UvChart(primvar=primvar, matrix=matrix, offset=offset)
+
+
+def _read_transform(node: Any, time: Any) -> tuple[NDArray[np.float64], tuple[float, ...]]:
+    """Return matrix and translation of a UsdTransform2d: it scales, rotates, then translates."""
+    angle = np.radians(
+        read_number(read_input(node, "rotation", time, 0), f"{node.GetPath()}.rotation")
+    )
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    matrix: NDArray[np.float64] = rotation * _vector(node, "scale", time, (1, 1))
+    return matrix, _vector(node, "translation", time, (0, 0))
 
 
 def asset_bytes(resolved: str, max_bytes: int) -> bytes | None:

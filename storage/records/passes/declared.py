@@ -12,8 +12,7 @@ from storage.conventions import in_camera
 from storage.errors import TrilightError, expected_one_of
 from storage.raycast.caster import MISS
 from storage.records.material import laid_out
-from storage.records.passes.motion import motion_px
-from storage.records.passes.rays import PassRays
+from storage.records.passes.rays import PassRays, motion_px
 
 Frame = Literal["", "world", "camera", "picture"]
 """Axes of a vector. World and camera are those of storage.conventions (a camera looks along -Z with

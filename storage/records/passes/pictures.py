@@ -13,8 +13,7 @@ from storage.conventions import camera_rays
 from storage.errors import TrilightError
 from storage.raycast.first_hits import SeenFrom, require_row
 from storage.records.passes.declared import MOTION, UV, Pass, declared_passes
-from storage.records.passes.motion import require_same_triangles
-from storage.records.passes.rays import Later, PassRays
+from storage.records.passes.rays import Later, PassRays, require_same_triangles
 from storage.records.scene import Scene
 
 BLOCK_RAYS = 2**14

@@ -13,13 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import TrilightError
-from storage.records.exr import (
-    Header,
-    channel_names,
-    decode_channels,
-    encode_channels,
-    window_size,
-)
+from storage.records.exr import channel_names, decode_channels, encode_channels
 from storage.records.passes.declared import UV, Pass, declared_passes
 from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
@@ -77,18 +71,10 @@ def decode_passes_exr(data: bytes, resolution: int) -> dict[str, NDArray]:
     stored_channels = set(channel_names(data))
     passes = [each for each in declared_passes() if stored_channels >= set(each.exr_channels)]
     names = [channel for each in passes for channel in each.exr_channels]
-
-    def check(header: Header) -> None:
-        if window_size(header) != (resolution, resolution):
-            raise TrilightError(
-                f"passes: {list(window_size(header))} pixels; expected {[resolution] * 2}."
-            )
-
     if COVERAGE not in {each.name for each in passes}:
         raise TrilightError("passes: channel A (coverage) is missing.")
-    channels = decode_channels(data, names, check, separate=True)
-    if any(channel.shape != (resolution, resolution) for channel in channels.values()):
-        raise TrilightError(f"passes: a channel has other pixels than {[resolution] * 2}.")
+    size = (resolution, resolution)
+    channels = decode_channels(data, names, size=size, what="passes", separate=True)
     nowhere = channels["A"] == 0
     return {each.name: _restore(each, channels, nowhere) for each in passes}
 

@@ -1,5 +1,6 @@
 """Images, manifests and locks: linted, validated and compared; none is built or applied here."""
 
+import hashlib
 import json
 import re
 import shlex
@@ -15,8 +16,6 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from infra.serving import deployments
-from infra.setup.locks import LockedPackage, read_lock, write_lock
-from infra.setup.sbom import plain_name
 from pipeline.flows.forms import DatasetInRuns
 from tests.conftest import ROOT
 from tests.for_each import case
@@ -121,11 +120,11 @@ def test_no_password_stands_in_a_file_and_every_port_is_on_loopback() -> None:
 
 def test_images_can_write_buckets_and_locks_hold_each_other() -> None:
     locked = {
-        name: {(row.name, row.version) for row in read_lock(ROOT / f"requirements/{name}.txt")}
+        name: set(_read_lock(ROOT / f"requirements/{name}.txt"))
         for name in ("dataset", "served", "all")
     }
     assert locked["dataset"] < locked["served"] < locked["all"]
-    assert {name for name, _ in locked["served"]} >= {"s3fs", "gcsfs"}
+    assert {pin.partition("==")[0] for pin in locked["served"]} >= {"s3fs", "gcsfs"}
     for path in IMAGES.glob("*.Dockerfile"):
         assert " served" in path.read_text().partition("install.sh /opt/venv/bin/python")[2], path
     compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())
@@ -211,36 +210,44 @@ def test_the_array_job_is_a_shell_script(tmp_path: Path) -> None:
 LOCKS = sorted((ROOT / "requirements").glob("*.txt"))
 
 
-def test_every_package_of_a_lock_has_a_digest() -> None:
+def _read_lock(path: Path) -> dict[str, set[str]]:
+    """Return the digests of the files of each NAME==VERSION of a lock."""
+    packages = {}
+    for line in path.read_text().replace("\\\n", " ").splitlines():
+        requirement, *digests = line.split("--hash=sha256:")
+        packages[requirement.partition(";")[0].strip()] = {digest.strip() for digest in digests}
+    return packages
+
+
+def test_every_package_of_a_lock_has_a_version_and_a_digest() -> None:
     assert LOCKS
     for path in LOCKS:
         with case(path.name):
-            rows = read_lock(path)
-            assert rows
-            assert [row.name for row in rows if not row.sha256] == []
-            assert len({row.name for row in rows}) == len(rows)
+            for pin, digests in _read_lock(path).items():
+                assert re.fullmatch(r"[a-z0-9.-]+==[0-9a-z.]+", pin), pin
+                assert digests and all(re.fullmatch("[0-9a-f]{64}", digest) for digest in digests)
             assert "://" not in path.read_text()
 
 
 def test_locks_that_share_a_package_share_its_version_and_its_digests() -> None:
-    seen: dict[str, LockedPackage] = {}
+    seen: dict[str, set[str]] = {}
     for path in LOCKS:
-        for row in read_lock(path):
-            assert seen.setdefault(row.name, row) == row, path.name
+        for pin, digests in _read_lock(path).items():
+            assert seen.setdefault(pin, digests) == digests, f"{path.name}: {pin}"
 
 
-def test_a_lock_is_read_as_it_was_written(tmp_path: Path) -> None:
-    rows = [LockedPackage(name="a-b", version="1.0", sha256=("0" * 64, "1" * 64))]
-    write_lock(tmp_path / "x.txt", rows)
-    assert read_lock(tmp_path / "x.txt") == rows
-    (tmp_path / "x.txt").write_text("a-b>=1\n")
-    with pytest.raises(ValueError, match="NAME==VERSION"):
-        read_lock(tmp_path / "x.txt")
+def test_files_of_others_are_those_that_their_digests_name() -> None:
+    rows = (ROOT / "requirements/vendored.sha256").read_text().splitlines()
+    for digest, name in [line.split() for line in rows if not line.startswith("#")]:
+        assert hashlib.sha256((ROOT / name).read_bytes()).hexdigest() == digest, name
 
 
 def test_a_lock_has_what_its_packages_ask_for_on_every_python() -> None:
     """It is written on one; Debian 12 has 3.11.2, and packages ask for more there."""
-    names = {canonicalize_name(row.name) for row in read_lock(ROOT / "requirements" / "all.txt")}
+    names = {
+        canonicalize_name(pin.partition("==")[0])
+        for pin in _read_lock(ROOT / "requirements" / "all.txt")
+    }
     names.add(canonicalize_name("pip"))  # venv brings it
     pythons = ("3.11.2", "3.11.9", "3.12.3", "3.13.1")
     places = [
@@ -257,26 +264,11 @@ def test_a_lock_has_what_its_packages_ask_for_on_every_python() -> None:
 
 def test_nothing_installs_a_lock_but_the_script_that_demands_digests() -> None:
     script = (ROOT / "infra/setup/install.sh").read_text()
-    assert re.search(
-        r"--require-hashes --no-build-isolation --no-deps \\\n\s+--only-binary :all:", script
-    )
+    demands = r"--require-hashes --no-build-isolation --no-deps \\\n\s+--only-binary :all:"
+    assert len(re.findall(demands, script)) == len(re.findall("pip install", script)) == 2
     for path in [ROOT / "Makefile", *(ROOT / "infra/images").glob("*.Dockerfile")]:
         text = path.read_text()
         assert "infra/setup/install.sh" in text
         assert not re.search(r"pip install[^\n]*(--requirement|-r )", text), path.name
         for line in re.findall(r"pip install[^\n]*", text):
             assert "--no-deps --no-build-isolation --editable ." in line, path.name
-
-
-def test_the_bill_of_materials_is_that_of_the_locks(tmp_path: Path) -> None:
-    done = [sys.executable, "-m", "infra.setup.sbom", str(tmp_path / "sbom.cdx.json")]
-    subprocess.run(done, cwd=ROOT, check=True)
-    bill = json.loads((tmp_path / "sbom.cdx.json").read_text())
-    assert (bill["bomFormat"], bill["specVersion"]) == ("CycloneDX", "1.6")
-    names = [row["bom-ref"] for row in bill["components"]]
-    assert len(set(names)) == len(names)
-    listed = {name.removeprefix("pkg:pypi/") for name in names if "pypi" in name}
-    rows = [row for path in LOCKS for row in read_lock(path)]
-    assert listed == {f"{plain_name(row.name)}@{row.version}" for row in rows}
-    (pymeshlab,) = [row for row in bill["components"] if row["name"] == "pymeshlab"]
-    assert "GPL" in pymeshlab["licenses"][0]["license"]["name"] or "GNU" in str(pymeshlab)

@@ -1,7 +1,6 @@
 """Who is answered, what the pages are made of, and a page that waits for what it shows."""
 
 import contextlib
-import hashlib
 import re
 import socket
 import threading
@@ -11,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from infra.setup.sbom import THREE_SHA256, THREE_VERSION
 from infra.viewer import server as viewer_server
 from infra.viewer.deferred_handlers import DeferredHandlers, page_of
 from infra.viewer.server import (
@@ -225,17 +223,6 @@ def test_pages_load_what_is_there_and_nothing_from_elsewhere() -> None:
         assert "innerHTML" not in text and "eval(" not in text, path
         assert "<script>" not in text and " style=" not in text and "onclick=" not in text, path
     assert named > 15
-
-
-THREE = STATIC / "three"
-
-
-def test_three_is_the_one_of_the_bill_of_materials() -> None:
-    for name, digest in THREE_SHA256.items():
-        assert hashlib.sha256((THREE / name).read_bytes()).hexdigest() == digest
-    revision = THREE_VERSION.split(".")[1]
-    assert f'="{revision}"' in (THREE / "three.core.min.js").read_text()
-    assert "The MIT License" in (THREE / "LICENSE").read_text()
 
 
 def test_every_element_that_a_script_asks_for_is_in_its_page() -> None:

@@ -64,6 +64,19 @@ def test_free_vertices_come_closer_than_those_of_the_source_and_these_than_clust
     free, subset, clusters = (p99(mesh, 600, name) for name in names)
     # Measured 0.6 and 0.3.
     assert free < 0.8 * subset < 0.5 * clusters
+    assert p99(mesh, 600, "libigl_qslim") < 0.8 * subset
+
+
+def test_qslim_collapses_a_mesh_that_is_no_manifold() -> None:
+    """libigl alone returns no face of a mesh that has an edge of three faces."""
+    mesh = cleaned(knot())
+    a, b = mesh.faces[0, :2]
+    apex = mesh.positions.mean(axis=0, keepdims=True)
+    fin = TriangleMesh(
+        positions=np.concatenate([mesh.positions, apex]),
+        faces=np.concatenate([mesh.faces, [[a, b, len(mesh.positions)]]]),
+    )
+    assert 480 <= len(decimate(fin, 600, "libigl_qslim").faces) <= 600
 
 
 def _call_with(flag: bool) -> None:

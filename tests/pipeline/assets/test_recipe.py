@@ -88,14 +88,13 @@ def test_faithful_works_without_pymeshlab_and_uniform_says_what_to_do(shared: Pa
         check=True,
     )
     told = json.loads(result.stdout.splitlines()[-1])
-    assert told["methods"] == ["meshoptimizer", "meshoptimizer_sloppy"]
-    assert [method for method, _ in told["levels"]] == ["meshoptimizer"] * 2
+    assert told["methods"] == ["libigl_qslim", "meshoptimizer", "meshoptimizer_sloppy"]
+    assert [method for method, _ in told["levels"]] == ["libigl_qslim"] * 2
     assert max(faces for _, faces in told["levels"]) <= 1400
     assert (told["missed"], told["loaded"]) == ([], [])
     assert re.search("profile uniform.*faithful", told["refusal"])
     assert "pymeshlab is not installed" in told["refusal"]
-    assert "pymeshlab=absent" in told["recipe"]
-    assert "pymeshlab=absent" not in RECIPE
+    assert told["recipe"] == "assets-3 libigl" != RECIPE
     assert methods_of("faithful")[0] == "pymeshlab_collapse"
 
 

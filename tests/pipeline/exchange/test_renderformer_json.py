@@ -64,10 +64,18 @@ def test_unknown_fields_are_named_and_harmless() -> None:
 REFUSED = [
     (changed(version="2.0"), "version is '2.0'; expected '1.0'"),
     (changed(objects={str(i): 1 for i in range(8193)}), "8193 objects; expected 1 to 8192"),
+    (changed(objects=[]), "objects is []; expected a JSON object"),
+    (changed(objects={"a": 1}), "objects.a is 1; expected a JSON object"),
     (changed(objects={"a\nb": OBJECT}), "expected a printable name"),
     (changed(cameras=[]), "cameras is []; expected a list of 1 to 1000"),
     (changed(scene_name=...), "scene_name is missing"),
     (changed(*BOX, mesh_path="a\0b"), "objects.box.mesh_path is 'a\\x00b'; expected printable"),
+    (changed(*BOX, mesh_path="\ud800"), "objects.box is nested too deeply, or holds half a char"),
+    (
+        changed(*BOX, mesh_path=...)[:-1] + b"," + b'"a":' + b"[" * 300 + b"]" * 300 + b"}",
+        "missing",
+    ),
+    (changed().replace(b'"box.obj"', b"[" * 900 + b"]" * 900), "objects.box is nested too deeply"),
     (changed(*BOX, remesh_target_face_num=2), "is 2; expected a whole number from 4"),
     (changed(*TRANSFORM, normalize="yes"), "transform.normalize is yes; expected true or false"),
     (changed(*TRANSFORM, scale=2), "objects.box.transform.scale is 2; expected a list of three"),
@@ -161,7 +169,10 @@ def test_normals_that_no_reader_makes_are_said_to_be_lost(tmp_path: Path) -> Non
     assert "floor: shading normals, which readers compute again" in lost
 
 
-def test_too_many_objects(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_much_light_and_too_many_objects(monkeypatch: pytest.MonkeyPatch) -> None:
+    bright = tiny_scene()
+    bright.materials[LIGHT, 7:] = 65505
+    assert any("cuts off" in text for text in describe_scene(bright, "a").lost)
     monkeypatch.setattr("pipeline.exchange.renderformer_json.MAX_OBJECTS", 1)
     with pytest.raises(TrilightError, match="2 objects of one material; a scene file holds at"):
         describe_scene(tiny_scene(), "a")

@@ -290,25 +290,24 @@ def _radiance(texels: NDArray[np.uint8]) -> NDArray[np.float64]:
     return np.asarray(radiance)
 
 
-@for_each("coding, columns", itertools.product(["runs", "old", "flat"], [8, 300, 1200]))
-def test_values_are_mantissa_times_a_power_of_two(coding: str, columns: int) -> None:
-    texels = _texels(3, columns)
-    values = read(radiance_hdr(texels, coding)).values
-    assert values.dtype == np.float32
-    np.testing.assert_array_equal(values, _radiance(texels))  # powers of two: exact
-
-
-@for_each("order", itertools.product("-+", "+-", [False, True]))
-def test_every_orientation_shows_the_same_picture(order: tuple[str, str, bool]) -> None:
+@for_each("order, columns", [
+    *((order, 12) for order in itertools.product("-+", "+-", [False, True])),
+    *((("-", "+", False), columns) for columns in (8, 300, 1200)),
+])  # fmt: skip
+def test_values_are_mantissa_times_a_power_of_two_in_every_orientation(
+    order: tuple[str, str, bool], columns: int
+) -> None:
     down, right, by_columns = order
-    upright = _texels(9, 12)
+    upright = _texels(9, columns)
     turned = upright[:: 1 if down == "-" else -1, :: 1 if right == "+" else -1]
     size = f"{down}Y {{}} {right}X {{}}"
     if by_columns:
         turned, size = turned.transpose(1, 0, 2), f"{right}X {{}} {down}Y {{}}"
     for coding in ("runs", "old", "flat"):
         data = radiance_hdr(np.ascontiguousarray(turned), coding, size=size)
-        np.testing.assert_array_equal(read(data).values, _radiance(upright))
+        values = read(data).values
+        assert values.dtype == np.float32
+        np.testing.assert_array_equal(values, _radiance(upright))  # powers of two: exact
 
 
 def test_factors_of_the_header_are_divided_out_and_ones_change_nothing() -> None:

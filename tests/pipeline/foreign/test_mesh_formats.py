@@ -9,8 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.assets.settings import AssetSettings
-from pipeline.exchange.scene_files import build_scene
 from pipeline.foreign.gltf.container import data_uri_bytes, local_path
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.load import load_mesh
@@ -25,6 +23,7 @@ from storage.errors import Rejected
 from storage.records.exr import encode_channels
 from tests.for_each import case, for_each
 from tests.pipeline.assets.source_materials import textured_kit as kit
+from tests.pipeline.exchange.exchange_kit import build_json
 from tests.pipeline.foreign.dialects import WRITERS, Polygons, Rng, draw_polygons
 
 KINDS = list(WRITERS)
@@ -153,6 +152,8 @@ REFUSED = {
     "stl without end": ("stl", "cut_off", "solid a\n"),
     "off binary": ("off", "load_error", "OFF BINARY\n3 1 0\n"),
     "off of four dimensions": ("off", "load_error", "nOFF 4\n3 1 0\n"),
+    "ply of uncounted faces": ("ply", "header_size_mismatch: the PLY header counts b'-5'",
+                               "ply\nformat ascii 1.0\nelement face -5\nend_header\n"),
     "ply of another format": ("ply", "load_error", "ply\nformat xml 1.0\nend_header\n"),
 }  # fmt: skip
 
@@ -337,15 +338,7 @@ def test_shades_of_public_reports(shared: Path) -> None:
 @pytest.mark.parametrize("name", ["46-json-concave-polygon/scene", "45-json-windows-paths/windows"])
 def test_json_scenes_of_public_reports(shared: Path, name: str) -> None:
     folder, _, scene = name.partition("/")
-    built, _ = build_scene(
-        (shared / "cases" / folder / "in").resolve(),
-        f"{scene}.json",
-        AssetSettings(),
-        licence="CC0-1.0",
-        num_views=None,
-        scene_index=0,
-        seed=0,
-    )
+    built = build_json(shared / "cases" / folder / "in", f"{scene}.json")
     corners = built.vertex_positions[built.faces[built.object_index == 0]].astype(np.float64)
     vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert np.linalg.norm(vectors, axis=1).sum() / 2 == pytest.approx(1.2, rel=1e-5)

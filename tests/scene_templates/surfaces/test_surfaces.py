@@ -7,9 +7,14 @@ import numpy as np
 import pytest
 
 from scene_templates.surfaces.draw import SurfaceMapSettings, draw_surface
-from scene_templates.surfaces.families import OUR_SURFACES, SURFACES
-from scene_templates.surfaces.laid import HEXAGONS, _hexagon_of, lay_rows
-from scene_templates.surfaces.made import exceeded_by
+from scene_templates.surfaces.families import (
+    HEXAGONS,
+    OUR_SURFACES,
+    SURFACES,
+    _hexagon_of,
+    exceeded_by,
+    lay_rows,
+)
 from scene_templates.surfaces.maps import MOST_ALBEDO, finish, surface_maps
 from scene_templates.surfaces.texels import Texels, stones
 from scene_templates.textures import TexturedLook, TextureSettings, draw_look

@@ -17,13 +17,13 @@ from storage.dataset.verify import Verification, verify_dataset
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError, Unreadable
 from storage.records.map_references import map_member
-from storage.records.packed_maps import pack_environment, pack_texture
+from storage.records.packed_maps import pack_environment
 from storage.records.sample import encode_sample, sample_key
 from storage.seeds import rng_for
 from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes, write_dataset
 from tests.storage.dataset.test_shard import TRAIN, four_samples
-from tests.textured_by_hand import colour_texture, number_texture, sky, textured_sample
+from tests.textured_by_hand import number_texture, sky, textured_sample
 
 
 def opened(made: Dataset) -> Dataset:
@@ -208,9 +208,7 @@ def test_a_manifest_that_does_not_say_what_its_pictures_are_is_a_fault(
     assert any("pictures (" in problem for problem in problems)
 
 
-SKY, COLOURS, ROUGHNESS = (
-    map_member(each.sha256) for each in (sky(), colour_texture(), number_texture())
-)
+SKY, ROUGHNESS = map_member(sky().sha256), map_member(number_texture().sha256)
 Change = Callable[[str, dict[str, bytes]], object]
 
 
@@ -234,35 +232,15 @@ def _with_sky(value: float) -> Change:
     return change
 
 
-def _with_bytes(name: str, damage: Callable[[bytes], bytes]) -> Change:
-    def change(_: str, members: dict[str, bytes]) -> None:
-        if name in members:
-            members[name] = damage(members[name])
-
-    return change
-
-
 DAMAGED: dict[str, tuple[Change, str, tuple[int, ...]]] = {
     "missing": (
         lambda _, members: members.pop(ROUGHNESS, None),
         "is missing; expected a member __map-",
         (1, 2, 3),
     ),
-    "other colours": (
-        _with_bytes(COLOURS, lambda _: pack_texture(colour_texture(2))),
-        "has the content",
-        (1, 2),
-    ),
-    "cut": (_with_bytes(SKY, lambda data: data[:-10]), "cut short", (1, 2)),
-    "another sky": (
-        _with_bytes(SKY, lambda _: pack_environment(sky(1))),
-        "has the content",
-        (1, 2),
-    ),
     "NaN": (_with_sky(np.nan), r"radiance_rgb\[0, 0, 0\] is nan; expected finite", (1, 2)),
-    "too bright": (_with_sky(1e10), "expected finite values from 0 to 1e", (1, 2)),
 }
-"""What is done to a map, what is said of it, and of which samples."""
+"""What is done to a map, what is said of it, and of which samples; test_packed_maps has more."""
 
 
 @pytest.mark.parametrize("name", DAMAGED)

@@ -242,7 +242,7 @@ def _arrays(**changed: Any) -> Callable[[dict[str, Any], dict[str, Any]], None]:
 SCENE_FILES: list[tuple[Callable[[dict[str, Any], dict[str, Any]], object], str]] = [
     (lambda arrays, _: arrays.pop("texture.1"), "texture.1 is missing"),
     (_arrays(texture=np.zeros(1, np.uint8)), "expected: 'texture'"),
-    (_arrays(**{"texture.0": np.zeros((1, 1, 3))}), "expected U8 or F16"),
+    (_arrays(**{"texture.0": np.zeros((1, 1, 3))}), "has dtype float64; expected uint8"),
     (_arrays(**{"texture.0": colour_texture(1).texels}), "has the content"),
     (_arrays(environment=np.full((1, 2, 3), np.nan, np.float32)), "is nan"),
     (lambda _, record: record.update(is_srgb=[True]), "for each texture"),

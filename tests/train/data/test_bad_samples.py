@@ -177,7 +177,7 @@ CASES: dict[str, tuple[Callable[[Members], object], str]] = {
     "deeply nested JSON": (nested, "not JSON"),
     "JSON of another kind": (lambda m: m.update(json=b"[1]"), "schema version None"),
     "no JSON": (lambda m: m.pop("json"), "json is missing"),
-    "views are a number": (record(lambda r: r.update(views=3)), "not iterable"),
+    "views are a number": (record(lambda r: r.update(views=3)), "views is 3; expected a list"),
     "a view too few": (record(lambda r: r["views"].pop()), "1 records of views; expected 2"),
     "an object of another kind": (record(lambda r: r["objects"][0].update(kind="x")), "kind"),
     "an object too few": (record(lambda r: r["objects"].pop()), "object_index.* rows below"),

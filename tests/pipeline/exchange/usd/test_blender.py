@@ -13,7 +13,8 @@ from PIL import Image
 
 from infra.bench.workloads import cycles as environment
 from infra.bench.workloads.traced_pictures import fixed_samples, render_shot
-from pipeline.exchange.usd.read import UsdScene, read_usd
+from pipeline.exchange.loaded_scene import LoadedScene
+from pipeline.exchange.usd.read import read_usd
 from pipeline.exchange.usd.write import write_usd
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.renders.variant import activate, choose_variant
@@ -130,7 +131,7 @@ def assert_shown(facts: dict[str, Any], scene: Scene) -> None:
         assert np.array_equal(np.array(shown, np.float32)[columns], values[columns])
 
 
-def assert_kept(found: UsdScene, scene: Scene, lamp: int, painted: int) -> None:
+def assert_kept(found: LoadedScene, scene: Scene, lamp: int, painted: int) -> None:
     """The table of the tutorial."""
     back = found.scene
     assert back.objects == scene.objects
@@ -155,7 +156,7 @@ def assert_kept(found: UsdScene, scene: Scene, lamp: int, painted: int) -> None:
     for name, tolerance in (("vertex_positions", 1e-6), ("vertex_normals", 1e-4)):
         kept, written = (getattr(s, name)[s.faces[others]] for s in (back, scene))
         assert kept == pytest.approx(written, abs=tolerance)  # Blender packs normals
-    first, change = found.lost
+    first, change = found.notes
     assert first.startswith("materials of Trilight are exact where nothing was changed")
     assert f"/material_{painted}: diffuse was changed since Trilight wrote it" in change
 
@@ -217,7 +218,7 @@ def test_a_scene_that_blender_exports_looks_as_blender_renders_it(
     assert sizes(again) == sizes(found)  # instances or copies: the same triangles
 
 
-def assert_read(found: UsdScene) -> None:
+def assert_read(found: LoadedScene) -> None:
     """What Blender says of the scene that it made: faces, colours, watts, angle, and losses."""
     scene = found.scene
     assert sizes(found) == {
@@ -240,11 +241,11 @@ def assert_read(found: UsdScene) -> None:
     (paint,) = scene.textures  # the bytes of the picture that Blender wrote
     assert paint.is_srgb and paint.texels.shape == (64, 64, 3)
     for words in ("emits to one side", "are square"):
-        assert any(words in text for text in found.lost), words
-    assert len(found.lost) == 2
+        assert any(words in text for text in found.notes), words
+    assert len(found.notes) == 2
 
 
-def sizes(found: UsdScene) -> dict[str, int]:
+def sizes(found: LoadedScene) -> dict[str, int]:
     """Return the triangles of each object."""
     counts = Counter(found.scene.object_index.tolist())
     return {entry.name: counts[row] for row, entry in enumerate(found.scene.objects)}

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from pxr import Sdf, UsdGeom
 
-from pipeline.exchange.usd.read import UsdScene, read_usd
+from pipeline.exchange.loaded_scene import LoadedScene
+from pipeline.exchange.usd.read import read_usd
 from pipeline.exchange.usd.write import write_usd
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
@@ -24,7 +25,7 @@ PREVIEW = f"{MATERIAL}/Preview"
 EXACT = ("trilight:exactRows", "trilight:exactPositions")
 
 
-def edited(tmp_path: Path, scene: Scene, edit: Callable[[Any], None]) -> UsdScene:
+def edited(tmp_path: Path, scene: Scene, edit: Callable[[Any], None]) -> LoadedScene:
     """Return what is read after an edit of the layer that we wrote."""
     write_usd(tmp_path / "a.usda", scene)
     layer = Sdf.Layer.OpenAsAnonymous(str(tmp_path / "a.usda"))
@@ -82,7 +83,7 @@ def test_an_edit_changes_its_column_alone(
     expected[:2, column] = value
     emits = [2, 0, 1] if name == "emissiveColor" else [0, 1, 2]
     assert np.array_equal(np.sort(rows(found.scene), axis=0), np.sort(expected[emits], axis=0))
-    assert sum("was changed since" in text for text in found.lost) == 1
+    assert sum("was changed since" in text for text in found.notes) == 1
 
 
 @pytest.mark.parametrize("specular", [False, True])
@@ -93,7 +94,7 @@ def test_what_blender_loses_is_still_there(tmp_path: Path, specular: bool) -> No
         index = np.array([[-1, 1, 0], [-1, -1, -1]], np.int32)
         scene = textured_scene(0, number_texture(), gloss, material_textures=index)
     found = edited(tmp_path, scene, as_blender_writes)
-    assert not found.exact and len(found.lost) == 1
+    assert len(found.notes) == 1
     assert {t.sha256: t.source for t in found.scene.textures} == {
         t.sha256: t.source for t in scene.textures
     }
@@ -131,7 +132,7 @@ def test_what_is_no_longer_so_is_said(
 ) -> None:
     found = edited(tmp_path, tiny_scene(), edit)
     assert rows(found.scene)[0, :6] == pytest.approx(albedos, rel=1e-6)
-    assert any(said in text for text in found.lost)
+    assert any(said in text for text in found.notes)
 
 
 def test_a_column_that_blender_drops_is_named(tmp_path: Path) -> None:
@@ -144,7 +145,7 @@ def test_a_column_that_blender_drops_is_named(tmp_path: Path) -> None:
         scene = tiny_scene()
         scene.materials[:, -WAVES.width :] = 0.25
         found = edited(tmp_path, scene, drop_array)
-    notes = [text for text in found.lost if "is not in the file any more" in text]
+    notes = [text for text in found.notes if "is not in the file any more" in text]
     assert notes and all(f"{WAVES.name!r}" in text for text in notes)
 
 
@@ -171,7 +172,7 @@ def as_written_before(layer: Any) -> None:
 def test_files_of_an_older_trilight_are_exact(tmp_path: Path) -> None:
     for scene in (odd_scene(), textured_scene()):
         found = edited(tmp_path, scene, as_written_before)
-        assert found.exact and encode_scene(found.scene) == encode_scene(scene)
+        assert not found.notes and encode_scene(found.scene) == encode_scene(scene)
 
 
 def test_objects_turn_about_their_centers(tmp_path: Path) -> None:
@@ -183,6 +184,7 @@ def test_objects_turn_about_their_centers(tmp_path: Path) -> None:
 
     scene = tiny_scene()
     found = edited(tmp_path, scene, turn)
+    assert any("changed since Trilight wrote it: read as any other" in text for text in found.notes)
     was, now = (s.vertex_positions[s.faces[2]] for s in (scene, found.scene))
     assert now.mean(axis=0)[2] == 2
     assert np.array_equal(rows(found.scene)[2], scene.materials[LIGHT])

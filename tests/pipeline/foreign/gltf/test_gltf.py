@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.assets.source_materials.skin import _parts
-from pipeline.exchange.gltf.read import GltfScene, read_gltf
+from pipeline.exchange.gltf.read import read_gltf
+from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.material import MaterialSamples, SourceMaterial, source_columns
@@ -49,13 +50,11 @@ def surface(path: Path) -> NDArray[np.float64]:
             base = slot.picture.sample(uv, np.zeros(len(chosen), np.int64))
         if parts.color is not None:
             base[:, :3] *= parts.color[chosen].mean(axis=1)
-        seen = MaterialSamples(base=base, metallic=None, roughness=None, specular_colour=None,
-                    specular_strength=None, glossiness=None)  # fmt: skip
-        colors[chosen] = source_columns(material, seen, len(chosen))[:, :3]
+        colors[chosen] = source_columns(material, MaterialSamples(base=base), len(chosen))[:, :3]
     return ordered(corners, colors)
 
 
-def scene_surface(found: GltfScene) -> NDArray[np.float64]:
+def scene_surface(found: LoadedScene) -> NDArray[np.float64]:
     """Return the same of a scene."""
     scene = found.scene
     corners = scene.vertex_positions[scene.faces].astype(np.float64)
@@ -305,6 +304,9 @@ REFUSED: dict[str, tuple[str, Callable[[GltfWriter], None]]] = {
     "a later version": ("unsupported_format", _set("asset/minVersion", "2.1")),
     "an older version": ("unsupported_format", _set("asset/version", "1.0")),
     "an unknown mode": ("unsupported_primitive", _set(f"{PRIMITIVE}/mode", 7)),
+    "a mesh without primitives": ("load_error", _set("meshes/0", {})),
+    "a node that is no object": ("load_error", _set("nodes/0", [])),
+    "a view beyond its buffer": ("load_error", _set("bufferViews/0/byteLength", 1 << 30)),
     "half a triangle": ("load_error", _set("accessors/1/count", 5)),
     "an index that counts from the end": ("load_error", _set("nodes/0/mesh", -1)),
     "doubles": ("unsupported_accessor", _set("accessors/0/componentType", 5130)),
@@ -380,7 +382,7 @@ def test_what_no_code_reads_is_named_once(tmp_path: Path, sentence: str) -> None
     path = plain(UNREAD[sentence]).save(tmp_path, "glb")
     source = read_source(path, KEPT)
     assert source.unread == ((sentence,) if sentence else ())
-    assert set(source.unread) <= set(read_gltf(path, "CC0-1.0").lost)
+    assert set(source.unread) <= set(read_gltf(path, "CC0-1.0").notes)
     assert len(load_mesh(source).faces) == (12 if "instancing" in sentence else 2)
 
 

@@ -10,14 +10,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
-from pipeline.exchange.usd.read import UsdScene, read_usd
+from pipeline.exchange.loaded_scene import LoadedScene
+from pipeline.exchange.usd.read import read_usd
 from pipeline.foreign.material import MaterialSamples, source_columns
 from pipeline.foreign.source_file import read_source
 from pipeline.foreign.usd.materials import usd_textured_mesh
 from storage.errors import Rejected, TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS
 from tests.for_each import for_each
-from tests.pipeline.assets.source_materials.textured_kit import KEEP
+from tests.pipeline.assets.source_materials.textured_kit import KEEP, F
 from tests.pipeline.assets.source_materials.usd_kit import new_stage
 
 POINTS = ((0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3))
@@ -57,23 +58,9 @@ def of_object(path: Path) -> Looks:
     columns = np.zeros((len(tint), 7))
     for row in np.unique(parts.material):
         own = parts.material == row
-        columns[own] = source_columns(parts.materials[row], tinted(tint[own]), int(own.sum()))
+        samples = MaterialSamples(base=tint[own].astype(np.float32))
+        columns[own] = source_columns(parts.materials[row], samples, int(own.sum()))
     return looks_of(parts.mesh.positions[parts.mesh.faces], columns[:, :3], columns[:, 6])
-
-
-def tinted(rgb: np.ndarray) -> MaterialSamples:
-    return MaterialSamples(
-        base=rgb.astype(np.float32),
-        metallic=None,
-        roughness=None,
-        specular_colour=None,
-        specular_strength=None,
-        glossiness=None,
-    )
-
-
-F = 0.04 + 0.96 / 21
-"""What a dielectric of index 1.5 reflects: F0, and the mean of Schlick's rise to 1."""
 
 
 def diffuse_of(rgb: Any) -> tuple[float, ...]:
@@ -81,7 +68,7 @@ def diffuse_of(rgb: Any) -> tuple[float, ...]:
     return tuple(rounded(np.array(rgb) * (1 - F)).tolist())
 
 
-def read(path: Path) -> UsdScene:
+def read(path: Path) -> LoadedScene:
     return read_usd(path, None, None, "CC0-1.0")
 
 
@@ -422,4 +409,4 @@ def test_a_dome_turns_with_its_pole_and_what_is_not_read_is_named(tmp_path: Path
     for word in (*words, "1 x RectLight"):
         assert any(word in note for note in usd.unread), word
     for word in (*words, "inputs:diffuse", "cone:angle"):
-        assert any(word in note for note in read(path).lost), word
+        assert any(word in note for note in read(path).notes), word
