@@ -36,7 +36,7 @@ test: setup-all  ## the quick tests, in five minutes on two cores
 # only files that have one are looked through: each worker imports all that it looks through
 # Blender, which some compare with, goes into the user's cache once: 380 MB
 test-slow: setup-all  ## the others, of the kinds in tests/conftest.py, in half an hour
-	$(if $(WITHOUT_GPL),,python -c 'import infra.bench.workloads.blender_environment as e; e.blender_python()' || echo Tests beside Blender skip.)
+	$(if $(WITHOUT_GPL),,python -c 'import infra.bench.workloads.cycles as e; e.blender_python()' || echo Tests beside Blender skip.)
 	python -m pytest -m slow -n 3 --dist loadfile --no-loadscope-reorder $$(grep -rl --include='test_*.py' 'mark\.slow' tests)
 
 test-elsewhere: setup-all  ## the most telling ones, as other processors would run them

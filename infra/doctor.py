@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Literal
@@ -39,12 +39,10 @@ _LEAST_LIMITS = {
 """Resource, unit and least value of each limit that a run needs, by name."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Finding:
     """Result of one check."""
 
-    name: str
-    """Name of the check, a key of CHECKS."""
     state: State
     """`ok`; `slower` if work goes on without it; `missing` if some work cannot be done."""
     found: str
@@ -53,6 +51,8 @@ class Finding:
     """Slower or impossible work; empty if the state is ok."""
     mend: str = ""
     """Command or action that fixes it; empty if none is known."""
+    name: str = ""
+    """Name of the check, a key of CHECKS; `examine` fills it in."""
 
 
 def examine(looking_at: Callable[[str], None] = lambda name: None) -> Iterator[Finding]:
@@ -64,79 +64,61 @@ def examine(looking_at: Callable[[str], None] = lambda name: None) -> Iterator[F
     for name, check in CHECKS.items():
         looking_at(name)
         try:
-            yield check()
+            finding = check()
         except TrilightError as error:  # its message names the next step
-            yield Finding(name=name, state="missing", found=str(error), consequence="", mend="")
+            finding = Finding("missing", str(error))
         except (metadata.PackageNotFoundError, ModuleNotFoundError) as error:
-            yield Finding(
-                name=name,
-                state="missing",
-                found=f"no package {error.name}",
-                consequence="what needs it fails",
-                mend="make setup",
-            )
+            text = f"no package {error.name}"
+            finding = Finding("missing", text, "what needs it fails", "make setup")
+        yield replace(finding, name=name)
 
 
 def _machine() -> Finding:
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     free = (free_memory() or 0) / 2**30
-    text = (
+    return Finding(
+        "ok",
         f"{available_cores()} of {os.cpu_count()} cores, {free:.0f} of {memory:.0f} GiB free, "
-        f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"
+        f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
     )
-    return Finding(name="machine", state="ok", found=text)
 
 
 def _disk() -> Finding:
     free = shutil.disk_usage(Path.cwd()).free
     text = f"{free / 2**30:.0f} GiB free here"
     if free >= _MIN_FREE_BYTES:
-        return Finding(name="disk", state="ok", found=text)
-    return Finding(
-        name="disk",
-        state="slower",
-        found=text,
-        consequence="a dataset of ten thousand scenes takes more",
-        mend="choose another disk with --out",
-    )
+        return Finding("ok", text)
+    problem = "a dataset of ten thousand scenes takes more"
+    return Finding("slower", text, problem, "choose another disk with --out")
 
 
 def _limits() -> Finding:
     """Check the resource limits that a shell, a scheduler or a service sets."""
-    problems = [f"no temporary folder ({error})" for error in _temporary_problem()]
+    problems = []
+    try:
+        with tempfile.TemporaryFile():
+            pass
+    except OSError as error:
+        problems.append(f"no temporary folder ({error})")
     for name, (kind, unit, least) in _LEAST_LIMITS.items():
         soft = resource.getrlimit(kind)[0]
         if soft != resource.RLIM_INFINITY and soft < least:
             problems.append(f"{soft // unit} {name}; expected at least {least // unit}")
     if not problems:
-        return Finding(name="limits", state="ok", found="none that would stop a run")
+        return Finding("ok", "none that would stop a run")
     return Finding(
-        name="limits",
-        state="missing",
-        found="; ".join(problems),
+        "missing",
+        "; ".join(problems),
         consequence="children cannot start, or are ended",
         mend="raise the limit where it is set (ulimit -a lists them); TMPDIR=/a/writable/folder",
     )
 
 
-def _temporary_problem() -> list[str]:
-    try:
-        with tempfile.TemporaryFile():
-            return []
-    except OSError as error:
-        return [str(error)]
-
-
 def _renderer() -> Finding:
     cache_folder("")  # raises where there is neither a cache nor a home
     text = f"mitsuba {metadata.version('mitsuba')}"
-    finding = _probe(
-        "renderer",
-        f"import {module_name('pipeline.renders')}, mitsuba; mitsuba.set_variant('scalar_rgb')",
-        summary=text,
-        consequence="nothing can be rendered",
-        mend=f"{_APT} libatomic1",
-    )
+    code = f"import {module_name('pipeline.renders')}, mitsuba; mitsuba.set_variant('scalar_rgb')"
+    finding = _probe(code, text, "nothing can be rendered", f"{_APT} libatomic1")
     if finding.state == "missing":
         return finding
     try:
@@ -144,161 +126,106 @@ def _renderer() -> Finding:
     except EnvironmentFailure:
         raise
     except TrilightError as error:
-        return Finding(
-            name="renderer",
-            state="missing",
-            found=str(error),
-            consequence="nothing can be rendered",
-            mend="pip install karellen-llvm-core",
-        )
-    text = ", ".join(part for part in (text, variant.name, variant.libllvm) if part)
-    return Finding(name="renderer", state="ok", found=text)
+        mend = "pip install karellen-llvm-core"
+        return Finding("missing", str(error), "nothing can be rendered", mend)
+    return Finding("ok", ", ".join(filter(None, (text, variant.name, variant.libllvm))))
 
 
 def _denoiser() -> Finding:
     variant = choose_variant("auto")
     facts = render_facts(variant)
     if "denoiser" not in facts:
-        return Finding(
-            name="denoiser",
-            state="missing",
-            found=f"pyoidn {facts['pyoidn']} does not respond",
-            consequence="pictures cannot be denoised",
-            mend="make setup",
-        )
+        text = f"pyoidn {facts['pyoidn']} does not respond"
+        return Finding("missing", text, "pictures cannot be denoised", "make setup")
     text = (
         f"OIDN {facts['denoiser']}, {facts['denoiser_device']}, {facts['threads']} threads; a view "
         f"of {VIEW_PX} pixels and {VIEW_SPP} samples takes {facts['view_s']} s"
     )
-    if variant.note:
-        return Finding(
-            name="denoiser",
-            state="slower",
-            found=text,
-            consequence=variant.note,
-            mend="a newer driver, or a card from compute capability 7.5 on",
-        )
-    return Finding(name="denoiser", state="ok", found=text)
+    if not variant.note:
+        return Finding("ok", text)
+    mend = "a newer driver, or a card from compute capability 7.5 on"
+    return Finding("slower", text, variant.note, mend)
 
 
 def _mesh_decimation() -> Finding:
-    return _probe(
-        "mesh decimation",
-        f"import {module_name('pipeline.assets.decimation.meshopt')}",
-        summary=f"wasmtime {metadata.version('wasmtime')}",
-        consequence="meshes cannot be decimated where pymeshlab fails",
-        mend="make setup",
-    )
+    code = f"import {module_name('pipeline.assets.decimation.meshopt')}"
+    problem = "meshes cannot be decimated where pymeshlab fails"
+    return _probe(code, f"wasmtime {metadata.version('wasmtime')}", problem, "make setup")
 
 
 def _mesh_filters() -> Finding:
     if importlib.util.find_spec("pymeshlab") is None:
-        return Finding(
-            name="mesh filters",
-            state="slower",
-            found="no pymeshlab (GPL)",
-            consequence="libigl decimates: other meshes, other digests, and no profile uniform",
-            mend="make setup",
-        )
+        problem = "libigl decimates: other meshes, other digests, and no profile uniform"
+        return Finding("slower", "no pymeshlab (GPL)", problem, "make setup")
     code = (
         f"from {module_name('pipeline.assets.environment')} import missing_filters; "
         "m = missing_filters(); "
         "raise SystemExit(', '.join(m) if m else 0)"
     )
-    return _probe(
-        "mesh filters",
-        code,
-        summary=f"pymeshlab {metadata.version('pymeshlab')}",
-        consequence="no mesh can be made by pymeshlab",
-        mend=f"{_APT} libgl1 libopengl0",
-    )
+    text = f"pymeshlab {metadata.version('pymeshlab')}"
+    return _probe(code, text, "no mesh can be made by pymeshlab", f"{_APT} libgl1 libopengl0")
 
 
 def _confinement() -> Finding:
     mode = confinement_mode()
-    missing = missing_features()
     version = landlock_version()
     has = [f"Landlock {version}"] if version else []
     text = ", ".join([*has, *(["seccomp"] if seccomp_works() else [])]) or "nothing to confine by"
-    if mode != "off" and not missing:
-        return Finding(name="confinement", state="ok", found=text)
+    if mode != "off" and not missing_features():
+        return Finding("ok", text)
+    mend = "run on Linux 5.13 or later, or read strangers' files in a container"
     if mode == "off":
         text = f"{text}; {VARIABLE}=off"
         mend = f"unset {VARIABLE}"
-    else:
-        mend = "run on Linux 5.13 or later, or read strangers' files in a container"
-    return Finding(
-        name="confinement",
-        state="missing" if mode == "required" else "slower",
-        found=text,
-        consequence="a file that takes over its parser can do all that you can",
-        mend=mend,
-    )
+    problem = "a file that takes over its parser can do all that you can"
+    return Finding("missing" if mode == "required" else "slower", text, problem, mend)
 
 
 def _orchestrator() -> Finding:
     cache_folder("")  # as the renderer
-    return _probe(
-        "orchestrator",
+    code = (
         f"from {module_name('pipeline.flows.prefect_server')} import load_prefect; "
-        "load_prefect(); import prefect.server.api.server",
-        summary=f"prefect {metadata.version('prefect')}, fastapi {metadata.version('fastapi')}",
-        consequence="no flow can run",
-        mend="make setup",
+        "load_prefect(); import prefect.server.api.server"
     )
+    text = f"prefect {metadata.version('prefect')}, fastapi {metadata.version('fastapi')}"
+    return _probe(code, text, "no flow can run", "make setup")
 
 
 def _learning() -> Finding:
     if importlib.util.find_spec("torch") is None:
-        return Finding(
-            name="learning",
-            state="missing",
-            found="no torch",
-            consequence="data can be made, but nothing can be trained",
-            mend="make setup-all",
-        )
-    return Finding(name="learning", state="ok", found=f"torch {metadata.version('torch')}")
+        problem = "data can be made, but nothing can be trained"
+        return Finding("missing", "no torch", problem, "make setup-all")
+    return Finding("ok", f"torch {metadata.version('torch')}")
 
 
 def _accelerator() -> Finding:
     rows = query_gpus("name,driver_version")
     if not rows:
-        return Finding(
-            name="GPU",
-            state="slower",
-            found="none",
-            consequence="rendering and training use the processor",
-            mend="run on a machine with an NVIDIA GPU",
-        )
+        problem = "rendering and training use the processor"
+        return Finding("slower", "none", problem, "run on a machine with an NVIDIA GPU")
     text = "; ".join(row.replace(", ", ", driver ") for row in rows)
     try:
         choose_variant(device="gpu")
     except TrilightError as error:
-        return Finding(
-            name="GPU",
-            state="slower",
-            found=f"{text}; {error}",
-            consequence="rendering uses the processor",
-            mend="a driver with OptiX; in a container NVIDIA_DRIVER_CAPABILITIES=all",
-        )
-    return Finding(name="GPU", state="ok", found=f"{text}; renders with the driver's OptiX")
+        mend = "a driver with OptiX; in a container NVIDIA_DRIVER_CAPABILITIES=all"
+        return Finding("slower", f"{text}; {error}", "rendering uses the processor", mend)
+    return Finding("ok", f"{text}; renders with the driver's OptiX")
 
 
 def _cache() -> Finding:
     folder = cache_folder("")
     existing = next(place for place in [folder, *folder.parents] if place.exists())
     if os.access(existing, os.W_OK):
-        return Finding(name="cache", state="ok", found=str(folder))
+        return Finding("ok", str(folder))
     return Finding(
-        name="cache",
-        state="missing",
-        found=f"{folder} cannot be written",
+        "missing",
+        f"{folder} cannot be written",
         consequence="the orchestrator cannot store its records",
         mend="export TRILIGHT_CACHE=/a/writable/folder",
     )
 
 
-def _probe(name: str, code: str, *, summary: str, consequence: str, mend: str) -> Finding:
+def _probe(code: str, text: str, consequence: str, mend: str) -> Finding:
     """Run code in a child process; a non-zero status, a crash or a hang is `missing`."""
     try:
         result = subprocess.run(
@@ -310,19 +237,16 @@ def _probe(name: str, code: str, *, summary: str, consequence: str, mend: str) -
             timeout=_PROBE_S,
             check=False,
         )
-        problem = "" if result.returncode == 0 else _last_line(result.stderr, result.returncode)
+        status = result.returncode
+        last = [f"ended with status {status}", *result.stderr.strip().splitlines()][-1]
+        problem = last if status else ""
     except subprocess.TimeoutExpired:
         problem = f"no answer within {_PROBE_S} s"
     except OSError as error:
         problem = f"{sys.executable} cannot be started ({error.strerror})"
     if not problem:
-        return Finding(name=name, state="ok", found=summary)
-    summary = f"{summary}: {problem}"
-    return Finding(name=name, state="missing", found=summary, consequence=consequence, mend=mend)
-
-
-def _last_line(text: str, status: int) -> str:
-    return text.strip().splitlines()[-1] if text.strip() else f"ended with status {status}"
+        return Finding("ok", text)
+    return Finding("missing", f"{text}: {problem}", consequence, mend)
 
 
 CHECKS: Mapping[str, Callable[[], Finding]] = {

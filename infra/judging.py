@@ -66,7 +66,6 @@ class Judgement:
     record: dict[str, Any]
     """All figures as JSON values (train.evaluation.report)."""
     views: tuple[JudgedView, ...]
-    """Scores of each view, in the order of the dataset."""
     contest: EvalConfig
     """Network, data and baselines of the evaluation."""
 

@@ -1,4 +1,7 @@
-"""Makes a leaderboard: selects the methods, judges them, and writes the files."""
+"""Makes a leaderboard: selects the methods, judges them, and writes the files.
+
+Folders of OpenEXR pictures from elsewhere are judged beside renderers; all are checked first.
+"""
 
 import contextlib
 import functools
@@ -6,7 +9,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from infra.picture_folder import picture_folders
+import numpy as np
+from numpy.typing import NDArray
+
 from infra.processor import processor
 from infra.render.methods import (
     BUILTIN_NETWORKS,
@@ -17,17 +22,22 @@ from infra.render.methods import (
 )
 from infra.render.path_tracer import RenderChild
 from model.neural_renderer import NeuralRenderer
+from pipeline.exchange.exports.scenes import picture_name
+from pipeline.exchange.pictures import MAX_BYTES, decode_pixels
 from pipeline.renders.variant import choose_variant
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from storage.records.safe_read import read_plain
+from storage.records.sample import Sample
 from train.evaluation.board import Board, OnProgress, first_keys, judge_all
 from train.evaluation.chart import plot_leaderboard
 from train.evaluation.evaluate import BASELINE_SCENES, make_baselines, stored_resolution
 from train.evaluation.options import LeaderboardOptions
 from train.evaluation.pages import leaderboard_page, pairs_csv, standings_csv
 from train.evaluation.standings import WidthStandings, standings_of
-from train.evaluation.stored_pictures import nearest_view
+from train.evaluation.stored_pictures import PictureSource, nearest_view
 from train.loss.lpips import load_lpips
 
 USUAL_WIDTHS = (64, 256, 512)
@@ -48,6 +58,12 @@ ALONE = "no picture is looked up: the set has no scene beside the one that is ju
 FEW_SCENES = 10
 """Number of scenes below which intervals over scenes are too narrow."""
 
+_LEAST = -1e-2
+"""Least radiance that still counts as a network's rounding of 0."""
+
+Views = Sequence[tuple[str, int]]
+"""Scene key and camera of every evaluated view."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Leaderboard:
@@ -56,11 +72,9 @@ class Leaderboard:
     widths: tuple[WidthStandings, ...]
     """Table of each width, ascending."""
     notes: tuple[str, ...]
-    """Notes for the reader, each once."""
     rival: str
     """Name of the row that all others are compared with."""
     out: Path
-    """Folder of the leaderboard's files."""
 
 
 def make_leaderboard(order: LeaderboardOptions, on_progress: OnProgress) -> Leaderboard:
@@ -265,3 +279,106 @@ def _beyond(most_triangles: dict[str, int], tables: Sequence[WidthStandings]) ->
                 f"{larger} of {len(sizes)} scenes have more triangles than any that {name} was "
                 "trained on"
             )
+
+
+def picture_folder(folder: Path, views: Views, widths: Sequence[int]) -> PictureSource:
+    """Return a folder of pictures from elsewhere, all of one width, after checking every view's.
+
+    Values slightly below 0, which networks of logarithms return, count as 0; alpha is ignored.
+
+    Raises:
+        TrilightError: a picture is missing, unreadable, of another width than the first one or than
+            the evaluated ones, or has values that are not finite or below 0.
+    """
+    _require_all(folder, views)
+    sha256: dict[tuple[str, int], str] = {}
+    by_width: dict[int, Path] = {}
+    for key, view in views:
+        path = folder / picture_name(key, view)
+        data = _bytes_of(path)
+        by_width.setdefault(_picture(data, path, widths).shape[0], path)
+        sha256[key, view] = sha256_hex(data)
+    if len(by_width) > 1:
+        listed = ", ".join(f"{path.name} has {width}" for width, path in by_width.items())
+        raise TrilightError(
+            f"--pictures {folder}: its pictures have several widths ({listed}); expected one. "
+            "Put those of each width into a folder of their own."
+        )
+    (resolution,) = by_width
+
+    def pictures(sample: Sample) -> NDArray[np.float32]:
+        names = [picture_name(sample.key, view) for view in range(sample.scene.num_views)]
+        paths = [folder / name for name in names]
+        read = [_picture(_bytes_of(path), path, [resolution]) for path in paths]
+        return np.maximum(np.stack(read), 0)
+
+    return PictureSource(
+        name=f"pictures of {folder.name or folder.resolve().name}",
+        resolution=resolution,
+        digest=lambda key, view: sha256[key, view],
+        pictures=pictures,
+    )
+
+
+def _require_all(folder: Path, views: Views) -> None:
+    if not folder.is_dir():
+        raise TrilightError(f"--pictures {folder}: no such folder; expected one.")
+    missing = [name for name in views if not (folder / picture_name(*name)).is_file()]
+    if missing:
+        raise TrilightError(
+            f"--pictures {folder}: {len(missing)} of {len(views)} pictures are missing, the first "
+            f"is {picture_name(*missing[0])}; expected one for each view, called as `trilight "
+            "export SET --form exr` calls them. Fewer scenes can be judged (--scenes of "
+            "leaderboard, --most-scenes of evaluate)."
+        )
+
+
+def _bytes_of(path: Path) -> bytes:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise TrilightError(f"{path.name}: expected a picture of at most {MAX_BYTES} bytes.")
+        return read_plain(path)
+    except OSError as error:
+        raise TrilightError(f"{path.name}: cannot be read ({error.strerror}).") from error
+
+
+def _picture(data: bytes, path: Path, widths: Sequence[int]) -> NDArray[np.float32]:
+    """Return the radiance [R, R, 3] of a file whose width is one of `widths`."""
+    pixels = decode_pixels(data, path.name)
+    if pixels is None or pixels.dtype != np.float32 or pixels.shape[2] < 3:
+        raise TrilightError(
+            f"{path.name}: no readable OpenEXR picture of channels R, G and B; expected linear "
+            "radiance as `trilight export SET --form exr` writes it."
+        )
+    height, width = pixels.shape[:2]
+    if height != width or width not in widths:
+        expected = " or ".join(f"{each} x {each}" for each in widths)
+        raise TrilightError(
+            f"{path.name}: {width} x {height} pixels; expected {expected}. Render it at that size, "
+            "or choose another width."
+        )
+    radiance_rgb = np.asarray(pixels[..., :3], np.float32)
+    illegal = ~(np.isfinite(radiance_rgb) & (radiance_rgb >= _LEAST))
+    if illegal.any():
+        row, column, channel = (int(place) for place in np.argwhere(illegal)[0])
+        raise TrilightError(
+            f"{path.name}: row {row}, column {column} is {radiance_rgb[row, column].tolist()}, and "
+            f"{int(illegal.any(axis=-1).sum())} pixels are like it; expected finite radiance of at "
+            f"least 0 (channel {'RGB'[channel]}). Make the picture again."
+        )
+    return radiance_rgb
+
+
+def picture_folders(
+    folders: Sequence[Path], views: Views, widths: Sequence[int]
+) -> list[PictureSource]:
+    """Return the checked folders; raises TrilightError for equal names."""
+    all_folders: list[PictureSource] = []
+    for folder in folders:
+        one = picture_folder(folder, views, widths)
+        if one.name in [other.name for other in all_folders]:
+            raise TrilightError(
+                f"--pictures {folder}: another folder has the same name; expected different ones."
+            )
+        all_folders.append(one)
+    return all_folders

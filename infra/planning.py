@@ -48,7 +48,6 @@ class Interval:
     """Predicted figure with its 90 % interval."""
 
     value: float
-    """Expected value of the figure."""
     low: float
     """5th percentile of the bootstrap."""
     high: float
@@ -68,7 +67,6 @@ class MeasuredScenes:
     num_bytes: tuple[int, ...]
     """Bytes of each scene in its shard, in the same order."""
     num_views: int
-    """Number of views of a scene."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,15 +78,12 @@ class Prediction:
     scenes_per_shard: int
     """Number of scenes in each shard but the last, which may have fewer."""
     core_hours: Interval
-    """CPU hours of all scenes."""
     hours: Interval
     """Wall-clock hours with all cores busy."""
     usd: Interval
-    """Price of the CPU hours in US dollars."""
     gigabytes: Interval
     """Size of all shards in 10^9 bytes."""
     shard_hours: Interval
-    """CPU hours of one average shard."""
     num_tasks: int
     """Number of task runs in one flow run that makes the whole dataset."""
     task_minutes: float
@@ -98,7 +93,6 @@ class Prediction:
     manifest_mb: float
     """Size of the finished manifest.json in 10^6 bytes."""
     notes: tuple[str, ...]
-    """Warnings about the predicted run."""
 
 
 def measure_scenes(
@@ -108,9 +102,7 @@ def measure_scenes(
 
     Args:
         order: options of the dataset, whose folder is not touched.
-        count: number of scenes to make.
         place: empty folder, which may be deleted afterwards.
-        scene_done: called after each scene.
 
     Raises:
         TrilightError: as `prepare_dataset`.

@@ -36,9 +36,7 @@ def repair(
     fails, they stay in the dataset with the suffix `.bad`.
 
     Args:
-        dataset: folder of the dataset.
         bad_shards: names of the shards (storage.dataset.verify).
-        objects: source of the objects, as in the `generate` command.
         scenes_from: folder of the scene files, as in the `generate` command; their digests are in
             the lock, so that no other files are accepted.
 
@@ -57,8 +55,6 @@ def repair(
     manifest = opened.manifest
     _require_generated(manifest, scenes_from)
     require_same_extensions(str(root), manifest.extensions, extension_digests("data"))
-    changes = _changes(manifest)
-    licence = _stated_licence(opened)
     command = read_asked(opened) or ()
     revisits = _revisit_source(opened, command)
     maps = _user_maps(opened, command)
@@ -67,7 +63,7 @@ def repair(
         objects=None if scenes_from or revisits else objects,
         out=str(root),
         scenes=None if scenes_from or revisits else manifest.num_scenes,
-        licence=licence,
+        licence=_stated_licence(opened),
         textures=maps.get("textures"),
         skies=maps.get("skies"),
         map_licence=maps.get("map_licence"),
@@ -75,9 +71,11 @@ def repair(
         revisits=revisits,
         views=manifest.num_views if scenes_from else None,
         albedo_over_one=cast(AlbedoOverOne, value_of(command, "--albedo-over-one") or "scale"),
-        changes=changes,
+        changes=_changes(manifest),
     )  # checks everything before a shard is moved
-    _set_aside(root, bad_shards)
+    for name in bad_shards:
+        if (root / name).exists():
+            (root / name).replace(root / f"{name}{ASIDE}")
     outcome = make_dataset(order, ThreadRunner())
     if outcome.digest != manifest.dataset_digest:
         raise TrilightError(
@@ -86,12 +84,6 @@ def repair(
         )
     for name in bad_shards:
         (root / f"{name}{ASIDE}").unlink(missing_ok=True)
-
-
-def _set_aside(root: Path, names: Sequence[str]) -> None:
-    for name in names:
-        if (root / name).exists():
-            (root / name).replace(root / f"{name}{ASIDE}")
 
 
 def _require_generated(manifest: Manifest, scenes_from: str | None) -> None:
@@ -147,9 +139,8 @@ def _user_maps(dataset: Dataset, command: Sequence[str]) -> dict[str, str | None
     if None in folders.values():
         raise TrilightError(
             f"{dataset.display_name}: its scenes have textures or maps of a folder, and "
-            "logs/asked.json "
-            "does not say where that is. Delete the bad shards, and run the same `trilight "
-            "generate` again."
+            "logs/asked.json does not say where that is. Delete the bad shards, and run the same "
+            "`trilight generate` again."
         )
     return folders | ({"map_licence": value_of(command, "--map-licence")} if folders else {})
 
@@ -165,12 +156,5 @@ def _changes(manifest: Manifest) -> dict[str, object]:
 
 def _stated_licence(dataset: Dataset) -> str | None:
     """Return the value of `--licence` when the objects were frozen; it applies to all of them."""
-    locked = dataset.objects_lock()
-    return next(
-        (
-            entry.licence
-            for entry in locked
-            if entry.licence_source == BY_USER and entry.kind == OBJECT
-        ),
-        None,
-    )
+    objects = [entry for entry in dataset.objects_lock() if entry.kind == OBJECT]
+    return next((each.licence for each in objects if each.licence_source == BY_USER), None)

@@ -3,8 +3,10 @@
 import contextlib
 import io
 import os
+import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from unittest import mock
 
 from cyclopts import CycloptsError
@@ -12,6 +14,7 @@ from rich.console import Console
 
 from infra.cli.commands import app, complaint
 from storage.errors import TrilightError
+from tests.conftest import ROOT
 
 
 @dataclass(frozen=True)
@@ -57,3 +60,21 @@ def trilight(words: Sequence[str], env: Mapping[str, str] | None = None) -> Ende
         except SystemExit as end:
             code = int(end.code or 0)
     return Ended(code, out.getvalue(), errors.getvalue(), caught)
+
+
+def run_program(
+    words: Sequence[str | Path],
+    folder: Path = ROOT,
+    *,
+    status: int = 0,
+    env: Mapping[str, str] = os.environ,
+    timeout: float = 900,
+    **variables: str,
+) -> "subprocess.CompletedProcess[str]":
+    """Run a program in a folder, with further variables, and require its exit status."""
+    done = subprocess.run(
+        words, cwd=folder, env={**env, **variables}, capture_output=True, text=True,
+        timeout=timeout, check=False,
+    )  # fmt: skip
+    assert done.returncode == status, f"{words}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
+    return done

@@ -20,47 +20,50 @@ from typing import TYPE_CHECKING, Any
 from trilight.lazy import offered_names
 
 if TYPE_CHECKING:
+    from infra.judging import Judgement as Judgement
+    from infra.judging import judge_network as judge_network
+    from infra.judging import write_judgement as write_judgement
+    from model.neural_renderer import NeuralRenderer as NeuralRenderer
+    from pipeline.generation.dataset_order import DatasetOrder as DatasetOrder
+    from pipeline.generation.run import Outcome as Outcome
+    from pipeline.renders.results import RenderedView as RenderedView
+    from storage.conventions import preview_srgb8 as preview_srgb8
+    from storage.dataset.dataset import Dataset as Dataset
+    from storage.dataset.dataset import open_dataset as open_dataset
+    from storage.dataset.statistics import Statistics as Statistics
+    from storage.dataset.statistics import dataset_statistics as dataset_statistics
+    from storage.errors import TrilightError as TrilightError
+    from storage.raycast.first_hits import FirstHits as FirstHits
+    from storage.raycast.first_hits import first_hits as first_hits
+    from storage.records.passes.declared import Pass as Pass
+    from storage.records.passes.declared import declared_passes as declared_passes
+    from storage.records.passes.pictures import view_passes as view_passes
+    from storage.records.sample import Sample as Sample
+    from storage.records.scene import Scene as Scene
+    from storage.records.scene import SceneObject as SceneObject
+    from train.monitoring.settings import WatchSettings as WatchSettings
+    from train.result import TrainResult as TrainResult
+    from train.runs import named_run as named_run
+    from train.settings import TrainSettings as TrainSettings
     from trilight.compose import SceneBuilder as SceneBuilder
-    from trilight.datasets import Dataset as Dataset
-    from trilight.datasets import DatasetOrder as DatasetOrder
-    from trilight.datasets import Outcome as Outcome
-    from trilight.datasets import Sample as Sample
-    from trilight.datasets import Statistics as Statistics
-    from trilight.datasets import dataset_statistics as dataset_statistics
     from trilight.datasets import generate as generate
-    from trilight.datasets import open_dataset as open_dataset
-    from trilight.errors import TrilightError as TrilightError
-    from trilight.learning import Judgement as Judgement
-    from trilight.learning import TrainResult as TrainResult
-    from trilight.learning import TrainSettings as TrainSettings
-    from trilight.learning import WatchSettings as WatchSettings
-    from trilight.learning import judge_network as judge_network
-    from trilight.learning import named_run as named_run
     from trilight.learning import train_network as train_network
-    from trilight.learning import write_judgement as write_judgement
     from trilight.parts import Material as Material
-    from trilight.pictures import FirstHits as FirstHits
-    from trilight.pictures import NeuralRenderer as NeuralRenderer
-    from trilight.pictures import Pass as Pass
-    from trilight.pictures import RenderedView as RenderedView
-    from trilight.pictures import declared_passes as declared_passes
-    from trilight.pictures import first_hits as first_hits
     from trilight.pictures import open_network as open_network
-    from trilight.pictures import preview_srgb8 as preview_srgb8
     from trilight.pictures import render as render
     from trilight.pictures import render_views as render_views
-    from trilight.pictures import view_passes as view_passes
     from trilight.pictures import write_picture as write_picture
-    from trilight.scenes import Scene as Scene
-    from trilight.scenes import SceneObject as SceneObject
     from trilight.scenes import read_scene as read_scene
     from trilight.scenes import read_scenes as read_scenes
     from trilight.scenes import within_budget as within_budget
     from trilight.scenes import write_scene as write_scene
 
 _HOME = offered_names(__file__)
-"""Module of this package and name there, for each name. No name equals a package of the checkout:
-an installed wheel has `trilight.train` and the other packages as subpackages."""
+"""Module and name there, for each name. No name equals a package of the checkout: an installed
+wheel has `trilight.train` and the other packages as subpackages."""
+
+_OF_TORCH = {"Judgement", "NeuralRenderer", "TrainResult", "judge_network", "write_judgement"}
+"""Names whose modules import torch."""
 
 __all__ = sorted(["__version__", *_HOME])  # noqa: PLE0605
 
@@ -71,6 +74,10 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, name_there = _HOME[name]
+    if name in _OF_TORCH:
+        from infra.torch_library import require_torch
+
+        require_torch(name)
     value = getattr(import_module(module), name_there)
     globals()[name] = value
     return value

@@ -1,25 +1,11 @@
-"""Datasets: generate, open, read and count them."""
+"""Datasets from Python: generate them."""
 
 from typing import TYPE_CHECKING
 
 from pipeline.generation.dataset_order import DatasetOrder
-from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.statistics import Statistics, dataset_statistics
-from storage.records.sample import Sample
 
 if TYPE_CHECKING:
     from pipeline.generation.run import Outcome
-
-__all__ = [
-    "Dataset",
-    "DatasetOrder",
-    "Outcome",
-    "Sample",
-    "Statistics",
-    "dataset_statistics",
-    "generate",
-    "open_dataset",
-]
 
 
 def generate(order: DatasetOrder) -> "Outcome":
@@ -37,11 +23,3 @@ def generate(order: DatasetOrder) -> "Outcome":
     from pipeline.generation.pipeline import make_dataset
 
     return make_dataset(order, ThreadRunner())
-
-
-def __getattr__(name: str) -> object:
-    if name != "Outcome":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from pipeline.generation.run import Outcome
-
-    return Outcome

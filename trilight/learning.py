@@ -1,41 +1,19 @@
-"""Networks: train and evaluate them; torch is loaded when a function is called."""
+"""Networks from Python: train them; torch is loaded when the function is called."""
 
 import os
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from infra.torch_library import require_torch
-from storage.installation import module_name
 from train.monitoring.settings import WatchSettings
 from train.resume import StartOptions
-from train.runs import changed_run, named_run
-from train.settings import TrainSettings
+from train.runs import changed_run
 
 if TYPE_CHECKING:
-    from infra.judging import Judgement, judge_network, write_judgement
     from train.progress import TrainProgress
     from train.result import TrainResult
-
-__all__ = [
-    "Judgement",
-    "TrainResult",
-    "TrainSettings",
-    "WatchSettings",
-    "judge_network",
-    "named_run",
-    "train_network",
-    "write_judgement",
-]
-
-_PLACES = {
-    "Judgement": "infra.judging",
-    "TrainResult": "train.result",
-    "judge_network": "infra.judging",
-    "write_judgement": "infra.judging",
-}
-"""Modules of names that need torch."""
+    from train.settings import TrainSettings
 
 
 def train_network(
@@ -91,10 +69,10 @@ def train_network(
     start.check(settings)
     return _train_alone(
         settings,
-        start,
-        roots=[data] if isinstance(data, str | os.PathLike) else data,
-        out=Path(out),
+        [data] if isinstance(data, str | os.PathLike) else data,
         device=device,
+        out=Path(out),
+        start=start,
         workers=workers,
         watched=watched,
         progress=progress,
@@ -102,36 +80,18 @@ def train_network(
 
 
 def _train_alone(
-    settings: TrainSettings,
-    start: StartOptions,
-    *,
+    settings: "TrainSettings",
     roots: Sequence[str | os.PathLike[str]],
-    out: Path,
+    *,
     device: str | None,
-    workers: int | None,
-    watched: WatchSettings | None,
-    progress: "TrainProgress | None",
+    **options: Any,
 ) -> "TrainResult":
-    """Train in this process as the only rank."""
+    """Run `train.run.train_run` in this process as the only rank."""
     from train.loop.distributed import DistributedContext, choose_device
     from train.run import train_run
 
-    result = train_run(
-        settings,
-        data=[os.fspath(root) for root in roots],
-        out=out,
-        start=start,
-        dist_context=DistributedContext(device=choose_device(device)),
-        workers=workers,
-        watched=watched,
-        progress=progress,
-    )
+    data = [os.fspath(root) for root in roots]
+    dist_context = DistributedContext(device=choose_device(device))
+    result = train_run(settings, data=data, dist_context=dist_context, **options)
     assert result is not None  # rank 0 returns a result
     return result
-
-
-def __getattr__(name: str) -> object:
-    if name not in _PLACES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    require_torch(name)
-    return getattr(import_module(module_name(_PLACES[name])), name)

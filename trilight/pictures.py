@@ -1,4 +1,4 @@
-"""Pictures of a scene: visible surfaces, path traced light, or a trained network's render."""
+"""Pictures of a scene from Python: path traced, by a trained network, and as files."""
 
 import contextlib
 import os
@@ -9,36 +9,18 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.render.cameras import own_camera
 from infra.render.quality import MOST_TRACED_SPP, ToStatedError
+from infra.render.sources import own_camera
 from infra.torch_library import require_torch
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import NoiseTargets
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX, preview_srgb8
 from storage.errors import TrilightError
-from storage.raycast.first_hits import FirstHits, first_hits
-from storage.records.passes.declared import Pass, declared_passes
-from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
 
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
-
-__all__ = [
-    "FirstHits",
-    "NeuralRenderer",
-    "Pass",
-    "RenderedView",
-    "declared_passes",
-    "first_hits",
-    "open_network",
-    "preview_srgb8",
-    "render",
-    "render_views",
-    "view_passes",
-    "write_picture",
-]
 
 
 def render(
@@ -185,12 +167,3 @@ def write_picture(path: str | os.PathLike[str], radiance_rgb: NDArray[np.float32
         write_atomically(target, encode_png(preview_srgb8(picture)))
     else:
         raise TrilightError(f"{target}: cannot be written as a picture; expected .exr or .png.")
-
-
-def __getattr__(name: str) -> object:
-    if name != "NeuralRenderer":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    require_torch(name)
-    from model.neural_renderer import NeuralRenderer
-
-    return NeuralRenderer

@@ -12,9 +12,7 @@ from infra.render.sources import scene_sources
 from pipeline.exchange.convert import write_scene as write_in_form
 from pipeline.exchange.open_scene import LoadedScene, scene_source
 from pipeline.exchange.reader import SceneReader
-from storage.records.scene import Scene, SceneObject
-
-__all__ = ["Scene", "SceneObject", "read_scene", "read_scenes", "within_budget", "write_scene"]
+from storage.records.scene import Scene
 
 
 def read_scene(source: str | os.PathLike[str]) -> Scene:

@@ -43,7 +43,6 @@ class BenchScale:
     picture_px: int
     """Width of pictures where whole samples are made, in pixels."""
     objects: int
-    """Number of objects of the experiment on decimation."""
     repeats: int
     """Number of measured rounds of the same work."""
     steps: int
@@ -99,7 +98,6 @@ class Point:
     """Measured setting, a row of the table; the results hold all fields but `measure`."""
 
     name: str
-    """Name of its row in the table."""
     measure: Measure | None = field(default=None, repr=False)
     """Function that measures it; None of a point that was read from results."""
     default: bool = False
@@ -125,9 +123,7 @@ class Experiment:
     """Experiment: points that are measured together, trial by trial."""
 
     name: str
-    """Name on the command line."""
     title: str
-    """Title of the table and of the plot."""
     about: str
     """Description of the measurement in one sentence."""
     cost: Column
@@ -141,7 +137,6 @@ class Experiment:
     better: Literal["higher", "lower"] = "lower"
     """Direction in which the error is better: decibels are higher where pictures agree."""
     columns: tuple[Column, ...] = ()
-    """Further columns of the table, after cost and error."""
     also_cost: tuple[str, ...] = ()
     """Further columns that count as costs: a point cheaper in any of them is not dominated."""
     because: str = ""

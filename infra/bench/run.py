@@ -6,10 +6,16 @@ only ratios within one run are meaningful.
 
 import contextlib
 import dataclasses
+import os
+import platform
+import shutil
+import subprocess
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import (
@@ -20,14 +26,18 @@ from infra.bench.experiment import (
     missing_need,
     public_options,
 )
-from infra.bench.machine import ROOT, machine_record
-from infra.bench.plot import plot
+from infra.bench.rows import plot
 from infra.bench.store import Run, Store
 from infra.bench_options import BenchOptions
+from infra.processor import processor
 from pipeline.isolation import ChildFailed
 from storage.errors import Rejected, TrilightError
 
+ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results" / "bench"
+
+_LIBRARIES = ("trilight", "mitsuba", "drjit", "pyoidn", "numpy", "torch", "pymeshlab",
+              "wasmtime", "libigl", "OpenEXR", "h5py")  # fmt: skip
 
 TrialDone = Callable[[int, int], None]
 """Callback with the number of finished trials and of all trials."""
@@ -56,7 +66,7 @@ def run(
     if lack := missing_need(experiment, options):
         raise TrilightError(f"bench {experiment.name}: {lack}.")
     if "blender" in experiment.needs:
-        from infra.bench.workloads.blender_environment import blender_python
+        from infra.bench.workloads.cycles import blender_python
 
         blender_python()  # before anything is measured
     points = _points_of(experiment, scale, options)
@@ -116,3 +126,45 @@ def _measure_missing(
         except (Rejected, ChildFailed) as error:
             store.leave_out(current, trial, str(error))
         trial_done(number, total)
+
+
+def machine_record(device: str) -> dict[str, Any]:
+    """Return the record of this machine as JSON values; on the device `cuda` with its GPU."""
+    versions = {}
+    for library in _LIBRARIES:
+        try:
+            versions[library] = metadata.version(library)
+        except metadata.PackageNotFoundError:
+            continue
+    return {
+        **({"gpu": _gpu_name()} if device == "cuda" else {}),
+        "processor": processor(),
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
+        "versions": versions,
+        "commit": commit_text(),
+    }
+
+
+def _gpu_name() -> str:
+    import torch
+
+    return str(torch.cuda.get_device_name()) if torch.cuda.is_available() else "no GPU"
+
+
+def commit_text(root: Path = ROOT) -> str:
+    """Return the commit of a checkout, with -dirty if files other than documents differ.
+
+    Results are documents, so that a run that writes them resumes as the same commit.
+    """
+    if shutil.which("git") is None:
+        return "unknown"  # an image has none
+
+    def git(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            ["git", *words], cwd=root, capture_output=True, text=True, check=False
+        )
+
+    commit = git("describe", "--always").stdout.strip()
+    changed = git("diff", "--quiet", "HEAD", "--", ".", ":(exclude)docs").returncode == 1
+    return f"{commit}-dirty" if changed else commit or "unknown"

@@ -1,13 +1,13 @@
 """`trilight assets`: objects to clean meshes, with a report."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from rich.table import Table
 from rich.text import Text
 
-from infra.cli.assets_next import generate_from_meshes
 from infra.cli.console import (
     console,
     first_words,
@@ -19,7 +19,9 @@ from infra.cli.console import (
 )
 from infra.cli.options import OutputOptions, command
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings, Profile
+from pipeline.builds.named import BUILDS, named_build
 from pipeline.objects.licences import DEFAULT_ALLOWED
+from storage.dataset.splits import shards_for, split_of_object, split_of_shard
 from storage.errors import TrilightError
 from storage.machine import available_cores
 from storage.records.objects import count_by_reason
@@ -37,6 +39,7 @@ _EPSILON_BUDGET = 4096
 """Triangles that the largest scene of RenderFormer may hold in all."""
 _SHOWN = 12
 _LEVELS = next(field.within for field in describe_fields(AssetSettings) if field.name == "budgets")
+_BUILD = "smoke"
 
 
 @checked()
@@ -197,3 +200,34 @@ def _print_table(report: "AssetReport") -> None:
     if len(worst) > _SHOWN:
         more = len(worst) - _SHOWN
         console.print(f"and {more} accepted objects with smaller errors\n", style="dim")
+
+
+def generate_from_meshes(
+    geometry_sha256: Sequence[str],
+    folder: Path,
+    allow_licences: Sequence[str],
+    *,
+    own_materials: bool = False,
+) -> list[str]:
+    """Return the words of a `generate` command whose splits all have objects.
+
+    With few objects a split may be empty: then the command makes only the scenes before the first
+    one that needs it, or if no object is for training, all scenes for testing.
+
+    Args:
+        geometry_sha256: digests of the meshes, by which objects are assigned to splits.
+        allow_licences: licences that were allowed in addition to the usual ones.
+        own_materials: whether meshes keep the materials of their source.
+    """
+    splits = named_build(_BUILD).splits
+    present = {split_of_object(digest, splits) for digest in geometry_sha256}
+    words = ["generate", _BUILD, "--objects", str(folder), "--out", f"{folder}-{_BUILD}"]
+    shards = shards_for(BUILDS[_BUILD].num_scenes, splits)
+    usable = next((i for i in range(shards) if split_of_shard(i, splits) not in present), shards)
+    if own_materials:
+        words += ["--set", "scenes.materials.source=object"]
+    if usable == 0:
+        words += ["--set", "splits.one_split=true"]
+    elif usable < shards:
+        words += ["--scenes", str(usable * splits.scenes_per_shard)]
+    return [*words, *(word for name in allow_licences for word in ("--allow-licences", name))]

@@ -86,7 +86,6 @@ def all_changes(
     """Return all changes to a preset's settings by dotted name, and check the changed settings.
 
     Args:
-        settings: settings of the preset.
         base: names a settings file, which overrides `liked`.
         liked: record of the settings to use instead of the preset's; may be empty.
         stated: values of other options and of `--set` by dotted name; they override both.

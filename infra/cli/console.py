@@ -193,6 +193,23 @@ def print_table(title: str, rows: Sequence[Mapping[str, object]]) -> None:
     console.print(table)
 
 
+def print_result(
+    title: str,
+    rows: Sequence[tuple[str, str]],
+    record: Mapping[str, Any],
+    *,
+    notes: Iterable[str] = (),
+    as_json: bool,
+) -> None:
+    """Print a result: its record as JSON, or its notes and a table of (name, value) rows."""
+    if as_json:
+        print_json(record)
+        return
+    for text in notes:
+        note(text)
+    print_rows(title, rows)
+
+
 def print_json(value: Any) -> None:
     """Print a value as one JSON document."""
     console.file.write(json.dumps(value, indent=1, sort_keys=True) + "\n")

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from infra.cli.console import first_words, note, print_json, print_rows, progress_bars
+from infra.cli.console import first_words, print_result, progress_bars
 from infra.cli.options import OutputOptions, command
 from pipeline.exchange.from_description import AlbedoOverOne
 from storage.settings.described import checked
@@ -47,19 +47,9 @@ def convert(options: ConvertOptions, output: OutputOptions) -> None:
             budget=options.budget,
             done=lambda now, total: bars.update(task, completed=now, total=total),
         )
-    if output.json:
-        print_json(
-            {
-                "files": [str(path) for path in result.files],
-                "notes": list(result.notes),
-                "triangles": result.triangles,
-            }
-        )
-        return
-    for text in result.notes:
-        note(text)
-    more = len(result.files) - 1
-    written = f"{result.files[0]}" + (
-        f" and {more} {'files' if more > 1 else 'file'} more" if more else ""
-    )
-    print_rows("Converted", [("written", written), ("triangles", f"{result.triangles}")])
+    files = [str(path) for path in result.files]
+    record = {"files": files, "notes": list(result.notes), "triangles": result.triangles}
+    more = len(files) - 1
+    written = files[0] + (f" and {more} {'files' if more > 1 else 'file'} more" if more else "")
+    rows = [("written", written), ("triangles", f"{result.triangles}")]
+    print_result("Converted", rows, record, notes=result.notes, as_json=output.json)

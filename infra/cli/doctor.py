@@ -53,7 +53,7 @@ def _measure_previews(*, silent: bool) -> "Finding":
 
     with console.status("measuring previews"):
         path = keep_machine_costs(measure_costs(shipped_table()))
-    finding = Finding(name="previews", state="ok", found=f"measured, and kept in {path}")
+    finding = Finding("ok", f"measured, and kept in {path}", name="previews")
     if not silent:
         console.print(_row(finding))
     return finding

@@ -3,9 +3,10 @@
 from pathlib import Path
 from typing import Literal
 
-from infra.cli.console import first_words, note, print_json, print_rows, progress_bars
+from infra.cli.console import first_words, print_result, progress_bars
 from infra.cli.options import OutputOptions, command
 from pipeline.exchange.exports.export import ExportForm
+from storage.records.sample import Sample
 from storage.remote.safe_url import safe_url
 from storage.settings.described import checked
 
@@ -35,14 +36,13 @@ def export(options: ExportOptions, output: OutputOptions) -> None:
     first_words(f"Exporting {safe_url(options.source)} to {options.out}", silent=output.json)
     from pipeline.exchange.exports.export import export_dataset  # slow: Pillow
 
-    scenes = views = 0
+    views: list[int] = []
+    """Number of views of each written scene."""
     with progress_bars() as bars:
         task = bars.add_task("scenes", total=None, note="", visible=not output.json)
 
-        def on_scene(num_views: int) -> None:
-            nonlocal scenes, views
-            scenes = scenes + 1
-            views = views + num_views
+        def on_scene(sample: Sample) -> None:
+            views.append(sample.scene.num_views)
             bars.advance(task)
 
         notes = export_dataset(
@@ -51,19 +51,9 @@ def export(options: ExportOptions, output: OutputOptions) -> None:
             options.out,
             split=options.split,
             scene=options.scene,
-            done=lambda sample: on_scene(sample.scene.num_views),
+            done=on_scene,
         )
-    if output.json:
-        about = {"form": options.form, "out": str(options.out), "scenes": scenes, "views": views}
-        print_json({**about, "notes": list(notes)})
-        return
-    for text in notes:
-        note(text)
-    print_rows(
-        "Exported",
-        [
-            ("form", options.form),
-            ("out", str(options.out)),
-            ("written", f"{scenes} scenes, {views} views"),
-        ],
-    )
+    about = {"form": options.form, "out": str(options.out)}
+    record = {**about, "scenes": len(views), "views": sum(views), "notes": list(notes)}
+    rows = [*about.items(), ("written", f"{len(views)} scenes, {sum(views)} views")]
+    print_result("Exported", rows, record, notes=notes, as_json=output.json)

@@ -1,16 +1,41 @@
-"""`trilight generate`: makes a dataset from objects or from scene files."""
+"""`trilight generate`: makes a dataset from objects or from scene files.
 
+Progress bars read the files of the dataset, so that they serve any executor.
+"""
+
+import contextlib
+import threading
 import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.progress import Progress as Bars
 
 from infra.cli.changes import BaseSettings, with_base_settings
-from infra.cli.console import first_words, note
-from infra.cli.generate_progress import show_progress
-from infra.cli.generate_report import report
+from infra.cli.console import first_words, next_step, note, print_json, print_rows, progress_bars
 from infra.cli.options import OutputOptions, command
 from pipeline.executors.registry import find_executor
 from pipeline.generation.dataset_order import DatasetOrder
-from storage.dataset.layout import dataset_folder
+from pipeline.objects.licences import USER_PROVIDED
+from storage.dataset.layout import DatasetFolder, dataset_folder
+from storage.dataset.manifest import Manifest, read_head
+from storage.dataset.progress import Progress, read_progress
+from storage.dataset.statistics import Statistics
+from storage.records.objects import count_by_reason, read_failures, read_objects_lock
 from storage.settings.described import checked
+
+if TYPE_CHECKING:
+    from pipeline.generation.run import Outcome
+
+_POLL_S = 0.5
+_MAX_NOTES = 20
+"""Maximum number of notes that are printed."""
+
+_RUN = "smoke"
+"""Training preset that the next step names."""
 
 
 @checked()
@@ -48,3 +73,157 @@ def make(order: DatasetOrder, runner: ExecutorOptions, output: OutputOptions) ->
     with show_progress(folder, silent=output.json):
         outcome = executor.make(order, runner.address)
     report(folder, outcome, time.monotonic() - started, as_json=output.json)
+
+
+@contextlib.contextmanager
+def show_progress(folder: DatasetFolder, *, silent: bool) -> Iterator[None]:
+    """Draw progress bars while the block runs."""
+    ended = threading.Event()
+    with progress_bars() as bars:
+        watcher = threading.Thread(target=_watch, args=(folder, bars, ended, silent), daemon=True)
+        watcher.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            watcher.join()
+
+
+def _watch(folder: DatasetFolder, bars: Bars, ended: threading.Event, silent: bool) -> None:
+    drawn = _Bars(bars, silent=silent)
+    waits = not silent and not folder.contact_sheet.exists()
+    last = False
+    while not last:
+        last = ended.wait(_POLL_S)
+        with contextlib.suppress(OSError, ValueError):  # a file may vanish between two looks
+            drawn.show(read_progress(folder))
+        if waits and folder.contact_sheet.exists():
+            waits = False
+            bars.console.print(f"First pictures: {folder.contact_sheet}", soft_wrap=True)
+
+
+class _Bars:
+    """Three bars: downloads, objects, and views; a view in progress counts as a fraction."""
+
+    def __init__(self, bars: Bars, *, silent: bool) -> None:
+        self._bars = bars
+        self._downloads, self._objects, self._views = (
+            bars.add_task(name, total=None, note="", visible=not silent)
+            for name in ("download", "objects", "views")
+        )
+        self._already: float | None = None
+        self._most = 0.0
+
+    def show(self, now: Progress) -> None:
+        """Update the bars."""
+        downloads = now.downloads_planned or None
+        objects = now.objects_planned or None
+        self._bars.update(self._downloads, completed=now.downloads_done, total=downloads)
+        self._bars.update(self._objects, completed=now.objects_done, total=objects)
+        if not now.scenes_planned or now.objects_done < now.objects_planned:
+            return
+        if self._already is None:  # rate and ETA leave out the views of earlier runs
+            self._already = now.views_done
+            self._bars.reset(self._views)
+        total = (now.scenes_planned - now.scenes_given_up) * now.num_views - self._already
+        # the bar does not go back where a scene begins again
+        self._most = min(max(self._most, now.views_done - self._already), total)
+        given_up = f", {now.scenes_given_up} given up" if now.scenes_given_up else ""
+        earlier = f", {self._already:.0f} views were there" if self._already else ""
+        self._bars.update(
+            self._views,
+            completed=self._most,
+            total=total,
+            note=f"scenes {now.scenes_done} of {now.scenes_planned}{given_up}{earlier}",
+        )
+
+
+def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json: bool) -> None:
+    """Print the result and the next commands."""
+    rejected = count_by_reason([*read_failures(folder.failures), *outcome.failures])
+    if as_json:
+        _print_json(folder, outcome, rejected, seconds)
+        return
+    statistics = outcome.statistics
+    used = f"{outcome.num_objects_used} of {outcome.num_objects_found}"
+    counts = Counter(entry.licence for entry in read_objects_lock(folder.objects_lock))
+    licences = ", ".join(f"{name} ({count})" for name, count in counts.most_common())
+    licences = licences.replace(USER_PROVIDED, f"{USER_PROVIDED}, taken as yours to use")
+    rows = [("objects used", used), ("licences", licences)]
+    rows += statistics.lines() if statistics else []
+    if outcome.num_scenes_given_up:
+        rows.append(("scenes given up", str(outcome.num_scenes_given_up)))
+    rows += [("rejected", f"{count} x {stage}: {reason}") for stage, reason, count in rejected]
+    if statistics:
+        looked_at = (folder.contact_sheet, folder.report, folder.card)
+        rows.append(("dataset digest", outcome.digest))
+        rows.append(("look at", ", ".join(_shown_path(folder, path) for path in looked_at)))
+    rows += [("wall time", f"{seconds:.0f} s"), ("shards, manifest", folder.display_name)]
+    if rejected:
+        later = "" if statistics else ", once the dataset is finished"
+        rows.append(("why rejected", f"{_shown_path(folder, folder.failures)}{later}"))
+    for text in outcome.notes[:_MAX_NOTES]:
+        note(text)
+    if (more := len(outcome.notes) - _MAX_NOTES) > 0:
+        note(f"{more} more; --json has all")
+    if statistics is None and outcome.digest:
+        print_rows("Dataset finished by another machine, which writes its documents", rows)
+        next_step(["verify", folder.display_name])
+        return
+    if statistics is None:
+        progress = f"{outcome.num_shards} of {outcome.num_shards_planned} shards are there"
+        print_rows(f"Range finished; {progress}", rows)
+        next_step(["status", folder.display_name])
+        return
+    print_rows("Dataset finished", rows)
+    next_step(*_next_steps(folder, statistics))
+
+
+def _next_steps(folder: DatasetFolder, statistics: Statistics) -> Iterator[Sequence[str]]:
+    """Yield the next commands for a finished dataset; training only where it has such scenes."""
+    yield ("verify", folder.display_name)
+    yield ("inspect", folder.display_name)
+    if statistics.scenes_by_split.get("train") and _fits_training(read_head(folder.manifest)):
+        yield ("train", _RUN, "--data", folder.display_name)
+
+
+def _fits_training(manifest: Manifest) -> bool:
+    """Return whether the smallest training preset fits the pictures, and torch is installed."""
+    from train.runs import named_run  # late, so that the first line is printed sooner
+
+    run = named_run(_RUN)
+    pictures = manifest.settings["renders"]["resolution"]
+    has_views = manifest.num_views >= run.views_per_scene
+    return has_views and pictures % run.resolution == 0 and find_spec("torch") is not None
+
+
+def _print_json(
+    folder: DatasetFolder,
+    outcome: "Outcome",
+    rejected: Sequence[tuple[str, str, int]],
+    seconds: float,
+) -> None:
+    statistics = outcome.statistics
+    row: dict[str, object] = {
+        "out": folder.display_name,
+        "dataset_digest": outcome.digest,
+        "finished": bool(outcome.digest),
+        "shards": outcome.num_shards,
+        "shards_planned": outcome.num_shards_planned,
+        "objects_found": outcome.num_objects_found,
+        "objects_used": outcome.num_objects_used,
+        "notes": list(outcome.notes),
+        "scenes_given_up": outcome.num_scenes_given_up,
+        "rejections": [list(row) for row in rejected],
+        "seconds": round(seconds, 1),
+    }
+    if statistics:
+        row["scenes"] = statistics.num_scenes
+        row["views"] = statistics.num_views
+        row["bytes"] = statistics.num_bytes
+    print_json(row)
+
+
+def _shown_path(folder: DatasetFolder, path: Path) -> str:
+    """Return the path or URL of a file of a dataset, for people."""
+    return f"{folder.display_name}/{path.relative_to(folder.root)}"

@@ -3,8 +3,9 @@
 import os
 import shlex
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 from infra.cli.console import (
     first_words,
     look_at,
-    note,
     print_json,
+    print_result,
     print_rows,
     progress_bars,
 )
@@ -65,7 +66,12 @@ def inspect(options: InspectOptions, output: OutputOptions) -> None:
         return
     first_words(f"Reading {safe_url(source)}", silent=output.json)
     opened = open_dataset(source)
-    _require_shards(opened)
+    name = opened.display_name
+    if not opened.manifest.shards:
+        raise TrilightError(
+            f"{name}: the dataset is empty, since none of its shards is finished; expected at "
+            f"least one. See its progress with `trilight status {shlex.quote(name)}`."
+        )
     from pipeline.documents.distributions import dataset_distributions  # slow: matplotlib
 
     with progress_bars() as bars:
@@ -79,28 +85,20 @@ def inspect(options: InspectOptions, output: OutputOptions) -> None:
     if output.json:
         print_json(_as_json(opened, statistics, distributions))
         return
-    _print_summary(opened.display_name, opened, statistics, distributions)
+    _print_summary(name, opened, statistics, distributions)
     look_at(f"Look at {folder.report} and {folder.contact_sheet}" if folder else _READ_ONLY)
 
 
 def _inspect_run(root: Path, *, json: bool) -> None:
     """Print the progress of a training run."""
     facts = run_facts(root)
-    if json:
-        print_json(facts)
-        return
-    print_rows(str(root), [(name.replace("_", " "), str(value)) for name, value in facts.items()])
-    look_at(f"Curves and pictures: {tensorboard_command(root)}")
+    print_result(str(root), _fact_rows(facts), facts, as_json=json)
+    if not json:
+        look_at(f"Curves and pictures: {tensorboard_command(root)}")
 
 
-def _require_shards(opened: Dataset) -> None:
-    if not opened.manifest.shards:
-        raise TrilightError(
-            f"{opened.display_name}: the dataset is empty, since none of its shards is finished; "
-            "expected "
-            "at least one. See its progress with `trilight status "
-            f"{shlex.quote(opened.display_name)}`."
-        )
+def _fact_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    return [(name.replace("_", " "), str(value)) for name, value in facts.items()]
 
 
 def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | None:
@@ -120,15 +118,9 @@ def _inspect_scene(source: str, turntable: Path | None, *, json: bool) -> None:
     from pipeline.generation.inspect_scene import inspect_scene
 
     result = inspect_scene(scene_source(source), turntable)
-    if json:
-        print_json({**result.facts, "notes": list(result.notes)})
-        return
-    for text in result.notes:
-        note(text)
-    print_rows(
-        source, [(name.replace("_", " "), str(value)) for name, value in result.facts.items()]
-    )
-    if turntable is not None:
+    record = {**result.facts, "notes": list(result.notes)}
+    print_result(source, _fact_rows(result.facts), record, notes=result.notes, as_json=json)
+    if turntable is not None and not json:
         look_at(f"Look at {turntable}")
 
 

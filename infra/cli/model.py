@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from infra.cli.console import first_words, print_json, print_rows
 from infra.cli.options import OutputOptions, command
@@ -11,7 +11,6 @@ from storage.settings.described import checked
 from storage.settings.ranges import Within
 
 if TYPE_CHECKING:
-    from model.config import ModelConfig
     from model.costs import Costs, Workload
     from model.renderformer import RenderFormer
 
@@ -51,15 +50,26 @@ def model(options: ModelOptions, files: PublishOptions, output: OutputOptions) -
         raise TrilightError("model: torch is not installed; run `make setup-all`.") from error
     network = None if name in SIZES else _open(name)
     config = network.config if network else SIZES[name]()
-    _require_pictures(config, options.resolution)
+    if options.resolution % config.picture_px:
+        raise TrilightError(
+            f"--resolution is {options.resolution}; expected a multiple of {config.picture_px}, as "
+            "this network's ray bundles and windows need."
+        )
     workload = Workload(
         triangles=options.triangles, views=options.views, resolution=options.resolution
     )
     network_costs = costs(config, workload)
     if files.publish:
-        _publish(name, network, files.publish)
+        if network is None:
+            raise TrilightError(
+                f"model: --publish needs a checkpoint; {name} is a size without weights."
+            )
+        from model.open import save_published
+
+        save_published(network, files.publish)
     if output.json:
-        print_json(_as_json(name, config, workload, network_costs))
+        records = {"config": dataclasses.asdict(config), "workload": dataclasses.asdict(workload)}
+        print_json({"name": name, **records, **dataclasses.asdict(network_costs)})
         return
     _report(name, workload, network_costs)
 
@@ -78,60 +88,20 @@ def _open(name: str) -> "RenderFormer":
         ) from error
 
 
-def _require_pictures(config: "ModelConfig", resolution: int) -> None:
-    if resolution % config.picture_px:
-        raise TrilightError(
-            f"--resolution is {resolution}; expected a multiple of {config.picture_px}, as this "
-            "network's ray bundles and windows need."
-        )
-
-
-def _publish(name: str, network: "RenderFormer | None", folder: Path) -> None:
-    from model.open import save_published
-
-    if network is None:
-        raise TrilightError(
-            f"model: --publish needs a checkpoint; {name} is a size without weights."
-        )
-    save_published(network, folder)
-
-
-def _as_json(
-    name: str, config: "ModelConfig", workload: "Workload", counted: "Costs"
-) -> dict[str, Any]:
-    return {
-        "name": name,
-        "config": dataclasses.asdict(config),
-        "workload": dataclasses.asdict(workload),
-        **dataclasses.asdict(counted),
-    }
-
-
 def _report(name: str, workload: "Workload", counted: "Costs") -> None:
     total = sum(counted.parameters.values())
     flops = sum(counted.flops.values())
     rows = [("parameters", f"{total / 1e6:.2f} M")]
     rows += [(f"  {part}", f"{count / 1e6:.2f} M") for part, count in counted.parameters.items()]
     rows += [("work", f"{flops / 1e9:.1f} GFLOP")]
-    rows += [
-        (f"  {part}", f"{count / 1e9:.1f} GFLOP, {count / flops:.0%}")
-        for part, count in counted.flops.items()
-    ]
-    rows += [
-        (
-            f"memory, {precision}",
-            f"weights {size / 1e6:.0f} MB, "
-            f"encoded scene {counted.scene_bytes[precision] / 1e6:.0f} MB",
-        )
-        for precision, size in counted.weight_bytes.items()
-    ]
-    rows += [
-        (
-            "memory, training",
-            f"{counted.training_bytes / 1e6:.0f} MB: float32 weights, gradients, AdamW; "
-            "without activations",
-        )
-    ]
+    for part, count in counted.flops.items():
+        rows.append((f"  {part}", f"{count / 1e9:.1f} GFLOP, {count / flops:.0%}"))
+    for precision, size in counted.weight_bytes.items():
+        scene_mb = counted.scene_bytes[precision] / 1e6
+        text = f"weights {size / 1e6:.0f} MB, encoded scene {scene_mb:.0f} MB"
+        rows.append((f"memory, {precision}", text))
+    parts = "float32 weights, gradients, AdamW; without activations"
+    rows.append(("memory, training", f"{counted.training_bytes / 1e6:.0f} MB: {parts}"))
     views = f"{workload.views} view{'s' if workload.views > 1 else ''}"
     print_rows(
         f"{name}: {workload.triangles} triangles, {views} of {workload.resolution} pixels", rows

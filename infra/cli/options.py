@@ -21,7 +21,6 @@ from typing import Annotated, Any, get_origin
 from cyclopts import Group, Parameter, Token
 
 from infra.cli.changes import parse_changes
-from infra.cli.completion import NAMES
 from infra.cli.extend_option import resolve_reference
 from storage.errors import TrilightError
 from storage.remote.url import parse_local_path
@@ -84,7 +83,8 @@ def command(*arguments: str) -> Callable[[Callable[..., None]], Callable[..., No
         parameters = {
             field.name: _parameter(field, group, by_place=field.name in arguments)
             for kind in kinds.values()
-            for group in [Group.create_ordered(_title(kind))]
+            for title in [(inspect.getdoc(kind) or "").split("\n")[0].removesuffix(".")]
+            for group in [Group.create_ordered(title)]
             for field in describe_fields(kind)
         }
         assert len(parameters) == sum(len(describe_fields(kind)) for kind in kinds.values()), (
@@ -102,10 +102,6 @@ def command(*arguments: str) -> Callable[[Callable[..., None]], Callable[..., No
         return run
 
     return decorate
-
-
-def _title(kind: type) -> str:
-    return (inspect.getdoc(kind) or "").split("\n")[0].removesuffix(".")
 
 
 def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> inspect.Parameter:
@@ -132,7 +128,7 @@ def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> insp
         choices=choices or None,
         json_list=False,
         completer=complete,
-        converter=None if kind is bool else _several if several else _word,
+        converter=None if kind is bool else _all_words if several else _first_word,
     )
     return inspect.Parameter(
         field.name,
@@ -164,12 +160,11 @@ def _help(
     return f"{sentence} [{'; '.join(facts)}]" if facts else sentence
 
 
-def _word(_: Any, tokens: tuple[Token, ...]) -> str:
-    """Return the word that was typed, unchanged."""
+def _first_word(_: Any, tokens: tuple[Token, ...]) -> str:
     return tokens[0].value
 
 
-def _several(_: Any, tokens: tuple[Token, ...]) -> list[str]:
+def _all_words(_: Any, tokens: tuple[Token, ...]) -> list[str]:
     return [token.value for token in tokens]
 
 
@@ -241,3 +236,36 @@ def is_repeated(hint: Any) -> bool:
 def takes_names(hint: Any) -> bool:
     """Return whether a field takes names with values."""
     return get_origin(unwrap(hint)[0]) in (Mapping, dict)
+
+
+def _builds() -> list[str]:
+    from pipeline.builds.named import BUILDS
+
+    return list(BUILDS)
+
+
+def _runs() -> list[str]:
+    from train.runs import RUNS
+
+    return list(RUNS)
+
+
+def _sizes() -> list[str]:
+    from model.config import SIZES
+
+    return list(SIZES)
+
+
+def _runners() -> list[str]:
+    from pipeline.executors.registry import EXECUTORS
+
+    return list(EXECUTORS)
+
+
+NAMES: dict[str, Callable[[], list[str]]] = {
+    "build": _builds,
+    "run": _runs,
+    "network": _sizes,
+    "runner": _runners,
+}
+"""Known names by the field that takes one; a field may also take a name that is not listed."""

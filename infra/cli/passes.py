@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from infra.cli.console import first_words, note, print_json, print_rows, progress_bars
+from infra.cli.console import first_words, print_result, progress_bars
 from infra.cli.options import OutputOptions, command
 from storage.records.exr import MAX_RESOLUTION
 from storage.records.passes.declared import pass_names
@@ -54,9 +54,6 @@ def passes(options: PassOptions, output: OutputOptions) -> None:
             bars.advance(task)
 
         notes = write_passes(options.source, options.out, selection, done=on_file)
-    if output.json:
-        print_json({"files": [str(path) for path in files], "notes": list(notes), "passes": names})
-        return
-    for text in notes:
-        note(text)
-    print_rows("Passes", [("written", f"{len(files)} files"), ("passes", ", ".join(names))])
+    record = {"files": list(map(str, files)), "notes": list(notes), "passes": names}
+    rows = [("written", f"{len(files)} files"), ("passes", ", ".join(names))]
+    print_result("Passes", rows, record, notes=notes, as_json=output.json)

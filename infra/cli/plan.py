@@ -10,8 +10,7 @@ from infra.cli.console import (
     first_words,
     next_step,
     note,
-    print_json,
-    print_rows,
+    print_result,
     progress_bars,
 )
 from infra.cli.options import OutputOptions, command
@@ -62,11 +61,11 @@ def plan(
         task = bars.add_task("scenes", total=samples, note="", visible=not output.json)
         measured = measure_scenes(order, samples, place, lambda: bars.advance(task))
     prediction = predict_cost(measured, order, cores=cores, usd_per_core_hour=core.price)
-    if output.json:
-        print_json(dataclasses.asdict(prediction))
-        return
     title = f"{build}, {prediction.num_scenes} scenes, predicted from {samples} (90 % intervals)"
-    print_rows(title, _rows(prediction, cores))
+    record = dataclasses.asdict(prediction)
+    print_result(title, _rows(prediction, cores), record, as_json=output.json)
+    if output.json:
+        return
     for text in prediction.notes:
         note(text)
     next_step((*generate_words(order), "--out", _free(order.place)))

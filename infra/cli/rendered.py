@@ -6,10 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from rich.text import Text
 
-from infra.cli.console import console, print_json, print_rows
-from infra.render.comparison import Flicker
+from infra.cli.console import console, note, print_json, print_rows
 from infra.render.look import enlargement
 from infra.render.networks import NetworkRenderer
 from infra.render.path_tracer import PathTracer
@@ -28,11 +26,7 @@ _FLOORS = {
 }
 """Metric by the name of the stated error (noise floor) of a path traced picture."""
 
-_FILTERS = {
-    "fast": "one fast denoise",
-    "high": "one denoise",
-    "off": "not denoised",
-}
+_FILTERS = {"fast": "one fast denoise", "high": "one denoise", "off": "not denoised"}
 
 _MEANING = {
     "psnr_linear_db": ": linear, clamped to [0, 1]",
@@ -61,8 +55,8 @@ def print_outcome(outcome: RenderResult, seconds: float, *, as_json: bool) -> No
         video = plan.output.video
         print_json({**common, "pictures": shots, "video": None if video is None else str(video)})
         return
-    for note in outcome.notes:
-        console.print(Text(f"Note: {note}.", style="yellow"))
+    for text in outcome.notes:
+        note(text)
     if plan.output.is_sequence:
         _print_sequence(plan, outcome.shots, seconds)
     else:
@@ -71,14 +65,15 @@ def print_outcome(outcome: RenderResult, seconds: float, *, as_json: bool) -> No
 
 def _shot_json(done: FinishedShot, *, timed: bool) -> dict[str, Any]:
     """Return the figures of one shot; those of a single renderer are not nested."""
-    by_renderer: Mapping[str, Any] = {
-        name: {**picture.facts, "exr": str(picture.path), "kept": picture.was_kept}
-        | ({"picture_seconds": _round_seconds(picture.seconds)} if timed else {})
-        for name, picture in done.pictures.items()
-    }
-    for facts in by_renderer.values():
+    by_renderer: dict[str, Any] = {}
+    for name, picture in done.pictures.items():
+        facts: dict[str, Any] = {**picture.facts}
         if "at_cap" in facts:
             facts["at_cap"] = bool(facts["at_cap"])
+        if timed:
+            seconds = picture.seconds
+            facts["picture_seconds"] = None if seconds is None else float(f"{seconds:.4g}")
+        by_renderer[name] = {**facts, "exr": str(picture.path), "kept": picture.was_kept}
     if len(by_renderer) == 1:
         (by_renderer,) = by_renderer.values()
     else:
@@ -129,18 +124,13 @@ def _describe(renderer: Renderer, facts: Facts) -> Rows:
             rows = [("noise floor", floors[0]), *(("", floor) for floor in floors[1:])]
             mean = f"{facts['mean_radiance']:.4g} (radiance), that of its samples"
             rows = [("samples per pixel", f"{facts['spp']}"), *rows, ("mean brightness", mean)]
-            return [*rows, *_layers(settings, facts)]
+            for part in settings.part_names:
+                floor_db = float(facts[f"{part}.noise_floor_db"])
+                rows.append((f"layer {part}", f"{floor_db:.1f} dB (psnr_log_db)"))
+            return rows
         case NetworkRenderer():
             return [("network", f"{renderer.checkpoint}; passes: {facts['passes']}")]
     raise TypeError(f"{renderer.name} is a renderer without a description")
-
-
-def _layers(settings: RenderSettings, facts: Facts) -> Rows:
-    """Return a row for each layer of the file with its noise floor."""
-    return [
-        (f"layer {part}", f"{float(facts[f'{part}.noise_floor_db']):.1f} dB (psnr_log_db)")
-        for part in settings.part_names
-    ]
 
 
 def _floor(settings: RenderSettings, facts: Facts, name: str, metric: str) -> str:
@@ -183,7 +173,11 @@ def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: fl
     for metric, values in floors.items():
         rows += _spread("noise floor" if metric == "psnr_log_db" else "", values, metric)
     rows += _spread("agreement", agreements, "psnr_log_db")
-    rows += _flicker([shot.flicker for shot in shots if shot.flicker is not None])
+    if flickers := [shot.flicker for shot in shots if shot.flicker is not None]:
+        db = np.median([flicker.db for flicker in flickers])
+        noise_db = np.median([flicker.noise_db for flicker in flickers])
+        text = f"median {db:.1f} dB from frame to frame; the traced frames' noise alone"
+        rows.append(("flicker", f"{text} {noise_db:.1f}"))
     rows += _time_rows(plan, shots)
     rows.append(("wall time", f"{seconds:.1f} s"))
     print_rows("Rendered", rows)
@@ -202,22 +196,9 @@ def _time_rows(plan: RenderPlan, shots: Sequence[FinishedShot]) -> Rows:
     return [("picture took", f"{text}; expected {plan.choice.priced.seconds:.2g} s")]
 
 
-def _round_seconds(seconds: float | None) -> float | None:
-    return None if seconds is None else float(f"{seconds:.4g}")
-
-
 def _spread(name: str, values_db: Sequence[float], metric: str) -> Rows:
     if not values_db:
         return []
     median = np.median(values_db)
     low = np.percentile(values_db, 5)
     return [(name, f"median {median:.1f} dB, 5th percentile {low:.1f} dB ({metric})")]
-
-
-def _flicker(flickers: Sequence[Flicker]) -> Rows:
-    if not flickers:
-        return []
-    median = np.median([flicker.db for flicker in flickers])
-    noise = np.median([flicker.noise_db for flicker in flickers])
-    text = f"median {median:.1f} dB from frame to frame; the traced frames' noise alone {noise:.1f}"
-    return [("flicker", text)]

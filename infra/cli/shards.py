@@ -11,7 +11,7 @@ from infra.cli.console import (
     next_step,
     note,
     print_json,
-    print_rows,
+    print_result,
     print_table,
     progress_bars,
 )
@@ -152,17 +152,15 @@ def _run(datasets: Sequence[Path], derive: DeriveOptions, out: Path, *, as_json:
             out,
             progress=lambda done, total: bars.update(task, completed=done, total=total),
         )
-    if as_json:
-        print_json(
-            {
-                "bytes": statistics.num_bytes,
-                "dataset_digest": digest,
-                "out": str(out),
-                "scenes": statistics.num_scenes,
-                "scenes_by_split": statistics.scenes_by_split,
-                "views": statistics.num_views,
-            }
-        )
-        return
-    print_rows("Dataset finished", [*statistics.lines(), ("dataset digest", digest)])
-    next_step(["verify", str(out)])
+    record = {
+        "bytes": statistics.num_bytes,
+        "dataset_digest": digest,
+        "out": str(out),
+        "scenes": statistics.num_scenes,
+        "scenes_by_split": statistics.scenes_by_split,
+        "views": statistics.num_views,
+    }
+    rows = [*statistics.lines(), ("dataset digest", digest)]
+    print_result("Dataset finished", rows, record, as_json=as_json)
+    if not as_json:
+        next_step(["verify", str(out)])

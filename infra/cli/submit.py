@@ -1,24 +1,47 @@
 """`trilight submit`: runs `generate` by workers of a Prefect server, or as an array of tasks."""
 
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App
 
 from infra.cli.changes import BaseSettings, with_base_settings
-from infra.cli.console import first_words, next_step
-from infra.cli.flow_runs import FlowRunOptions, run_flow
+from infra.cli.console import (
+    console,
+    first_words,
+    next_step,
+    note,
+    print_json,
+    print_rows,
+    progress_bars,
+)
 from infra.cli.options import OutputOptions, command
-from infra.cli.submit_array import ARRAYS, ArrayOptions, submit_to_array
-from pipeline.executors.array_job import DatasetByArray
-from pipeline.executors.kubernetes_array import KubernetesOptions
+from pipeline.executors.array_job import ArrayJob, DatasetByArray, array_job
+from pipeline.executors.kubernetes_array import (
+    KubernetesOptions,
+    create_command,
+    submit_job,
+    write_job_file,
+)
+from pipeline.executors.slurm_array import sbatch_command, sbatch_environment, submit_array
 from pipeline.flows.prefect_server import load_prefect
 from pipeline.generation.dataset_order import DatasetOrder
 from storage.errors import TrilightError
+from storage.number_ranges import number_ranges
 from storage.settings.described import checked
+from storage.settings.ranges import Within
+
+if TYPE_CHECKING:
+    from pipeline.flows.submission import RunStatus, SubmittedRun
 
 app = App(name="submit", usage="trilight submit FLOW BUILD [OPTIONS]")
 BY_ARRAY = "make-by-array"
 """Flow that submits an array to a scheduler and shows the progress of its tasks."""
+SLURM = "slurm"
+ARRAYS = (SLURM, "kubernetes")
+"""Schedulers that take an array of tasks."""
 FLOWS = ("generate-scenes", "prepare-assets", "build-dataset")
 """Flows that take the options of `trilight generate`."""
 
@@ -38,6 +61,30 @@ class SubmitOptions:
                 f"flow {self.flow!r} is unknown; expected one of {served}, or of "
                 f"{', '.join(ARRAYS)}."
             )
+
+
+@checked()
+class FlowRunOptions:
+    """Prefect server."""
+
+    deployment: str | None = None
+    """Name of the flow's deployment; by default local (make serve), or the only one."""
+    no_watch: bool = False
+    """Return once the server has the run, without watching it."""
+
+
+@checked()
+class ArrayOptions:
+    """Array (slurm or kubernetes)."""
+
+    shards_per_task: Annotated[int | None, Within(1, 10**6, unit="shards")] = None
+    """Number of shards of an array task; by default as few as 1000 tasks allow."""
+    at_once: Annotated[int | None, Within(1, 10**6, unit="tasks")] = None
+    """Maximum number of tasks at the same time; by default the cluster decides."""
+    sbatch: tuple[str, ...] = ()
+    """slurm: further options of sbatch, such as --sbatch=--partition=cpu; by default none."""
+    dry_run: bool = False
+    """Write the files and print the commands, but submit nothing."""
 
 
 @app.default
@@ -86,3 +133,127 @@ def _submit_flow(
     ended = run_flow(flow, values, runs, where=order.place, as_json=output.json)
     if ended and not output.json and Path(order.place).is_dir():
         next_step(["verify", order.place], ["inspect", order.place])
+
+
+def submit_to_array(
+    order: DatasetOrder, on: str, array: ArrayOptions, machines: KubernetesOptions, *, as_json: bool
+) -> None:
+    """Submit the missing shards of a dataset and print the job; raises TrilightError."""
+    if on == SLURM and machines != KubernetesOptions():
+        raise TrilightError(
+            "submit slurm: --image, --where and the other options of machines are those of "
+            "submit kubernetes; leave them out, and use --sbatch."
+        )
+    if on != SLURM and array.sbatch:
+        raise TrilightError(f"submit {on}: --sbatch is an option of submit slurm; leave it out.")
+    first_words(f"Looking for what is missing of {order.place}", silent=as_json)
+    job = array_job(order, per_task=array.shards_per_task, at_once=array.at_once, on=on)
+    if not job.tasks:
+        if as_json:
+            print_json({"job": None, "array": "", "shards_per_task": None})
+            return
+        print_rows("Nothing is missing", [("dataset", order.place)])
+        next_step(["verify", order.place])
+        return
+    numbers = number_ranges(job.tasks)
+    record: dict[str, Any] = {"array": numbers, "shards_per_task": job.per_task}
+    if on == SLURM:
+        name = None if array.dry_run else submit_array(job, array.sbatch)
+        line = _slurm_line(job, array.sbatch)
+    else:
+        manifest = (write_job_file if array.dry_run else submit_job)(job, machines)
+        name = manifest.parent.name
+        words = create_command(manifest)
+        line = shlex.join(words)
+        record |= {"files": [str(manifest)], "commands": [words], "submitted": not array.dry_run}
+    if as_json:
+        print_json({"job": name, **record})
+        return
+    rows = [("tasks", f"{len(job.tasks)}: {numbers}"), ("shards a task", str(job.per_task))]
+    rows += [("job", name)] if name else []
+    print_rows("Would be submitted" if array.dry_run else "Submitted", rows)
+    if array.dry_run:
+        console.print(line, soft_wrap=True)
+        return
+    note("the same command submits again what is missing then, once no task is left in the queue")
+    next_step(["status", order.place])
+
+
+def _slurm_line(job: ArrayJob, options: Sequence[str]) -> str:
+    """Return the shell command; it makes the folder of the logs, without which all tasks fail."""
+    variables = sbatch_environment(job).items()
+    settings = [f"{name}={shlex.quote(value)}" for name, value in variables]
+    return " ".join(["mkdir -p logs &&", *settings, shlex.join(sbatch_command(job, options))])
+
+
+def run_flow(
+    flow: str, parameters: Mapping[str, Any], runs: FlowRunOptions, *, where: str, as_json: bool
+) -> bool:
+    """Run a flow by a worker of the server; print its progress and its summary.
+
+    Args:
+        where: folder or URL of the dataset, for the summary.
+
+    Returns:
+        Whether the run has ended; False where it is not watched.
+
+    Raises:
+        TrilightError: there is no such server or deployment, or the run failed.
+    """
+    from pipeline.flows import submission as prefect  # Prefect reads its settings at the import
+
+    with prefect.server() as client:
+        run = prefect.submit(client, flow, runs.deployment, parameters)
+        if not as_json:
+            console.print(f"Run {run.name} of {run.deployment}: {run.page}", soft_wrap=True)
+            ends = f"prefect flow-run cancel {run.id} ends it"
+            console.print(f"Ctrl-C here leaves it running; {ends}", soft_wrap=True)
+            if not prefect.workers_online(client, run.pool):
+                start = f"prefect worker start --pool {run.pool}"
+                text = f"no worker of the pool {run.pool} is online, and the run waits for one"
+                note(f"{text}: {start}")
+        if runs.no_watch:
+            if as_json:
+                print_json({"flow_run": str(run.id), "deployment": run.deployment})
+            return False
+        last = _watch_run(prefect.poll_run(client, run.id), silent=as_json)
+    _report(run, last, where, as_json=as_json)
+    return True
+
+
+def _watch_run(looks: "Iterable[RunStatus]", *, silent: bool) -> "RunStatus":
+    """Draw the progress of a run, and return its last state."""
+    last = None
+    with progress_bars() as bars:
+        bar = bars.add_task("percent", total=100, note="", visible=not silent)
+        for look in looks:
+            if not silent and (last is None or last.state != look.state):
+                bars.console.print(look.state)
+            scenes = dict(look.tables.get("progress", ())).get("scenes in shards")
+            note = f"scenes {scenes}" if scenes else ""
+            bars.update(bar, completed=round(look.percent), note=note)
+            last = look
+    assert last is not None  # a run has at least one look
+    return last
+
+
+def _report(run: "SubmittedRun", last: "RunStatus", where: str, *, as_json: bool) -> None:
+    rows: Sequence[tuple[str, str]] = last.tables.get("summary", ())
+    if as_json:
+        print_json(
+            {
+                "flow_run": str(run.id),
+                "deployment": run.deployment,
+                "state": last.state,
+                "message": last.message,
+                "summary": dict(rows),
+            }
+        )
+    elif last.is_completed:
+        print_rows(f"{run.deployment} finished", [*rows, ("where", where)])
+    if not last.is_completed:
+        reason = last.message.rstrip(".") or "no reason given"
+        raise TrilightError(
+            f"{run.deployment}: the run ended as {last.state}: {reason}. Its log is "
+            f"at {run.page}; the same command goes on with what is missing."
+        )

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, NoReturn
 
 from rich.progress import Progress as Bars
 from rich.progress import TaskID
-from rich.text import Text
 
 from infra.cli.changes import BaseSettings, all_changes, run_record
-from infra.cli.console import console, look_at, next_step, print_rows, progress_bars
+from infra.cli.console import console, look_at, next_step, note, print_rows, progress_bars
 from infra.cli.options import OutputOptions, command
 from infra.run_record import tensorboard_command
 from infra.torch_library import require_torch
@@ -28,7 +27,6 @@ from train.settings import TrainSettings
 
 if TYPE_CHECKING:
     from train.result import TrainResult
-    from train.resume import Event
 
 
 class _BarProgress(TrainProgress):
@@ -40,7 +38,7 @@ class _BarProgress(TrainProgress):
         self._first_step = 0
 
     def note(self, text: str) -> None:
-        console.print(Text(f"Note: {text}.", style="yellow"))
+        note(text)
 
     def begin(
         self,
@@ -187,7 +185,11 @@ def _report(result: "TrainResult", data: Sequence[str]) -> None:
         *_validation_rows(result),
         ("steps", f"{result.num_steps}, of which {result.skipped_steps} not finite and skipped"),
         *(("left out", message) for message in result.unusable),
-        *(("changed", _event_text(event)) for event in result.history if event.kind == "meaning"),
+        *(
+            ("changed", f"{event.name} from {event.before} to {event.after} at step {event.step}")
+            for event in result.history
+            if event.kind == "meaning"
+        ),
         ("wall time", f"{result.seconds / 60:.1f} min"),
         ("weights", str(result.folder.weights)),
     ]
@@ -197,12 +199,6 @@ def _report(result: "TrainResult", data: Sequence[str]) -> None:
     if result.scores is not None:
         named = [word for each in data for word in ("--data", each)]
         next_step(["evaluate", str(result.folder.root), *named, "--split", "validation"])
-
-
-def _event_text(event: "Event") -> str:
-    before = event.before
-    after = event.after
-    return f"{event.name} from {before} to {after} at step {event.step}"
 
 
 def _validation_rows(result: "TrainResult") -> list[tuple[str, str]]:

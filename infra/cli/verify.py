@@ -120,24 +120,16 @@ def _as_json(verification: Verification) -> dict[str, object]:
 
 def _report(verification: Verification, *, fast: bool) -> None:
     manifest = verification.manifest
+    shards = f"{len(manifest.shards)}"
+    title = "Verified"
+    if not verification.is_finished:
+        shards += f" of {verification.num_shards_planned}"
+        title = "Unfinished; everything present is valid"
     rows = [
         ("dataset digest", manifest.dataset_digest),
-        ("shards", f"{_shards(verification)}, {manifest.num_bytes / 1e6:.1f} MB"),
+        ("shards", f"{shards}, {manifest.num_bytes / 1e6:.1f} MB"),
         ("scenes", f"{verification.num_samples} of {manifest.num_scenes} planned"),
         ("checked", "sizes and counts" if fast else "hashes, members, laws, pictures, splits"),
         *(("wrong", problem) for problem in verification.problems),
     ]
-    print_rows(_verdict(verification), rows)
-
-
-def _shards(verification: Verification) -> str:
-    count = len(verification.manifest.shards)
-    return (
-        f"{count}" if verification.is_finished else f"{count} of {verification.num_shards_planned}"
-    )
-
-
-def _verdict(verification: Verification) -> str:
-    if verification.problems:
-        return "Does not match its manifest"
-    return "Verified" if verification.is_finished else "Unfinished; everything present is valid"
+    print_rows("Does not match its manifest" if verification.problems else title, rows)

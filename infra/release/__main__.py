@@ -14,10 +14,8 @@ import cyclopts
 from cyclopts import Parameter
 
 from infra.cli.console import first_words, next_step, print_rows, progress_bars
-from infra.release.hub_limits import require_within_limits
-from infra.release.page import write_page
-from infra.release.pictures import chosen_scenes, compare_scenes
-from infra.release.push import NETWORK_FILE, kind_of
+from infra.release.page import chosen_scenes, compare_scenes, write_page
+from infra.release.push import NETWORK_FILE, kind_of, require_within_limits
 from model.open import BUILTIN_NETWORKS
 from pipeline.documents.sums import write_sums
 from storage.atomic import write_atomically

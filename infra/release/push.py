@@ -1,18 +1,19 @@
-"""Upload of a folder to a repository of the Hugging Face hub, by the package huggingface_hub."""
+"""Upload of a folder to a repository of the Hugging Face hub, by the package huggingface_hub.
+
+The hub's limits are from https://huggingface.co/docs/hub/storage-limits, "Repository limitations"
+(2026-11).
+"""
 
 import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-from infra.release.hub_limits import require_within_limits
-from pipeline.documents.sums import SUMS, UNPUBLISHED, stale_sums
+from pipeline.documents.sums import SUMS, UNPUBLISHED, published_files, stale_sums
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-
-if TYPE_CHECKING:
-    from huggingface_hub import HfApi
 
 RepositoryKind = Literal["dataset", "model", "space"]
 
@@ -21,6 +22,19 @@ NETWORK_FILE = "model.safetensors"
 _PART = r"(?!\S*(?:--|\.\.))\w(?:[\w.-]{0,94}\w)?"
 _REPOSITORY = re.compile(f"{_PART}/{_PART}", re.ASCII)
 """Names that huggingface_hub accepts; it would refuse others only later."""
+
+_NO_TOKEN = (
+    "{repository}: the hub takes uploads from its owner alone; set HF_TOKEN to a token that may "
+    "write there, or run hf auth login."
+)
+MOST_FILES = 100_000
+"""Maximum number of files of a repository."""
+
+MOST_ENTRIES = 10_000
+"""Maximum number of entries of a folder."""
+
+MOST_FILE_BYTES = 20_000_000_000
+"""Maximum size of a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,11 +46,8 @@ class Upload:
     repository: str
     """Name of the repository as USER/NAME."""
     kind: RepositoryKind
-    """Kind of the repository on the hub."""
     files: int
-    """Number of files to upload."""
     num_bytes: int
-    """Size of all files together."""
 
 
 def kind_of(folder: Path) -> RepositoryKind:
@@ -107,8 +118,12 @@ def push(upload: Upload, *, private: bool) -> str:
             exist_ok=True,
             space_sdk="static" if upload.kind == "space" else None,
         )
-        if private:
-            _require_private(hub, upload)
+        # an existing repository is never changed
+        if private and not hub.repo_info(upload.repository, repo_type=upload.kind).private:
+            raise TrilightError(
+                f"{upload.repository}: is there already and public; expected a private one. Make "
+                "it private in its settings on the hub, or leave out --private."
+            )
         hub.upload_folder(
             repo_id=upload.repository,
             repo_type=upload.kind,
@@ -129,21 +144,6 @@ def push(upload: Upload, *, private: bool) -> str:
     return str(made.url)
 
 
-def _require_private(hub: "HfApi", upload: Upload) -> None:
-    """Refuse a public repository if the upload should be private; never change an existing one."""
-    if not hub.repo_info(upload.repository, repo_type=upload.kind).private:
-        raise TrilightError(
-            f"{upload.repository}: is there already and public; expected a private one. Make it "
-            "private in its settings on the hub, or leave out --private."
-        )
-
-
-_NO_TOKEN = (
-    "{repository}: the hub takes uploads from its owner alone; set HF_TOKEN to a token that may "
-    "write there, or run hf auth login."
-)
-
-
 def _broken_off(upload: Upload, what: str, error: Exception) -> TrilightError:
     said = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
     return TrilightError(
@@ -162,3 +162,28 @@ def _require_sound(folder: Path) -> None:
             f"{folder}: is damaged ({verification.problems[0].rstrip('.')}); expected a whole "
             f"dataset. See trilight verify {folder}."
         )
+
+
+def require_within_limits(folder: Path) -> tuple[int, int]:
+    """Return the numbers of files and bytes of a folder's upload.
+
+    Raises:
+        TrilightError: the folder is empty, or exceeds the hub's limits.
+    """
+    files = list(published_files(folder))
+    sizes = {path: path.stat().st_size for path in files}
+    entries = Counter(path.parent for path in files).most_common(1)
+    largest = max(sizes, key=lambda path: sizes[path], default=None)
+    for got, limit, what in (
+        (len(files), MOST_FILES, "files"),
+        (entries[0][1] if entries else 0, MOST_ENTRIES, "entries in one folder"),
+        (sizes[largest] if largest else 0, MOST_FILE_BYTES, f"bytes in one file, {largest}"),
+    ):
+        if got > limit:
+            raise TrilightError(
+                f"{folder}: {got} {what}; the hub advises at most {limit}. Make larger or smaller "
+                "shards: trilight shards reshard."
+            )
+    if not files:
+        raise TrilightError(f"{folder}: holds no file; expected a finished dataset or a network.")
+    return len(files), sum(sizes.values())

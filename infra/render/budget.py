@@ -69,10 +69,11 @@ class Choice:
         """The choice as one line of text."""
         one = self.priced
         lead = "chosen" if self.fits else "nothing is as quick; the quickest is chosen"
+        seconds = f"{one.seconds:.2g}" if one.seconds < 10 else f"{one.seconds:.0f}"
         return (
             f"{self.budget}: {lead}: {one.samples or NETWORK}; expected {one.db:.1f} dB in the "
             f"median of {self.scenes} scenes at {one.judged_px} pixels ({one.least_db:.1f} in the "
-            f"worst), in {_seconds_text(one.seconds)} s after start-up; {self.costs}"
+            f"worst), in {seconds} s after start-up; {self.costs}"
         )
 
     @property
@@ -97,9 +98,6 @@ def price_all(
     """Return every row of the table with its expected cost and error.
 
     Args:
-        table: numbers of samples and the network, with their errors.
-        costs: costs of the parts of pictures.
-        width: width of a picture in pixels.
         threads: number of threads; no more than there are cores.
         per_scene: pictures that share the loading of a scene, at least 1.
         network: whether the network can run here; it is offered only between the widths at which it
@@ -186,13 +184,12 @@ def _part_seconds(costs: PictureCosts, width: int, threads: int) -> dict[str, fl
     for row in costs.rows:
         seconds = max(row.serial_s + row.parallel_s / threads, _LEAST_S)
         by_part.setdefault(row.part, {})[row.width] = seconds
-    return {part: _cost_at(width, by_width) for part, by_width in by_part.items()}
-
-
-def _cost_at(width: int, by_width: Mapping[int, float]) -> float:
-    logs = {each: math.log(seconds) for each, seconds in by_width.items()}
-    inside = math.exp(_at_width(width, logs))
-    return inside * max(width / max(by_width), 1.0) ** 2
+    part_s = {}
+    for part, by_width in by_part.items():
+        logs = {each: math.log(seconds) for each, seconds in by_width.items()}
+        beyond = max(width / max(by_width), 1.0)
+        part_s[part] = math.exp(_at_width(width, logs)) * beyond**2
+    return part_s
 
 
 def _at_width(width: int, by_width: Mapping[int, float]) -> float:
@@ -200,7 +197,3 @@ def _at_width(width: int, by_width: Mapping[int, float]) -> float:
     widths = sorted(by_width)
     values = [by_width[each] for each in widths]
     return float(np.interp(math.log2(width), np.log2(widths), values))
-
-
-def _seconds_text(seconds: float) -> str:
-    return f"{seconds:.2g}" if seconds < 10 else f"{seconds:.0f}"

@@ -52,10 +52,15 @@ def log_error(neural_rgb: NDArray[np.float32], traced_rgb: NDArray[np.float32]) 
 
 def flicker(before: Frame | None, now: Frame) -> Flicker | None:
     """Return the flicker from one frame to the next; None where their scenes do not belong."""
-    if before is None or not _is_same_sequence(before.source, now.source):
+    if before is None:
+        return None
+    # one scene or frames of one stage, unlike the scenes of a shard
+    is_stage = not FORMATS[now.source.path.suffix.lower()].always_many
+    if before.source != now.source and not (is_stage and before.source.path == now.source.path):
         return None
     noise = 10 ** (-before.noise_floor_db / 10) + 10 ** (-now.noise_floor_db / 10)
-    return Flicker(db=flicker_log_db(before.error_RR3, now.error_RR3), noise_db=_db(noise))
+    noise_db = float(-10 * np.log10(max(noise, 1e-10)))
+    return Flicker(db=flicker_log_db(before.error_RR3, now.error_RR3), noise_db=noise_db)
 
 
 def comparison_sheet(
@@ -82,14 +87,3 @@ def comparison_sheet(
         sheet.paste(Image.fromarray(pixels), (column_px, _CAPTION_PX))
         draw.text((column_px + 2, 3), caption, fill=_INK, font=font)
     return np.asarray(sheet)
-
-
-def _is_same_sequence(before: SceneSource, now: SceneSource) -> bool:
-    """Return whether both are one scene or frames of one stage, unlike the scenes of a shard."""
-    if before == now:
-        return True
-    return before.path == now.path and not FORMATS[now.path.suffix.lower()].always_many
-
-
-def _db(mean_square: float) -> float:
-    return float(-10 * np.log10(max(mean_square, 1e-10)))

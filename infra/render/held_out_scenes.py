@@ -43,8 +43,6 @@ def composing_child(
     """Return a child that composes and renders the scenes of a preset; the caller closes it.
 
     Args:
-        build: settings of the preset.
-        objects: source of the objects.
         folder: empty folder for the record of the objects.
         threads: CPU threads of Mitsuba and the denoiser; None for all cores.
         variant: Mitsuba variant; None for that of the CPU, or of TRILIGHT_VARIANT.

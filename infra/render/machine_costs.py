@@ -67,7 +67,6 @@ def costs_of(table: PreviewTable, timed: PartSeconds, cores: int, machine: str) 
         timed: mean seconds of the probes' parts, on one thread and on `cores`; a part without a
             time keeps its shipped cost.
         cores: maximum number of threads.
-        machine: name of this machine.
     """
     then = {(row.part, row.width): row.serial_s + row.parallel_s for row in table.probe.rows}
     rows = []

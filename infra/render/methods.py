@@ -54,7 +54,7 @@ def network_labels(paths: Sequence[str]) -> tuple[str, ...]:
 
 def samples_name(level: tuple[int, Filtered]) -> str:
     """Return the row's name of a number of samples with a filter."""
-    return f"{level[0]} sample{'s' if level[0] > 1 else ''}, {level[1]}"
+    return f"{FixedSamples(spp=level[0], denoiser=level[1]).count}, {level[1]}"
 
 
 def kind_of(name: str) -> str:
@@ -82,9 +82,7 @@ def compared_renderers(
     view, as those of `trilight render --orbit`.
 
     Args:
-        resolution: width in pixels.
         networks: networks by the names of their rows.
-        child: render child, which the previews share.
         levels: samples per pixel and filters of the previews.
     """
     compared: list[Renderer] = [DirectLightRenderer(resolution=resolution)]

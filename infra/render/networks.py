@@ -33,6 +33,23 @@ class SceneHere:
         return self.render_image(camera)
 
 
+class RendererHere:
+    """Base of renderers that hold nothing outside of this process."""
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """What all pictures lack: nothing."""
+        return ()
+
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        """Everything but scene and camera that decides a picture, as JSON values."""
+        return {}
+
+    def close(self) -> None:
+        """Do nothing: what is held is freed with this process."""
+
+
 def image_here(view: Callable[[], NDArray[np.float32]], facts: Facts) -> Image:
     """Return the linear radiance [R, R, 3] of a function as a picture, clipped to half floats."""
     began_s = time.process_time()
@@ -45,7 +62,7 @@ def image_here(view: Callable[[], NDArray[np.float32]], facts: Facts) -> Image:
 
 
 @dataclass(kw_only=True, eq=False)
-class NetworkRenderer:
+class NetworkRenderer(RendererHere):
     """Trained network, read when first needed."""
 
     checkpoint: str
@@ -116,12 +133,9 @@ class NetworkRenderer:
             notes=prepared.notes,
         )
 
-    def close(self) -> None:
-        """Do nothing: the network is freed with this process."""
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class DirectLightRenderer:
+class DirectLightRenderer(RendererHere):
     """Direct light of lamps, as the view stage `hits` traces it.
 
     Nothing is gathered or mirrored and no network runs. Light is sampled by points on the lamps
@@ -130,7 +144,6 @@ class DirectLightRenderer:
 
     resolution: int
     name: str = "direct light, no network"
-    notes: Sequence[str] = ()
 
     @property
     def identity(self) -> Mapping[str, Any]:
@@ -168,9 +181,6 @@ class DirectLightRenderer:
             seconds=time.perf_counter() - began,
             cpu_seconds=time.process_time() - began_s,
         )
-
-    def close(self) -> None:
-        """Do nothing: nothing is held."""
 
 
 def traced_network() -> "NeuralRenderer":

@@ -29,12 +29,10 @@ class PictureFile:
     """Picture on disk, without its pixels, since a video may have thousands."""
 
     path: Path
-    """Path of the EXR file."""
     facts: Facts
     was_kept: bool
     """True where an equal file existed already."""
     is_black: bool
-    """True where all pixels are 0."""
     seconds: float | None
     """Wall-clock seconds of rendering, those of loading the scene included for its first picture;
     None where the file was kept."""
@@ -46,10 +44,8 @@ def header_of(
     """Return the header of a picture, without times and folders: everything that decides it.
 
     Args:
-        renderer: what makes the picture.
         source: name of the scene's file, without its folders.
         scene_sha256: digest of the scene by storage.records.scene_file.scene_digest.
-        camera: camera of the picture.
     """
     pose: dict[str, Any] = {"c2w": camera.c2w.tolist(), "fov_deg": camera.fov_deg}
     values = {

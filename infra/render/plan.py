@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from infra.render.budget import Choice, choose, price_all
-from infra.render.cameras import camera_path, orbit, own_camera, pair_cameras
 from infra.render.look import Look
 from infra.render.networks import NetworkRenderer
 from infra.render.options import EngineChoice, RenderOptions
@@ -15,7 +14,7 @@ from infra.render.output_paths import OutputPaths, output_paths
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.preview_table import known_costs, shipped_table
 from infra.render.quality import Budget, FixedSamples, Traced
-from infra.render.sources import scene_sources
+from infra.render.sources import camera_path, orbit, own_camera, pair_cameras, scene_sources
 from infra.torch_library import require_torch
 from pipeline.exchange.open_scene import SceneSource, scene_source
 from pipeline.exchange.reader import SceneReader
@@ -40,7 +39,6 @@ class Shot:
     exrs: Mapping[str, Path]
     """Paths of the EXR files by the name of their renderer."""
     png: Path
-    """Path of the PNG file for people."""
     keep: bool
     """True to keep existing files of an equal picture."""
 
@@ -60,13 +58,10 @@ class RenderPlan:
     resolution: int
     """Width of every picture in pixels."""
     look: Look
-    """Display options of the PNG files."""
     output: OutputPaths
-    """Paths of pictures and video."""
     shots: Sequence[Shot]
     """Pictures in order; those of one scene are consecutive."""
     fps: int
-    """Frames per second of the video."""
     choice: Choice | None = None
     """Samples or network for a budget, with their expected cost and error; None without one."""
 
@@ -89,7 +84,7 @@ def plan_render(options: RenderOptions, reader: SceneReader) -> RenderPlan:
     if options.out.suffix.lower() == ".exr":
         scene_source(options.source)  # reports a wrong name before any library is loaded
     output = output_paths(options.out)
-    pairs = _pairs(options, reader) if output.is_sequence else _one_pair(options)
+    pairs = _pairs(options, reader, output)
     if isinstance(quality, Budget):
         choice = _choose(quality, pairs, resolution, options.threads)
         renderers = _renderers(options, choice.priced.samples, None, resolution)
@@ -175,13 +170,11 @@ def _choose(budget: Budget, pairs: Pairs, resolution: int, threads: int | None) 
     return choose(budget, candidates, table, known, resolution)
 
 
-def _one_pair(options: RenderOptions) -> Pairs:
-    if options.orbit is not None or options.cameras is not None:
+def _pairs(options: RenderOptions, reader: SceneReader, output: OutputPaths) -> Pairs:
+    if not output.is_sequence:
+        if options.orbit is None and options.cameras is None:
+            return [(scene_source(options.source), options.view)]
         raise TrilightError(f"--out is {options.out}; expected a folder, X.mp4 or X.webp for many.")
-    return [(scene_source(options.source), options.view)]
-
-
-def _pairs(options: RenderOptions, reader: SceneReader) -> Pairs:
     sources = scene_sources(options.source, reader)
     cameras: Sequence[Camera | int] = [options.view]
     if options.cameras is not None:

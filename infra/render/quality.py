@@ -24,7 +24,6 @@ class ToStatedError:
     targets: NoiseTargets = USUAL_TARGETS
     """Target errors; psnr_log_db of 40 where none is set."""
     max_spp: int = MOST_TRACED_SPP
-    """Maximum number of samples per pixel."""
     split: bool = False
     """True to keep direct and indirect light apart."""
     split_lobes: bool = False
@@ -61,11 +60,15 @@ class FixedSamples:
     spp: int
     """Number of paths through each pixel, from 1."""
     denoiser: Filtered
-    """Filter of Open Image Denoise."""
+
+    @property
+    def count(self) -> str:
+        """The number of samples as text, such as `4 samples`."""
+        return f"{self.spp} sample{'s' if self.spp > 1 else ''}"
 
     def __str__(self) -> str:
         """Return samples and filter as text."""
-        return f"{self.spp} sample{'s' if self.spp > 1 else ''} a pixel, filter {self.denoiser}"
+        return f"{self.count} a pixel, filter {self.denoiser}"
 
     def settings(self, resolution: int) -> PreviewSettings:
         """Return the settings at a width in pixels; raises TrilightError if it is invalid."""

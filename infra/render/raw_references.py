@@ -46,8 +46,6 @@ def raw_reference(scene: Scene, camera: PixelCamera, spp: int, *name: int) -> Ra
     """Return two halves of raw samples of a view; runs in a render child.
 
     Args:
-        scene: scene that passes `Scene.check`.
-        camera: camera of the view.
         spp: samples per pixel of both halves together, a multiple of 128.
         name: numbers that the seeds are derived from.
     """

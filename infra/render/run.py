@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from infra.render.budget import Choice
-from infra.render.cameras import own_camera
 from infra.render.comparison import Flicker, Frame, comparison_sheet, flicker, log_error
 from infra.render.look import Look, display_pixels
+from infra.render.output_paths import write_video
 from infra.render.picture_file import (
     PictureFile,
     Radiance,
@@ -19,7 +19,7 @@ from infra.render.picture_file import (
     write_picture,
 )
 from infra.render.plan import RenderPlan, Shot
-from infra.render.video import write_video
+from infra.render.sources import own_camera
 from pipeline.documents.png import encode_png
 from pipeline.exchange.formats import SceneSource
 from pipeline.exchange.reader import SceneReader
@@ -40,7 +40,6 @@ class FinishedShot:
     scene_sha256: str
     """SHA-256 of the scene by storage.records.scene_file.scene_digest."""
     num_triangles: int
-    """Number of triangles of the scene, emitting ones included."""
     num_lights: int
     """Number of emitter objects of the scene, not of their triangles."""
     pictures: Mapping[str, PictureFile]
@@ -57,7 +56,6 @@ class RenderResult:
 
     plan: RenderPlan
     shots: Sequence[FinishedShot]
-    """Results in the order of the plan's shots."""
     notes: Sequence[str]
     """Warnings about scenes and pictures, each once."""
 

@@ -42,9 +42,14 @@ def grant(url: str) -> dict[str, str]:
     Raises:
         TrilightError: the checkout holds a prefect.toml of the user, or a file cannot be written.
     """
-    _require_no_other_link()
+    if LINK.exists() and not LINK.is_symlink() and not os.environ.get("TRILIGHT_STATE"):
+        raise TrilightError(
+            f"make serve: {LINK} is a file of your own; expected none, because a link to the "
+            "server's password goes there. Move its settings to your profile (prefect config set)."
+        )
     password = os.environ.get(PASSWORD) or new_password()
-    text = "\n".join(["[api]", f"url = {_toml(url)}", f"auth_string = {_toml(password)}", ""])
+    quoted = [json.dumps(each, ensure_ascii=False) for each in (url, password)]  # as TOML does
+    text = "[api]\nurl = {}\nauth_string = {}\n".format(*quoted)
     file = settings_file()
     file.unlink(missing_ok=True)
     with open_private(file, "w") as stream:
@@ -70,15 +75,3 @@ def next_command() -> str:
     if not os.environ.get("TRILIGHT_STATE"):
         return command
     return f"cd {shlex.quote(str(state_folder()))} && {command}"
-
-
-def _require_no_other_link() -> None:
-    if LINK.exists() and not LINK.is_symlink() and not os.environ.get("TRILIGHT_STATE"):
-        raise TrilightError(
-            f"make serve: {LINK} is a file of your own; expected none, because a link to the "
-            "server's password goes there. Move its settings to your profile (prefect config set)."
-        )
-
-
-def _toml(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)

@@ -2,26 +2,35 @@
 
     python -m infra.serving.deployments NAME TEMPLATE
 
-makes the pool NAME as the file TEMPLATE says, the limits of flows (infra.serving.limits), and each
-deployment of that name; what is there already is replaced, and keeps its schedules. The server is
-the one that Prefect's settings name. Prefect's own commands do the same in three processes, where
-`prefect deploy` executes a flow's file anew for each deployment: 19 processor seconds and not 4.
+makes the pool NAME as the file TEMPLATE says, the limits of flows, and each deployment of that
+name; what is there already is replaced, and keeps its schedules. The server is the one that
+Prefect's settings name. A flow takes a slot of a limit while it writes documents, and while it uses
+a GPU; a limit that does not exist limits nothing, so the limits come first. Prefect's own commands
+do the same in three processes, where `prefect deploy` executes a flow's file anew for each
+deployment: 19 processor seconds and not 4.
 """
 
 import importlib
 import json
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from infra.serving.limits import limits
+from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
 from pipeline.flows.prefect_server import load_prefect, prefect_client
+from pipeline.renders.visible_gpus import visible_gpus
 from storage.errors import TrilightError
 from storage.installation import FILES_ROOT
 
 _KINDS = {"local": "process"}
 """Kinds of workers, by pools that are not named after theirs."""
+
+_DISK_SLOTS = 2
+"""Number of runs that may write documents at the same time: each reads its whole dataset."""
+
+_MOST_CARDS = 100_000
 
 
 def deploy(name: str, template: Path) -> None:
@@ -76,6 +85,31 @@ def _deploy_flow(row: dict[str, Any]) -> None:
     deployment.storage = LocalStorage(folder["directory"])
     deployment.entrypoint = row["entrypoint"]
     deployment.apply()
+
+
+def limits(environment: Mapping[str, str]) -> dict[str, int]:
+    """Return the number of slots by limit.
+
+    Args:
+        environment: TRILIGHT_CARDS is the number of GPUs of all workers, if these have others than
+            this machine.
+
+    Raises:
+        TrilightError: TRILIGHT_CARDS is no number of GPUs.
+    """
+    return {DISK_LIMIT: _DISK_SLOTS, GPU_LIMIT: _cards(environment)}
+
+
+def _cards(environment: Mapping[str, str]) -> int:
+    """Return the number of GPUs, at least 1, because a limit of 0 would block every flow."""
+    text = environment.get("TRILIGHT_CARDS")
+    if text is None:
+        return len(visible_gpus()) or 1
+    if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= _MOST_CARDS:
+        raise TrilightError(
+            f"TRILIGHT_CARDS is {text!r}; expected a whole number from 1 to {_MOST_CARDS}."
+        )
+    return int(text)
 
 
 if __name__ == "__main__":

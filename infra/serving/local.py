@@ -63,7 +63,6 @@ def start(*, host: str, port: int, workers: int) -> str:
 
     Args:
         host: host name or IPv4 address to bind to.
-        port: port of the server.
         workers: number of workers of the pool; each runs one flow at a time.
 
     Raises:
@@ -84,7 +83,9 @@ def start(*, host: str, port: int, workers: int) -> str:
         server = [*SERVER, "--host", host, "--port", str(port)]
         process = _launch("server", server, environment)
         wait_until_healthy(url, process, _log("server"))
-        _prepare(environment)
+        _say(f"making the pool `{POOL}`, its limits and the deployments")
+        deploy = [sys.executable, "-m", f"{__package__}.deployments", POOL]
+        _call([*deploy, "infra/serving/pool.json"], environment)
         _say(f"starting {workers} worker{'s' if workers > 1 else ''}")
         for number, share in enumerate(shares):
             name = f"worker-{number}"
@@ -157,13 +158,6 @@ def running(*, without: str | None = None) -> list[int]:
             if alive and mark in variables and not other:
                 pids.append(int(place.name))
     return pids
-
-
-def _prepare(environment: Mapping[str, str]) -> None:
-    """Create pool, limits and deployments, or replace existing ones."""
-    _say(f"making the pool `{POOL}`, its limits and the deployments")
-    module = f"{__package__}.deployments"
-    _call([sys.executable, "-m", module, POOL, "infra/serving/pool.json"], environment)
 
 
 def _call(command: Sequence[str], environment: Mapping[str, str]) -> None:

@@ -1,20 +1,21 @@
 """Request handlers of a dataset's page: rows, thumbnails, and any scene as a page below it."""
 
 import dataclasses
+import functools
 import re
-from collections import OrderedDict
 from pathlib import Path
 
 from infra.render.path_tracer import RenderChild
-from infra.viewer.dataset_filter import SceneFilter, filter_of
-from infra.viewer.dataset_index import DatasetIndex, SceneRow
-from infra.viewer.open_scenes import OpenScenes
-from infra.viewer.page_renderers import StoredPictures, page_renderers
-from infra.viewer.scene_handlers import SceneHandlers
+from infra.viewer.dataset_index import DatasetIndex, SceneFilter, SceneRow, filter_of
+from infra.viewer.scene_handlers import (
+    MOST_THUMBNAILS,
+    OpenScenes,
+    SceneHandlers,
+    handlers_of_scene,
+    thumbnail_png,
+)
 from infra.viewer.server import NotFound, Request, Response, Route, json_response
-from pipeline.documents.png import encode_png
-from pipeline.documents.scene_page import preview
-from storage.conventions import preview_gain
+from pipeline.exchange.formats import LoadedScene
 from storage.dataset.dataset import Dataset, LocalFiles, reading
 from storage.dataset.shard import read_member, scan_samples
 from storage.errors import TrilightError
@@ -24,7 +25,6 @@ from storage.remote.safe_url import safe_url
 MOST_ROWS = 200
 """Maximum number of scenes in one response."""
 
-_MOST_THUMBNAILS = 1000
 _WIDEST = 1024
 _KEY = re.compile(r"[0-9A-Za-z_\-]+")
 
@@ -46,7 +46,7 @@ class DatasetHandlers:
         self._source = source
         self._child = child
         self._checkpoint = checkpoint
-        self._thumbnails = OrderedDict[tuple[str, int, int], bytes]()
+        self._png = functools.lru_cache(MOST_THUMBNAILS)(self._small_png)
         self._scenes = OpenScenes(_KEY, self._open_scene)
         self.index = DatasetIndex(dataset)
         self.index.begin()
@@ -117,15 +117,9 @@ class DatasetHandlers:
             raise NotFound("the scene has no such view.")
         if not width.isdecimal() or not 16 <= int(width) <= _WIDEST:
             raise TrilightError(f"px is {width:.10}; expected 16 to {_WIDEST}.")
-        key_view_px = (key, int(view), int(width))
-        png = self._thumbnails.get(key_view_px)
-        if png is None:
-            png = self._thumbnails[key_view_px] = self._small_picture(row, int(view), int(width))
-            while len(self._thumbnails) > _MOST_THUMBNAILS:
-                self._thumbnails.popitem(last=False)
-        return Response(body=png, kind="image/png")
+        return Response(body=self._png(row, int(view), int(width)), kind="image/png")
 
-    def _small_picture(self, row: SceneRow, view: int, width: int) -> bytes:
+    def _small_png(self, row: SceneRow, view: int, width: int) -> bytes:
         shard = self._dataset.manifest.shards[row.shard]
         with (
             self._dataset.files.open(shard, checked=False) as stream,
@@ -134,22 +128,15 @@ class DatasetHandlers:
             samples = scan_samples(stream, shard.name)
             members = next(members for key, members in samples if key == row.key)
             radiance_rgb = decode_exr(read_member(stream, members[f"{view}.exr"]))
-        return encode_png(preview(radiance_rgb * preview_gain(radiance_rgb), width))
+        return thumbnail_png(radiance_rgb, width)
 
     def _open_scene(self, key: str) -> SceneHandlers:
         row = self.index.row(key)
         shard = self._dataset.manifest.shards[row.shard]
         (sample,) = self._dataset.read_samples(shard, [key])
         floors = [view.noise_floor_db for view in sample.views]
-        target = StoredPictures(
-            scene=sample.scene, radiance_rgb=sample.radiance_rgb, errors_db=floors
-        )
+        loaded = LoadedScene(scene=sample.scene, notes=(), radiance_rgb=sample.radiance_rgb)
         is_here = isinstance(self._dataset.files, LocalFiles)
-        return SceneHandlers(
-            source=f"{Path(self._source) / shard.name}::{key}" if is_here else "",
-            name=f"scene {key}, {row.split}",
-            scene=sample.scene,
-            notes=(),
-            renderers=page_renderers(self._child, target, self._checkpoint),
-            target_px=target.resolution,
-        )
+        place = f"{Path(self._source) / shard.name}::{key}" if is_here else ""
+        name = f"scene {key}, {row.split}"
+        return handlers_of_scene(name, loaded, place, self._child, self._checkpoint, floors)

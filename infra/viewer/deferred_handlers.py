@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Protocol
 
 from infra.run_record import is_run, tensorboard_command
-from infra.viewer.server import Request, Response, Route, dispatch
-from infra.viewer.static_files import static_routes
+from infra.viewer.server import Request, Response, Route, dispatch, static_routes
 from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError
 

@@ -3,27 +3,25 @@
 A file is read when its row becomes visible, by one child with limits; thumbnails have few samples.
 """
 
+import functools
 import re
 import threading
-from collections import OrderedDict
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
 
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import FixedSamples
-from infra.viewer.open_scenes import OpenScenes
-from infra.viewer.page_renderers import StoredPictures, page_renderers
-from infra.viewer.scene_handlers import SceneHandlers
+from infra.viewer.scene_handlers import (
+    MOST_THUMBNAILS,
+    OpenScenes,
+    SceneHandlers,
+    handlers_of_scene,
+    thumbnail_png,
+)
 from infra.viewer.scene_list import SceneList
 from infra.viewer.server import NotFound, Request, Response, Route, json_response
-from pipeline.documents.png import encode_png
-from pipeline.documents.scene_page import preview
 from pipeline.exchange.formats import LoadedScene
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
-from storage.conventions import preview_gain
 from storage.records.lights import num_lights
 from storage.renderer import Camera
 
@@ -32,7 +30,6 @@ THUMBNAIL_PX = 128
 
 _THUMBNAIL = FixedSamples(spp=4, denoiser="fast")
 
-_MOST_THUMBNAILS = 1000
 _NUMBER = re.compile(r"\d{1,5}", re.ASCII)
 
 
@@ -47,7 +44,7 @@ class FolderHandlers:
         self._reader = SceneReader()
         self._reading = threading.Lock()
         self._last: tuple[int, LoadedScene] | None = None
-        self._thumbnails = OrderedDict[int, bytes]()
+        self._png = functools.lru_cache(MOST_THUMBNAILS)(self._small_png)
         self._scenes = OpenScenes(_NUMBER, self._open_scene)
 
     def gets(self) -> dict[str, Route]:
@@ -95,22 +92,17 @@ class FolderHandlers:
         )
 
     def _thumbnail(self, request: Request) -> Response:
-        number = self._number(request, "api/thumbnail/")
-        png = self._thumbnails.get(number)
-        if png is None:
-            radiance_rgb = self._small_picture(number, self._load(number))
-            exposed = radiance_rgb * preview_gain(radiance_rgb)
-            png = self._thumbnails[number] = encode_png(preview(exposed, THUMBNAIL_PX))
-            while len(self._thumbnails) > _MOST_THUMBNAILS:
-                self._thumbnails.popitem(last=False)
+        png = self._png(self._number(request, "api/thumbnail/"))
         return Response(body=png, kind="image/png")
 
-    def _small_picture(self, number: int, loaded: LoadedScene) -> NDArray[np.float32]:
+    def _small_png(self, number: int) -> bytes:
+        loaded = self._load(number)
         if loaded.radiance_rgb is not None and len(loaded.radiance_rgb):
-            return loaded.radiance_rgb[0]
+            return thumbnail_png(loaded.radiance_rgb[0], THUMBNAIL_PX)
         tracer = PathTracer(self._child, _THUMBNAIL, THUMBNAIL_PX)
         traced = tracer.load(loaded.scene, self._files.names[number])
-        return traced.render(Camera.of_scene(loaded.scene, 0)).radiance_rgb
+        image = traced.render(Camera.of_scene(loaded.scene, 0))
+        return thumbnail_png(image.radiance_rgb, THUMBNAIL_PX)
 
     def _number(self, request: Request, prefix: str) -> int:
         text = request.path.removeprefix(prefix)
@@ -133,25 +125,4 @@ class FolderHandlers:
         name = self._files.names[number]
         loaded = self._load(number)
         place = str(self._files.root / name)
-        return handlers_of_scene(name, loaded, self._child, self._checkpoint, place)
-
-
-def handlers_of_scene(
-    name: str,
-    loaded: LoadedScene,
-    child: RenderChild,
-    checkpoint: str | None,
-    source: str,
-) -> SceneHandlers:
-    """Return the handlers of a loaded scene; they do not close the render child."""
-    target = None
-    if loaded.radiance_rgb is not None and len(loaded.radiance_rgb):
-        target = StoredPictures(scene=loaded.scene, radiance_rgb=loaded.radiance_rgb)
-    return SceneHandlers(
-        name=name,
-        scene=loaded.scene,
-        notes=loaded.notes,
-        renderers=page_renderers(child, target, checkpoint),
-        target_px=None if target is None else target.resolution,
-        source=source,
-    )
+        return handlers_of_scene(name, loaded, place, self._child, self._checkpoint)

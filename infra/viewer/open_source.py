@@ -5,7 +5,8 @@ from pathlib import Path
 from infra.render.path_tracer import RenderChild
 from infra.viewer.dataset_handlers import DatasetHandlers
 from infra.viewer.deferred_handlers import PageHandlers, page_of
-from infra.viewer.folder_handlers import FolderHandlers, handlers_of_scene
+from infra.viewer.folder_handlers import FolderHandlers
+from infra.viewer.scene_handlers import handlers_of_scene
 from infra.viewer.scene_list import scene_list
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
@@ -34,7 +35,7 @@ def open_handlers(source: str, *, checkpoint: str | None, threads: int | None) -
     with SceneReader() as reader:
         loaded = reader.load(file, pictures=True)
     child = _child(threads)
-    room = handlers_of_scene(file.name, loaded, child, checkpoint, source)
+    room = handlers_of_scene(file.name, loaded, source, child, checkpoint)
     room.child = child
     return room
 

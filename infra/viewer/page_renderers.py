@@ -4,13 +4,13 @@ import functools
 import importlib.util
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.render.networks import NetworkRenderer, SceneHere
+from infra.render.networks import NetworkRenderer, RendererHere, SceneHere
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import FixedSamples, ToStatedError
 from infra.viewer.picture_options import PictureOptions
@@ -41,7 +41,6 @@ class PageRenderer:
     means: str
     """Description on the page, one sentence."""
     make: Callable[[PictureOptions], Renderer]
-    """Function that returns the renderer of a request."""
     words: Sequence[str] = ()
     """Options of `trilight render` for the same picture; without them, path tracing."""
 
@@ -55,13 +54,11 @@ class PassImage(Image):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PassRenderer:
+class PassRenderer(RendererHere):
     """Pass of the visible surfaces, such as depth: a function of scene and camera without light."""
 
     pass_view: PassView
     resolution: int
-    notes: Sequence[str] = ()
-    identity: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -71,9 +68,6 @@ class PassRenderer:
     def load(self, scene: Scene, name: str) -> SceneHere:
         """Return the scene as it is."""
         return SceneHere(render_image=functools.partial(self._render, scene))
-
-    def close(self) -> None:
-        """Do nothing: nothing is held."""
 
     def _render(self, scene: Scene, camera: Camera) -> Image:
         (name,) = pass_names([self.pass_view.word])
@@ -95,7 +89,7 @@ class PassRenderer:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StoredPictures:
+class StoredPictures(RendererHere):
     """Pictures that a dataset or an HDF5 file holds of the scene's own cameras."""
 
     scene: Scene
@@ -104,8 +98,6 @@ class StoredPictures:
     errors_db: Sequence[float] = ()
     """Stated errors as psnr_log_db; may be empty."""
     name: str = "target"
-    notes: Sequence[str] = ()
-    identity: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def resolution(self) -> int:
@@ -117,9 +109,6 @@ class StoredPictures:
         if scene is not self.scene:
             raise Unrenderable("The file's picture shows the scene without your changes.")
         return SceneHere(render_image=self._look_up)
-
-    def close(self) -> None:
-        """Do nothing: nothing is held."""
 
     def _look_up(self, camera: Camera) -> Image:
         if camera.view is None or camera.view >= len(self.radiance_rgb):
@@ -140,9 +129,7 @@ def page_renderers(
     """Return the renderers by name, in the order of the page.
 
     Args:
-        child: render child of this page.
         target: pictures of the file; None where it holds none.
-        checkpoint: network of the user; may be None.
     """
     offered = {
         "traced": PageRenderer(
@@ -192,7 +179,7 @@ def samples_on_page(child: RenderChild, spp: int) -> PageRenderer:
     """Return a preview of a number of samples per pixel with one denoise."""
     quality = FixedSamples(spp=spp, denoiser=usual_filter(spp))
     return PageRenderer(
-        title=f"{spp} sample{'s' if spp > 1 else ''}, filtered",
+        title=f"{quality.count}, filtered",
         means=f"{spp} path{'s' if spp > 1 else ''} a pixel, then Open Image Denoise "
         f"({quality.denoiser}).",
         make=lambda options: PathTracer(child, quality, options.resolution),

@@ -12,9 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from infra.viewer.edits import apply_edits
 from infra.viewer.page_renderers import PageRenderer, PassImage
-from infra.viewer.picture_options import PictureOptions
+from infra.viewer.picture_options import PictureOptions, apply_edits
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.scene import Scene
@@ -51,7 +50,6 @@ class RenderJob:
     scene_core_s: float | None = None
     """CPU seconds of the scene's preparation; None where they are unknown."""
     notes: Sequence[str] = ()
-    """Warnings about the scene with this renderer."""
     sampling: Sampling | None = None
     """Progress of a path tracer since the last image."""
     error: str = ""

@@ -1,10 +1,16 @@
-"""Request handlers of a scene's page: the scene in 3D, pictures by every engine, and exports."""
+"""Request handlers of a scene's page: the scene in 3D, pictures by every engine, and exports.
 
+Below the page of many scenes, the most recent ones stay open.
+"""
+
+import dataclasses
 import json
+import re
 import shlex
 import tempfile
 import threading
-from collections.abc import Mapping, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,18 +18,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.render.look import Look, ToneMap, tone_mapped
+from infra.render.look import ToneMap, tone_mapped
 from infra.render.path_tracer import RenderChild
-from infra.viewer.page_renderers import PageRenderer, PassImage
-from infra.viewer.picture_options import parse_edits, parse_picture_options
+from infra.viewer.page_renderers import PageRenderer, PassImage, StoredPictures, page_renderers
+from infra.viewer.picture_options import parse_edits, parse_picture_options, short_digest
 from infra.viewer.render_queue import RenderJob, RenderQueue, agreement_db
 from infra.viewer.scene_bytes import scene_bytes, sky_bytes, texture_png
-from infra.viewer.server import NotFound, Request, Response, Route, json_response
+from infra.viewer.server import (
+    NotFound,
+    Request,
+    Response,
+    Route,
+    dispatch,
+    json_response,
+    static_routes,
+)
 from pipeline.documents.png import encode_png
+from pipeline.documents.scene_page import preview
 from pipeline.exchange.convert import write_scene
-from pipeline.exchange.formats import FORMATS
+from pipeline.exchange.formats import FORMATS, LoadedScene
 from pipeline.exchange.renderformer_json import camera_entry
-from storage.digests import canonical_json, sha256_hex
+from storage.conventions import preview_gain
 from storage.errors import TrilightError
 from storage.records.lights import num_lights
 from storage.records.scene import Scene
@@ -42,7 +57,14 @@ CAMERA = "camera.json"
 EDITED = "scene.safetensors"
 """Names of saved files in the commands that the page shows."""
 
+MOST_THUMBNAILS = 1000
+"""Maximum number of small pictures that a page keeps."""
+
 _OCTETS = "application/octet-stream"
+MOST_OPEN = 3
+"""Maximum number of scenes whose pages stay open."""
+
+_BELOW = re.compile(r"scene/([^/]+)/(.*)", re.DOTALL)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -50,12 +72,10 @@ class SceneHandlers:
     """Handlers of one scene and its pictures."""
 
     name: str
-    """Title of the scene on the page."""
     scene: Scene
     notes: Sequence[str]
     """Losses of the conversion from the scene's file."""
     renderers: Mapping[str, PageRenderer]
-    """Renderers by name, in the order of the page."""
     target_px: int | None
     """Width in pixels of the pictures in the file; None without such pictures."""
     source: str = ""
@@ -189,13 +209,48 @@ class SceneHandlers:
         edits = parse_edits(body)
         if suffix not in EXPORTS or not self._is_offered(suffix):
             raise TrilightError(f"form {suffix:.20}: expected one of {' '.join(EXPORTS)}.")
-        key = sha256_hex(canonical_json(edits))[:24]
+        key = short_digest(edits)
         with self._writing, tempfile.TemporaryDirectory(prefix="trilight-view-") as folder:
             path = Path(folder) / f"scene{suffix}"
             lost = write_scene(path, self.queue.scene(key, edits))
             data = path.read_bytes()
         said = "; ".join(lost).encode("ascii", "replace").decode()[:800]
         return Response(body=data, kind=_OCTETS, headers={"X-Lost": said} if said else {})
+
+
+def handlers_of_scene(
+    name: str,
+    loaded: LoadedScene,
+    source: str,
+    child: RenderChild,
+    checkpoint: str | None,
+    errors_db: Sequence[float] = (),
+) -> SceneHandlers:
+    """Return the handlers of a loaded scene; they do not close the render child.
+
+    Args:
+        source: scene as `trilight render` takes it; empty where it cannot.
+        child, checkpoint: render child and network of the page.
+        errors_db: stated errors of the pictures as psnr_log_db.
+    """
+    target = None
+    if loaded.radiance_rgb is not None and len(loaded.radiance_rgb):
+        target = StoredPictures(
+            scene=loaded.scene, radiance_rgb=loaded.radiance_rgb, errors_db=errors_db
+        )
+    return SceneHandlers(
+        name=name,
+        scene=loaded.scene,
+        notes=loaded.notes,
+        renderers=page_renderers(child, target, checkpoint),
+        target_px=None if target is None else target.resolution,
+        source=source,
+    )
+
+
+def thumbnail_png(radiance_rgb: NDArray[np.float32], width: int) -> bytes:
+    """Return a picture [R, R, 3] of linear radiance as a small PNG, exposed for looking."""
+    return encode_png(preview(radiance_rgb * preview_gain(radiance_rgb), width))
 
 
 def _job_record(job: RenderJob, reference: RenderJob | None) -> Mapping[str, Any]:
@@ -235,5 +290,42 @@ def _tone_map(radiance_rgb: NDArray[np.float32], query: Mapping[str, str]) -> ND
         raise TrilightError("ev: expected a number of stops.") from error
     if not -32 <= exposure_ev <= 32:
         raise TrilightError(f"ev is {exposure_ev}; expected -32 to 32.")
-    look = Look(tone_map=tone_map, exposure_ev=exposure_ev)
-    return tone_mapped(radiance_rgb * np.float32(2.0**look.exposure_ev), look.tone_map)
+    return tone_mapped(radiance_rgb * np.float32(2.0**exposure_ev), tone_map)
+
+
+class OpenScenes:
+    """Handlers of the most recent scenes by key, each at `scene/KEY/`."""
+
+    def __init__(self, key: re.Pattern[str], open_scene: Callable[[str], SceneHandlers]) -> None:
+        """Store the pattern of keys, and the function that opens a scene by its key."""
+        self._key = key
+        self._open_scene = open_scene
+        self._opening = threading.Lock()
+        self._open = OrderedDict[str, SceneHandlers]()
+
+    def get(self, request: Request) -> Response:
+        """Respond to a GET request."""
+        room, below = self._scene_handlers(request)
+        return dispatch({**static_routes("scene.html"), **room.gets()}, below)
+
+    def post(self, request: Request) -> Response:
+        """Respond to a POST request."""
+        room, below = self._scene_handlers(request)
+        return dispatch(room.posts(), below)
+
+    def close(self) -> None:
+        """Stop rendering, and wait for its end."""
+        for room in self._open.values():
+            room.close()
+
+    def _scene_handlers(self, request: Request) -> tuple[SceneHandlers, Request]:
+        match = _BELOW.fullmatch(request.path)
+        if match is None or not self._key.fullmatch(match[1]):
+            raise NotFound("there is no such scene.")
+        key = match[1]
+        with self._opening:
+            room = self._open.pop(key, None) or self._open_scene(key)
+            self._open[key] = room
+            while len(self._open) > MOST_OPEN:
+                self._open.popitem(last=False)[1].queue.close()
+        return room, dataclasses.replace(request, path=match[2])

@@ -1,19 +1,27 @@
-"""HTTP server of a page: dispatches guarded requests by a table of routes, on loopback only."""
+"""HTTP server of a page on loopback: guards requests, and dispatches them by a table of routes.
+
+The address holds a secret token, as the first component of every path. A browser sends the host
+name of its request and the origin of the requesting page. Both must be those of this server, so
+that DNS rebinding and a guessed port fail. Static files are listed when the server starts, so that
+a request's path only selects from a list.
+"""
 
 import contextlib
+import hmac
 import json
 import math
+import secrets
 import socket
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, unquote
 
-from infra.viewer.guard import HOST, SAFE_HEADERS, new_token, refusal
 from storage.errors import TrilightError
 
 MOST_CONNECTIONS = 32
@@ -27,6 +35,42 @@ _MOST_AWAITED = 64
 
 _STALLED_S = 30.0
 """Seconds without progress after which a connection is dropped."""
+
+HOST = "127.0.0.1"
+"""Address of the server, which only this machine reaches."""
+
+_ONCE = ("host", "origin", "sec-fetch-site", "sec-fetch-dest", "content-length")
+"""Headers that may stand only once, since another program might read the other one of two."""
+
+MAX_PATH = 4096
+"""Maximum number of characters of a path with its query."""
+
+MAX_BODY_BYTES = 1 << 18
+"""Maximum size of a request's body in bytes."""
+
+SAFE_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}
+"""Headers of every response; none lets another origin read it."""
+
+Refusal = tuple[HTTPStatus, str]
+"""Status of a refused request, and the reason as a sentence that the page shows."""
+
+STATIC = Path(__file__).with_name("static")
+_KINDS = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".svg": "image/svg+xml",
+    "": "text/plain; charset=utf-8",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,7 +215,7 @@ class _Handler(BaseHTTPRequestHandler):
         refused = refusal(method, self.path, self.headers.items(), port=port, token=token)
         if refused is not None:
             self.close_connection = True
-            self._send_sentence(refused.status, refused.sentence)
+            self._send_sentence(*refused)
             return
         data = self.rfile.read(int(self.headers["Content-Length"])) if method == "POST" else b""
         self.server.note_arrival(self.connection)
@@ -231,3 +275,67 @@ def _parse_number(text: str) -> float:
     if not math.isfinite(value):
         raise ValueError(text)
     return int(text) if text.removeprefix("-").isdecimal() else value
+
+
+def new_token() -> str:
+    """Return a new secret token for an address."""
+    return secrets.token_urlsafe(24)
+
+
+def refusal(
+    method: str, path: str, pairs: Iterable[tuple[str, str]], *, port: int, token: str
+) -> Refusal | None:
+    """Return why a request is refused, or None where it is allowed.
+
+    Args:
+        path: path as it was sent, with its query.
+        pairs: headers of the request, names in any case.
+        port: port of the server.
+        token: secret token of the address.
+    """
+    server_address = f"{HOST}:{port}"
+    pairs = [(name.lower(), value) for name, value in pairs]
+    headers = dict(pairs)
+    if len(path) > MAX_PATH:
+        return HTTPStatus.REQUEST_URI_TOO_LONG, "The address is too long."
+    if any([name for name, _ in pairs].count(name) > 1 for name in _ONCE):
+        return HTTPStatus.BAD_REQUEST, "A header is there twice."
+    if headers.get("host") != server_address:
+        only = f"Only http://{server_address} is answered, and no other name of this machine."
+        return HTTPStatus.FORBIDDEN, only
+    origin = headers.get("origin")
+    site = headers.get("sec-fetch-site", "none")
+    # a followed link with the whole address is allowed: the browser leaves the other page
+    followed = method == "GET" and headers.get("sec-fetch-dest") == "document"
+    near = site in ("none", "same-origin") or followed
+    if origin not in (None, f"http://{server_address}") or not near:
+        return HTTPStatus.FORBIDDEN, "Pages of other origins are not answered."
+    if method == "POST" and origin is None:
+        return HTTPStatus.FORBIDDEN, "The request does not say from which page it comes."
+    sent_token = path.split("?")[0].removeprefix("/").split("/")[0]
+    if not hmac.compare_digest(sent_token.encode(), token.encode()):
+        return HTTPStatus.FORBIDDEN, "Open the whole address that `trilight view` printed."
+    length = headers.get("content-length", "")
+    if method == "POST" and not (length.isascii() and length.isdecimal()):
+        return HTTPStatus.LENGTH_REQUIRED, "The request has no length."
+    if method == "POST" and (len(length) > 9 or int(length) > MAX_BODY_BYTES):
+        return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "The request is too large."
+    return None
+
+
+def static_routes(page: str) -> dict[str, Route]:
+    """Return the routes of the files below `static/`, and of the page at the root."""
+    files = {
+        path.relative_to(STATIC).as_posix(): path for path in STATIC.rglob("*") if path.is_file()
+    }
+
+    def file(request: Request) -> Response:
+        name = request.path.removeprefix("static/")
+        if name not in files:
+            raise NotFound("there is no such file.")
+        return Response(body=files[name].read_bytes(), kind=_KINDS[files[name].suffix])
+
+    def index(request: Request) -> Response:
+        return Response(body=files[page].read_bytes(), kind=_KINDS[".html"])
+
+    return {"": index, "static/": file}

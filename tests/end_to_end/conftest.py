@@ -14,23 +14,17 @@ import numpy as np
 import pytest
 
 from infra.cli.app import main
+from tests.command_line import run_program
 
 Trilight = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
 @pytest.fixture
 def trilight(tmp_path: Path) -> Trilight:
-    """Run `trilight` with arguments in an empty folder, as a user does."""
+    """Run `trilight` in an empty folder, as a user does, and require its exit status."""
 
-    def run(*arguments: str) -> "subprocess.CompletedProcess[str]":
-        return subprocess.run(
-            command(*arguments),
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=600,
-            check=False,
-        )
+    def run(*arguments: str, status: int = 0) -> "subprocess.CompletedProcess[str]":
+        return run_program(command(*arguments), tmp_path, status=status)
 
     return run
 

@@ -18,7 +18,7 @@ from model.neural_renderer import NeuralRenderer
 from model.open import open_network, save_published
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from pipeline.exchange.convert import write_scene
-from pipeline.exchange.open_scene import load_source, scene_source
+from pipeline.exchange.open_scene import scene_source
 from pipeline.generation.inspect_scene import _facts
 from pipeline.renders.variant import choose_variant
 from scene_templates.families import DEFAULT_FAMILIES
@@ -28,7 +28,6 @@ from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from storage.records.material import EMISSION, PUBLISHED_COLUMNS
 from storage.records.scene import Scene
-from storage.records.scene_file import scene_digest
 from tests.columns_kit import COAT, TINT, WITH_COAT, declared
 from tests.for_each import for_each
 from tests.infra.child_here import use_children_here
@@ -173,20 +172,6 @@ def test_the_published_form_refuses_it(tmp_path: Path) -> None:
     config = dataclasses.replace(tiny_config("dpt"), material_columns=WITH_COAT)
     with pytest.raises(TrilightError, match="material_columns .*coat"):
         save_published(awake(config), tmp_path)
-
-
-@for_each("form", ["safetensors", "usdc"])
-def test_a_scene_comes_back_from_exact_forms_and_others_say_their_loss(
-    tmp_path: Path, form: str
-) -> None:
-    scene = composed(0)
-    for other in ("json", "h5"):
-        notes = write_scene(tmp_path / f"a.{other}", scene)
-        assert any("materials.coat" in note for note in notes)
-    assert write_scene(tmp_path / f"a.{form}", scene) == ()
-    back = load_source(scene_source(str(tmp_path / f"a.{form}"))).scene
-    assert np.array_equal(back.materials, scene.materials)
-    assert scene_digest(back) == scene_digest(scene)
 
 
 def test_the_shipped_network_gives_the_same_bytes_and_says_what_it_does_not_read() -> None:

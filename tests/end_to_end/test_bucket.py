@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.end_to_end.production_kit import FEW_SAMPLES, FEW_SAMPLES_CHANGES, call
 from tests.http_server import serve
@@ -134,11 +135,7 @@ def _refused(environment: dict[str, str], port: int) -> list[str]:
     control(port, "reset-auth", b"0")
     refused = []
     for out in ("s3://shards/set", f"s3://me:{CANARY}@shards/set", f"s3://shards/set?k={CANARY}"):
-        done = subprocess.run(
-            [sys.executable, *_generate(out)], cwd=ROOT, env=environment, text=True,
-            capture_output=True, timeout=RUN_S, check=False,
-        )  # fmt: skip
-        assert done.returncode == 1
+        done = run_program([sys.executable, *_generate(out)], env=environment, status=1)
         assert "trilight: out 's3://shards/set" in done.stderr.strip().splitlines()[-1]
         refused.append(done.stdout + done.stderr)
     control(port, "reset-auth", b"inf")

@@ -1,15 +1,17 @@
 """A run that is killed at any moment ends, when run again, in the digest of one that was not."""
 
 import contextlib
+import json
 import os
 import pty
 import shlex
+import shutil
 import signal
 import subprocess
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +20,7 @@ import pytest
 
 from pipeline.isolation import is_transient
 from storage.dataset.dataset import open_dataset
+from storage.dataset.manifest import shard_row
 from storage.dataset.verify import verify_dataset
 from tests.end_to_end.conftest import (
     command,
@@ -26,6 +29,9 @@ from tests.end_to_end.conftest import (
     num_meshes,
     wait_until_nobody_is_left,
 )
+from tests.end_to_end.production_kit import call, postgres, served, start_served, stop_served
+from tests.for_each import for_each
+from tests.pipeline.documents.dataset_by_hand import five_scenes
 
 ARGUMENTS = (
     "generate", "smoke", "--objects", "builtin:12", "--scenes", "8",
@@ -183,3 +189,180 @@ def _read_all(terminal: int, shown: bytearray) -> None:
     with contextlib.suppress(OSError), open(terminal, "rb", buffering=0) as stream:
         while data := stream.read(1 << 16):
             shown.extend(data)
+
+
+CHAOS_KILLS = int(os.environ.get("TRILIGHT_CHAOS_KILLS", "4"))
+"""One of each kind; 8 take ten minutes, 30 half an hour and more: ask for them by the variable."""
+SCENES = 4 * -(-CHAOS_KILLS // 2)
+"""Two for each kill, in whole shards of four."""
+OBJECTS = 12
+WORDS = {
+    "flow": "prefect.engine",
+    "child": "multiprocessing.forkserver",
+    "worker": "worker start",
+    "server": "pipeline.flows.guarded_server",
+}
+"""By what a process is known among those that carry the test's mark."""
+SHARES = {"child": 0.5, "flow": 0.3, "worker": 0.1, "server": 0.1}
+"""Of the victims after one of each kind; a worker or server takes half a minute to come back."""
+LOOK_S = 0.1
+"""Between two looks for a victim that is not there yet, such as a child of a flow that starts."""
+LOOK_EVERY_S = 0.2
+"""Between two looks of the watcher."""
+FLOW_S = 600
+
+
+def _parameters(out: Path) -> list[str]:
+    parameters = {
+        "objects": f"builtin:{OBJECTS}", "scenes": SCENES, "resolution": 32, "noise_floor_db": 20,
+        "out": out,
+    }  # fmt: skip
+    return [word for key, value in parameters.items() for word in ("-p", f"{key}={value}")]
+
+
+def _next_kind(killed: Counter[str], rng: np.random.Generator) -> str:
+    """Return each kind once, those that only work brings first, and then kinds by their shares."""
+    left = [kind for kind in SHARES if not killed[kind]]
+    return left[0] if left else str(rng.choice(list(SHARES), p=list(SHARES.values())))
+
+
+@contextlib.contextmanager
+def _watched(out: Path, whole: Path) -> Iterator[list[str]]:
+    """Compare what is visible under a final name with what it must be, all the time.
+
+    Whatever goes wrong in the thread is told too: a watcher that died would have seen nothing.
+    """
+    wrong: list[str] = []
+    ended = threading.Event()
+
+    def look() -> None:
+        while not ended.wait(LOOK_EVERY_S):
+            try:
+                wrong.extend(_wrong_now(out, whole))
+            except Exception as error:
+                wrong.append(repr(error))
+
+    watcher = threading.Thread(target=look)
+    watcher.start()
+    try:
+        yield wrong
+    finally:
+        ended.set()
+        watcher.join()
+
+
+def _wrong_now(out: Path, whole: Path) -> Iterator[str]:
+    """Yield what is visible and is not as it must be; raises for what cannot be read at all."""
+    listed = open_dataset(str(out)).manifest.shards if (out / "manifest.json").exists() else ()
+    expected = {shard.name: shard for shard in open_dataset(str(whole)).manifest.shards}
+    for shard in out.glob("*.tar"):
+        if shard.read_bytes() != (whole / shard.name).read_bytes():
+            yield shard.name
+    for entry in listed:  # read before: a shard is there before the manifest says so
+        if not (out / entry.name).exists():
+            yield f"{entry.name} is listed and not there"
+        if shard_row(entry) != shard_row(expected[entry.name]):
+            yield f"{entry.name} is listed as another one"
+    for path in out.glob("*.json"):
+        json.loads(path.read_text())
+    for path in out.glob("*.jsonl"):
+        for line in path.read_text().splitlines():
+            json.loads(line)
+
+
+DAMAGES: dict[str, tuple[str, bytes | None]] = {
+    "FileNotFoundError": ("train-000009.tar", b""),
+    "train-000000.tar": ("train-000000.tar", b"half"),
+    "train-000000.tar is listed and not there": ("train-000000.tar", None),
+    "manifest.json: all of it is not JSON": ("manifest.json", b"{"),
+    "JSONDecodeError": ("failures.jsonl", b'{"stage"'),
+}
+"""What must never be seen, by what the watcher says of it: a file, and its bytes, if any."""
+
+
+@for_each("told", ["", *DAMAGES])
+def test_the_watcher_tells_what_must_not_be_seen(tmp_path: Path, told: str) -> None:
+    out, whole = tmp_path / "set", tmp_path / "whole"
+    five_scenes(whole)
+    shutil.copytree(whole, out)
+    if told:
+        name, content = DAMAGES[told]
+        (out / name).unlink(missing_ok=True)
+        if content is not None:
+            (out / name).write_bytes(content)
+    with _watched(out, whole) as wrong:
+        deadline = time.monotonic() + (60 if told else 3 * LOOK_EVERY_S)
+        while not wrong and time.monotonic() < deadline:
+            time.sleep(0.01)
+    assert bool(wrong) == bool(told)
+    assert all(told in line for line in wrong), wrong
+
+
+@pytest.mark.slow("kills")
+@pytest.mark.timeout(3600)
+def test_kills_of_everything_end_in_the_same_digest(tmp_path: Path) -> None:
+    size = ["--scenes", str(SCENES), "--resolution", "32", "--noise-floor", "20"]
+    plain = ["-m", "trilight", "generate", "smoke", "--objects", f"builtin:{OBJECTS}", *size]
+    call([*plain, "--out", str(tmp_path / "whole")], os.environ, FLOW_S)
+    expected = open_dataset(str(tmp_path / "whole")).digest
+    rng, out = np.random.default_rng(0), tmp_path / "set"
+    mark, marked = marked_environment()
+    cold = tmp_path / "cache"
+    marked["TRILIGHT_CACHE"] = str(cold)
+    run = ["-m", "prefect", "deployment", "run", "generate-scenes/local", *_parameters(out)]
+    with (
+        postgres() as database,
+        _watched(out, tmp_path / "whole") as wrong,
+        served(tmp_path, database.url, 1, marked) as environment,
+    ):
+        killed: Counter[str] = Counter()
+        while killed.total() < CHAOS_KILLS:
+            call(run, environment, FLOW_S)
+            deadline = time.monotonic() + 60  # then what was killed may not have been the flow
+            pause_s = rng.uniform(0.5, 6.0) if killed else LOOK_S
+            while killed.total() < CHAOS_KILLS and time.monotonic() < deadline:
+                time.sleep(pause_s)
+                if not killed:  # while meshes are made
+                    if not num_meshes(cold):
+                        pause_s = LOOK_S
+                        continue
+                    assert num_meshes(cold) < OBJECTS
+                kind = _next_kind(killed, rng)
+                if not kill_one(WORDS[kind], mark, rng):
+                    pause_s = LOOK_S
+                    continue
+                killed[kind] += 1
+                if kind == "worker" and not killed["server"]:  # one restart brings both back
+                    killed["server"] += kill_one(WORDS["server"], mark, rng)
+                pause_s = rng.uniform(0.5, 6.0)
+                if killed.total() == CHAOS_KILLS // 2:
+                    database.stop()
+                    time.sleep(rng.uniform(1.0, 5.0))
+                    database.start()
+                if kind in ("worker", "server"):
+                    stop_served(environment)
+                    start_served(environment)
+                if kind != "child":
+                    break
+        if kind not in ("worker", "server"):  # after those there was a fresh start
+            stop_served(environment)
+            start_served(environment)
+        call([*run, "--watch"], environment, FLOW_S)
+    assert not wrong
+    assert open_dataset(str(out)).digest == expected
+    assert verify_dataset(out).problems == []
+    assert set(killed) >= set(list(SHARES)[:CHAOS_KILLS]), (
+        killed
+    )  # a kill is too few to be of each kind
+    _nothing_was_made_twice(out)
+    wait_until_nobody_is_left(mark)
+
+
+def _nothing_was_made_twice(out: Path) -> None:
+    """A scene gets its row after it was staged for good: one in flight at a kill has none yet, and
+    the kill may come between the two, so that at most one row for each kill is missing."""
+    rows = [
+        json.loads(line)["scene"] for path in (out / "logs").glob("*.jsonl") for line in path.open()
+    ]
+    assert [scene for scene, number in Counter(rows).items() if number > 1] == []
+    assert SCENES - CHAOS_KILLS <= len(rows) <= SCENES

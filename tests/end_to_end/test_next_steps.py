@@ -14,6 +14,7 @@ import pytest
 
 from infra.cli.process_exit import temporary_folder
 from storage.dataset.manifest import read_manifest
+from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import Trilight, command
 from tests.end_to_end.production_kit import SIXTEEN_SAMPLES
@@ -85,13 +86,8 @@ def test_plan_leaves_no_scenes_behind_at_ctrl_c(tmp_path: Path) -> None:
 
 def test_ctrl_c_while_libraries_are_loaded_leaves_no_traceback(tmp_path: Path) -> None:
     (tmp_path / "cyclopts.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\n")
-    run = subprocess.run(
-        command("doctor"),
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])},
-    )
-    assert (run.returncode, run.stderr) == (130, "")
+    path = os.pathsep.join([str(tmp_path), str(ROOT)])
+    assert run_program(command("doctor"), status=130, PYTHONPATH=path).stderr == ""
 
 
 def test_a_temporary_folder_is_gone_after_its_block() -> None:
@@ -120,9 +116,7 @@ def _next_steps(printed: str) -> list[list[str]]:
 
 
 def _ran(trilight: Trilight, *words: str, status: int = 0) -> list[list[str]]:
-    result = trilight(*words)
-    assert result.returncode == status, f"{words}\n{result.stdout}\n{result.stderr}"
-    return _next_steps(result.stdout)
+    return _next_steps(trilight(*words, status=status).stdout)
 
 
 @pytest.mark.slow("commands")
@@ -150,7 +144,8 @@ def test_what_generate_names_runs_for_eight_scenes(trilight: Trilight, tmp_path:
     shard.write_bytes(whole[shard.name][:-1])
     (repair,) = _ran(trilight, "verify", MINE, status=1)
     assert repair == ["verify", MINE, "--repair"]
-    assert json.loads(trilight("verify", MINE, "--json").stdout)["bad_shards"] == [shard.name]
+    told = json.loads(trilight("verify", MINE, "--json", status=1).stdout)
+    assert told["bad_shards"] == [shard.name]
     assert _ran(trilight, *repair) == []
     assert {path.name: path.read_bytes() for path in root.glob("*.tar")} == whole
     assert read_manifest(root / "manifest.json") == manifest
@@ -170,11 +165,9 @@ def test_an_unfinished_set_names_the_command_that_finishes_it(
     (status,) = _ran(trilight, *begun, "--shards", "0:1")
     assert status == ["status", MINE]
     (goes_on,) = _ran(trilight, *status)
-    result = trilight("verify", MINE)
-    assert result.returncode == 1
-    assert "Unfinished" in result.stdout
-    assert "1 of 2" in result.stdout
-    assert _next_steps(result.stdout) == [goes_on]
+    verified = trilight("verify", MINE, status=1).stdout
+    assert "Unfinished" in verified and "1 of 2" in verified
+    assert _next_steps(verified) == [goes_on]
     steps = _ran(trilight, *goes_on)
     assert [words[0] for words in steps] == ["verify", "inspect"]  # one view is too few for smoke
     _ran(trilight, *steps[0])

@@ -4,7 +4,6 @@ import json
 import os
 import re
 import shlex
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,7 @@ from PIL import Image
 from infra.setup.generated_pages import PAGES as GENERATED
 from storage.dataset.dataset import open_dataset
 from storage.extensions import is_reference
-from tests.command_line import trilight
+from tests.command_line import run_program, trilight
 from tests.conftest import ROOT
 from tests.end_to_end.production_kit import (
     SIXTEEN_SAMPLES,
@@ -118,17 +117,8 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 def _run(command: str, folder: Path) -> None:
     environment = {k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MAKELEVEL")}
-    environment["PATH"] = f"{ROOT / '.venv' / 'bin'}:{environment['PATH']}"
-    result = subprocess.run(
-        ["sh", "-c", command],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=1500,
-        check=False,
-    )
-    assert result.returncode == 0, f"{command}\n{result.stdout[-2000:]}\n{result.stderr[-2000:]}"
+    path = f"{ROOT / '.venv' / 'bin'}:{environment['PATH']}"
+    run_program(["sh", "-c", command], folder, env=environment, timeout=1500, PATH=path)
 
 
 def _view(command: str, folder: Path) -> None:

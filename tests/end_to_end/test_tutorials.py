@@ -10,7 +10,6 @@ import dataclasses
 import os
 import re
 import shlex
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,7 +25,7 @@ from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_of_file
 from storage.records.objects import write_objects_lock
 from storage.records.scene import Scene
-from tests.command_line import trilight
+from tests.command_line import run_program, trilight
 from tests.conftest import ROOT
 from tests.end_to_end.production_kit import Step, steps_of, tutorial
 from tests.infra.viewer.served_kit import served
@@ -125,11 +124,7 @@ def look(source: str) -> None:
 def apart(line: str, desk: Path) -> None:
     """Run a line of a shell in a process of its own."""
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    done = subprocess.run(
-        ["sh", "-c", line], cwd=desk, env={**os.environ, "PATH": path, "PYTHONPATH": str(ROOT)},
-        capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, f"{line}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
+    run_program(["sh", "-c", line], desk, PATH=path, PYTHONPATH=str(ROOT))
 
 
 @pytest.mark.parametrize(

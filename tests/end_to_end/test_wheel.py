@@ -1,7 +1,6 @@
 """A wheel is built, installed in a fresh environment, and used in a folder of somebody's own."""
 
 import os
-import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
@@ -13,6 +12,7 @@ from packaging.requirements import Requirement
 
 from storage.dataset.dataset import open_dataset
 from storage.records.scene_file import encode_scene, read_scene_file
+from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.end_to_end.production_kit import SIXTEEN_SAMPLES
 from tests.scenes_by_hand import tiny_scene
@@ -31,18 +31,10 @@ print(trilight.__file__)
 """
 
 
-def _call(command: list[str], folder: Path, **more: str) -> str:
+def _call(command: list[str], folder: Path) -> str:
     """Run a program outside of any checkout's environment; return what it says."""
-    ran = subprocess.run(
-        command,
-        cwd=folder,
-        env={**{k: v for k, v in os.environ.items() if k != "PYTHONPATH"}, **more},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert ran.returncode == 0, f"{command}\n{ran.stdout[-2000:]}\n{ran.stderr[-2000:]}"
-    return ran.stdout
+    bare = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    return run_program(command, folder, env=bare).stdout
 
 
 @pytest.fixture(scope="module")

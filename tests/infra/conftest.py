@@ -22,3 +22,22 @@ def source(tmp_path: Path) -> Path:
     path = tmp_path / "tiny.safetensors"
     path.write_bytes(encode_scene(tiny_scene()))
     return path
+
+
+def write_network(path: Path, max_triangles: int | None = None, bias: float = 0.3) -> Path:
+    """Write a network of the size `smoke` that nobody trained: its pictures are a pattern."""
+    import torch
+
+    from model.config import smoke
+    from model.weights import TrainedRange, encode_weights
+    from tests.model.kit import awake
+
+    model = awake(smoke(), torch.float32)
+    last = model.decoder.head.last
+    assert last.bias is not None
+    with torch.no_grad():
+        last.weight *= 0.1
+        last.bias.fill_(bias)
+    known = None if max_triangles is None else TrainedRange(max_triangles=max_triangles)
+    path.write_bytes(encode_weights(model, known))
+    return path

@@ -18,9 +18,10 @@ from infra.leaderboard import (
     NEAREST_TRAINED,
     Leaderboard,
     make_leaderboard,
+    picture_folder,
+    picture_folders,
     widths_of,
 )
-from infra.picture_folder import picture_folder, picture_folders
 from infra.render.methods import DIRECT_LIGHT, TRACED_LIGHT
 from infra.render.networks import NetworkRenderer
 from model.open import save_published
@@ -326,15 +327,9 @@ def test_pictures_are_shown_as_they_are_at_their_one_width(folder: Path) -> None
     write(folder / picture_name(*SHOWN[0]), picture(9))
     after = picture_folder(folder, SHOWN, WIDTHS)
     assert after.digest(*SHOWN[0]) != before and after.digest(*SHOWN[1]) == one.digest(*SHOWN[1])
-
-
-def test_missing_pictures_are_counted_and_the_first_is_named(folder: Path, tmp_path: Path) -> None:
-    for name in SHOWN[1:3]:
-        (folder / picture_name(*name)).unlink()
-    said = refusal(folder)
-    assert "2 of 4 pictures are missing, the first is 000000000_view_1.exr" in said
-    assert "--form exr" in said and "--scenes" in said
-    assert "no such folder; expected one" in refusal(tmp_path / "nowhere")
+    assert [each.name for each in picture_folders([folder], SHOWN, WIDTHS)] == [one.name]
+    with pytest.raises(TrilightError, match="another folder has the same name"):
+        picture_folders([folder, folder], SHOWN, WIDTHS)
 
 
 BAD_PICTURES: list[tuple[bytes, str]] = [
@@ -345,28 +340,25 @@ BAD_PICTURES: list[tuple[bytes, str]] = [
 ]
 
 
-def test_what_is_no_picture_of_the_set_is_said(folder: Path) -> None:
+def test_what_is_no_picture_of_the_set_is_said(folder: Path, tmp_path: Path) -> None:
+    third = folder / picture_name(*SHOWN[2])
     for data, said in BAD_PICTURES:
         with case(said):
-            (folder / picture_name(*SHOWN[2])).write_bytes(data)
-            assert f"000000001_view_0.exr{said}" in refusal(folder)
-
-
-def test_values_that_are_no_radiance_are_said_with_their_place(folder: Path) -> None:
+            third.write_bytes(data)
+            assert f"{third.name}{said}" in refusal(folder)
     for bad in [np.nan, -1.0]:
-        with case(bad):
-            rgb = picture(0)
-            rgb[5, 6, 1] = rgb[7, 8, 0] = bad
-            write(folder / picture_name(*SHOWN[2]), rgb)
-            said = refusal(folder)
-            assert "000000001_view_0.exr: row 5, column 6" in said and "channel G" in said
-            assert "2 pixels are like it; expected finite radiance of at least 0" in said
-
-
-def test_two_folders_of_one_name_are_refused(folder: Path) -> None:
-    assert [one.name for one in picture_folders([folder], SHOWN, WIDTHS)] == ["pictures of mine"]
-    with pytest.raises(TrilightError, match="another folder has the same name"):
-        picture_folders([folder, folder], SHOWN, WIDTHS)
+        rgb = picture(0)
+        rgb[5, 6, 1] = rgb[7, 8, 0] = bad
+        write(third, rgb)
+        said = refusal(folder)
+        assert f"{third.name}: row 5, column 6" in said and "channel G" in said
+        assert "2 pixels are like it; expected finite radiance of at least 0" in said
+    for name in SHOWN[1:3]:
+        (folder / picture_name(*name)).unlink()
+    said = refusal(folder)
+    assert "2 of 4 pictures are missing, the first is 000000000_view_1.exr" in said
+    assert "--form exr" in said and "--scenes" in said
+    assert "no such folder; expected one" in refusal(tmp_path / "nowhere")
 
 
 KEY = RowKey(64, "000000001", 0, "somebody", "d")
@@ -384,19 +376,16 @@ def test_rows_come_back_and_the_later_of_two_counts(tmp_path: Path) -> None:
     assert len(path.read_text().splitlines()) == 3
     # written before rows named their machine: a price of nowhere
     assert rows.price(KEY, "somewhere") is None and again.machines() == {UNKNOWN_MACHINE}
-
-
-def test_a_line_that_a_kill_cut_short_is_judged_again(tmp_path: Path) -> None:
-    path = tmp_path / "rows.jsonl"
+    # a line that a kill cut short is judged again
+    path.unlink()
     Rows(path, "set a").add(KEY, ROW)
     whole = path.read_bytes()
     path.write_bytes(whole + b'{"width": 64, "sce')
-    rows = Rows(path, "set a")
-    assert rows.get(KEY) == ROW
+    assert Rows(path, "set a").get(KEY) == ROW
     path.write_bytes(whole[: whole.index(b"\n") + 20])
-    rows = Rows(path, "set a")
-    assert rows.get(KEY) is None
-    rows.add(KEY, ROW)
+    cut = Rows(path, "set a")
+    assert cut.get(KEY) is None
+    cut.add(KEY, ROW)
     assert path.read_bytes() == whole
 
 

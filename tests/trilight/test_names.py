@@ -7,9 +7,7 @@ pyzmq) would add what no cell needs: the display of values.
 
 import ast
 import json
-import os
 import re
-import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
@@ -19,9 +17,11 @@ import pytest
 
 import trilight
 from infra.setup.wheel_tree import PACKAGES
+from tests.command_line import run_program
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from trilight import extend
+from trilight.lazy import offered_names
 
 
 @for_each(("module", "missing"), [(trilight, "rendr"), (extend, "TEMPLATE")])
@@ -62,15 +62,7 @@ def _code(text: str) -> list[str]:
 
 def _require_runs(folder: Path, *words: str) -> None:
     """Run a program as a user does, in a separate folder."""
-    ran = subprocess.run(
-        [sys.executable, *words],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert ran.returncode == 0, ran.stderr
+    run_program([sys.executable, *words], folder, PYTHONPATH=str(ROOT), MPLBACKEND="Agg")
 
 
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
@@ -125,3 +117,18 @@ def test_the_page_runs(tmp_path: Path) -> None:
     _require_runs(tmp_path, str(program))
     made = {path.name for path in tmp_path.iterdir()}
     assert {"still.usdz", "still.exr", "network.png", "set", "run", "evaluation"} <= made
+
+
+def test_a_name_is_exported_as_its_import_calls_it(tmp_path: Path) -> None:
+    module = tmp_path / "package.py"
+    module.write_text(
+        "from typing import TYPE_CHECKING\n"
+        "if TYPE_CHECKING:\n"
+        "    from json import dumps as dumps\n"
+        "    from os.path import join as joined, split as split\n"
+    )
+    assert offered_names(str(module)) == {
+        "dumps": ("json", "dumps"),
+        "joined": ("os.path", "join"),
+        "split": ("os.path", "split"),
+    }

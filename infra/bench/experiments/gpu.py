@@ -73,7 +73,7 @@ def _measure(name: str, part: Measured, context: BenchContext, trial: str) -> Fi
     """Measure a part; one that fails has no figures, and a note with the reason."""
     import torch
 
-    from infra.bench.gpu.probe import device_facts
+    from infra.bench.gpu.steps import device_facts
 
     device = torch.device(device_of(context.options))
     context.note(device_facts(device))
@@ -85,13 +85,13 @@ def _measure(name: str, part: Measured, context: BenchContext, trial: str) -> Fi
 
 
 def _product(kind: str, context: BenchContext, device: "torch.device") -> Figures:
-    from infra.bench.gpu.probe import product_figures
+    from infra.bench.gpu.steps import product_figures
 
     return product_figures(device, kind, _PRODUCT_WIDTH[device.type])
 
 
 def _copy(kind: str, context: BenchContext, device: "torch.device") -> Figures:
-    from infra.bench.gpu.probe import copy_figures
+    from infra.bench.gpu.steps import copy_figures
 
     return copy_figures(device, kind, _COPIED_BYTES[device.type])
 

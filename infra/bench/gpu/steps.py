@@ -1,34 +1,64 @@
-"""Steps of a training preset on a device, and their time by part of the network.
+"""Throughput of a device, and the steps of a training preset with their time by part.
 
-Where memory is too small, a step has fewer scenes. Times of parts are from PyTorch's profiler.
+Batches are synthetic, since the content does not change the time. Where memory is too small, a step
+has fewer scenes. Times of parts are from PyTorch's profiler.
 """
 
 import dataclasses
 import gc
+import math
 import statistics
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import nn
 
-from infra.bench.gpu.drawn_batch import drawn_batch, drawn_lpips, workloads
-from infra.bench.gpu.probe import time_calls
+from infra.bench.workloads.cost_scene import cost_scene
 from model.config import ModelConfig, hits_smoke, smoke, tiny
-from model.costs import training_flops
+from model.costs import Workload, training_flops
+from model.precision import fast_float32_products
+from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
+from pipeline.renders.visible_gpus import query_gpus
+from storage.conventions import look_at_c2w
+from train.data.buckets import TrainingBatch
 from train.loop.distributed import DistributedContext
 from train.loop.state import new_state
 from train.loop.step import Stepper
-from train.loss.lpips import Lpips
+from train.loss.lpips import BLOCKS, Lpips
 from train.loss.objective import TrainingLoss
 from train.runs import named_run
 from train.settings import TrainSettings
 
+if TYPE_CHECKING:
+    from model.config import ModelConfig
+
 MARK = "trilight: "
 """Prefix of the names of parts in a trace."""
 REST = "backward and rest"
+SHRUNK_PX = 32
+SHRUNK_TRIANGLES = 64
+SHRUNK_SCENES = 2
+THIN = (4, 8, 16, 16, 16)
+"""Channels of LPIPS for shrunk presets."""
+
+_WARM_STEPS = 3
+_LIGHTS = 4
+UNSTATED_TRIANGLES = 1024
+"""Triangles of the longest scene if a preset sets no limit."""
+
+SPREAD = 0.06
+"""Fraction by which the shortest scene of a pass is shorter than the longest, as in the buckets of
+`pretrain`. Half of it is padding on average, so that attention has a mask."""
+
+VGG16_WIDTHS = (64, 128, 256, 512, 512)
+"""Channels of VGG16's blocks, as in the published LPIPS."""
+
+REPEATS = 5
 
 
 @contextmanager
@@ -129,14 +159,6 @@ def _kernel_us(event: Any) -> float:
     return float(event.self_device_time_total if on_gpu else event.self_cpu_time_total)
 
 
-SHRUNK_PX = 32
-SHRUNK_TRIANGLES = 64
-SHRUNK_SCENES = 2
-THIN = (4, 8, 16, 16, 16)
-"""Channels of LPIPS for shrunk presets."""
-_WARM_STEPS = 3
-
-
 def step_settings(run: str, device: torch.device) -> TrainSettings:
     """Return a preset with random initial weights; without a GPU a small one of its form."""
     settings = dataclasses.replace(named_run(run), from_weights=False)
@@ -223,3 +245,145 @@ def _measure_steps(
     with marked_parts(state.model, objective, state.updater):
         kernels, parts = profile_call(step, device)
     return {**figures, "kernels": float(kernels)}, parts
+
+
+def workloads(settings: TrainSettings, scenes: int) -> list[Workload]:
+    """Return the scenes of a pass, longest first."""
+    longest = settings.most_triangles or UNSTATED_TRIANGLES
+    return [
+        Workload(
+            triangles=round(longest * (1 - SPREAD * row / max(scenes - 1, 1))),
+            views=settings.views_per_scene,
+            resolution=settings.resolution,
+        )
+        for row in range(scenes)
+    ]
+
+
+def scene_of(workload: Workload) -> SceneTensors:
+    """Return two objects in a room with an exact number of triangles, and cameras around them."""
+    scene = cost_scene(math.ceil(1.3 * workload.triangles) + 32, _LIGHTS)
+    poses = [
+        look_at_c2w(
+            eye=(1.4 + math.cos(6 * angle), math.sin(6 * angle) - 2.2, 1.3),
+            target=(0, 0, 0.35),
+            up=(0, 0, 1),
+        )
+        for angle in np.linspace(0, 1, workload.views, endpoint=False)
+    ]
+    tensors = scene_tensors(
+        scene.with_cameras(
+            np.stack(poses).astype(np.float32), np.full(workload.views, 40.0, np.float32)
+        )
+    )
+    # rows spread over the scene, the room first and the lights last
+    rows = torch.linspace(0, tensors.num_triangles - 1, workload.triangles).round().long()
+    return SceneTensors(
+        triangles_T33=tensors.triangles_T33[rows],
+        normals_T33=tensors.normals_T33[rows],
+        material_TM=tensors.material_TM[rows],
+        c2w_V44=tensors.c2w_V44,
+        fov_deg_V=tensors.fov_deg_V,
+    )
+
+
+def drawn_batch(settings: TrainSettings, scenes: int) -> TrainingBatch:
+    """Return a batch on the processor: scenes of real geometry, with noise as targets."""
+    generator = torch.Generator().manual_seed(0)
+    views = settings.views_per_scene
+    px = settings.resolution
+    return TrainingBatch(
+        scenes=batch_scenes(
+            [_prepare(scene_of(each), settings.model, px) for each in workloads(settings, scenes)]
+        ),
+        target_BVRR3=0.3 * torch.rand(scenes, views, px, px, 3, generator=generator),
+        noise_BV=torch.full((scenes, views), 1e-3),
+    )
+
+
+def _prepare(tensors: SceneTensors, model: "ModelConfig", px: int) -> SceneTensors:
+    """Return a scene with the inputs of its network, as the stream does."""
+    if not model.hit_rays:
+        return tensors
+    from model.demodulated import with_albedo
+    from model.hits.tracing import with_traced
+
+    if model.demodulated:
+        return with_albedo(tensors, px, model.hit_rays)
+    return with_traced(tensors, px, model, 0)
+
+
+def drawn_lpips(settings: TrainSettings, widths: tuple[int, ...] = VGG16_WIDTHS) -> Lpips | None:
+    """Return LPIPS with random weights of the published sizes; None if a preset has no LPIPS."""
+    if settings.loss.perceptual != "lpips":
+        return None
+    vgg16 = {}
+    linear = {}
+    channels = 3
+    generator = torch.Generator().manual_seed(0)
+    for block, (numbers, width) in enumerate(zip(BLOCKS, widths, strict=True)):
+        for number in numbers:
+            spread = (2 / (9 * channels)) ** 0.5
+            weight = spread * torch.randn(width, channels, 3, 3, generator=generator)
+            vgg16[f"features.{number}.weight"] = weight
+            vgg16[f"features.{number}.bias"] = torch.zeros(width)
+            channels = width
+        linear[f"lin{block}.model.1.weight"] = torch.rand(1, width, 1, 1, generator=generator)
+    return Lpips(vgg16, linear)
+
+
+def device_facts(device: torch.device) -> str:
+    """Return a line on a device: memory, libraries, driver, without a serial number."""
+    if device.type != "cuda":
+        return f"no GPU: torch {torch.__version__} with {torch.get_num_threads()} threads"
+    properties = torch.cuda.get_device_properties(device)
+    driver = next(iter(query_gpus("driver_version")), "unknown")
+    return (
+        f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, torch {torch.__version__}, "
+        f"CUDA {torch.version.cuda}, driver {driver}"
+    )
+
+
+def product_figures(device: torch.device, kind: str, width: int) -> dict[str, float]:
+    """Return the seconds and FLOP/s of a large square matrix product: the best of five.
+
+    Args:
+        kind: float32, tf32, bfloat16 or float16.
+    """
+    dtype = torch.float32 if kind == "tf32" else getattr(torch, kind)
+    matrix = torch.randn(width, width, device=device).to(dtype)
+    with fast_float32_products(device, enabled=kind == "tf32"):
+        seconds = min(time_calls(lambda: matrix @ matrix, device))
+    return {"ms": 1e3 * seconds, "teraflop_per_s": 2 * width**3 / seconds / 1e12}
+
+
+def copy_figures(device: torch.device, kind: str, size: int) -> dict[str, float]:
+    """Return the seconds and bytes a second of a copy.
+
+    Args:
+        kind: within (bytes read and written count), to_pageable or to_pinned.
+    """
+    target = torch.zeros(size, dtype=torch.uint8, device=device)
+    if kind == "within":
+        source = torch.zeros(size, dtype=torch.uint8, device=device)
+    else:
+        source = torch.zeros(size, dtype=torch.uint8)
+        source = source.pin_memory() if kind == "to_pinned" else source
+    non_blocking = kind == "to_pinned"
+    seconds = min(time_calls(lambda: target.copy_(source, non_blocking=non_blocking), device))
+    moved = 2 * size if kind == "within" else size
+    return {"ms": 1e3 * seconds, "gigabyte_per_s": moved / seconds / 1e9}
+
+
+def time_calls(
+    work: Callable[[], object], device: torch.device, repeats: int = REPEATS, *, warm_up: int = 1
+) -> list[float]:
+    """Return the seconds of several calls until the device is done, after some that warm it up."""
+    times = []
+    for _ in range(warm_up + repeats):
+        began = time.perf_counter()
+        work()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        times.append(time.perf_counter() - began)
+    return times[warm_up:]

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from infra.bench.gpu.probe import time_calls
+from infra.bench.gpu.steps import time_calls
 from infra.bench.workloads.cost_scene import cost_scene
 from model.neural_renderer import NeuralRenderer
 from model.open import BUILTIN_NETWORKS

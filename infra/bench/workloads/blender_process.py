@@ -1,6 +1,6 @@
 """Process that opens a Trilight USD file in Blender and renders its first view with Cycles.
 
-Run by path with the Python of blender_environment.py, which has no module of Trilight:
+Run by path with the Python of cycles.py, which has no module of Trilight:
 
     python -I blender_process.py FOLDER
 

@@ -1,7 +1,15 @@
-"""Renders the first view of a `Scene` with Blender's Cycles, by way of its USD, with the cost."""
+"""Renders the first view of a `Scene` with Blender's Cycles, by way of its USD, with the cost.
+
+Blender is under the GPL, large, and exists for one version of Python. So it is never a dependency:
+a comparison installs it from the package index into the user's cache, in a separate environment,
+and only a separate process imports it (infra.bench.workloads.blender_process).
+"""
 
 import json
 import os
+import shutil
+import subprocess
+import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,11 +17,25 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.bench.workloads.blender_environment import run_blender
 from pipeline.exchange.usd.write import write_usd
+from storage.cache import cache_folder
+from storage.errors import TrilightError
 from storage.records.scene import Scene
 
 _SCRIPT = Path(__file__).with_name("blender_process.py")
+BLENDER = "4.5.15"
+"""Version of Blender and of its wheel, with which the reference pictures were made."""
+
+LOCK = Path(__file__).with_name("blender.txt")
+"""Lock file of the environment, with the digests of all files (infra/setup/lock.sh)."""
+
+PYTHON = "3.11"
+"""Only version of Python that the wheel supports."""
+
+_INSTALL_S = 1800
+_RENDER_S = 4 * 3600
+_PROBE = f"import bpy; assert bpy.app.version_string.startswith({BLENDER!r})"
+_READY = "ready"
 
 
 def render_with_cycles(
@@ -28,10 +50,8 @@ def render_with_cycles(
     """Render raw pictures of a scene's first view in a separate process.
 
     Args:
-        scene: scene that passes `Scene.check`.
         resolution: width and height in pixels.
         spp: samples per pixel; adaptive sampling is off.
-        seeds: seed of each picture's samples.
         bounces: maximum number of bounces, in sum and of each kind; 8 is Mitsuba's max_depth of 10,
             and 0 direct light.
         threads: threads of Cycles; None for one for each core.
@@ -41,7 +61,7 @@ def render_with_cycles(
         the file and building the tree of triangles.
 
     Raises:
-        TrilightError: Blender cannot be installed (blender_environment), or it failed.
+        TrilightError: Blender cannot be installed (`blender_python`), or it failed.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
@@ -62,3 +82,81 @@ def render_with_cycles(
             for number in range(len(seeds))
         ]
         return pictures, json.loads((folder / "timing.json").read_text())["core_s"]
+
+
+def installed_python() -> Path | None:
+    """Return the Python that can import Blender, or None if it is not installed."""
+    folder = _folder()
+    return _python_of(folder) if (folder / _READY).is_file() else None
+
+
+def blender_python() -> Path:
+    """Return the Python that can import Blender, after installing it (380 MB) if necessary.
+
+    Raises:
+        TrilightError: there is no Python of that version, the package index lacks the wheel, or the
+            wheel cannot be loaded here.
+    """
+    if installed := installed_python():
+        return installed
+    folder = _folder()
+    _run("make its environment", [_base_python(), "-m", "venv", "--clear", str(folder)])
+    python = _python_of(folder)
+    pip = [str(python), "-m", "pip", "install", "--quiet", "--only-binary", ":all:", "--no-deps"]
+    _run("install it from the package index", [*pip, "--require-hashes", "-r", str(LOCK)])
+    _run("load it", [str(python), "-I", "-c", _PROBE])
+    (folder / _READY).touch()  # last: an interrupted installation begins anew
+    return python
+
+
+def run_blender(script: Path, folder: Path) -> None:
+    """Run a script with a folder as its argument in the Python of Blender.
+
+    Files that Blender writes by itself stay in the folder.
+
+    Raises:
+        TrilightError: as `blender_python`, or the script failed.
+    """
+    command = [str(blender_python()), "-I", str(script), str(folder)]
+    homes = {"HOME": str(folder), "BLENDER_USER_RESOURCES": str(folder)}
+    _run(f"run {script.name}", command, timeout_s=_RENDER_S, **homes)
+
+
+def _folder() -> Path:
+    return cache_folder("cycles") / f"bpy-{BLENDER}"
+
+
+def _python_of(folder: Path) -> Path:
+    return folder / "bin" / "python"
+
+
+def _base_python() -> str:
+    """Return a Python of the wheel's version: this one, or one on the path."""
+    if f"{sys.version_info.major}.{sys.version_info.minor}" == PYTHON:
+        return sys.executable
+    python = shutil.which(f"python{PYTHON}")
+    if python is None:
+        raise _unavailable(f"python{PYTHON} is not on the path; install that version of Python")
+    return python
+
+
+def _run(step: str, command: list[str], *, timeout_s: int = _INSTALL_S, **more: str) -> None:
+    """Run a command, with more variables of the environment; raises TrilightError if it fails."""
+    try:
+        result = subprocess.run(
+            command,
+            env={**os.environ, **more},
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise _unavailable(f"could not {step} ({type(error).__name__})") from error
+    if result.returncode:
+        said = (result.stderr or result.stdout).strip().splitlines()
+        raise _unavailable(f"could not {step}: {said[-1] if said else 'no message'}")
+
+
+def _unavailable(why: str) -> TrilightError:
+    return TrilightError(f"Blender {BLENDER}: {why}.")

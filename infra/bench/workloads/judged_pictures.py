@@ -29,9 +29,6 @@ def load_or_render_reference(
     """Return two halves of raw samples of a view, from the cache or rendered by a child.
 
     Args:
-        child: render child.
-        scene: scene that passes `Scene.check`.
-        camera: camera of the view.
         spp: samples per pixel of both halves together, a multiple of 128.
     """
     view = [camera.c2w.tolist(), camera.fov_deg, camera.resolution, spp]

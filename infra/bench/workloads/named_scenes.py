@@ -71,7 +71,6 @@ def mapped_scene(child: IsolatedChild, name: str) -> Scene:
     """Return the scene of a name, with one camera.
 
     Args:
-        child: render child with objects.
         name: `surfaces N`, a scene of `textured-256`, or `sky` and one of SKIES.
 
     Raises:

@@ -62,9 +62,7 @@ def write_copies(
 
     Args:
         root: folder of the dataset; it may be missing.
-        members: files of each sample by name.
         copies: number of keys of each sample.
-        per_shard: number of samples of a shard.
     """
     folder = DatasetFolder(root)
     every = [(sample_key(k), members[k % len(members)]) for k in range(copies * len(members))]
@@ -92,10 +90,7 @@ def time_reading(
 
     Args:
         data: data to read, again from its start when it ends.
-        settings: settings of the stream.
         threads: number of decoding threads; with 0 the main thread decodes.
-        least_count: minimum number of samples.
-        least_s: minimum number of seconds.
 
     Raises:
         TrilightError: the data cannot be read at this width.

@@ -53,8 +53,6 @@ def measure_work(name: str, size: int, folder: Path) -> dict[str, float]:
     """Return seconds and peak bytes of a kind of WORK at a size, in a fresh process.
 
     Args:
-        name: key of WORK.
-        size: size of the work.
         folder: empty folder.
 
     Raises:

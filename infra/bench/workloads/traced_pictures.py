@@ -79,11 +79,9 @@ def render_levels(
     CPU seconds are those of the samples, the guide pictures, and one denoise.
 
     Args:
-        scene: scene that passes `Scene.check`.
         resolution: width in pixels.
         levels_spp: ascending samples per pixel. Mitsuba is called once for the samples that each
             level adds, since calls with few samples are up to a tenth slower.
-        seed: seed of the samples.
     """
     camera = first_camera(scene, resolution)
     _Plain(scene).radiance(camera, seed_for(seed, "plain warm-up"), levels_spp[0])

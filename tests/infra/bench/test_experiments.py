@@ -21,9 +21,9 @@ from infra.bench.experiments.paired_training import SIDE_A, SIDE_B, scene_of, se
 from infra.bench.gpu import steps
 from infra.bench.gpu.steps import REST, parts_ms, step_figures, step_settings
 from infra.bench.gpu.twin import NETWORKS, twin_figures
-from infra.bench.workloads import blender_environment as environment
+from infra.bench.workloads import cycles as environment
 from infra.bench.workloads import sized_work
-from infra.bench.workloads.blender_environment import installed_python
+from infra.bench.workloads.cycles import installed_python
 from infra.bench.workloads.judged_pictures import load_or_render_reference
 from infra.bench.workloads.reading import LAYOUTS, unpacking_figures, write_copies
 from infra.bench.workloads.sized_work import WORK, measure_work, session_bytes, sizes_of

@@ -5,7 +5,6 @@ import os
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,8 +21,7 @@ from infra.setup.generated_pages import PAGES
 from pipeline.shards.expression import TEXTS, condition, kind_of
 from storage.records.quantities import QUANTITIES
 from storage.settings.fields import option_of
-from tests.command_line import trilight
-from tests.conftest import ROOT
+from tests.command_line import run_program, trilight
 from tests.for_each import case
 
 ALL = {found.name: found for found in every_command()}
@@ -42,43 +40,26 @@ def test_every_command_is_there_with_those_within() -> None:
 
 
 def test_every_option_says_what_it_is_and_its_default() -> None:
+    """At 80 columns no text is lost: Rich would take `[builtin:]` for a style and drop it."""
     for name in ALL:
         with case(name):
+            shown = trilight([*name.split(), "-h"], env={"COLUMNS": "80"}).stdout
+            assert shown.startswith(f"Usage: trilight {name} ")
+            assert max(map(len, shown.splitlines())) <= 80
             for option in ALL[name].options:
                 assert option.help[0].isupper() or ": " in option.help
                 facts = option.help.rpartition(" [")[2]
                 said = "default" in option.help or "required" in facts
                 assert said or not option.takes, f"{option.names}: {option.help}"
-
-
-def test_no_help_text_is_lost_at_80_columns() -> None:
-    """Rich would take `[builtin:]` for a style and drop it."""
-    for name in ALL:
-        with case(name):
-            shown = trilight([*name.split(), "--help"], env={"COLUMNS": "80"})
-            assert max(map(len, shown.stdout.splitlines())) <= 80
-            words = shown.stdout.split()
-            for option in ALL[name].options:
-                assert set(option.help.split()) <= set(words), option.names
-
-
-def test_every_name_is_that_of_its_field() -> None:
-    for found in ALL.values():
-        for option in found.options:
-            if option.names[0].startswith("--"):
-                assert option.names[0] == option_of(option.field)
-            assert option.names[1:] == tuple(filter(None, [ALIASES.get(option.field)]))
-
-
-def test_the_short_option_helps_everywhere() -> None:
-    for words in (["-h"], ["verify", "-h"], ["shards", "-h"], ["shards", "merge", "-h"]):
-        shown = trilight(words)
-        assert shown.exit_code == 0
-        assert shown.stdout.startswith(f"Usage: {' '.join(['trilight', *words[:-1]])} ")
+                assert set(option.help.split()) <= set(shown.split()), option.names
+                if option.names[0].startswith("--"):
+                    assert option.names[0] == option_of(option.field)
+                assert option.names[1:] == tuple(filter(None, [ALIASES.get(option.field)]))
 
 
 def test_no_words_are_a_question_for_help_and_the_version_is_a_number() -> None:
-    assert trilight([]).stdout == trilight(["--help"]).stdout
+    assert trilight([]).stdout == trilight(["--help"]).stdout == trilight(["-h"]).stdout
+    assert trilight(["shards", "-h"]).stdout.startswith("Usage: trilight shards ")
     assert "--extend FILE.py" in trilight([]).stdout
     shown = trilight(["--version"])
     assert (shown.exit_code, shown.stdout.split()[0]) == (0, "trilight")
@@ -96,39 +77,48 @@ MISTAKES = {
     "verify here --fast=3": "verify: --fast is '3'; expected no value.",
     "render x --out y.exr --engine neurl": "--engine is 'neurl'; did you mean neural? Expected",
 }
-
-
-def test_a_mistyped_command_line_is_one_line() -> None:
-    for words in MISTAKES:
-        with case(words):
-            ended = trilight(words.split())
-            assert (ended.exit_code, ended.stdout) == (2, "")
-            assert ended.stderr.startswith("trilight: ") and ended.stderr.count("\n") == 1
-            assert MISTAKES[words] in ended.stderr
-            assert (
-                f"See trilight {words.split()[0] if ': ' in ended.stderr[10:] else ''}"
-                in ended.stderr
-            )
-
-
+"""What is mistyped."""
+PRICE = "expected a number from 0 to 1000 USD per core-hour."
 REFUSED = {
     "generate smoke --scenes 0": "--scenes is 0; expected a whole number from 1 to 1000000000",
     "generate smoke --noise-floor nan": "--noise-floor-db is nan; expected a number above 0",
     "render x --out y.exr --exposure -99": "--exposure-ev is -99",
+    "plan smoke --price -1": f"--price is -1.0; {PRICE}",
+    "plan smoke --price nan": f"--price is nan; {PRICE}",
+    "status nowhere --price inf": f"--price is inf; {PRICE}",
+    "status nowhere --price 1000.5": f"--price is 1000.5; {PRICE}",
+    "status set --lines": "--lines is given; expected it only",
+    "model huge": "model 'huge': neither a size nor a checkpoint here",
+    "model large --resolution 72": "--resolution is 72; expected a multiple of 64",
+    "model smoke --publish x": "model: --publish needs a checkpoint",
+    "submit x smoke": "flow 'x' is unknown; expected one of generate-scenes, prepare-assets, "
+    "build-dataset, make-by-array, or of slurm",
+    "submit slurm smoke --image x": "submit slurm: --image, --where and the other options of "
+    "machines are those of submit kubernetes; leave them out, and use --sbatch",
+    "submit generate-scenes smoke --where x": "submit generate-scenes: --shards-per-task, "
+    "--at-once, --dry-run and the options of machines are those of submit slurm, kubernetes",
+    "bench rungs-64": "experiment 'rungs-64' is unknown; expected one of cycles, frontier, gpu, "
+    "growth, loader, meshes, methods, paired-training",
 }
+"""Values that the settings refuse, each named by its option, before anything is done."""
 
 
-def test_a_value_that_the_settings_refuse_is_named_by_its_option() -> None:
-    for words in REFUSED:
+def test_what_cannot_be_asked_is_one_line() -> None:
+    for words, message in MISTAKES.items():
         with case(words):
             ended = trilight(words.split())
-            assert ended.exit_code == 1
-            assert ended.stderr.startswith(f"trilight: {REFUSED[words]}")
+            assert (ended.exit_code, ended.stdout) == (2, "")
+            assert message in ended.mistake
+            see = words.split()[0] if ": " in ended.mistake else ""
+            assert f"See trilight {see}" in ended.mistake
+    for words, message in REFUSED.items():
+        with case(words):
+            ended = trilight(words.split())
+            assert ended.exit_code == 1 and ended.mistake.startswith(message)
 
 
 def test_the_real_command_names_no_module() -> None:
-    found = _run([sys.executable, "-m", "trilight", "verify"], dict(os.environ))
-    assert found.returncode == 2
+    found = run_program([sys.executable, "-m", "trilight", "verify"], status=2)
     assert "infra.cli" not in found.stdout + found.stderr
     assert "trilight verify" in found.stdout + found.stderr
 
@@ -136,21 +126,15 @@ def test_the_real_command_names_no_module() -> None:
 def test_too_little_memory_is_one_sentence(tmp_path: Path) -> None:
     """Where more is left, libraries end the process in ways of their own."""
     train = f"{sys.executable} -m trilight train smoke --data {tmp_path} --out {tmp_path}/run"
-    ended = _run(["bash", "-c", f"ulimit -v 300000; exec {train}"], dict(os.environ))
+    ended = run_program(["bash", "-c", f"ulimit -v 300000; exec {train}"], status=1)
     *before, last = ended.stderr.splitlines()
-    assert ended.returncode == 1 and "Traceback" not in " ".join(before)
+    assert "Traceback" not in " ".join(before)
     assert last.startswith("trilight: too little memory") and last.endswith("raise `ulimit -v`.")
-
-
-def _run(words: list[str], environment: dict[str, str]) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run(
-        words, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=False
-    )
 
 
 def test_completion_installs_and_completes(tmp_path: Path) -> None:
     """In a home of its own; the shell itself asks for the names of builds."""
-    home = {**os.environ, "HOME": str(tmp_path), "PATH": f"{_bin(tmp_path)}:{os.environ['PATH']}"}
+    path = f"{_bin(tmp_path)}:{os.environ['PATH']}"
     for shell, typed in COMPLETED.items():
         script = tmp_path / f"completion of {shell}"
         words = ["--install-completion", "--shell", shell, "--output", str(script)]
@@ -161,7 +145,8 @@ def test_completion_installs_and_completes(tmp_path: Path) -> None:
             assert "--albedo-over-one" in text and "refuse" in text
             if typed and shutil.which(shell) is not None:
                 asked = [shell, "-c", typed.replace("FILE", shlex.quote(str(script)))]
-                assert _run(asked, home).stdout.split() == ["pretrain-256"]
+                completed = run_program(asked, HOME=str(tmp_path), PATH=path)
+                assert completed.stdout.split() == ["pretrain-256"]
 
 
 def _bin(folder: Path) -> Path:
@@ -230,8 +215,7 @@ stream.flush()
 @pytest.mark.parametrize(("name", "number"), [("stdout", 1), ("stderr", 2)])
 def test_a_signal_in_the_middle_of_a_write_is_answered(name: str, number: int) -> None:
     program = INTERRUPTED_WRITE.replace("NUMBER", str(number)).replace("NAME", name)
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert (run.returncode, run.stderr) == (130, "interrupted\n")
+    assert run_program([sys.executable, "-c", program], status=130).stderr == "interrupted\n"
 
 
 def test_the_page_of_quantities_names_what_a_condition_can_ask() -> None:

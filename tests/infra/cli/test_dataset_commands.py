@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from infra.cli.assets_next import generate_from_meshes
+from infra.cli.assets import generate_from_meshes
 from infra.cli.extend_option import load_extensions
 from infra.repair import repair
 from infra.run_record import is_run, run_facts
@@ -22,7 +22,6 @@ from storage.errors import TrilightError
 from storage.records.sample import PartFloor
 from tests.command_line import trilight
 from tests.extensions_kit import room_for_extensions, written
-from tests.for_each import case
 from tests.infra.run_by_hand import write_run
 from tests.pipeline.documents.dataset_by_hand import (
     five_scenes,
@@ -63,32 +62,19 @@ def test_a_run_is_summed_up_and_the_command_that_shows_it_named(tmp_path: Path) 
     assert json.loads(inspect(tmp_path / "my run", "--json"))["steps"] == 12
 
 
-def test_another_folder(tmp_path: Path) -> None:
+def test_a_dataset_that_is_read_only_stays_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     five_scenes(tmp_path / "set")
     before = {path: path.read_bytes() for path in (tmp_path / "set").iterdir()}
+    # the superuser may write anywhere, so that permissions alone would not do
+    monkeypatch.setattr("os.access", lambda path, mode: not mode & os.W_OK)
+    printed = inspect(tmp_path / "set")
+    assert "5 (1 test, 4 train)" in printed and "--out" in printed
     inspect(tmp_path / "set", "--out", tmp_path / "out")
     assert {path: path.read_bytes() for path in (tmp_path / "set").iterdir()} == before
     written = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert written == ["contact_sheet.png", "report", "report.html"]
-
-
-def test_a_read_only_dataset_is_summed_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    five_scenes(tmp_path)
-    # the superuser may write anywhere, so that permissions alone would not do
-    monkeypatch.setattr("os.access", lambda path, mode: not mode & os.W_OK)
-    printed = inspect(tmp_path)
-    assert "5 (1 test, 4 train)" in printed
-    assert "--out" in printed
-    assert not (tmp_path / "report.html").exists()
-
-
-def test_damage_of_the_same_length_is_named(tmp_path: Path) -> None:
-    five_scenes(tmp_path)
-    shard = sorted(tmp_path.glob("*.tar"))[0]
-    data = shard.read_bytes()
-    shard.write_bytes(data[:600] + bytes(len(data) - 1200) + data[-600:])
-    ended = trilight(["inspect", str(tmp_path)])
-    assert ended.exit_code == 1 and f"{shard.name}: " in str(ended.exception or ended.output)
 
 
 def test_parts_show_with_their_floors(tmp_path: Path) -> None:
@@ -108,20 +94,23 @@ def test_parts_show_with_their_floors(tmp_path: Path) -> None:
     assert "view 1, indirect" in page.read_text() and "38.25" in page.read_text()
 
 
-def _refused(dataset: Path) -> str:
-    """Return the one line that `inspect` ends with."""
-    return trilight(["inspect", str(dataset)]).mistake
+def _refused(*words: str | Path) -> str:
+    """Return the one line that a command ends with."""
+    return trilight([*map(str, words)]).mistake
 
 
-def test_an_empty_dataset_and_a_cut_shard_are_one_sentence(tmp_path: Path) -> None:
+def test_an_empty_dataset_and_a_damaged_shard_are_one_sentence(tmp_path: Path) -> None:
     write_dataset(tmp_path, {})
-    assert "the dataset is empty" in _refused(tmp_path)
+    assert "the dataset is empty" in _refused("inspect", tmp_path)
     assert not (tmp_path / "report.html").exists()
     dataset = five_scenes(tmp_path / "my set")
     name = dataset.manifest.shards[0].name
     path = dataset.folder.shard(name)
-    path.write_bytes(path.read_bytes()[:2000])
-    said = _refused(tmp_path / "my set")
+    data = path.read_bytes()
+    path.write_bytes(data[:600] + bytes(len(data) - 1200) + data[-600:])
+    assert f"{name}: " in _refused("inspect", tmp_path / "my set"), "of the same length"
+    path.write_bytes(data[:2000])
+    said = _refused("inspect", tmp_path / "my set")
     assert said.startswith(f"{name}: 2000 bytes; expected ")
     assert f"`trilight verify '{tmp_path}/my set'` says how" in said
 
@@ -155,15 +144,11 @@ def test_merge_select_and_reshard(tmp_path: Path) -> None:
     outcome = json.loads(shards("reshard", tmp_path / "ab", "--out", tmp_path / "d", *size))
     assert outcome["scenes_by_split"] == {"test": 4, "train": 8}
     assert outcome["dataset_digest"] == open_dataset(str(tmp_path / "d")).digest
-
-
-def test_what_is_missing_is_named(tmp_path: Path) -> None:
-    a, out = finished(tmp_path / "a", scenes(0)), tmp_path / "c"
-    with pytest.raises(TrilightError, match="1 dataset; expected at least 2"):
-        shards("merge", a, "--out", out)
-    with pytest.raises(TrilightError, match="expected --where, --split, --template or --min-noise"):
-        shards("select", a, "--out", out)
-    assert not out.exists()
+    out = ("--out", tmp_path / "e")
+    assert "1 dataset; expected at least 2" in _refused("shards", "merge", a, *out)
+    lacking = "expected --where, --split, --template or --min-noise-floor"
+    assert lacking in _refused("shards", "select", a, *out)
+    assert not (tmp_path / "e").exists()
 
 
 def test_a_bad_derived_shard_is_made_of_its_sources_again(tmp_path: Path) -> None:
@@ -175,13 +160,9 @@ def test_a_bad_derived_shard_is_made_of_its_sources_again(tmp_path: Path) -> Non
     assert "Make it again from its sources: trilight shards merge" in found.output
     with pytest.raises(TrilightError, match=r"made by `trilight shards merge`; expected one of"):
         repair(str(tmp_path / "ab"), ["train-000001.tar"], objects=None, scenes_from=None)
-    found = trilight(["verify", str(damaged := _without_a_shard(a))])
-    assert f"Next: trilight verify {damaged} --repair" in found.output
-
-
-def _without_a_shard(root: Path) -> Path:
-    (root / "train-000000.tar").unlink()
-    return root
+    (a / "train-000000.tar").unlink()
+    found = trilight(["verify", str(a)])
+    assert f"Next: trilight verify {a} --repair" in found.output
 
 
 WIDE = {"COLUMNS": "200"}
@@ -202,14 +183,10 @@ def test_an_unfinished_set_is_not_verified(tmp_path: Path) -> None:
     assert f"Next: trilight generate smoke --seed 7 --out '{place}'" in begun.output
     told = json.loads(trilight(["verify", place, "--fast", "--json"]).output)
     assert (told["finished"], told["shards"], told["shards_planned"]) == (False, 1, 3)
-
-
-def test_words_that_do_not_print_are_not_repeated(tmp_path: Path) -> None:
-    """Whoever hands out a dataset may have written them."""
-    publication = begin_tiny(tmp_path, 12)
+    # words that do not print are not repeated: whoever hands out a dataset may have written them
     for words in (["train", "smoke"], ["generate", "smoke\x1b[2J"], ["generate", "a\nb"]):
         write_asked(publication.folder, words)
-        shown = trilight(["verify", str(tmp_path)], env=WIDE).output
+        shown = trilight(["verify", place], env=WIDE).output
         assert "Next:" not in shown
         assert "run the trilight generate command that began it" in shown
 
@@ -247,18 +224,6 @@ def test_status_says_how_far_and_what_next(tmp_path: Path) -> None:
     row = json.loads(told.output)
     assert (row["shards_done"], row["scenes_planned"], row["finished"]) == (1, 12, False)
     assert row["cost_usd"] == 0.5
-
-
-def test_a_price_that_is_none_is_refused_before_anything_is_done() -> None:
-    for price in ["-1", "nan", "inf", "1000.5"]:
-        for command in [("plan", "smoke"), ("status", "nowhere")]:
-            with case((price, command)):
-                told = trilight([*command, "--price", price])
-                assert isinstance(told.exception, TrilightError)
-                assert str(told.exception) == (
-                    f"--price is {float(price)!r}; expected a number from 0 to 1000 USD "
-                    "per core-hour."
-                )
 
 
 def test_objects_of_one_split_limit_the_scenes_to_that_split() -> None:

@@ -1,10 +1,11 @@
-"""`trilight render`: a picture of every kind of source, and one clear line where there is none."""
+"""`trilight render`: pictures of every kind of source by both engines, previews, and refusals."""
 
 import io
 import itertools
 import json
 import os
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,26 @@ import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
+from pxr import Usd, UsdGeom
 
 from infra.render import path_tracer
 from infra.render.options import RenderOptions
+from infra.render.preview_table import (
+    PartCost,
+    PictureCosts,
+    keep_machine_costs,
+    machine_name,
+    shipped_table,
+)
+from model.neural_renderer import NeuralRenderer
 from pipeline.exchange.open_scene import load_source, scene_source
+from pipeline.exchange.renderformer_h5 import write_renderformer_h5
+from pipeline.exchange.usd.write import write_usd
+from pipeline.renders.variant import choose_variant
 from storage.conventions import preview_srgb8
 from storage.dataset.shard import write_shard
 from storage.errors import TrilightError
+from storage.metrics import psnr_log_db
 from storage.records.exr import decode_exr
 from storage.records.parts import sum_of_parts
 from storage.records.profiles import Profile
@@ -30,31 +44,70 @@ from tests.command_line import trilight
 from tests.crash import CrashingRenderer
 from tests.for_each import case
 from tests.infra.child_here import use_processes
-from tests.infra.render.render_kit import SMALL, mistake, render
+from tests.infra.conftest import write_network
+from tests.model.test_neural_renderer import many_lights
+from tests.pipeline.exchange.strangers_stage import write_stage
 from tests.scenes_by_hand import tiny_sample, tiny_scene
+from train.evaluation.error_colors import error_picture
 
 pytestmark = pytest.mark.usefixtures("children_here")
 
+FEW = ("--resolution", "16", "--max-spp", "8")
+SMALL = (*FEW, "--noise-floor", "90")
 FLOOR = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nf 1 2 3 4\n"
-WIDE = {"COLUMNS": "300"}
 LAMP = "v -0.1 -0.1 2\nv 0 0.1 2\nv 0.1 -0.1 2\nf 1 2 3\n"
+
+
+def printed(*words: str | Path) -> str:
+    """Return what a render says, in one line: long paths break it even on a wide screen."""
+    ended = trilight(["render", *map(str, words)], env={"COLUMNS": "400"})
+    assert ended.exit_code == 0, ended.exception
+    return " ".join(ended.stdout.split())
+
+
+def render(*words: str | Path) -> dict[str, Any]:
+    """Return what `trilight render --json` prints of a small picture."""
+    return rendered(*words, *SMALL)
+
+
+def rendered(*words: str | Path) -> dict[str, Any]:
+    ended = trilight(["render", *map(str, words), "--json"])
+    assert ended.exit_code == 0, ended.exception
+    return dict(json.loads(ended.output))
+
+
+def mistake(*words: str | Path) -> str:
+    """Return the one line that a mistake becomes."""
+    return trilight(["render", *map(str, words)]).mistake
+
+
+def header(path: Path) -> dict[str, Any]:
+    """Return the header of a picture without the prefix of its names."""
+    stored = OpenEXR.File(io.BytesIO(path.read_bytes()), header_only=True).header()
+    return {name.removeprefix("trilight."): value for name, value in stored.items()}
+
+
+def shown(path: Path) -> np.ndarray:
+    """Return the pixels of a PNG."""
+    return np.asarray(Image.open(path))
+
+
+@pytest.fixture
+def network(tmp_path: Path) -> Path:
+    return write_network(tmp_path / "model.safetensors", max_triangles=2)
 
 
 def _object(mesh: str, emissive: float, **more: Any) -> dict[str, Any]:
     place = {"translation": [0, 0, 0], "rotation": [0, 0, 0], "scale": [1, 1, 1]}
-    albedo = 0.0 if emissive else 0.4
-    return {
-        "mesh_path": mesh,
-        "transform": {**place, "normalize": False},
-        "material": {
-            "diffuse": [albedo] * 3,
-            "specular": [0.2] * 3,
-            "roughness": 0.5,
-            "emissive": [emissive] * 3,
-            "smooth_shading": False,
-        },
-        **more,
+    material = {
+        "diffuse": [0.0 if emissive else 0.4] * 3,
+        "specular": [0.2] * 3,
+        "roughness": 0.5,
+        "emissive": [emissive] * 3,
+        "smooth_shading": False,
     }
+    transform = {**place, "normalize": False}
+    return {"mesh_path": mesh, "transform": transform, "material": material, **more}
 
 
 @pytest.fixture
@@ -65,15 +118,12 @@ def described(tmp_path: Path) -> Path:
     (folder / "floor.obj").write_text(FLOOR)
     (folder / "lamp.obj").write_text(LAMP)
     camera = {"look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 40}
-    scene = {
-        "scene_name": "two",
-        "version": "1.0",
-        "objects": {
-            "floor": _object("floor.obj", 0, colour="red"),
-            "lamp": _object("lamp.obj", 100),
-        },
-        "cameras": [{**camera, "position": [2, 0, 1]}, {**camera, "position": [0, 2, 1]}],
+    objects = {
+        "floor": _object("floor.obj", 0, colour="red"),
+        "lamp": _object("lamp.obj", 100),
     }
+    cameras = [{**camera, "position": place} for place in ([2, 0, 1], [0, 2, 1])]
+    scene = {"scene_name": "two", "version": "1.0", "objects": objects, "cameras": cameras}
     (folder / "two.json").write_text(json.dumps(scene))
     return folder / "two.json"
 
@@ -86,96 +136,191 @@ def _shard(path: Path, scene: Scene, profile: Profile = "lossless") -> Path:
     return path
 
 
-def test_one_scene_gives_one_picture_whatever_it_is_read_from(
-    described: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_every_form_of_a_scene_gives_one_picture_by_both_engines(
+    described: Path, network: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The last one in child processes, as for a user; the others here."""
     scene = load_source(scene_source(str(described))).scene
     (tmp_path / "two.safetensors").write_bytes(encode_scene(scene))
+    write_usd(tmp_path / "two.usda", scene)
     shard = _shard(tmp_path / "train-000000.tar", scene)
     packed = _shard(tmp_path / "train-000001.tar", scene, "compact")
-    sources: list[str | Path] = [
-        described,
-        tmp_path / "two.safetensors",
-        f"{shard}::000000012",
-        f"{packed}::000000012",
-    ]
-    outs = [tmp_path / f"new/{row}.exr" for row in range(len(sources))]
-    found = []
-    for source, out in zip(sources, outs, strict=True):
-        if source == sources[-1]:
+    forms: list[str | Path] = ["two.usda", described, "two.safetensors", f"{shard}::000000012"]
+    forms.append(f"{packed}::000000012")
+    with pytest.warns(UserWarning, match="3 triangles"):
+        expected = NeuralRenderer.load(network, device="cpu").render(scene, 16)[1]
+    traced: list[np.ndarray] = []
+    for row, form in enumerate(forms):
+        if form == forms[-1]:
             use_processes(monkeypatch)
-        found.append(render(source, "--view", "1", "--out", out))
-    pictures = [decode_exr(out.read_bytes()) for out in outs]
-    assert pictures[0].shape == (16, 16, 3)
-    assert pictures[0].mean() > 0.01
-    for picture, outcome in zip(pictures, found, strict=True):
-        np.testing.assert_array_equal(picture, pictures[0])
-        assert outcome["scene_sha256"] == scene_digest(scene)
-        assert (outcome["spp"], outcome["view"], outcome["at_cap"]) == (8, 1, True)
-        assert outcome["mean_radiance"] == pytest.approx(picture.mean(dtype=np.float64), rel=1e-3)
-        assert (outcome["triangles"], outcome["lights"]) == (3, 1)
-    assert found[0]["notes"][0] == "two.json: unknown field objects.floor.colour"
-    assert "may flatter" in found[1]["notes"][0]
-    shown = np.asarray(Image.open(outs[0].with_suffix(".png")))
-    assert shown.shape == (256, 256, 3)
-    np.testing.assert_array_equal(shown[::16, ::16], preview_srgb8(pictures[0]))
+        out = tmp_path / f"new/{row}.exr"
+        engines = ("--engine", "both", "--checkpoint", network, "--view", "1")
+        with case(form):
+            found = render(tmp_path / form, "--out", out, *engines)
+            of_network = decode_exr(out.with_suffix(".neural.exr").read_bytes())
+            # half floats are exact to 2^-11 of their value
+            np.testing.assert_allclose(of_network, expected, rtol=1e-3, atol=1e-4)
+            assert (found["triangles"], found["lights"], found["neural"]["passes"]) == (3, 1, 1)
+            assert "trained on at most 2" in str(found["notes"])
+            assert "may flatter" in str(found["notes"])
+            assert ("unknown field objects.floor.colour" in found["notes"][0]) == (row == 1)
+            traced.append(decode_exr(out.with_suffix(".mitsuba.exr").read_bytes()))
+            np.testing.assert_array_equal(traced[-1], traced[0])
+            assert found["scene_sha256"] == scene_digest(scene)
+            facts = found["mitsuba"]
+            assert (facts["spp"], found["view"], facts["at_cap"]) == (8, 1, True)
+            mean = traced[0].mean(dtype=np.float64)
+            assert facts["mean_radiance"] == pytest.approx(mean, rel=1e-3)
+    assert traced[0].shape == (16, 16, 3) and traced[0].mean() > 0.01
 
 
-def test_the_picture_says_how_it_was_made(source: Path, tmp_path: Path) -> None:
-    out = tmp_path / "tiny.exr"
-    outcome = render(source, "--out", out, "--seed", str(1 << 40))
-    header = OpenEXR.File(io.BytesIO(out.read_bytes()), header_only=True).header()
-    assert header["trilight.source"] == "tiny.safetensors"
-    assert header["trilight.scene_sha256"] == scene_digest(tiny_scene())
-    assert header["trilight.seed"] == str(1 << 40)
-    assert header["trilight.spp"] == 8
-    # an attribute is a float32
-    assert header["trilight.noise_floor_db"] == pytest.approx(outcome["noise_floor_db"], rel=1e-6)
-    settings = json.loads(header["trilight.settings"])
-    assert settings["resolution"] == 16
+def test_a_picture_says_how_it_was_made(source: Path, network: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.exr"
+    both = ("--engine", "both", "--checkpoint", network, "--seed", str(1 << 40))
+    outcome = render(source, "--out", out, *both)
+    files = {name: tmp_path / f"x.{name}.exr" for name in ("mitsuba", "neural")}
+    traced, drawn = (header(path) for path in files.values())
+    for found in (traced, drawn):
+        assert found["scene_sha256"] == scene_digest(tiny_scene())
+        assert str(tmp_path) not in str(found)
+    assert traced["source"] == "tiny.safetensors"
+    assert (traced["seed"], traced["spp"]) == (str(1 << 40), 8)
+    floor_db = outcome["mitsuba"]["noise_floor_db"]
+    assert traced["noise_floor_db"] == pytest.approx(floor_db, rel=1e-6), "a float32 in a header"
     # no target that was not asked for: pictures made before there were others are kept
-    assert set(settings) == {
+    assert set(json.loads(traced["settings"])) == {
         "resolution", "noise_floor_db", "min_spp", "max_spp", "reject_at_cap", "max_depth",
         "rr_depth", "aux_spp", "denoiser", "min_mean_radiance", "per_light", "arithmetic",
     }  # fmt: skip
-    assert "mitsuba_variant" in json.loads(header["trilight.environment"])
-    assert str(tmp_path) not in str(header)
-    first = out.read_bytes()
-    render(source, "--out", out, "--seed", str(1 << 40))
-    assert out.read_bytes() == first
+    assert "mitsuba_variant" in json.loads(traced["environment"])
+    assert (drawn["engine"], drawn["checkpoint"]) == ("neural", "model.safetensors")
+    assert drawn["network_sha256"] == NeuralRenderer.load(network).digest
+    assert json.loads(drawn["settings"]) == {
+        "lights_per_pass": 8, "precision": "float32", "resolution": 16, "skip_empty_bundles": False
+    }  # fmt: skip
+    first = {name: path.read_bytes() for name, path in files.items()}
+    render(source, "--out", out, *both)
+    assert {name: path.read_bytes() for name, path in files.items()} == first
 
 
-def unwrapped(printed: str) -> str:
-    """Return what was printed in one line: long paths break the last ones even on a wide screen."""
-    return " ".join(printed.split())
+def test_both_engines_stand_side_by_side(network: Path, source: Path, tmp_path: Path) -> None:
+    out, arguments = tmp_path / "x.exr", ("--engine", "both", "--checkpoint", network)
+    found = render(source, "--out", out, *arguments)
+    traced, drawn = (
+        decode_exr((tmp_path / f"x.{name}.exr").read_bytes()) for name in ("mitsuba", "neural")
+    )
+    assert not out.exists()
+    assert found["psnr_log_db"] == pytest.approx(psnr_log_db(drawn, traced), abs=1e-3)
+    sheet = shown(tmp_path / "x.png")
+    assert sheet.shape == (256 + 24, 3 * 256 + 2 * 8, 3)
+    left, middle, right = (sheet[24::16, at : at + 256 : 16] for at in (0, 264, 528))
+    np.testing.assert_array_equal(left, preview_srgb8(traced))
+    np.testing.assert_array_equal(middle, preview_srgb8(drawn))
+    np.testing.assert_array_equal(right, error_picture(drawn, traced))
+    said = printed(source, "--out", out, *arguments, *SMALL, "--exposure", "-2")
+    darker = shown(tmp_path / "x.png")
+    np.testing.assert_array_equal(darker[24::16, :256:16], preview_srgb8(traced / 4))
+    np.testing.assert_array_equal(darker[24:, 528:], sheet[24:, 528:])  # an error stays one
+    for text in ("agreement", "samples per pixel", "model.safetensors; passes: 1", "x.png"):
+        assert text in said
 
 
-def test_the_last_line_says_all_three_floors(source: Path, tmp_path: Path) -> None:
-    words = ["render", str(source), "--resolution", "16", "--max-spp", "8"]
-    of_one = trilight([*words, "--out", str(tmp_path / "x.exr")], env=WIDE).output
-    floors = r"noise floor -?\d+\.\d dB \(linear -?\d+\.\d, objects -?\d+\.\d\)$"
-    assert re.search(rf"measure with \S+x\.exr; {floors}", unwrapped(of_one))
-    of_two = trilight([*words, "--orbit", "2", "--out", str(tmp_path / "turn")], env=WIDE).output
-    assert re.search(rf"median {floors}", unwrapped(of_two))
-    for metric in ("psnr_log_db", "psnr_linear_db", "object_psnr_log_db"):
-        assert f"({metric}" in of_one and f"({metric})" in of_two
-
-
-def test_a_linear_target_alone_governs_and_is_said_beside_what_came_of_it(
-    source: Path, tmp_path: Path
+def test_a_network_clips_what_half_floats_lack_and_groups_lights(
+    source: Path, network: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "x.exr"
-    words = ["render", str(source), "--out", str(out), "--resolution", "16"]
-    printed = unwrapped(
-        trilight([*words, "--noise-floor-linear", "5", "--max-spp", "64"], env=WIDE).output
+    bright = write_network(tmp_path / "bright.safetensors", bias=6.0)
+    found = render(source, "--out", out, "--engine", "neural", "--checkpoint", bright)
+    assert found["clipped_pixels"] == 16 * 16
+    assert "neural: pixels beyond what half floats hold were clipped" in str(found["notes"])
+    assert decode_exr(out.read_bytes()).max() == 65504
+    source.write_bytes(encode_scene(many_lights(9)))
+    drawn = (source, "--out", out, "--engine", "neural", "--checkpoint", network)
+    for most, passes in (("8", 2), ("3", 3), ("9", 1)):
+        assert render(*drawn, "--lights-per-pass", most)["passes"] == passes
+    np.testing.assert_array_equal(
+        shown(out.with_suffix(".png"))[::16, ::16], preview_srgb8(decode_exr(out.read_bytes()))
     )
-    assert "clamped to [0, 1]; reached 5 dB)" in printed and "(psnr_log_db)" in printed
-    header = OpenEXR.File(io.BytesIO(out.read_bytes()), header_only=True).header()
-    settings = json.loads(header["trilight.settings"])
+    write_renderformer_h5(tmp_path / "many.h5", many_lights(9), texture_type="float32")
+    first = decode_exr(out.read_bytes())
+    render(tmp_path / "many.h5", *drawn[1:], "--lights-per-pass", "9")
+    # it orders the triangles anew, and half floats are exact to 2^-11 of their value
+    np.testing.assert_allclose(decode_exr(out.read_bytes()), first, rtol=2e-3, atol=2e-4)
+
+
+def test_a_turn_is_path_traced_to_a_video_and_kept(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "turn.webp"
+    words = (source, "--out", out, "--orbit", "3", "--fps", "10")
+    found = render(*words)
+    assert found["video"] == str(out)
+    assert [picture["kept"] for picture in found["pictures"]] == [False] * 3
+    exrs = [Path(picture["exr"]) for picture in found["pictures"]]
+    assert [path.name for path in exrs] == ["000000.exr", "000001.exr", "000002.exr"]
+    pictures = [decode_exr(path.read_bytes()) for path in exrs]
+    assert min(picture.mean() for picture in pictures) > 0.01
+    assert (pictures[0] != pictures[1]).any()
+    with Image.open(out) as video:
+        assert (getattr(video, "n_frames", 1), video.size) == (3, (256, 256))
+    exrs[1].unlink()
+    assert [picture["kept"] for picture in render(*words)["pictures"]] == [True, False, True]
+    np.testing.assert_array_equal(decode_exr(exrs[1].read_bytes()), pictures[1])
+    floors = r"median noise floor -?\d+\.\d dB \(linear -?\d+\.\d, objects -?\d+\.\d\)$"
+    assert re.search(floors, printed(*words, *SMALL))
+
+
+def test_a_stage_that_moves_is_drawn_frame_by_frame_by_both_engines(
+    network: Path, tmp_path: Path
+) -> None:
+    path = write_stage(tmp_path)
+    stage = Usd.Stage.Open(str(path))
+    move = UsdGeom.Xformable(stage.GetPrimAtPath("/W/Grid")).AddTranslateOp()
+    for frame, height in ((1, 0), (3, 20)):
+        move.Set((0, height, 0), frame)
+    stage.SetStartTimeCode(1)
+    stage.SetEndTimeCode(3)
+    stage.GetRootLayer().Save()
+    out = tmp_path / "both"
+    words = (path, "--out", out, "--engine", "both", "--checkpoint", network)
+    found = render(*words)
+    assert found["video"] is None
+    assert len({picture["scene_sha256"] for picture in found["pictures"]}) == 3
+    assert all(0 < picture["psnr_log_db"] < 100 for picture in found["pictures"])
+    # by hand from the files: what of the error is another in the next frame
+    light = {
+        name: [
+            np.log10(1 + decode_exr((out / f"{at:06d}.{name}.exr").read_bytes()))
+            for at in (0, 1, 2)
+        ]
+        for name in ("neural", "mitsuba")
+    }
+    errors = np.subtract(light["neural"], light["mitsuba"])
+    changes = [np.mean((errors[at + 1] - errors[at]) ** 2) for at in range(2)]
+    flicker = [picture.get("flicker") for picture in found["pictures"]]
+    assert flicker[0] is None
+    for at in range(2):
+        # files hold half floats of radiance: 5e-4 of a value, 0.01 dB of an error above 0.1
+        assert flicker[at + 1]["db"] == pytest.approx(-10 * np.log10(changes[at]), abs=0.05)
+        assert flicker[at + 1]["noise_db"] > 0
+    suffixes = ("mitsuba.exr", "neural.exr", "png")
+    names = [f"{at:06d}.{suffix}" for at in range(3) for suffix in suffixes]
+    assert sorted(path.name for path in out.iterdir()) == names
+    said = printed(*words, *SMALL)
+    for text in ("6, of which 6 were there already", "agreement", "flicker"):
+        assert text in said
+
+
+def test_a_target_governs_and_all_three_floors_are_said(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.exr"
+    words = (source, "--out", out, "--resolution", "16", "--noise-floor-linear", "5")
+    said = printed(*words, "--max-spp", "64")
+    floors = r"noise floor -?\d+\.\d dB \(linear -?\d+\.\d, objects -?\d+\.\d\)$"
+    assert re.search(rf"measure with \S+x\.exr; {floors}", said)
+    for text in ("(psnr_log_db)", "(psnr_linear_db: linear, clamped to [0, 1]; reached 5 dB)"):
+        assert text in said
+    assert "(object_psnr_log_db" in said
+    settings = json.loads(header(out)["settings"])
     assert (settings["noise_floor_db"], settings["noise_floor_linear_db"]) == (None, 5)
-    asked = ("--noise-floor-linear", "5", "--noise-floor-objects", "95", "--max-spp", "8")
-    both = unwrapped(trilight([*words, *asked], env=WIDE).output)
+    both = printed(*words, "--noise-floor-objects", "95", "--max-spp", "8")
     assert "clamped to [0, 1]; reached 5 dB)" in both
     assert "geometry is seen; the cap came before 95 dB)" in both
 
@@ -190,7 +335,7 @@ def test_the_words_of_what_was_asked_give_the_picture_again(source: Path, tmp_pa
     typed += ["--resolution", "16", "--out", str(out)]
     pictures = []
     for words in (typed, option_words(asked, leave_out=("source",))):
-        assert trilight(["render", str(source), *words]).exit_code == 0
+        printed(source, *words)
         pictures.append(out.read_bytes())
     assert pictures[0] == pictures[1]
 
@@ -198,23 +343,137 @@ def test_the_words_of_what_was_asked_give_the_picture_again(source: Path, tmp_pa
 def test_parts_stand_as_layers_in_the_file_of_the_picture(source: Path, tmp_path: Path) -> None:
     """With their floors in its header; a film's files with layers are kept like others."""
     out = tmp_path / "x.exr"
-    words = ["render", str(source), "--out", str(out), "--split", *SMALL]
-    assert "layer indirect" in unwrapped(trilight(words, env=WIDE).output)
+    assert "layer indirect" in printed(source, "--out", out, "--split", *SMALL)
     file = OpenEXR.File(io.BytesIO(out.read_bytes()))
     assert set(file.channels()) == {"RGB", "direct", "indirect"}
     layers = {name: file.channels()[name].pixels.astype(np.float32) for name in file.channels()}
     picture = layers.pop("RGB")
     assert picture.mean() > 0.01
     np.testing.assert_array_equal(sum_of_parts(layers), picture)
-    assert file.header()["trilight.indirect.noise_floor_db"] == 100.0  # a lone floor
+    assert header(out)["indirect.noise_floor_db"] == 100.0  # a lone floor
     film = ("--orbit", "1", "--out", tmp_path / "film", "--split", "--split-lobes")
     for kept in (False, True):
         (shot,) = render(source, *film)["pictures"]
         assert shot["kept"] is kept
         assert shot["diffuse_indirect.noise_floor_db"] == 100.0
-    assert "a network makes all light together" in mistake(
-        source, "--out", out, "--split", "--engine", "neural"
+
+
+def test_a_preview_says_that_its_error_is_unknown(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.exr"
+    words = (source, "--out", out, "--resolution", "16", "--spp", "3")
+    said = printed(*words)
+    assert "samples per pixel 3, one fast denoise noise floor unknown" in said
+    assert "--noise-floor 40 measures it and samples on to it" in said
+    assert f"Look at {out.with_suffix('.png')}; measure with {out}" in said
+    found = header(out)
+    assert found["spp"] == 3 and json.loads(found["settings"])["denoiser"] == "fast"
+    assert not [name for name in found if "noise_floor" in name]
+    assert rendered(*words)["spp"] == 3
+    assert "3, not denoised" in printed(*words, "--denoiser", "off")
+
+
+def test_what_is_chosen_is_said_made_and_recorded(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.exr"
+    words = (source, "--out", out, "--resolution", "32")
+    said = printed(*words, "--error", "20")
+    assert "--error 20: chosen: " in said and "a pixel, filter fast; expected" in said
+    assert f"dB in the median of {shipped_table().scenes} scenes" in said
+    assert "noise floor unknown: a preview measures none" in said
+    assert "s after start-up; expected" in said
+    recorded = header(out)
+    assert recorded["chosen_for"] == "--error 20"
+    assert recorded["expected_db"] >= 20 and recorded["expected_seconds"] > 0
+    assert json.loads(recorded["settings"])["spp"] == recorded["spp"]
+    for option, value in (("--seconds", "1e-9"), ("--seconds", "0.05"), ("--error", "0")):
+        with case(f"{option} {value}"):
+            found = rendered(*words, option, value)
+            assert found["chosen_for"] == f"{option} {value}".replace("1e-9", "1e-09")
+            assert found["choice"].startswith(found["chosen_for"])
+            assert ("nothing is as quick" in found["choice"]) == (value == "1e-9")
+            assert found["picture_seconds"] > 0 and found["expected_seconds"] > 0
+            assert "noise_floor_db" not in found
+
+
+def test_an_orbit_is_chosen_for_each_of_its_pictures(source: Path, tmp_path: Path) -> None:
+    """Pictures of one scene share its loading; a second run keeps them."""
+    words = ("--resolution", "32", "--seconds", "1e-9")
+    turn = (source, "--out", tmp_path / "turn", "--orbit", "3", *words)
+    found = rendered(*turn)
+    one = rendered(source, "--out", tmp_path / "x.exr", *words)
+    assert len(found["pictures"]) == 3
+    assert all(each["expected_seconds"] < one["expected_seconds"] for each in found["pictures"])
+    again = rendered(*turn)["pictures"]
+    assert [(each["kept"], each["picture_seconds"]) for each in again] == [(True, None)] * 3
+
+
+def test_the_costs_of_this_machine_choose(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A machine on which everything takes next to nothing is given the best of all ways."""
+    variant = choose_variant()  # remembered where the cache was before
+    monkeypatch.setattr("infra.render.preview_table.cache_folder", lambda name: tmp_path)
+    rows = tuple(
+        PartCost(part=row.part, width=row.width, serial_s=1e-7, parallel_s=0)
+        for row in shipped_table().costs.rows
     )
+    keep_machine_costs(PictureCosts(machine=machine_name(variant), rows=rows))
+    words = ("--out", tmp_path / "x.exr", "--resolution", "32", "--seconds", "1e-3")
+    found = rendered(source, *words)
+    assert found["spp"] >= 256 and "costs as measured here" in found["choice"]
+
+
+REFUSED = {
+    "--engine cycles": "--engine is 'cycles'; expected one of mitsuba, neural, both",
+    "--exposure 33": "--exposure-ev is 33.0; expected a number from -32 to 32 stops",
+    "--orbit 3": "expected a folder, X.mp4 or X.webp",
+    "--orbit 3 --cameras a.json": "expected no --orbit beside it",
+    "--resolution 20": "resolution is 20; expected a multiple of 8",
+    "--max-spp 100": "max_spp 100; expected multiples of 8",
+    "--noise-floor-objects loud": "--noise-floor-objects-db is 'loud'",
+    "--threads 0": "--threads is 0",
+    "--split --engine neural": "a network makes all light together",
+    "--checkpoint model.safetensors": "expected --engine neural or both beside it",
+    "--engine neural --checkpoint no": "checkpoint no: no such file",
+    "--engine neural --checkpoint tiny.safetensors": "weights that carry no configuration of ours",
+    "--engine neural --precision half": "--precision is 'half'; expected one of float32",
+    "--seconds 1 --spp 4": "--spp is 4 beside --seconds; expected one of them",
+    "--seconds 1 --error 30": "--seconds is 1 beside --error; expected one of",
+    "--spp 4 --noise-floor 30": "--spp is 4 beside --noise-floor; expected one",
+    "--error 30 --split": "--error is 30 beside --split; expected one of them: a pr",
+    "--error 30 --denoiser fast": "--denoiser is fast; expected --spp beside it",
+    "--seconds 1 --engine neural": "--seconds is 1 beside --engine neural; expec",
+    "--spp 4 --engine both": "--engine both; expected --engine mitsuba: a",
+    "--seconds nan": "--seconds is nan; expected a number above 0, up to 1e+09 seconds",
+    "--error 99": "--error is 99; expected at most",
+    "--error 30 --resolution 20": "expected a multiple of 8",
+    "--out x.png": "--out is",
+    "--out /dev/null/x.exr": "cannot write x.exr",
+    "--out all --cameras none.json": "none.json: no such file",
+    "--out all --orbit 2 --view 9": "--view is 9",
+    "https://h/{0..1}.h5 --out all": "only files of this machine",
+    # what only the child finds out
+    "--view 2 --noise-floor 90": "--view is 2; expected 0 to 1",
+    "--view 2 --engine both --checkpoint model.safetensors": "--view is 2",
+    "blinding.safetensors --max-spp 8": "view 0 cannot be rendered (radiance_overflow",
+}
+"""Words after the source tiny.safetensors and --out x.exr, unless they name others."""
+
+
+def test_refusals_are_one_line(
+    network: Path, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    materials = tiny_scene().materials.copy()
+    materials[1, 7:] = 3e38
+    Path("blinding.safetensors").write_bytes(encode_scene(tiny_scene(materials=materials)))
+    for line, message in REFUSED.items():
+        words = shlex.split(line)
+        of = [] if not words[0].startswith("--") else [source.name]
+        to = [] if "--out" in words else ["--out", "x.exr"]
+        wide = [] if "--resolution" in words else ["--resolution", "32"]
+        with case(line):
+            assert message in mistake(*of, *words, *to, *wide)
+    assert not Path("x.exr").exists()
 
 
 BAD_SOURCES = {
@@ -225,34 +484,30 @@ BAD_SOURCES = {
     "set": "a folder; expected a scene",
     "text.safetensors": "text.safetensors: safetensors: the header claims",
     "pipe.safetensors": "pipe.safetensors: expected a regular file",
+    "train-000000.tar": "expected .*train-000000.tar::KEY",
+    "train-000000.tar::000000013": "no sample 000000013; expected one of its 2: 0000000",
+    "train-000001.tar::000000012": r"sample 000000012: scene: fov_deg\[1\] is 181",
+    "cut.tar::000000012": "cut.tar|000000012",
+    "scenes/two.json": "leads out of the folder",
 }
 
 
-def test_a_bad_source_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bad_source_is_one_line(
+    described: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     Path("set").mkdir()
     Path("text.safetensors").write_text("no scene")
     os.mkfifo("pipe.safetensors")
+    shard = _shard(tmp_path / "train-000000.tar", tiny_scene())
+    Path("cut.tar").write_bytes(shard.read_bytes()[:700])
+    _shard(tmp_path / "train-000001.tar", tiny_scene(fov_deg=np.array([45, 181], np.float32)))
+    described.write_text(described.read_text().replace("floor.obj", "../floor.obj"))
     for source, message in BAD_SOURCES.items():
         with case(source), pytest.raises(TrilightError, match=message) as caught:
             load_source(scene_source(source))
         assert "\n" not in str(caught.value), source
         assert "secret" not in str(caught.value), source
-
-
-def test_a_shard_needs_a_key_that_it_has_and_a_lawful_scene(tmp_path: Path) -> None:
-    shard = _shard(tmp_path / "train-000000.tar", tiny_scene())
-    with pytest.raises(TrilightError, match="expected .*train-000000.tar::KEY"):
-        scene_source(str(shard))
-    with pytest.raises(TrilightError, match="no sample 000000013; expected one of its 2: 0000000"):
-        load_source(scene_source(f"{shard}::000000013"))
-    shard.write_bytes(shard.read_bytes()[:700])
-    with pytest.raises(TrilightError, match="train-000000.tar|000000012"):
-        load_source(scene_source(f"{shard}::000000012"))
-    lawless = tiny_scene(fov_deg=np.array([45, 181], np.float32))
-    shard = _shard(tmp_path / "train-000001.tar", lawless)
-    with pytest.raises(TrilightError, match=r"sample 000000012: scene: fov_deg\[1\] is 181"):
-        load_source(scene_source(f"{shard}::000000012"))
 
 
 def test_no_engine_takes_a_vertex_beyond_the_farthest_position(
@@ -270,41 +525,6 @@ def test_no_engine_takes_a_vertex_beyond_the_farthest_position(
         told = mistake(source, "--engine", engine, "--out", tmp_path / "x.exr", *SMALL)
         assert "vertex_positions[0, 0] is " in told and "expected from -10000 to 10000 m" in told
     assert not (tmp_path / "x.exr").exists()
-
-
-def test_a_mesh_outside_of_the_folder_is_refused(described: Path) -> None:
-    described.write_text(described.read_text().replace("floor.obj", "../floor.obj"))
-    with pytest.raises(TrilightError, match="leads out of the folder"):
-        load_source(scene_source(str(described)))
-
-
-def test_mistakes_on_the_command_line_are_one_line(source: Path, tmp_path: Path) -> None:
-    out = tmp_path / "x.exr"
-    for words, message in (
-        (("--engine", "cycles"), "--engine is 'cycles'; expected one of mitsuba, neural, both"),
-        (("--exposure", "33"), "--exposure-ev is 33.0; expected a number from -32 to 32 stops"),
-        (("--orbit", "3"), "expected a folder, X.mp4 or X.webp"),
-        (("--orbit", "3", "--cameras", "a.json"), "expected no --orbit beside it"),
-        (("--resolution", "20"), "resolution is 20; expected a multiple of 8"),
-        (("--max-spp", "100"), "max_spp 100; expected multiples of 8"),
-        (("--noise-floor-objects", "loud"), "--noise-floor-objects-db is 'loud'"),
-        (("--threads", "0"), "--threads is 0"),
-    ):
-        assert message in mistake(source, "--out", out, *words)
-    assert "--out is" in mistake(source, "--out", tmp_path / "x.png")
-    assert "cannot write x.exr" in mistake(source, "--out", "/dev/null/x.exr")
-    assert not out.exists()
-
-
-def test_what_only_the_child_finds_out_is_one_line_too(source: Path, tmp_path: Path) -> None:
-    out = tmp_path / "x.exr"
-    assert "--view is 2; expected 0 to 1" in mistake(source, "--out", out, *SMALL, "--view", "2")
-    materials = tiny_scene().materials.copy()
-    materials[1, 7:] = 3e38
-    source.write_bytes(encode_scene(tiny_scene(materials=materials)))
-    told = mistake(source, "--out", out, *SMALL)
-    assert "view 0 cannot be rendered (radiance_overflow" in told
-    assert not out.exists()
 
 
 def test_a_crash_in_native_code_is_one_line(

@@ -35,12 +35,15 @@ FORMS = ("usda", "usdc", "usdz", "json", "h5", "safetensors")
 PROFILE: Profile = "lossless"
 
 
-def convert(*arguments: str | Path) -> dict[str, Any]:
-    """Return what `trilight convert --json` prints."""
-    words = ["convert", *(str(argument) for argument in arguments), "--json"]
-    result = trilight(words)
+def said(*words: str | Path) -> dict[str, Any]:
+    """Return what a command prints as JSON."""
+    result = trilight([*map(str, words), "--json"])
     assert result.exit_code == 0, result.exception
     return dict(json.loads(result.output))
+
+
+def convert(*words: str | Path) -> dict[str, Any]:
+    return said("convert", *words)
 
 
 def refused(*words: str | Path) -> str:
@@ -105,6 +108,8 @@ def test_hdf5_takes_the_pictures_of_a_sample_along(tmp_path: Path, shard: Path) 
 def test_a_strangers_stage_within_a_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A child that is confined can read the stage and write its scene, as for a user."""
     stage = write_stage(tmp_path, sphere=True)
+    for budget, message in (("0", "from 1 to"), ("20", "emitters take")):
+        assert message in refused("convert", stage, tmp_path / "a.json", "--budget", budget)
     fewer = convert(stage, tmp_path / "few.safetensors", "--budget", "600")
     use_processes(monkeypatch)
     whole = convert(stage, tmp_path / "whole.safetensors")
@@ -150,18 +155,6 @@ def test_a_crash_in_native_code_is_one_line(
     assert told.startswith("stage.usda: could not be converted (crashed_signal_11")
 
 
-def test_budgets_that_cannot_be(tmp_path: Path) -> None:
-    stage = write_stage(tmp_path)
-    assert "from 1 to" in refused("convert", stage, tmp_path / "a.json", "--budget", "0")
-    assert "emitters take" in refused("convert", stage, tmp_path / "a.json", "--budget", "20")
-
-
-def run(*words: str | Path) -> dict[str, Any]:
-    result = trilight(["passes", *map(str, words), "--json"])
-    assert result.exit_code == 0, result.exception
-    return dict(json.loads(result.output))
-
-
 @pytest.fixture
 def dataset(tmp_path: Path) -> Path:
     scenes = {"train-000000.tar": [0, 1], "test-000001.tar": [2]}
@@ -170,9 +163,11 @@ def dataset(tmp_path: Path) -> Path:
     return tmp_path / "data"
 
 
-def test_the_views_of_a_dataset(dataset: Path, tmp_path: Path) -> None:
+def test_passes_are_of_the_views_that_are_named(dataset: Path, tmp_path: Path) -> None:
+    """Of a dataset, of one scene of it, and of the file of a scene; what is not there is named."""
     out = tmp_path / "out"
-    found = run(dataset, "--passes", "normal,depth", "--passes", "object", "--out", out)
+    words = ("--passes", "normal,depth", "--passes", "object", "--out", out)
+    found = said("passes", dataset, *words)
     assert found["passes"] == ["object", "depth_axis_m", "shading_normal"]
     assert [Path(path).name for path in found["files"]] == [
         f"{scene:09d}.{view}.passes.exr" for scene in (2, 0, 1) for view in range(2)
@@ -180,53 +175,33 @@ def test_the_views_of_a_dataset(dataset: Path, tmp_path: Path) -> None:
     names = ("object", "depth_axis_m", "shading_normal")
     data = (out / "000000002.1.passes.exr").read_bytes()
     assert data == passes_exr(furnished(["a"]), names, view=1, resolution=16)
-
-
-def test_one_view_of_one_scene(dataset: Path, tmp_path: Path) -> None:
-    words = (dataset, "--scene", "1", "--view", "1", "--resolution", "8", "--rays-a-side", "2")
-    (path,) = run(*words, "--out", tmp_path / "out")["files"]
+    one = ("--scene", "1", "--view", "1", "--resolution", "8", "--rays-a-side", "2")
+    (path,) = said("passes", dataset, *one, "--out", tmp_path / "one")["files"]
     assert Path(path).name == "000000001.1.passes.exr"
     assert set(decode_passes_exr(Path(path).read_bytes(), 8)) == {
         *("object", "coverage", "depth_axis_m", "shading_normal")
     }
-
-
-def test_the_file_of_a_scene(tmp_path: Path) -> None:
-    path = tmp_path / "floor.safetensors"
-    path.write_bytes(encode_scene(tiny_scene()))
-    found = run(path, "--view", "0", "--passes", "triangle", "--out", tmp_path)
+    file = tmp_path / "floor.safetensors"
+    file.write_bytes(encode_scene(tiny_scene()))
+    found = said("passes", file, "--view", "0", "--passes", "triangle", "--out", tmp_path)
     assert found["files"] == [str(tmp_path / "floor.0.passes.exr")]
     data = (tmp_path / "floor.0.passes.exr").read_bytes()
     assert data == passes_exr(tiny_scene(), ["triangle"], view=0, resolution=256)
-
-
-def test_wrong_passes_are_named(dataset: Path, tmp_path: Path) -> None:
-    for words, message in (
-        (("--scene", "9"), "no scene 000000009; expected one of its 3"),
-        (("--view", "2"), "view is 2; expected 0 to 1"),
-        (("--passes", "dept"), "did you mean depth?"),
-        (("--passes", "motion_px"), "another moment"),
+    for option, value, message in (
+        ("--scene", "9", "no scene 000000009; expected one of its 3"),
+        ("--view", "2", "view is 2; expected 0 to 1"),
+        ("--passes", "dept", "did you mean depth?"),
+        ("--passes", "motion_px", "another moment"),
     ):
-        assert message in refused("passes", dataset, *words, "--out", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-def printed(*arguments: str) -> str:
-    result = trilight(["model", *arguments])
-    if result.exception:
-        raise result.exception
-    assert result.exit_code == 0
-    return result.stdout
+        assert message in refused("passes", dataset, option, value, "--out", tmp_path / "none")
+    assert not (tmp_path / "none").exists()
 
 
 def test_a_size_is_described() -> None:
-    text = printed("base")
+    text = trilight(["model", "base"]).stdout
     for word in ("194.96 M", "692.7 GFLOP", "memory, bfloat16", "cross-attention"):
         assert word in text
-
-
-def test_json_holds_the_numbers() -> None:
-    found = json.loads(printed("large", "--json", "--views", "4", "--resolution", "512"))
+    found = said("model", "large", "--views", "4", "--resolution", "512")
     assert sum(found["parameters"].values()) == 483_266_819
     assert found["workload"] == {"resolution": 512, "triangles": 1536, "views": 4}
     assert found["config"]["window_bundles"] == 8
@@ -238,21 +213,11 @@ def test_a_checkpoint_is_described_and_published(tmp_path: Path) -> None:
     path = tmp_path / "model.safetensors"
     path.write_bytes(encode_weights(model))
     target = tmp_path / "published"
-    text = printed(str(path), "--publish", str(target), "--json", "--resolution", "64")
-    assert json.loads(text)["config"]["window_bundles"] == 8
+    found = said("model", path, "--publish", target, "--resolution", "64")
+    assert found["config"]["window_bundles"] == 8
     again = open_network(str(target))
     for (name, a), b in zip(again.named_parameters(), model.parameters(), strict=True):
         assert torch.equal(a, b), name
-
-
-def test_mistakes_about_a_model_are_named(tmp_path: Path) -> None:
-    for words, message in (
-        (["huge"], "neither a size nor a checkpoint here"),
-        (["large", "--resolution", "72"], "a multiple of 64"),
-        (["smoke", "--publish", "x"], "--publish needs a checkpoint"),
-    ):
-        assert message in refused("model", *words)
-    path = tmp_path / "model.safetensors"
     path.write_bytes(encode_weights(awake(tiny_config(), torch.float32)))
     assert "head linear" in refused("model", str(path), "--publish", str(tmp_path / "out"))
     assert not (tmp_path / "out").exists()

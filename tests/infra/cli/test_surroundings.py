@@ -1,12 +1,11 @@
 """What lies around a run: no file of the working folder is run, whatever its name."""
 
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from tests.command_line import run_program
 from tests.end_to_end.conftest import command
 from tests.end_to_end.production_kit import SIXTEEN_SAMPLES
 from tests.for_each import case
@@ -46,18 +45,9 @@ def _trapped(folder: Path) -> Path:
     return folder
 
 
-def _run(words: list[str], folder: Path, **variables: str) -> str:
-    run = subprocess.run(
-        words, cwd=folder, env={**os.environ, **variables}, capture_output=True, text=True,
-        check=False, timeout=280,
-    )  # fmt: skip
-    assert run.returncode == 0, run.stderr
-    return run.stderr
-
-
 def test_a_conversion_runs_nothing_of_the_folder(tmp_path: Path) -> None:
-    _run(command("convert", "scene.json", "out.glb"), _trapped(tmp_path))
-    _run([sys.executable, "-P", "-c", PROGRAM], tmp_path)
+    run_program(command("convert", "scene.json", "out.glb"), _trapped(tmp_path))
+    run_program([sys.executable, "-P", "-c", PROGRAM], tmp_path)
     assert not (tmp_path / "RAN").exists(), (tmp_path / "RAN").read_text()
 
 
@@ -87,11 +77,8 @@ def test_what_a_shell_leaves_a_run_is_one_sentence_or_works(tmp_path: Path) -> N
     (tmp_path / ("t" * 120)).mkdir()
     for line, (status, said) in cases.items():
         with case(line):
-            run = subprocess.run(
-                ["bash", "-c", line], cwd=tmp_path, capture_output=True, text=True, check=False
-            )
-            assert (run.returncode, run.stderr.count("\n")) == (status, status), run.stderr
-            assert said in run.stderr
+            run = run_program(["bash", "-c", line], tmp_path, status=status)
+            assert run.stderr.count("\n") == status and said in run.stderr
 
 
 @pytest.mark.slow("commands")
@@ -112,5 +99,5 @@ def test_no_command_runs_a_file_of_the_folder(tmp_path: Path) -> None:
         [*torchrun, "--device", "cpu", "--out", "run"],
     ):
         with case(words):
-            _run(words, folder, TRILIGHT_CACHE=fresh)
+            run_program(words, folder, TRILIGHT_CACHE=fresh)
             assert not (folder / "RAN").exists(), (folder / "RAN").read_text()

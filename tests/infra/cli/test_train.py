@@ -25,7 +25,7 @@ from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
 from storage.settings.changes import changed
 from storage.settings.described import settings_record
-from tests.command_line import trilight
+from tests.command_line import run_program, trilight
 from tests.conftest import ROOT
 from tests.for_each import case
 from tests.pipeline.generation.test_dataset_writer import begin_tiny
@@ -67,10 +67,7 @@ def test_mistakes_and_the_first_words_come_before_torch(tmp_path: Path) -> None:
         "    ended = trilight(words)\n"
         "    print(json.dumps([ended.exit_code, ended.stdout, ended.stderr]))\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, json.dumps(words)],
-        cwd=ROOT, capture_output=True, text=True, check=True, env=os.environ | {"COLUMNS": "200"},
-    )  # fmt: skip
+    done = run_program([sys.executable, "-c", code, json.dumps(words)], COLUMNS="200")
     ended = dict(zip(asked, map(json.loads, done.stdout.splitlines()), strict=True))
     assert {name: status for name, (status, *_) in ended.items()} == dict.fromkeys(asked, 1)
     said = {name: mistake for name, (_, _, mistake) in ended.items()}
@@ -216,9 +213,7 @@ def test_a_wait_policy_of_the_users_own_stays() -> None:
     )
     for own, expected in (({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")):
         unset = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-        done = subprocess.run(
-            [sys.executable, "-c", code], cwd=ROOT, env=unset | own, capture_output=True, text=True
-        )
+        done = run_program([sys.executable, "-c", code], env=unset | own)
         assert done.stdout.splitlines()[-1] == expected
 
 
@@ -256,21 +251,15 @@ def _file(folder: Path, text: str) -> str:
     return str(path)
 
 
-def test_a_build_like_another_is_that_other() -> None:
-    for build in BUILDS:
-        with case(build):
-            other = named_build(build)
-            changes = all_changes(named_build("smoke"), BaseSettings(), other.as_json(), {})
-            assert changed(named_build("smoke"), changes).as_json() == other.as_json()
-            assert all_changes(other, BaseSettings(), other.as_json(), {}) == {}
-
-
-def test_a_run_like_another_is_that_other() -> None:
-    for run in RUNS:
-        with case(run):
-            other = named_run(run)
-            changes = all_changes(named_run("smoke"), BaseSettings(), settings_record(other), {})
-            assert changed(named_run("smoke"), changes) == other
+def test_a_preset_like_another_is_that_other() -> None:
+    builds = [(named_build("smoke"), named_build(name)) for name in BUILDS]
+    runs = [(named_run("smoke"), named_run(name)) for name in RUNS]
+    for smoke, other in [*builds, *runs]:
+        with case(other):
+            record = settings_record(other)
+            changes = all_changes(smoke, BaseSettings(), record, {})
+            assert settings_record(changed(smoke, changes)) == record
+            assert all_changes(other, BaseSettings(), record, {}) == {}
 
 
 def test_a_dataset_is_followed_and_options_count_more(tmp_path: Path) -> None:
@@ -305,13 +294,7 @@ def test_a_floor_that_is_asked_for_replaces_those_of_a_file(tmp_path: Path) -> N
     }
 
 
-def test_a_preset_takes_the_place_of_single_settings(tmp_path: Path) -> None:
-    file = _file(tmp_path, "model: {width: 60}\nloss.perceptual: none\n")
-    changes = all_changes(named_run("smoke"), BaseSettings(settings=file), {}, {"model": "tiny"})
-    assert changes == {"loss.perceptual": "none", "model": "tiny"}
-
-
-def test_a_file_says_what_set_would() -> None:
+def test_a_file_says_what_set_would(tmp_path: Path) -> None:
     """Plain words are JSON or words, and quoted ones texts: YAML's own rules read 1e-3 as one."""
     stated = read_settings_file(str(Path(__file__).parent / "shared.yaml"))
     found = {name: value for name, (value, _) in stated.items()}
@@ -326,6 +309,10 @@ def test_a_file_says_what_set_would() -> None:
         "resume": False,
         "source": None,
     }
+    # a preset takes the place of single settings
+    base = BaseSettings(settings=_file(tmp_path, "model: {width: 60}\nloss.perceptual: none\n"))
+    changes = all_changes(named_run("smoke"), base, {}, {"model": "tiny"})
+    assert changes == {"loss.perceptual": "none", "model": "tiny"}
 
 
 WRONG: dict[str, tuple[str, str]] = {

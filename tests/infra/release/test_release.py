@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,19 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from infra.release import hub_limits
+from infra.release import push as pushing
 from infra.release.__main__ import _sum_and_say, _write_network
-from infra.release.hub_limits import require_within_limits
-from infra.release.page import write_page
-from infra.release.pictures import NETWORK, RIVALS, SceneComparison, chosen_scenes
-from infra.release.push import kind_of, planned_upload
+from infra.release.page import NETWORK, RIVALS, SceneComparison, chosen_scenes, write_page
+from infra.release.push import kind_of, planned_upload, require_within_limits
 from model.open import open_network
 from pipeline.documents.sums import SUMS, published_files
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from tests.command_line import trilight
+from tests.command_line import run_program, trilight
 from tests.conftest import ROOT
 from tests.infra.release.hub_upload_server import hub_for_uploads, settings_of
 from tests.pipeline.documents.dataset_by_hand import (
@@ -146,11 +143,8 @@ def pushed(
         The exit status, stdout and stderr of each push, and what the hub holds after it.
     """
     command = [sys.executable, "-c", PUSHES, json.dumps(asked), str(there)]
-    done = subprocess.run(
-        command, cwd=ROOT, env=settings, capture_output=True, text=True, timeout=300, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return [tuple(json.loads(line)) for line in done.stdout.splitlines()]
+    said = run_program(command, env=settings).stdout
+    return [tuple(json.loads(line)) for line in said.splitlines()]
 
 
 def test_the_hub_gets_every_file_and_reads_as_it_was(dataset: Dataset, tmp_path: Path) -> None:
@@ -214,7 +208,7 @@ def test_the_limits_of_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         ("MOST_FILE_BYTES", 29, "30 bytes in one file"),
     ):
         with monkeypatch.context() as patched:
-            patched.setattr(hub_limits, limit, value)
+            patched.setattr(pushing, limit, value)
             with pytest.raises(TrilightError, match=message):
                 require_within_limits(tmp_path)
 

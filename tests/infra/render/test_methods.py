@@ -1,5 +1,6 @@
 """What networks are judged beside: methods without one, the path tracer, raw references."""
 
+import contextlib
 import dataclasses
 from pathlib import Path
 
@@ -15,15 +16,21 @@ from infra.render.networks import (
     traced_network,
     untrained_network,
 )
+from infra.render.path_tracer import MOST_SCENES, PathTracer, RenderChild, RenderWorker
+from infra.render.quality import FixedSamples, ToStatedError
 from infra.render.raw_references import RawReference, true_error_db
 from model.config import hits_smoke
 from model.neural_renderer import NeuralRenderer
 from pipeline.exchange.open_scene import SceneSource
 from pipeline.renders.noise_floor import clamped_radiance
+from pipeline.renders.settings import NoiseTargets
+from pipeline.renders.variant import choose_variant
 from storage.conventions import log10_radiance
+from storage.errors import Unrenderable
 from storage.metrics import psnr_linear_db, psnr_log_db
-from storage.renderer import Camera, Renderer
+from storage.renderer import Camera, Image, Renderer, Sampling, fingerprint
 from tests.for_each import case
+from tests.scenes_by_hand import tiny_scene
 from tests.train.toy import toy_scene
 
 SCENE = toy_scene(2)
@@ -129,3 +136,66 @@ def test_two_renderers_without_noise() -> None:
     assert difference_db(one, other, log10_radiance) == pytest.approx(exact, abs=0.5)
     same = RawReference(a_rgb=_noisy(rng, 0.05), b_rgb=_noisy(rng, 0.05))
     assert difference_db(one, same, log10_radiance) > exact + 8
+
+
+TINY = tiny_scene()
+TINY_CAMERA = Camera.of_scene(TINY, 0)
+FEW = FixedSamples(spp=4, denoiser="fast")
+MEASURED = ToStatedError(targets=NoiseTargets(log_db=95.0), max_spp=1024)
+
+
+class Enough(Exception):
+    """Ends a picture."""
+
+
+def test_path_tracers_share_a_child_that_can_be_stopped_and_keeps_few_scenes() -> None:
+    told = list[Sampling | Image]()
+
+    def stop(step: Sampling | Image) -> None:
+        raise Enough
+
+    with contextlib.closing(RenderChild(choose_variant(), threads=1)) as child:
+        growing = PathTracer(child, MEASURED, 32, shows_looks=True)
+        grown = growing.load(TINY, "tiny")
+        with pytest.raises(Enough):
+            grown.render(TINY_CAMERA, stop)
+        last = grown.render(TINY_CAMERA, told.append)
+        looks = [step for step in told if isinstance(step, Image)]
+        assert len(looks) > 3 and any(isinstance(step, Sampling) for step in told)
+        assert looks[0].stated_error_db is None and "not measured" in looks[0].remark
+        assert last.stated_error_db is not None and (last.samples or 0) > 256
+        assert (last.cpu_seconds or 0) > (looks[0].cpu_seconds or 0) > 0
+        plain = PathTracer(child, MEASURED, 32).load(TINY, "tiny").render(TINY_CAMERA)
+        np.testing.assert_array_equal(last.radiance_rgb, plain.radiance_rgb)
+        preview = PathTracer(child, FEW, 32).load(TINY, "tiny")
+        assert child._child.call_method(count_loaded) == MOST_SCENES
+        picture = preview.render(TINY_CAMERA)
+        assert (picture.samples, picture.facts) == (4, {"spp": 4})
+        again = grown.render(TINY_CAMERA)  # it was forgotten, and is sent again
+        assert psnr_log_db(again.radiance_rgb, last.radiance_rgb) > 90
+        dark = tiny_scene(
+            faces=TINY.faces[2:],
+            material_index=np.array([1], np.uint16),
+            object_index=np.array([1], np.uint16),
+        )
+        with pytest.raises(Unrenderable, match="^dark cannot be rendered .no_surfaces"):
+            growing.load(dark, "dark")
+
+
+def count_loaded(worker: RenderWorker) -> int:
+    """Return the number of scenes in a child."""
+    return len(worker._loaded)
+
+
+def test_a_fingerprint_tells_quality_width_and_seed_apart() -> None:
+    child = RenderChild(choose_variant(), threads=1)
+    tracers = [
+        PathTracer(child, FEW, 32),
+        PathTracer(child, FEW, 32, seed=1),
+        PathTracer(child, FEW, 64),
+        PathTracer(child, MEASURED, 32),
+    ]
+    assert len({fingerprint(tracer.identity) for tracer in tracers}) == len(tracers)
+    assert fingerprint(PathTracer(child, FEW, 32, name="other").identity) == fingerprint(
+        tracers[0].identity
+    )

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 from infra.render import plan
-from infra.render.cameras import camera_path, orbit, own_camera, pair_cameras
 from infra.render.networks import NetworkRenderer
 from infra.render.options import RenderOptions
 from infra.render.path_tracer import PathTracer
 from infra.render.plan import plan_render
-from infra.render.sources import scene_sources
+from infra.render.sources import camera_path, orbit, own_camera, pair_cameras, scene_sources
 from pipeline.exchange.open_scene import SceneSource
 from pipeline.exchange.reader import SceneReader
 from pipeline.isolation import Result
@@ -26,7 +25,7 @@ from storage.records.sample import encode_sample
 from storage.records.scene_file import encode_scene
 from storage.renderer import Camera
 from tests.conftest import ROOT
-from tests.infra.render.render_kit import write_network
+from tests.infra.conftest import write_network
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 
@@ -65,13 +64,8 @@ def test_a_turn_begins_at_the_camera_and_looks_at_one_point() -> None:
     np.testing.assert_allclose(arc[0].c2w[:3, 3], [0, -2, 1], atol=1e-5)
     np.testing.assert_allclose(arc[2].c2w[:3, 3], [0, 2, 1], atol=1e-5)
     np.testing.assert_allclose(orbit(scene, start, 1, 90)[0].c2w, start.c2w, atol=1e-6)
-
-
-def test_a_camera_that_looks_away_turns_about_itself() -> None:
-    scene = tiny_scene()
     away = look_at_c2w(eye=[2, 0, 1], target=[4, 0, 1], up=[0, 0, 1]).astype(np.float32)
-    turn = orbit(scene, Camera(c2w=away, fov_deg=40.0), 4, 360)
-    for camera in turn:
+    for camera in orbit(scene, Camera(c2w=away, fov_deg=40.0), 4, 360):  # about itself
         np.testing.assert_allclose(camera.c2w[:3, 3], [2, 0, 1], atol=1e-6)
 
 
@@ -120,9 +114,6 @@ def test_numbered_scenes_come_in_the_order_of_their_numbers(tmp_path: Path) -> N
     (tmp_path / "none").mkdir()
     with pytest.raises(TrilightError, match="none: holds no scene file"):
         scene_sources(str(tmp_path / "none"), HereReader())
-
-
-def test_a_shard_without_a_key_is_all_of_its_scenes(tmp_path: Path) -> None:
     keys = ["000000003", "000000007"]
     shard = tmp_path / "train-000000.tar"
     write_shard(shard, [(key, encode_sample(tiny_sample(key=key))) for key in keys])
@@ -130,29 +121,20 @@ def test_a_shard_without_a_key_is_all_of_its_scenes(tmp_path: Path) -> None:
     assert [source.key for source in scene_sources(f"{shard}::{keys[1]}", HereReader())] == keys[1:]
 
 
-def test_one_picture_is_of_the_scenes_own_camera(source: Path, tmp_path: Path) -> None:
-    asked = RenderOptions(source=str(source), out=tmp_path / "new/x.exr", view=1, threads=3)
-    plan = plan_render(asked, HereReader())
+def test_a_plan_has_all_that_was_asked(source: Path, tmp_path: Path) -> None:
+    """One picture is of the scene's own camera; both engines share the width."""
+    one = {"out": tmp_path / "new/x.exr", "view": 1, "threads": 3}
+    plan = plan_render(RenderOptions(source=str(source), **one), HereReader())  # type: ignore[arg-type]
     (shot,), (tracer,) = plan.shots, plan.renderers
     assert isinstance(tracer, PathTracer)
     assert (tracer.child.threads, tracer.settings.resolution, plan.resolution) == (3, 512, 512)
-    assert shot.camera == 1
+    assert (shot.camera, shot.png) == (1, tmp_path / "new/x.png")
     assert shot.exrs == {"mitsuba": tmp_path / "new/x.exr"}
-    assert shot.png == tmp_path / "new/x.png"
-
-
-def test_both_engines_share_the_width_and_have_files_of_their_own(
-    source: Path, tmp_path: Path
-) -> None:
     network = str(write_network(tmp_path / "model.safetensors"))
     asked = RenderOptions(
-        source=str(source),
-        out=tmp_path / "turn.webp",
-        engine="both",
-        checkpoint=network,
-        resolution=16,
-        orbit=3,
-    )
+        source=str(source), out=tmp_path / "turn.webp", engine="both", checkpoint=network,
+        resolution=16, orbit=3,
+    )  # fmt: skip
     plan = plan_render(asked, HereReader())
     mitsuba, neural = plan.renderers
     assert isinstance(mitsuba, PathTracer) and isinstance(neural, NetworkRenderer)
@@ -160,7 +142,6 @@ def test_both_engines_share_the_width_and_have_files_of_their_own(
     assert neural.checkpoint == network
     assert plan.output.video == tmp_path / "turn.webp"
     assert len(plan.shots) == 3
-    assert all(isinstance(shot.camera, Camera) for shot in plan.shots)
     last, folder = plan.shots[2], tmp_path / "turn"
     assert isinstance(last.camera, Camera)
     assert (last.camera.name, last.camera.view) == ("picture 000002", None)

@@ -9,13 +9,13 @@ import pytest
 from PIL import Image as Picture
 
 from infra.render import look as look_module
-from infra.render.cameras import orbit, own_camera, pair_cameras
 from infra.render.comparison import comparison_sheet
 from infra.render.look import Look, enlarge, enlargement, tone_mapped
-from infra.render.output_paths import OutputPaths, output_paths
+from infra.render.networks import RendererHere, SceneHere
+from infra.render.output_paths import OutputPaths, output_paths, write_video
 from infra.render.plan import RenderPlan, shots
 from infra.render.run import FinishedShot, run_plan
-from infra.render.video import write_video
+from infra.render.sources import orbit, own_camera, pair_cameras
 from pipeline.exchange.open_scene import SceneSource
 from storage.conventions import preview_srgb8
 from storage.errors import TrilightError
@@ -28,37 +28,29 @@ from tests.infra.render.test_plan import HereReader
 from tests.scenes_by_hand import tiny_scene
 
 
-class FlatRenderer:
+class FlatRenderer(RendererHere):
     """Every picture is as bright as the camera stands far to the right; counts its work."""
 
-    resolution, notes = 16, ()
+    resolution = 16
 
     def __init__(self, name: str = "neural", setting: int = 0) -> None:
         self.name = name
-        self.identity: Mapping[str, Any] = {"setting": setting}
+        self.setting = setting
         self.opened = 0
         self.rendered = 0
 
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        return {"setting": self.setting}
+
     def load(self, scene: Scene, name: str) -> ReadyScene:
         self.opened += 1
-        return LoadedFlat(self)
+        return SceneHere(render_image=self.render, notes=("it was opened",))
 
-    def close(self) -> None:
-        pass
-
-
-class LoadedFlat:
-    """A scene in it."""
-
-    notes, seconds, cpu_seconds = ("it was opened",), 0.0, 0.0
-
-    def __init__(self, renderer: FlatRenderer) -> None:
-        self.renderer = renderer
-
-    def render(self, camera: Camera, on_progress: object = None) -> Image:
-        self.renderer.rendered += 1
+    def render(self, camera: Camera) -> Image:
+        self.rendered += 1
         picture = np.full((16, 16, 3), 3 + camera.c2w[0, 3], np.float32)
-        facts = {"number": self.renderer.rendered, "half": 0.5}
+        facts = {"number": self.rendered, "half": 0.5}
         return Image(radiance_rgb=picture, cpu_seconds=0.0, facts=facts)
 
 

@@ -22,14 +22,14 @@ from prefect.exceptions import ParameterTypeError
 
 from infra.serving import access, local
 from infra.serving.access import grant, next_command, revoke, settings_file, state_folder
-from infra.serving.limits import limits
+from infra.serving.deployments import limits
 from infra.serving.local import running, start, stop
 from infra.serving.train_model import RunChanges, TrainOptions, train_model, train_order
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
 from pipeline.flows.prefect_server import STOPPED_BY_PARENT, wait_until_healthy
 from storage.errors import TrilightError
 from storage.settings.fields import describe_fields
-from tests.command_line import trilight
+from tests.command_line import run_program, trilight
 from tests.conftest import ROOT
 from tests.for_each import case
 from train.runs import RUNS, named_run
@@ -212,10 +212,7 @@ def test_prefect_reads_it_from_the_checkout_and_nothing_needs_to_be_exported(
         "runpy.run_module('prefect', run_name='__main__')\n"
     )
     bare = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=checkout, env=bare, capture_output=True, text=True, check=True,
-    )  # fmt: skip
+    done = run_program([sys.executable, "-c", code], checkout, env=bare)
     read, _, shown = done.stdout.partition("\n")
     assert json.loads(read) == [URL, 'me:a"quoted\\ pässword']
     assert URL in shown and "quoted" not in shown + done.stderr

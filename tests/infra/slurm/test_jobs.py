@@ -188,10 +188,6 @@ def test_refusals(tools: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "/nowhere")
     assert "no kubectl here" in trilight(words).mistake
     assert "--sbatch is an option of submit slurm" in trilight([*words, "--sbatch=-x"]).mistake
-    slurm = trilight(["submit", "slurm", "smoke", "--image", "x"])
-    assert "leave them out, and use --sbatch" in slurm.mistake
-    flow = trilight(["submit", "generate-scenes", "smoke", "--where", "x"])
-    assert "options of machines are those of submit slurm, kubernetes" in flow.mistake
 
 
 def test_status_prints_what_any_scheduler_needs(
@@ -205,7 +201,6 @@ def test_status_prints_what_any_scheduler_needs(
         "missing": [0, 2, 4], "array": "0,2,4", "shards": ["0:2", "4:6", "8:10"],
         "shards_per_task": 2,
     }  # fmt: skip
-    assert "--lines is given; expected it only" in trilight(["status", "set", "--lines"]).mistake
 
 
 RUN = SubmittedRun(
@@ -268,7 +263,3 @@ def test_who_does_not_watch_gets_the_run(asked: list[Any]) -> None:
     words = ["submit", "generate-scenes", "smoke", "--no-watch", "--deployment", "cluster"]
     assert json.loads(trilight([*words, "--json"]).stdout)["flow_run"] == str(RUN.id)
     assert asked[0][:2] == ("generate-scenes", "cluster")
-
-
-def test_a_flow_that_is_none_is_told_those_there_are() -> None:
-    assert "build-dataset, make-by-array, or of slurm" in trilight(["submit", "x", "smoke"]).mistake

@@ -6,21 +6,21 @@ import json
 import struct
 import threading
 from collections.abc import Mapping
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from PIL import Image as Picture
 
+from infra.render.networks import RendererHere
 from infra.viewer import scene_bytes as module
-from infra.viewer.edits import apply_edits
 from infra.viewer.page_renderers import (
     PageRenderer,
     StoredPictures,
     network_on_page,
     samples_on_page,
 )
-from infra.viewer.picture_options import PictureOptions, parse_picture_options
+from infra.viewer.picture_options import PictureOptions, apply_edits, parse_picture_options
 from infra.viewer.render_queue import RenderJob, RenderQueue, agreement_db
 from infra.viewer.scene_bytes import scene_bytes, sky_bytes, texture_png
 from infra.viewer.scene_handlers import SceneHandlers
@@ -37,11 +37,10 @@ from tests.textured_by_hand import colour_texture, number_texture, textured_scen
 TARGETS = np.full((2, 16, 16, 3), 0.5, np.float32)
 
 
-class GreyRenderer:
+class GreyRenderer(RendererHere):
     """Renders grey at once, or step by step until it is told to end."""
 
-    name, resolution, notes = "grey", 16, ()
-    identity: ClassVar[dict[str, str]] = {}
+    name, resolution = "grey", 16
     seconds, cpu_seconds = 0.0, 0.5
 
     def __init__(self, grey: float, *, floor_db: float | None = None, waits: bool = False) -> None:
@@ -52,9 +51,6 @@ class GreyRenderer:
 
     def load(self, scene: Scene, name: str) -> "GreyRenderer":
         return self
-
-    def close(self) -> None:
-        pass
 
     def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Image:
         self.rendered += 1
@@ -123,8 +119,10 @@ def test_who_asks_for_another_gives_up_the_one_at_hand() -> None:
     slow, quick = GreyRenderer(0.1, waits=True), GreyRenderer(0.5)
     easel = queue_of({"traced": slow, "hits": quick})
     given_up = until_begun(easel, easel.submit(wanted()))
-    never_begun = easel.submit(wanted(fov=50.0))
-    last = over(easel, easel.submit(wanted("hits")))
+    with easel._changed:  # so that the queue sees both at once
+        never_begun = easel.submit(wanted(fov=50.0))
+        next_one = easel.submit(wanted("hits"))
+    last = over(easel, next_one)
     assert (given_up.state, never_begun.state, last.state) == ("cancelled", "cancelled", "done")
     assert slow.rendered == 1
     again = easel.submit(wanted())
@@ -226,6 +224,8 @@ def test_a_scene_is_saved_with_its_changes_and_nothing_is_written_here() -> None
                 assert len(changed[1]) > 500 and changed[1] != plain[1]
                 for bad in ("../x.usda", ".exe", "", None, ".json"):
                     assert asker.ask("api/export", {"form": bad})[0] == 422
+    textured = dataclasses.replace(room_of({}), scene=textured_scene())  # in more files than one
+    assert textured._is_offered(".usdz") and not textured._is_offered(".usda")
 
 
 def test_a_lamp_moves_and_shines_brighter_and_all_else_stays() -> None:
@@ -372,9 +372,3 @@ def test_the_page_shows_the_command_of_each_way() -> None:
     network = "--engine neural --checkpoint 'a b.safetensors'"
     assert command("hits", view=None) == f"'a set/x.tar::000000001' {free} {network}"
     assert command("samples-4").endswith("--resolution 16 --spp 4")
-
-
-def test_only_forms_of_one_file_are_offered() -> None:
-    textured = dataclasses.replace(room_of({}), scene=textured_scene())
-    offered = [room._is_offered(".usda") for room in (room_of({}), textured)]
-    assert offered == [True, False] and textured._is_offered(".usdz")

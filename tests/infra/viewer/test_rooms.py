@@ -13,8 +13,8 @@ from PIL import Image
 
 from infra.render.path_tracer import RenderChild
 from infra.viewer import scene_list as list_module
-from infra.viewer.dataset_filter import filter_of
 from infra.viewer.dataset_handlers import DatasetHandlers
+from infra.viewer.dataset_index import filter_of
 from infra.viewer.folder_handlers import THUMBNAIL_PX, FolderHandlers
 from infra.viewer.scene_list import scene_list
 from pipeline.exchange.convert import write_scene

@@ -22,7 +22,8 @@ def compare_exchange() -> Any:
     return function
 
 
-def _aligned_pair() -> tuple[ctypes.Array[ctypes.c_char], ctypes.Array[ctypes.c_uint64]]:
+def _aligned_pair() -> tuple[Any, Any]:
+    """Return a buffer, and two numbers in it at a multiple of 16 bytes."""
     room = ctypes.create_string_buffer(32)
     offset = -ctypes.addressof(room) % 16
     return room, (_WORD * 2).from_buffer(room, offset)

@@ -16,8 +16,7 @@ import OpenEXR
 import pytest
 from numpy.typing import NDArray
 
-from infra.bench.workloads.blender_environment import installed_python, run_blender
-from infra.bench.workloads.cycles import render_with_cycles
+from infra.bench.workloads.cycles import installed_python, render_with_cycles, run_blender
 from pipeline.exchange.usd.write import write_usd
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.settings import RenderSettings

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from infra.bench.workloads import blender_environment as environment
+from infra.bench.workloads import cycles as environment
 from infra.bench.workloads.traced_pictures import fixed_samples, render_shot
 from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.usd.read import read_usd
