@@ -1,4 +1,4 @@
-"""Loads a library of the system, or a stand-in where the system lacks it and nobody may install it.
+"""Loads a library of the system, or a stand-in where the system lacks it.
 
 pymeshlab's wheel links to OpenGL and never calls it here. Dr.Jit's links to GCC's libatomic for one
 function. A stand-in is a small ELF file in memory: it has the name that the loader looks for, and
@@ -97,7 +97,7 @@ def _elf_file(name: str, functions: Mapping[str, bytes]) -> bytes:
         (1, 5, 0, len(file), _PAGE),  # LOAD, to read and to run
         (1, 6, _PAGE, len(dynamic), _PAGE),  # LOAD, writable: glibc before 2.35 writes into it
         (2, 6, _PAGE, len(dynamic), 8),  # DYNAMIC
-        (0x6474E551, 6, 0, 0, 16),  # GNU_STACK, which nobody runs
+        (0x6474E551, 6, 0, 0, 16),  # GNU_STACK, not to run
     )
     file[:64] = b"\x7fELF\x02\x01\x01".ljust(16, b"\0") + struct.pack(
         "<2HI3QI6H", 3, 62, 1, 0, 64, 0, 0, 64, 56, len(segments), 64, 0, 0

@@ -91,7 +91,8 @@ def trace_light(
     throughput = mi.Color3f(emitter.radiance / dr.max(emitter.radiance))
     first = next_hit(scene, start, direction, active)
     active &= first.is_valid
-    triangle, barycentric = first.triangle, first.barycentric
+    triangle = first.triangle
+    barycentric = first.barycentric
     pick_mis_ratio = mi.Float(scene.to_pick_pdf(dr.square(first.distance) / leaving))
     depth = mi.UInt32(1)
     while active:
@@ -120,7 +121,8 @@ def trace_light(
         direction = mi.Vector3f(vertex.frame.to_world(local))
         hit = next_hit(scene, point, direction, active)
         active &= hit.is_valid
-        triangle, barycentric = hit.triangle, hit.barycentric
+        triangle = hit.triangle
+        barycentric = hit.barycentric
 
 
 def _leave_emitter(
@@ -278,7 +280,8 @@ def trace_photons(
     throughput = mi.Color3f(emitter.radiance / dr.max(emitter.radiance))
     first = next_hit(scene, start, direction, active)
     active &= first.is_valid
-    triangle, barycentric = first.triangle, first.barycentric
+    triangle = first.triangle
+    barycentric = first.barycentric
     depth = mi.UInt32(1)
     drawn = mi.Float(0)
     while active:
@@ -303,4 +306,5 @@ def trace_photons(
         direction = mi.Vector3f(vertex.frame.to_world(local))
         hit = next_hit(scene, point, direction, active)
         active &= hit.is_valid
-        triangle, barycentric = hit.triangle, hit.barycentric
+        triangle = hit.triangle
+        barycentric = hit.barycentric

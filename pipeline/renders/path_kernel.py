@@ -53,7 +53,9 @@ def trace(
     """
     first = Hit(scene.surfaces.ray_intersect_preliminary(ray, coherent=True))
     active = mi.Bool(first.is_valid)
-    distance, triangle, barycentric = first.distance, first.triangle, first.barycentric
+    distance = first.distance
+    triangle = first.triangle
+    barycentric = first.barycentric
     direction = mi.Vector3f(ray.d)
     radiance = _background(scene, parts, direction, active)
     throughput = mi.Color3f(1)
@@ -97,7 +99,9 @@ def trace(
         lit = _sky_emission(scene, direction, pdf, throughput, active, hit)
         radiance = radiance if lit is None else parts.add(radiance, lit, depth, share)
         active &= hit.is_valid
-        distance, triangle, barycentric = hit.distance, hit.triangle, hit.barycentric
+        distance = hit.distance
+        triangle = hit.triangle
+        barycentric = hit.barycentric
     return radiance
 
 

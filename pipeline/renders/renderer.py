@@ -166,7 +166,8 @@ class SceneRenderer:
         }
 
     def _refuse_black(self, samples: DualBuffer) -> None:
-        mean, bound = self._arithmetic.mean_radiance(samples), self._settings.min_mean_radiance
+        mean = self._arithmetic.mean_radiance(samples)
+        bound = self._settings.min_mean_radiance
         if mean < bound:
             raise Rejected("black_view", f"mean radiance {mean:.2g} is below {bound:.2g}")
 
