@@ -1,4 +1,4 @@
-"""Position encodings: rotary angles of triangles, and sines of their normals.
+"""Position encodings: rotary angles of triangles (RoPE), and sines of their normals.
 
 Queries and keys are rotated by angles proportional to the nine vertex coordinates, so that their
 product depends only on differences of positions: the network is invariant to translation (Zeng et

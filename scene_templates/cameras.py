@@ -56,7 +56,7 @@ class CameraSettings:
 
 
 def sample_camera(rng: np.random.Generator, settings: CameraSettings, sector: Sector) -> CameraPose:
-    """Draw one camera. Whether it sees anything is for the caller to find out."""
+    """Draw one camera pose by look-at. Whether it sees anything is for the caller to find out."""
     target = rng.uniform(-settings.target_jitter, settings.target_jitter, size=3)
     eye = target + rng.uniform(*settings.distance) * sector.sample_direction(rng)
     up = np.array([0, 0, 1]) + rng.uniform(-settings.up_jitter, settings.up_jitter, size=3)

@@ -11,11 +11,11 @@ from rich.text import Text
 from infra.cli.console import (
     console,
     first_words,
-    look_at,
     next_step,
     print_json,
     print_rows,
     progress_bars,
+    suggest_look,
 )
 from infra.cli.options import OutputOptions, command
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings, Profile
@@ -114,7 +114,7 @@ def _print_report(
         ("meshes, catalogue", f"{folder.meshes}, {folder.catalogue}"),
     ]
     print_rows("Assets finished" if report.rows else "No object can be used", rows)
-    look_at(f"Look at {folder.page}")
+    suggest_look(f"Look at {folder.page}")
     if report.rows:
         next_step(
             generate_from_meshes(

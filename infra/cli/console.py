@@ -87,7 +87,7 @@ def command_line(words: Sequence[str], recorded: Mapping[str, str] = MappingProx
     return shlex.join(["trilight", *safe, *extend_words(recorded)])
 
 
-def look_at(text: str) -> None:
+def suggest_look(text: str) -> None:
     """Print a file to look at, or a next step that is no command."""
     console.print(Text(f"\n{text}", style="bold"), soft_wrap=True)
 

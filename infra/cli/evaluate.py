@@ -7,7 +7,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from infra.cli.console import console, first_words, look_at, print_json, progress_bars
+from infra.cli.console import console, first_words, print_json, progress_bars, suggest_look
 from infra.cli.leaderboard import judge_methods
 from infra.cli.options import OutputOptions, command
 from infra.torch_library import require_torch
@@ -83,4 +83,4 @@ def _report(record: dict[str, Any], out: Path) -> None:
     console.print(table)
     for sentence in sentences(record["path tracer"]):
         console.print(sentence, soft_wrap=True)
-    look_at(f"Read {out / 'evaluation.md'}, look at {out / 'worst.png'}")
+    suggest_look(f"Read {out / 'evaluation.md'}, look at {out / 'worst.png'}")

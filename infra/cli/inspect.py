@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from infra.cli.console import (
     first_words,
-    look_at,
     print_json,
     print_result,
     print_rows,
     progress_bars,
+    suggest_look,
 )
 from infra.cli.options import OutputOptions, command
 from infra.run_record import is_run, run_facts, tensorboard_command
@@ -86,7 +86,7 @@ def inspect(options: InspectOptions, output: OutputOptions) -> None:
         print_json(_as_json(opened, statistics, distributions))
         return
     _print_summary(name, opened, statistics, distributions)
-    look_at(f"Look at {folder.report} and {folder.contact_sheet}" if folder else _READ_ONLY)
+    suggest_look(f"Look at {folder.report} and {folder.contact_sheet}" if folder else _READ_ONLY)
 
 
 def _inspect_run(root: Path, *, json: bool) -> None:
@@ -94,7 +94,7 @@ def _inspect_run(root: Path, *, json: bool) -> None:
     facts = run_facts(root)
     print_result(str(root), _fact_rows(facts), facts, as_json=json)
     if not json:
-        look_at(f"Curves and pictures: {tensorboard_command(root)}")
+        suggest_look(f"Curves and pictures: {tensorboard_command(root)}")
 
 
 def _fact_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -121,7 +121,7 @@ def _inspect_scene(source: str, turntable: Path | None, *, json: bool) -> None:
     record = {**result.facts, "notes": list(result.notes)}
     print_result(source, _fact_rows(result.facts), record, notes=result.notes, as_json=json)
     if turntable is not None and not json:
-        look_at(f"Look at {turntable}")
+        suggest_look(f"Look at {turntable}")
 
 
 def _write(

@@ -4,11 +4,11 @@ from typing import Any
 
 from infra.cli.console import (
     first_words,
-    look_at,
     note,
     print_json,
     print_table,
     progress_bars,
+    suggest_look,
 )
 from infra.cli.options import OutputOptions, command
 from infra.torch_library import require_torch
@@ -42,7 +42,9 @@ def judge_methods(order: LeaderboardOptions, *, silent: bool) -> dict[str, Any]:
             print_table(f"{title}, lead over {board.rival}", rows)
         for text in board.notes:
             note(text)
-        look_at(f"Read {board.out / 'leaderboard.md'}, look at {board.out / 'leaderboard.png'}")
+        suggest_look(
+            f"Read {board.out / 'leaderboard.md'}, look at {board.out / 'leaderboard.png'}"
+        )
     return {"out": str(board.out), "rival": board.rival, "widths": _plain(board)}
 
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from infra.cli.console import first_words, look_at, next_step, print_json, print_rows
+from infra.cli.console import first_words, next_step, print_json, print_rows, suggest_look
 from infra.cli.options import OutputOptions, command
 from storage.settings.described import checked
 
@@ -50,4 +50,4 @@ def push(options: PushOptions, output: OutputOptions) -> None:
     elif upload.kind == "dataset":
         next_step(["verify", f"hf://datasets/{upload.repository}"])
     else:
-        look_at(f"Look at {facts['address']}")
+        suggest_look(f"Look at {facts['address']}")

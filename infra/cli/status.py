@@ -8,10 +8,10 @@ from infra.cli.console import (
     command_line,
     console,
     duration,
-    look_at,
     next_step,
     print_json,
     print_rows,
+    suggest_look,
 )
 from infra.cli.options import OutputOptions, command
 from pipeline.generation.price import CorePrice
@@ -74,7 +74,7 @@ def status(options: StatusOptions, core: CorePrice, output: OutputOptions) -> No
     if progress.next_words:
         next_step(progress.next_words, recorded=progress.extensions)
     else:
-        look_at(_next(progress))
+        suggest_look(_next(progress))
 
 
 def _print_missing(options: StatusOptions, *, as_json: bool) -> None:

@@ -12,7 +12,7 @@ from rich.progress import Progress as Bars
 from rich.progress import TaskID
 
 from infra.cli.changes import BaseSettings, all_changes, run_record
-from infra.cli.console import console, look_at, next_step, note, print_rows, progress_bars
+from infra.cli.console import console, next_step, note, print_rows, progress_bars, suggest_look
 from infra.cli.options import OutputOptions, command
 from infra.run_record import tensorboard_command
 from infra.torch_library import require_torch
@@ -195,7 +195,7 @@ def _report(result: "TrainResult", data: Sequence[str]) -> None:
     ]
     print_rows("Training finished", rows)
     sheet = "" if result.scores is None else f"Look at {result.folder.sheet}\n"
-    look_at(f"{sheet}Curves and pictures: {tensorboard_command(result.folder.root)}")
+    suggest_look(f"{sheet}Curves and pictures: {tensorboard_command(result.folder.root)}")
     if result.scores is not None:
         named = [word for each in data for word in ("--data", each)]
         next_step(["evaluate", str(result.folder.root), *named, "--split", "validation"])

@@ -4,11 +4,11 @@ import sys
 
 from infra.cli.console import (
     first_words,
-    look_at,
     next_step,
     print_json,
     print_rows,
     progress_bars,
+    suggest_look,
 )
 from infra.cli.options import OutputOptions, command
 from storage.dataset.asked import read_asked, value_of
@@ -81,22 +81,22 @@ def _print_repair(verification: Verification, dataset: str) -> None:
                 (*generate_command, "--out", dataset), recorded=verification.manifest.extensions
             )
         else:
-            look_at("To resume, run the trilight generate command that began it.")
+            suggest_look("To resume, run the trilight generate command that began it.")
     elif not verification.problems:
         return
     elif not verification.bad_shards:
-        look_at(
+        suggest_look(
             "No shard was found wrong. Verify again what could not be read. A document that was "
             "edited is written anew by the command that made the dataset (keep notes in a file of "
             "your own). Restore other named files from a copy."
         )
     elif is_remote:
-        look_at(
+        suggest_look(
             "Delete the named shards there and run trilight generate again, or copy them again "
             "from the folder that the dataset was copied from."
         )
     elif derivation is not None:
-        look_at(f"Make it again from its sources: trilight shards {derivation.operation}.")
+        suggest_look(f"Make it again from its sources: trilight shards {derivation.operation}.")
     else:
         sources = ("--objects", "--scenes-from")
         values = [(option, value_of(generate_command or (), option)) for option in sources]

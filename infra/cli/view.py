@@ -8,7 +8,7 @@ import time
 import webbrowser
 from typing import Annotated
 
-from infra.cli.console import console, first_words, look_at
+from infra.cli.console import console, first_words, suggest_look
 from infra.cli.options import command
 from infra.torch_library import require_torch
 from storage.remote.safe_url import safe_url
@@ -48,7 +48,7 @@ def view(options: ViewOptions) -> None:
     stops: list[int] = []
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    look_at(f"Look at {server.address}")
+    suggest_look(f"Look at {server.address}")
     console.print("Only this machine reaches it, with this address. Ctrl-C ends it.", style="dim")
     if not options.no_browser and _has_screen():
         webbrowser.open(server.address)

@@ -1,4 +1,4 @@
-"""Stated error of a picture, without a reference: each half of its samples judges the other.
+"""Stated error of a picture by the variance between its halves, without a reference.
 
 The samples of a picture are two halves A and B that share nothing. Let T be the truth, x = A - T
 and y = B - T their noise, and a, b the errors of the two halves once they are denoised:

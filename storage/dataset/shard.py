@@ -29,6 +29,8 @@ Place = TypeVar("Place")
 def write_shard(path: Path, samples: Iterable[tuple[str, Mapping[str, bytes]]]) -> None:
     """Write samples, given as (key, members by suffix) in order of keys, as one tar file.
 
+    The layout is that of WebDataset's ShardWriter.
+
     Equal samples give equal bytes. The file appears under its name only when it is complete, and
     never in the place of another: the first writer of a shard wins.
 

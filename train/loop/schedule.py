@@ -21,7 +21,10 @@ def decay_start_step(settings: TrainSettings) -> int | None:
 
 
 def learning_rate(step: int, settings: TrainSettings) -> float:
-    """Return the rate of step 0 ... num_steps - 1; the first is above 0, the last the final one."""
+    """Return the rate of step 0 ... num_steps - 1, by warmup, constant rate and decay.
+
+    The first is above 0, the last the final one.
+    """
     if step < settings.warmup_steps:
         return settings.learning_rate * (step + 1) / (settings.warmup_steps + 1)
     if settings.schedule == "cosine":

@@ -40,7 +40,7 @@ def normalize(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def clean(mesh: TriangleMesh) -> TriangleMesh:
-    """Return a clean copy of a mesh in the unit box; it may have no faces left.
+    """Weld a mesh in the unit box, and return a clean copy; it may have no faces left.
 
     Vertices are sorted by position, faces by vertex, each starting at its lowest vertex. Faces with
     the same three vertices become one, whatever their windings: orientation comes later.

@@ -245,7 +245,7 @@ def test_what_is_printed_tells_the_terminal_nothing(monkeypatch: pytest.MonkeyPa
             console.print_table(name, [{name: name}])
             console.note(name)
             console.first_words(name)
-            console.look_at(name)
+            console.suggest_look(name)
             console.next_step([name])
             with console.progress_bars() as bars:
                 bars.update(bars.add_task(name, total=2, note=name), completed=1)
