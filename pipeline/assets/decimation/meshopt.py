@@ -67,7 +67,7 @@ class _Library:
             memory = self._exports["memory"]
             data = memory.read(self._store, simplified, simplified + 4 * count)
         except (wasmtime.WasmtimeError, wasmtime.Trap) as error:
-            raise Rejected("decimation_failed", f"meshoptimizer: {error}") from error
+            raise Rejected("decimation_failed", "meshoptimizer stopped at this mesh") from error
         finally:
             self._call("sbrk", end - self._call("sbrk", 0))
         faces = np.frombuffer(data, np.uint32).reshape(-1, 3).astype(np.int64)
