@@ -120,7 +120,7 @@ def test_no_refusal_cites_a_library_an_address_or_this_machine(tmp_path: Path) -
 
 
 def test_no_handler_cites_what_a_library_raised() -> None:
-    folders = ("foreign", "exchange", "objects/maps", "assets", "making", "scenes")
+    folders = ("foreign", "exchange", "objects/maps", "assets", "generation", "scenes")
     paths = [path for folder in folders for path in (ROOT / "pipeline" / folder).rglob("*.py")]
     cited = []
     for path in paths:
