@@ -75,7 +75,7 @@ def place(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     _call([sys.executable, "-m", "venv", "env"], folder)
     (site,) = (folder / "env/lib").glob("python3.*/site-packages")
     (ours,) = metadata.distributions(name="trilight", path=[str(wheel)])
-    _lend(ours, {"train"}, site, set())
+    _lend(ours, {"train"}, site, {"pip"})  # it has its own
     pip = [str(folder / "env/bin/python"), "-m", "pip", "install", "--quiet"]
     _call([*pip, "--no-index", f"{wheel}[train]"], folder)
     (folder / "train").mkdir()
