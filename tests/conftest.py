@@ -7,9 +7,15 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from pipeline.renders.variant import llvm_libraries
+
 # No test asserts a time: a crowded machine must not fail what is right.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")
+
+# Dr.Jit loads LLVM when it is imported: in a test's module, before `activate` has named a library.
+for library in llvm_libraries()[:1]:
+    os.environ["DRJIT_LIBLLVM_PATH"] = str(library)
 
 ROOT = Path(__file__).parents[1]
 

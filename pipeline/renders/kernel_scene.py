@@ -74,6 +74,28 @@ class KernelScene:
         return pdf if self.sky is None else self.sky.of_lamps(pdf)
 
 
+def build_mesh(
+    name: str, faces: NDArray[Any], properties: Any = None, **vertices: NDArray[Any]
+) -> Any:
+    """Return a mi.Mesh; nothing else knows its constructor, which Mitsuba 3.10 changes.
+
+    Args:
+        name: of the mesh.
+        faces: vertex numbers, [T, 3].
+        properties: a mi.Properties with BSDF and emitter, if any.
+        vertices: rows of `positions`, and of `normals` and `texcoords` where the mesh has them.
+    """
+    has = {f"has_vertex_{field}": True for field in vertices if field != "positions"}
+    material = {} if properties is None else {"props": properties}
+    mesh = mi.Mesh(name, len(vertices["positions"]), len(faces), **material, **has)
+    parameters = mi.traverse(mesh)
+    for field, rows in vertices.items():
+        parameters[f"vertex_{field}"] = own_floats(rows)
+    parameters["faces"] = own_integers(faces)
+    parameters.update()
+    return mesh
+
+
 def load_triangles(scene: Scene, triangles: NDArray[np.intp], child: Any = None) -> Any:
     """Return a mi.Scene of one mesh, whose triangle numbers are positions in `triangles`.
 
@@ -81,11 +103,7 @@ def load_triangles(scene: Scene, triangles: NDArray[np.intp], child: Any = None)
     kernel use one OptiX shader binding table, and miss whatever is in another table. A scene that
     has another scene as a child shares its table.
     """
-    mesh = mi.Mesh("triangles", len(scene.vertex_positions), len(triangles))
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = own_floats(scene.vertex_positions)
-    parameters["faces"] = own_integers(scene.faces[triangles])
-    parameters.update()
+    mesh = build_mesh("triangles", scene.faces[triangles], positions=scene.vertex_positions)
     children = {"mesh": mesh} if child is None else {"mesh": mesh, "beside": child}
     return mi.load_dict({"type": "scene", **children})
 
