@@ -85,9 +85,14 @@ def build_mesh(
         properties: a mi.Properties with BSDF and emitter, if any.
         vertices: rows of `positions`, and of `normals` and `texcoords` where the mesh has them.
     """
-    has = {f"has_vertex_{field}": True for field in vertices if field != "positions"}
-    material = {} if properties is None else {"props": properties}
-    mesh = mi.Mesh(name, len(vertices["positions"]), len(faces), **material, **has)
+    mesh = mi.Mesh(
+        name,
+        len(vertices["positions"]),
+        len(faces),
+        props=mi.Properties() if properties is None else properties,
+        has_vertex_normals="normals" in vertices,
+        has_vertex_texcoords="texcoords" in vertices,
+    )
     parameters = mi.traverse(mesh)
     for field, rows in vertices.items():
         parameters[f"vertex_{field}"] = own_floats(rows)

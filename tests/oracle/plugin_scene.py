@@ -196,7 +196,7 @@ def _mesh(scene: Scene, triangles: NDArray[np.intp], material: Any) -> Any:
     if scene.uv is not None:
         vertices = {name: rows[faces.ravel()] for name, rows in vertices.items()}
         vertices["texcoords"] = scene.uv.reshape(-1, 3, 2)[triangles].reshape(-1, 2)
-        faces = np.arange(faces.size).reshape(-1, 3)
+        faces = np.arange(faces.size, dtype=np.uint32).reshape(-1, 3)
     properties = mi.Properties()
     properties["bsdf"] = material
     return _build_mesh("surfaces", faces, properties, **vertices)
