@@ -13,10 +13,6 @@ from pipeline.renders.variant import llvm_libraries
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")
 
-# Dr.Jit loads LLVM when it is imported: in a test's module, before `activate` has named a library.
-for library in llvm_libraries()[:1]:
-    os.environ["DRJIT_LIBLLVM_PATH"] = str(library)
-
 ROOT = Path(__file__).parents[1]
 
 BUDGET = json.loads((ROOT / "tests/architecture/budget.json").read_bytes())
@@ -53,6 +49,12 @@ def shared() -> Path:
     if not (folder / "objects").is_dir():
         pytest.skip(f"no real objects: set TRILIGHT_SHARED ({folder} has no objects/)")
     return folder
+
+
+def pytest_configure() -> None:
+    """Name LLVM, which Dr.Jit loads when a test's module imports it, before any `activate`."""
+    for library in llvm_libraries()[:1]:
+        os.environ["DRJIT_LIBLLVM_PATH"] = str(library)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
