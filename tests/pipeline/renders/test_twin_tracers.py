@@ -113,6 +113,7 @@ def test_both_integrators_agree_within_their_noise(
 
 _IN_SCALAR = """
 import json
+import pipeline.renders  # which loads what the system may lack
 import mitsuba
 mitsuba.set_variant("scalar_rgb")
 import drjit
