@@ -53,12 +53,19 @@ _METHODS: Mapping[Profile, tuple[str, ...]] = {
 or where its result fails the quality checks."""
 
 
-def methods_of(profile: Profile) -> tuple[str, ...]:
+_WATERTIGHT = ("libigl_qslim_alone", "meshoptimizer")
+
+
+def methods_of(profile: Profile, *, watertight: bool = False) -> tuple[str, ...]:
     """Return the installed methods of a profile; pymeshlab (GPL) is optional.
+
+    `watertight`: those that keep `faithful` meshes so.
 
     Raises:
         TrilightError: `uniform` without pymeshlab, the only method that makes triangles even.
     """
+    if watertight and profile == "faithful":
+        return _WATERTIGHT
     if _installed_version("pymeshlab") != "absent":
         return _METHODS[profile]
     if profile == "uniform":

@@ -92,6 +92,9 @@ class AssetSettings:
     epsilon: Annotated[float | None, PART] = None
     """Sufficient two-way distance (99th percentile, as a fraction of the diagonal): the finest
     level is then the smallest mesh within it, instead of one that fills its budget."""
+    watertight: bool = False
+    """Make levels closed, oriented and manifold; reject objects where such a level does not pass
+    the quality checks. Open surfaces become thin plates, with up to twice the accepted area."""
     gate: GateSettings = dataclasses.field(default_factory=GateSettings)
     """Quality checks of each level; where one fails, the next method runs, or the level is absent.
     """
@@ -118,10 +121,12 @@ class AssetSettings:
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out `own_materials` where off, so that digests of earlier builds stay equal."""
+        """Leave out what is off, so that digests of earlier builds stay equal."""
         record: dict[str, Any] = as_usual(self)
         if not self.own_materials.keep:
             record.pop("own_materials", None)
+        if not self.watertight:
+            record.pop("watertight", None)
         return record
 
     def __post_init__(self) -> None:

@@ -49,7 +49,10 @@ class AssetStore:
 
     def key(self, kind: str, source_sha256: str, settings: AssetSettings) -> str:
         """Return the key of the outcome of a source file."""
-        parts = [kind, source_sha256, asdict(settings), RECIPE, READERS]
+        wanted = asdict(settings)
+        if not settings.watertight:
+            del wanted["watertight"]  # keys of earlier outcomes stay
+        parts = [kind, source_sha256, wanted, RECIPE, READERS]
         return sha256_hex(canonical_json(parts))[:32]
 
     def asset_path(self, key: str) -> Path:
