@@ -39,6 +39,7 @@ BUILD_V1 = BuildSettings(
         profile="faithful",
         budgets=(1400, 1000, 700, 500, 340, 240),
         epsilon=None,
+        watertight=False,
         gate=GateSettings(
             max_error_p99=0.03,
             max_outside=0.01,
