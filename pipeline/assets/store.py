@@ -50,8 +50,10 @@ class AssetStore:
     def key(self, kind: str, source_sha256: str, settings: AssetSettings) -> str:
         """Return the key of the outcome of a source file."""
         wanted = asdict(settings)
-        if not settings.watertight:
-            del wanted["watertight"]  # keys of earlier outcomes stay
+        if not settings.watertight:  # keys of earlier outcomes stay
+            del wanted["watertight"]
+        if settings.own_materials.transmission == "opaque":
+            del wanted["own_materials"]["transmission"]
         parts = [kind, source_sha256, wanted, RECIPE, READERS]
         return sha256_hex(canonical_json(parts))[:32]
 
