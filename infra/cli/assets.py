@@ -56,6 +56,8 @@ class AssetOptions:
     """Mesh tolerance, such as 0.5% of the diagonal, by the fewest triangles; by default none."""
     profile: Profile = "faithful"
     """Triangles are placed by shape (faithful) or are equally large (uniform)."""
+    watertight: bool = False
+    """Make every mesh closed, oriented and manifold, or reject the object."""
     own_materials: bool = False
     """Keep the materials and textures of the objects, as GLB files."""
     licence: str | None = None
@@ -165,6 +167,7 @@ def _settings(options: AssetOptions) -> AssetSettings:
         profile=options.profile,
         budgets=(usual if options.budget is None else options.budget,),
         epsilon=_parse_fraction(options.epsilon) if options.epsilon else None,
+        watertight=options.watertight,
         own_materials=OwnMaterialSettings(keep=options.own_materials),
     )
 

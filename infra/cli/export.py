@@ -6,7 +6,6 @@ from typing import Literal
 from infra.cli.console import first_words, print_result, progress_bars
 from infra.cli.options import OutputOptions, command
 from pipeline.exchange.exports.export import ExportForm
-from storage.records.sample import Sample
 from storage.remote.safe_url import safe_url
 from storage.settings.described import checked
 
@@ -20,7 +19,8 @@ class ExportOptions:
     form: ExportForm
     """Format of the files. nerfstudio: transforms.json, pictures and depth. coco: masks and boxes.
     huggingface: pictures, depth and ids for datasets.load_dataset. hypersim: HDF5 of reflectance,
-    illumination, residual and geometry (needs renders.split_lobes=true). h5, json, usd: each scene
+    illumination, residual and geometry (needs renders.split_lobes=true). energon: the shards as
+    they are, with NVIDIA Energon's metadata. h5, json, usd: each scene
     as RenderFormer's HDF5, as its JSON with meshes, or as USD. exr: pictures as OpenEXR. benchmark:
     the last four, each in its folder, with a table of views."""
     out: Path
@@ -41,8 +41,8 @@ def export(options: ExportOptions, output: OutputOptions) -> None:
     with progress_bars() as bars:
         task = bars.add_task("scenes", total=None, note="", visible=not output.json)
 
-        def on_scene(sample: Sample) -> None:
-            views.append(sample.scene.num_views)
+        def on_scene(num_views: int) -> None:
+            views.append(num_views)
             bars.advance(task)
 
         notes = export_dataset(

@@ -22,6 +22,7 @@ lock all.txt --constraint served.txt all.in
 lock docs.txt --constraint all.txt docs.in
 lock build.txt --constraint all.txt build.in
 lock uv.txt uv.in
+lock readers.txt --no-deps readers.in
 lock ../infra/bench/workloads/blender.txt ../infra/bench/workloads/blender.in
 
 # What torch's build for graphics cards needs on Linux stands apart: the one for processors does not.

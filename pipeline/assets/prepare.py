@@ -12,12 +12,13 @@ from pipeline.assets.cleaning.guards import check_clean, check_raw
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.decimation.by_name import decimate, safe_method
 from pipeline.assets.decimation.smallest import smallest_passing
-from pipeline.assets.quality.level_checks import check_level
+from pipeline.assets.quality.level_checks import check_level, require_watertight
 from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.assets.quality.triangles import count_edges
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.source_materials.skin import add_source_materials
+from pipeline.assets.watertight import LevelBase, make_watertight
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
@@ -39,7 +40,7 @@ def prepare_asset(
     Raises:
         Rejected: the object is unusable by any method; each step has its reason codes.
 
-    Holes stay open and inner components stay in.
+    Holes stay open and inner components stay in, unless `settings.watertight`.
     """
     source = read_source(path, settings.read_limits, root)
     raw = load_mesh(source)
@@ -48,8 +49,13 @@ def prepare_asset(
     check_clean(cleaned)
     mesh, front_share = orient_outward(cleaned)
     measured = MeasuredSource(mesh)
-    safe = safe_method(mesh, method)
-    levels, missed = _levels(measured, settings, safe)
+    base = (
+        make_watertight(measured, settings)
+        if settings.watertight
+        else LevelBase(mesh=mesh, start=mesh, gate=settings.gate)
+    )
+    safe = safe_method(base.start, method)
+    levels, missed = _levels(measured, base, settings, safe)
     levels, missed, materials = add_source_materials(levels, missed, source, mesh, settings)
     return AssetAttempt(
         method=safe,
@@ -93,7 +99,7 @@ def _count_flipped(before: TriangleMesh, after: TriangleMesh) -> int:
 
 
 def _levels(
-    source: MeasuredSource, settings: AssetSettings, method: str
+    source: MeasuredSource, base: LevelBase, settings: AssetSettings, method: str
 ) -> tuple[tuple[Level, ...], dict[int, tuple[str, str]]]:
     """Return the levels from the largest budget, and the reasons of the missing ones.
 
@@ -106,7 +112,7 @@ def _levels(
             continue
         epsilon = settings.epsilon if budget == settings.budgets[0] else None
         try:
-            levels.append(_level(source, settings, method, budget, epsilon))
+            levels.append(_level(source, base, settings, method, budget, epsilon))
         except Rejected as failure:
             missed[budget] = (failure.reason, failure.message)
     return tuple(levels), missed
@@ -114,6 +120,7 @@ def _levels(
 
 def _level(
     source: MeasuredSource,
+    base: LevelBase,
     settings: AssetSettings,
     method: str,
     budget: int,
@@ -123,15 +130,19 @@ def _level(
 
     Raises Rejected where that one fails the quality checks.
     """
-    num_faces = len(source.mesh.faces)
+    num_faces = len(base.mesh.faces)
     # A source within budget is used unchanged where its triangles need not be even.
     keeps_source = settings.profile == "faithful"
+    is_source = base.form == "source"
 
     def make(faces: int, max_error_p99: float) -> tuple[str, TriangleMesh, LevelQuality]:
-        if keeps_source and num_faces <= faces:
+        if keeps_source and num_faces <= faces and is_source:
             return "source", source.mesh, source.source_quality()
-        result = decimate(source.mesh, faces, method)
-        return method, *check_level(result, source, faces, settings.gate, max_error_p99)
+        result = decimate(base.start, faces, method)
+        mesh, quality = check_level(result, source, faces, base.gate, max_error_p99)
+        if settings.watertight:
+            require_watertight(mesh)
+        return method if is_source else f"{base.form} {method}", mesh, quality
 
     made = None
     if epsilon is not None:

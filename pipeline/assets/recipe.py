@@ -37,15 +37,22 @@ READERS = 4
 """Version of the readers' results: part of cache keys and of no asset, so that a fixed reader reads
 its files again."""
 
+_WATERTIGHT = ("libigl_qslim_alone", "meshoptimizer")
 
-def methods_of(profile: Profile, decimator: Decimator = "pymeshlab") -> tuple[str, ...]:
+
+def methods_of(
+    profile: Profile, decimator: Decimator = "pymeshlab", *, watertight: bool = False
+) -> tuple[str, ...]:
     """Return the installed decimation methods in the order of trial; pymeshlab (GPL) is optional.
 
     The next one runs where one crashes its child process, or its result fails the quality checks.
+    `watertight`: those that keep `faithful` meshes so.
 
     Raises:
         TrilightError: `uniform` without pymeshlab, the only method that makes triangles even.
     """
+    if watertight and profile == "faithful":
+        return _WATERTIGHT
     with_pymeshlab = _installed_version("pymeshlab") != "absent"
     if profile == "uniform" and not with_pymeshlab:
         raise TrilightError(

@@ -63,15 +63,23 @@ class OwnMaterialSettings:
     emission: bool = False
     """Keep the emission of surfaces, as one radiance for each triangle of a level. Implied by
     `scenes.materials.own_emission`."""
+    transmission: Literal["opaque", "reject"] = "opaque"
+    """Fate of an object with transmissive or transparent materials. `opaque`: its surfaces are
+    opaque, and its record and the log name what was lost. `reject`: it is refused."""
     if_lost: Literal["drawn", "reject"] = "drawn"
     """Fate of an object whose materials are missing, unreadable or too far off. `drawn`: it gets
     random materials, and its record holds the reason. `reject`: it is refused."""
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out `emission` where off, so that digests of earlier builds stay equal."""
+        """Leave out later settings at their defaults: digests of earlier builds stay equal."""
         record: dict[str, Any] = as_usual(self)
-        return {name: value for name, value in record.items() if name != "emission" or value}
+        defaults = {"emission": False, "transmission": "opaque"}
+        return {
+            name: value
+            for name, value in record.items()
+            if name not in defaults or value != defaults[name]
+        }
 
 
 @checked()
@@ -96,6 +104,9 @@ class AssetSettings:
     epsilon: Annotated[float | None, PART] = None
     """Sufficient two-way distance (99th percentile, as a fraction of the diagonal): the finest
     level is then the smallest mesh within it, instead of one that fills its budget."""
+    watertight: bool = False
+    """Make levels closed, oriented and manifold; reject objects where such a level does not pass
+    the quality checks. Open surfaces become thin plates, with up to twice the accepted area."""
     gate: GateSettings = dataclasses.field(default_factory=GateSettings)
     """Quality checks of each level; where one fails, the next method runs, or the level is absent.
     """
@@ -128,6 +139,8 @@ class AssetSettings:
             record.pop("own_materials", None)
         if self.decimator == "pymeshlab":
             record.pop("decimator", None)
+        if not self.watertight:
+            record.pop("watertight", None)
         return record
 
     def __post_init__(self) -> None:

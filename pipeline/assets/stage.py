@@ -64,7 +64,7 @@ def prepare_assets(
     Raises:
         TrilightError: the store cannot be written, or a needed library is not installed.
     """
-    methods = methods_of(settings.profile, settings.decimator)
+    methods = methods_of(settings.profile, settings.decimator, watertight=settings.watertight)
     _LOG.info("prepare %d objects with %s", len(records), library_versions())
 
     def prepare(record: ObjectRecord) -> PreparedObject | Failure:
@@ -118,8 +118,21 @@ def _prepare_once(
         geometry_sha256=asset.geometry_sha256,
         least_triangles=min(len(level.faces) for level in asset.levels),
         without_own="" if asset.materials is None else asset.materials.reason,
-        unread=store.unread(key),
+        unread=(*store.unread(key), *_list_lost_properties(asset)),
     )
+
+
+def _list_lost_properties(asset: Asset) -> list[str]:
+    """Return sentences on properties of the source's materials that are not shown."""
+    if asset.materials is None:
+        return []
+    see_through = asset.materials.see_through
+    return [
+        f"{word} of materials: surfaces are opaque"
+        if word in see_through
+        else f"{word} of materials: not shown"
+        for word in asset.materials.lost
+    ]
 
 
 def _key(

@@ -49,7 +49,12 @@ class AssetStore:
 
     def key(self, kind: str, source_sha256: str, settings: AssetSettings) -> str:
         """Return the key of the outcome of a source file."""
-        parts = [kind, source_sha256, asdict(settings), RECIPE, READERS]
+        record = asdict(settings)
+        if not settings.watertight:  # keys of earlier outcomes stay
+            del record["watertight"]
+        if settings.own_materials.transmission == "opaque":
+            del record["own_materials"]["transmission"]
+        parts = [kind, source_sha256, record, RECIPE, READERS]
         return sha256_hex(canonical_json(parts))[:32]
 
     def asset_path(self, key: str) -> Path:

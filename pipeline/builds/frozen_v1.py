@@ -40,6 +40,7 @@ BUILD_V1 = BuildSettings(
         decimator="pymeshlab",
         budgets=(1400, 1000, 700, 500, 340, 240),
         epsilon=None,
+        watertight=False,
         gate=GateSettings(
             max_error_p99=0.03,
             max_outside=0.01,
@@ -59,6 +60,7 @@ BUILD_V1 = BuildSettings(
             max_colour_error=0.05,
             max_missed=0.1,
             emission=False,
+            transmission="opaque",
             if_lost="drawn",
         ),
     ),

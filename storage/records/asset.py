@@ -93,7 +93,8 @@ class LevelRecord:
     budget: int
     """The most triangles that the level was allowed."""
     method: str
-    """`source` (within budget as it was), or the name of the decimation."""
+    """`source` (within budget as it was), or the name of the decimation; after `capped`, `solid` or
+    `hollow` where the mesh was made watertight."""
     quality: LevelQuality
 
 

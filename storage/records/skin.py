@@ -50,6 +50,11 @@ class OwnMaterials:
     lost: tuple[str, ...] = ()
     """Properties of the source that this renderer cannot show, such as `emission`."""
 
+    @property
+    def see_through(self) -> tuple[str, ...]:
+        """Those of `lost` by which light passes through surfaces, which are opaque here."""
+        return tuple(word for word in self.lost if word in ("transmission", "transparency"))
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LevelSkin:

@@ -56,6 +56,7 @@ DECIMATIONS: Mapping[str, Decimation] = {
     "pymeshlab_uniform": Decimation(run=_remesh_evenly, always_ends=False),
     "pymeshlab_collapse": Decimation(run=_collapse, always_ends=False),
     "libigl_qslim": Decimation(run=_qslim, always_ends=True),
+    "libigl_qslim_alone": Decimation(run=qslim.collapse, always_ends=True),
     "meshoptimizer": Decimation(run=meshopt.simplify, always_ends=True),
     "meshoptimizer_sloppy": Decimation(run=meshopt.simplify_sloppily, always_ends=True),
 }

@@ -1,9 +1,11 @@
 """Quality checks of a level, whichever method made it. Cheap checks come first."""
 
+import igl
 import numpy as np
 
 from pipeline.assets.cleaning.clean import clean
 from pipeline.assets.quality.measure import MeasuredSource
+from pipeline.assets.quality.triangles import half_edges, open_half_edges
 from pipeline.assets.settings import GateSettings
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
@@ -83,4 +85,18 @@ def _check_shape(quality: LevelQuality, budget: int, gate: GateSettings) -> None
             "parts_lost",
             f"parts with {quality.lost_area:.1%} of the area are gone at {budget} faces; "
             f"expected <= {gate.max_lost_area:.1%}",
+        )
+
+
+def require_watertight(mesh: TriangleMesh) -> None:
+    """Raise Rejected `not_watertight` where a clean mesh is not closed, oriented and manifold."""
+    edges = half_edges(mesh)
+    num_open = len(open_half_edges(mesh))
+    num_shared = len(edges) - len(np.unique(edges, axis=0))
+    num_joints = int((~igl.is_vertex_manifold(mesh.faces)).sum()) if len(edges) else 0
+    if num_open or num_shared or num_joints:
+        raise Rejected(
+            "not_watertight",
+            f"{num_open} edges without a second triangle, {num_shared} with triangles of equal "
+            f"direction, {num_joints} vertices where surfaces touch; expected 0 of each",
         )

@@ -48,10 +48,23 @@ def smallest_angles_deg(mesh: TriangleMesh) -> NDArray[np.float64]:
 
 def count_edges(mesh: TriangleMesh) -> EdgeCounts:
     """Count the open and non-manifold edges."""
-    ends = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    ends = np.sort(half_edges(mesh), axis=1)
     shared = np.unique(ends[:, 0] * len(mesh.positions) + ends[:, 1], return_counts=True)[1]
     return EdgeCounts(
         open=int((shared == 1).sum()),
         nonmanifold=int((shared > 2).sum()),
         most_faces=int(shared.max()),
     )
+
+
+def half_edges(mesh: TriangleMesh) -> NDArray[np.int64]:
+    """Return the edges of each face in its direction: [3F, 2] rows of `positions`."""
+    return mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+
+def open_half_edges(mesh: TriangleMesh) -> NDArray[np.int64]:
+    """Return the edges [E, 2] that no face has in the opposite direction."""
+    edges = half_edges(mesh)
+    count = len(mesh.positions)
+    opposite = edges[:, 1] * count + edges[:, 0]
+    return edges[~np.isin(edges[:, 0] * count + edges[:, 1], opposite)]

@@ -47,7 +47,8 @@ def add_source_materials(
         settings: `own_materials` keeps materials, and says what happens where they are lost.
 
     Raises:
-        Rejected: as `open_skin_baker`, where `if_lost` is `reject`.
+        Rejected: as `open_skin_baker`, where `if_lost` is `reject`; transmissive_material, where
+            `transmission` is.
     """
     reasons = dict(missed)
     if not settings.own_materials.keep:
@@ -59,6 +60,12 @@ def add_source_materials(
         if refuse:
             raise
         return levels, reasons, OwnMaterials(reason=lost.reason, message=lost.message)
+    if settings.own_materials.transmission == "reject" and materials.see_through:
+        raise Rejected(
+            "transmissive_material",
+            f"its materials have {' and '.join(materials.see_through)}; expected opaque ones, or "
+            "own_materials.transmission=opaque",
+        )
     with_skins = list[Level]()
     for level in levels:
         try:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from pipeline.exchange.exports.coco import write_coco
+from pipeline.exchange.exports.energon import write_energon
 from pipeline.exchange.exports.huggingface import write_huggingface
 from pipeline.exchange.exports.hypersim import write_hypersim
 from pipeline.exchange.exports.nerfstudio import write_nerfstudio
@@ -17,7 +18,16 @@ from storage.errors import TrilightError
 from storage.records.sample import Sample
 
 ExportForm = Literal[
-    "nerfstudio", "coco", "huggingface", "hypersim", "h5", "json", "usd", "exr", "benchmark"
+    "nerfstudio",
+    "coco",
+    "huggingface",
+    "hypersim",
+    "energon",
+    "h5",
+    "json",
+    "usd",
+    "exr",
+    "benchmark",
 ]
 
 Samples = Iterator[tuple[str, Sample]]
@@ -34,6 +44,9 @@ FORMS: dict[str, Callable[[Samples, Path], Sequence[str] | None]] = {
 """Writers by format. Each writes into a folder, index files last, and may return sentences about
 losses."""
 
+WHOLE_SHARDS = "energon"
+"""The format that takes the shards as they are."""
+
 _RIGHTS = ("LICENSE.md", "attribution.csv")
 """Files of a dataset on rights, which every export contains."""
 
@@ -45,7 +58,7 @@ def export_dataset(
     *,
     split: str | None,
     scene: str | None,
-    done: Callable[[Sample], None],
+    done: Callable[[int], None],
 ) -> Sequence[str]:
     """Write samples of a dataset in the format of another library, with the rights of its objects.
 
@@ -54,7 +67,7 @@ def export_dataset(
         form: a name of FORMS.
         out: a folder that is empty, or does not exist.
         split, scene: as `select_samples`.
-        done: called with each sample that is read.
+        done: called after each sample with its number of views.
 
     Returns:
         Sentences about what the format cannot hold.
@@ -70,9 +83,18 @@ def export_dataset(
     def samples() -> Samples:
         for split_sample in select_samples(dataset, split=split, scene=scene):
             yield split_sample
-            done(split_sample[1])
+            done(split_sample[1].scene.num_views)
 
-    lost = FORMS[form](samples(), out)
+    lost: Sequence[str] | None = None
+    if form == WHOLE_SHARDS:
+        if scene is not None:
+            raise TrilightError(
+                "--form energon copies whole shards, and --scene names a sample; leave it out, or "
+                "make a dataset of it first (`trilight shards select`)."
+            )
+        write_energon(dataset, out, split, done)
+    else:
+        lost = FORMS[form](samples(), out)
     for name in _RIGHTS:
         if (data := dataset.files.read(name)) is not None:
             write_atomically(out / name, data)

@@ -1,6 +1,7 @@
 """An object's colours and light from its file to its asset: orientation, exactness, workflows."""
 
 import dataclasses
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected
 from storage.records.asset import decode_asset, encode_asset
 from storage.records.skin import LevelSkin
+from storage.settings.described import settings_record
+from tests.command_line import trilight
 from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import (
     geometry,
@@ -200,6 +203,31 @@ def test_what_nothing_here_can_show_is_named(tmp_path: Path) -> None:
     asset = prepare(write_glb(tmp_path / "a.glb", tree, buffer), KEEP)
     assert asset.materials is not None
     assert asset.materials.lost == ("clearcoat", "emission", "transparency")
+
+
+def test_transmission_is_made_opaque_and_said_or_refused(tmp_path: Path) -> None:
+    tree, buffer = textured_tree(PICTURE)
+    tree["materials"][0]["normalTexture"] = {"index": 0}
+    tree["materials"][0]["extensions"] = {"KHR_materials_transmission": {"transmissionFactor": 1}}
+    (tmp_path / "in").mkdir()
+    path = write_glb(tmp_path / "in/a.glb", tree, buffer)
+    assert_corners(prepare(path, KEEP))  # opaque, in its own colours
+    for if_lost in ("drawn", "reject"):
+        own = dataclasses.replace(OWN, transmission="reject", if_lost=if_lost)
+        refuse = dataclasses.replace(KEEP, own_materials=own)
+        with pytest.raises(Rejected, match="its materials have transmission; expected") as refusal:
+            prepare(path, refuse)
+        assert refusal.value.reason == "transmissive_material"
+    assert prepare(textured_glb(tmp_path / "b.glb", PICTURE), refuse).levels  # nothing of the kind
+    assert "transmission" not in settings_record(KEEP)["own_materials"]
+    words = ["assets", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--own-materials"]
+    ended = trilight([*words, "--json"])
+    assert ended.exit_code == 0, ended.exception
+    (said,) = json.loads(ended.stdout)["unread"].values()
+    assert said == [
+        "normal map of materials: not shown",
+        "transmission of materials: surfaces are opaque",
+    ]
 
 
 def test_a_level_over_its_bound_goes_without_and_one_far_from_its_source_is_told(

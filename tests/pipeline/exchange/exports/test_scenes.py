@@ -225,11 +225,10 @@ def test_nerfstudio(dataset: Path) -> None:
     np.testing.assert_array_equal(picture, preview_srgb8(made.radiance_rgb[1]))
 
 
-def test_its_rays_and_our_depth_lead_to_our_points(dataset: Path) -> None:
-    """Opened by nerfstudio itself, which is not among the project's packages.
-
-    `pip install --no-deps nerfstudio==1.1.5` with jaxtyping, opencv-python-headless and viser.
-    """
+@pytest.mark.slow("references")
+@pytest.mark.timeout(900)
+def test_its_rays_and_our_depth_lead_to_our_points(dataset: Path, foreign: None) -> None:
+    """Opened by nerfstudio itself."""
     parsers: Any = pytest.importorskip("nerfstudio.data.dataparsers.nerfstudio_dataparser")
     depths: Any = pytest.importorskip("nerfstudio.data.datasets.depth_dataset")
     folder = exported(dataset, "nerfstudio", "--scene", "1") / "000000001"

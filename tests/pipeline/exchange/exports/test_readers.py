@@ -1,0 +1,230 @@
+"""Readers that are not ours open our data unchanged.
+
+Packages at pinned versions: here webdataset with torch, Hugging Face datasets and NVIDIA Energon;
+in test_scenes.py nerfstudio's parser and COCO's tools. By their published arithmetic: here
+RenderFormer-Studio's validator and weights; in test_scenes.py RenderFormer's loader, and Hypersim's
+layout.
+"""
+
+import io
+import json
+import re
+import shutil
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import OpenEXR
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+from pipeline.builds.named import named_build
+from scene_templates.sample_layout import scene_plan
+from storage.dataset.dataset import open_dataset
+from storage.records.sample import sample_key
+from tests.command_line import trilight
+from tests.train.toy import VIEWS, toy_sample, write_toy_dataset
+
+PX = 16
+TRAIN, VALIDATION, PER_SHARD = 5, 3, 2
+
+pytestmark = [pytest.mark.slow("references"), pytest.mark.timeout(900)]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a dataset of three training shards and two for validation, with its card."""
+    root = tmp_path_factory.mktemp("set") / "data"
+    write_toy_dataset(root, train=TRAIN, validation=VALIDATION, per_shard=PER_SHARD, resolution=PX)
+    ended = trilight(["inspect", str(root), "--json"])
+    assert ended.exit_code == 0, ended.exception
+    return root
+
+
+def picture(data: bytes) -> NDArray:
+    """Decode a picture as the documents tell a reader to."""
+    return OpenEXR.File(io.BytesIO(data)).channels()["RGB"].pixels
+
+
+def check_sample(key: str, members: dict[str, Any]) -> None:
+    """Assert that the members by suffix are those of the toy scene."""
+    sample = toy_sample(int(key), resolution=PX)
+    for view in range(VIEWS):
+        half = sample.radiance_rgb[view].astype(np.float16)
+        np.testing.assert_array_equal(picture(members[f"{view}.exr"]), half)
+    told = members["json"]
+    told = json.loads(told) if isinstance(told, bytes | str) else told
+    assert len(told["views"]) == VIEWS
+
+
+def keys(count: int, first: int = 0) -> list[str]:
+    return [sample_key(index) for index in range(first, first + count)]
+
+
+def test_webdataset_with_torch(dataset: Path) -> None:
+    """Two workers take the shards apart; every sample comes once, in batches and decoded."""
+    import torch
+    import webdataset
+
+    urls = sorted(str(path) for path in dataset.glob("train-*.tar"))
+    assert len(urls) == 3
+    source = webdataset.WebDataset(urls, shardshuffle=False)
+    loader = torch.utils.data.DataLoader(source, batch_size=None, num_workers=2)
+    seen = {sample["__key__"]: sample for sample in loader}
+    assert sorted(seen) == keys(TRAIN)
+    for key, sample in seen.items():
+        check_sample(key, sample)
+    pictures = webdataset.WebDataset(urls, shardshuffle=False).to_tuple("0.exr")
+    tensors = pictures.map_tuple(lambda data: torch.from_numpy(picture(data).astype(np.float32)))
+    shapes = [tuple(batch.shape) for (batch,) in tensors.batched(PER_SHARD)]
+    assert shapes == [(2, PX, PX, 3)] * 2 + [(1, PX, PX, 3)]
+
+
+def test_hugging_face_datasets_by_the_card(dataset: Path, tmp_path: Path) -> None:
+    """The folder as it is: its card names the shards of each split; and its webdataset builder."""
+    from datasets import load_dataset
+
+    loaded = load_dataset(str(dataset), cache_dir=str(tmp_path / "cache"))
+    assert {name: rows.num_rows for name, rows in loaded.items()} == {
+        "train": TRAIN,
+        "validation": VALIDATION,
+    }
+    for row in loaded["train"]:
+        check_sample(row["__key__"], row)
+    urls = sorted(str(path) for path in dataset.glob("train-*.tar"))
+    stream = load_dataset("webdataset", data_files={"train": urls}, split="train", streaming=True)
+    seen = {row["__key__"]: row for row in stream}
+    assert sorted(seen) == keys(TRAIN)
+    for key, row in seen.items():
+        check_sample(key, row)
+
+
+def test_energon(dataset: Path, tmp_path: Path, foreign: None) -> None:
+    """Its loader reads the export; its own preparation makes the same index of the same shards."""
+    energon: Any = pytest.importorskip("megatron.energon")
+    out = tmp_path / "out"
+    words = ["export", str(dataset), "--form", "energon", "--out", str(out), "--json"]
+    ended = trilight(words)
+    assert ended.exit_code == 0, ended.exception
+    told = json.loads(ended.stdout)
+    assert (told["scenes"], told["views"]) == (TRAIN + VALIDATION, VIEWS * (TRAIN + VALIDATION))
+    for shard in open_dataset(str(dataset)).manifest.shards:
+        assert (out / shard.name).read_bytes() == (dataset / shard.name).read_bytes()
+
+    encoder = energon.DefaultTaskEncoder()
+    encoder.cookers = [energon.Cooker(energon.stateless(lambda sample: sample))]
+    counts = {"train": (TRAIN, 0), "val": (VALIDATION, TRAIN)}
+    for part, (count, first) in counts.items():
+        opened = energon.get_val_dataset(
+            str(out),
+            split_part=part,
+            worker_config=energon.WorkerConfig.default_worker_config(num_workers=0),
+            task_encoder=encoder,
+            batch_size=None,
+        )
+        seen = {sample["__key__"].split("/")[-1]: sample for sample in energon.get_loader(opened)}
+        assert sorted(seen) == keys(count, first)
+        for key, sample in seen.items():
+            check_sample(key, sample)
+
+    # its own preparation of the shards alone
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for path in out.glob("*.tar"):
+        shutil.copy(path, bare)
+    from megatron.energon.epathlib import EPath
+    from megatron.energon.flavors import BaseWebdatasetFactory
+
+    BaseWebdatasetFactory.prepare_dataset(
+        EPath(bare),
+        [path.name for path in sorted(bare.glob("*.tar"))],
+        split_parts_patterns=[("train", "train-.*"), ("val", "validation-.*"), ("test", "test-.*")],
+        progress_fn=lambda items, total: items,
+        workers=1,
+    )
+    for path in bare.glob("*.tar.idx"):
+        assert path.read_bytes() == (out / path.name).read_bytes()
+    theirs = json.loads((bare / ".nv-meta/.info.json").read_text())["shard_counts"]
+    ours = json.loads((out / ".nv-meta/.info.json").read_text())["shard_counts"]
+    assert ours == theirs
+
+    refused = trilight([*words[:4], "--out", str(tmp_path / "one"), "--scene", "1"])
+    assert "copies whole shards, and --scene names a sample" in str(refused.exception)
+    refused = trilight([*words[:4], "--out", str(tmp_path / "one"), "--split", "test"])
+    assert "no shard in split test; expected one of train, validation" in str(refused.exception)
+
+
+STUDIO_SHAPES = {
+    "triangles": ("float32", ("T", 3, 3)),
+    "texture": ("float32", ("T", 13, 32, 32)),
+    "vn": ("float32", ("T", 3, 3)),
+    "c2w": ("float32", ("V", 4, 4)),
+    "fov": ("float32", ("V",)),
+    "mvp": ("float32", ("V", 4, 4)),
+}
+"""What RenderFormer-Studio's `renderformer data validate-h5` asks of the first version's files
+(src/renderformer/data/h5/validate.py at a5daa311)."""
+
+
+def test_what_the_validator_of_renderformer_studio_asks(dataset: Path, tmp_path: Path) -> None:
+    words = ["export", str(dataset), "--form", "h5", "--out", str(tmp_path / "h5"), "--json"]
+    ended = trilight(words)
+    assert ended.exit_code == 0, ended.exception
+    paths = sorted((tmp_path / "h5").glob("*.h5"))
+    assert len(paths) == TRAIN + VALIDATION
+    for path in paths:
+        with h5py.File(path) as file:
+            sizes = {"T": file["triangles"].shape[0], "V": file["c2w"].shape[0]}
+            for name, (dtype, shape) in STUDIO_SHAPES.items():
+                assert file[name].dtype == dtype, name
+                assert file[name].shape == tuple(sizes.get(str(n), n) for n in shape), name
+
+
+STUDIO_STAGES = {
+    "renderformer-v1-256": """
+        corner-single-object 3, corner-multi-object 3, corner-no-object 1,
+        corner-multi-object-patch 1, corner-multi-object-special 2, corner-single-object-patch 1,
+        corner-single-object-special 2, no-ceil-box-multi 3, no-ceil-box-single 3,
+        no-ceil-box-multi-patch 1, no-ceil-box-single-patch 1, no-ceil-box-no 1,
+        plane-multi-object 3, plane-single-object 3, plane-no-object 1, wall-multi-object 3,
+        wall-single-object 3, wall-no-object 1, wall-multi-object-patch 1,
+        wall-single-object-patch 1, thin-objects/plane-single-object 8""",
+    "renderformer-v1-512": """
+        corner-multi-object 3, corner-single-object 3, no-ceil-box-multi-patch 2,
+        no-ceil-box-multi 3, no-ceil-box-single-patch 2, no-ceil-box-single 3,
+        plane-multi-object 4, plane-single-object 4, wall-multi-object 3, wall-single-object 3,
+        more-tri/corner-multi-object 3, more-tri/no-ceil-box-multi 3, more-tri/plane-multi-object 3,
+        more-tri/wall-multi-object 3""",
+}
+"""Templates and weights of configs/data/v1/stage_{01_1k_256res,02_4k_512res}.yaml (a5daa311)."""
+
+
+def our_name(template: str) -> str:
+    """Return the name here of a template there."""
+    folder, _, name = template.rpartition("/")
+    name = name.replace("no-ceil-box", "open_box").replace("-object", "")
+    name = re.sub(r"-no\b", "-none", name)
+    if folder == "more-tri":
+        return name.replace("-multi", "-more")
+    return f"{name}-thin" if folder == "thin-objects" else name
+
+
+@pytest.mark.parametrize("build", STUDIO_STAGES)
+def test_layouts_are_as_frequent_as_in_renderformer_studio(build: str) -> None:
+    rows = [row.split() for row in STUDIO_STAGES[build].split(",")]
+    weights = {our_name(template): int(weight) for template, weight in rows}
+    assert (
+        len(weights) == len(rows) == {"renderformer-v1-256": 21, "renderformer-v1-512": 14}[build]
+    )
+    scenes, seed = named_build(build).scenes, 7
+    drawn = 250 * sum(weights.values())
+    counts = Counter(
+        scene_plan(scenes, seed=seed, scene_index=index).family.name for index in range(drawn)
+    )
+    assert counts.keys() == weights.keys()
+    expected = [250 * weight for weight in weights.values()]
+    # chance alone is farther off once in a thousand
+    assert stats.chisquare([counts[name] for name in weights], expected).pvalue > 1e-3
