@@ -52,6 +52,8 @@ class AssetStore:
         record = asdict(settings)
         if not settings.watertight:  # keys of earlier outcomes stay
             del record["watertight"]
+        if settings.decimator == "pymeshlab":
+            del record["decimator"]
         if settings.own_materials.transmission == "opaque":
             del record["own_materials"]["transmission"]
         parts = [kind, source_sha256, record, RECIPE, READERS]
