@@ -48,8 +48,8 @@ def scene_sky(
 
     Args:
         settings: the ranges to draw from.
-        emitters: [N, 3, 3] corners of the emitting triangles, around the middle of the room; if there
-            are none, the drawn strength is the mean radiance of the sky.
+        emitters: [N, 3, 3] corners of the emitting triangles, around the middle of the room; if
+            there are none, the drawn strength is the mean radiance of the sky.
         radiance_rgb: [N, 3] their radiance.
         scene_key: its attempt decides which sky, not whether there is one.
         user_skies: the user's own maps.

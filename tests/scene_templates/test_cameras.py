@@ -90,9 +90,7 @@ def test_an_object_alone_stands_in_the_middle() -> None:
 
 
 def test_a_layout_without_a_room_holds_one_object() -> None:
-    with pytest.raises(
-        TrilightError, match=r"\(1, 2\); expected \(1, 1\) for alone"
-    ):
+    with pytest.raises(TrilightError, match=r"\(1, 2\); expected \(1, 1\) for alone"):
         Family(**{**vars(alone()), "num_objects": (1, 2)})
 
 

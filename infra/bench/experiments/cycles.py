@@ -168,7 +168,7 @@ EXPERIMENT = Experiment(
     title="Plain, textured and sky-lit scenes compared with Blender's Cycles",
     about="Raw samples of ours and a denoised picture against raw samples of Cycles, of sampled "
     "scenes, of scenes with procedural surfaces, of scenes below skies, of objects alone, and "
-    "of those in `--scenes`; the first run installs Blender (GPL-3, 380 MB) in its own environment.",
+    "of those in `--scenes`; the first run installs Blender (GPL-3, 380 MB) in an environment.",
     cost=Column(name="core-seconds of Cycles", figure="core_s"),
     error=Column(name="agreement without noise, linear dB", figure="noiseless_db"),
     better="higher",

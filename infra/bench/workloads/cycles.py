@@ -62,8 +62,8 @@ def render_with_cycles(
         threads: threads of Cycles; None for one for each core.
 
     Returns:
-        Linear radiance [R, R, 3] for each seed of each view; and the CPU seconds of all renders, without reading
-        the file and building the tree of triangles.
+        Linear radiance [R, R, 3] for each seed of each view; and the CPU seconds of all
+        renders, without reading the file and building the tree of triangles.
 
     Raises:
         TrilightError: Blender cannot be installed (`blender_python`), or it failed.
