@@ -135,11 +135,31 @@ def object_views() -> BuildSettings:
     )
 
 
+def olat() -> BuildSettings:
+    """One light at a time: rooms with 2 to 6 lamps, half of them below a sky too, each light alone.
+
+    Lamps are white, so that a reader colors them.
+    """
+    build = pretrain_256()
+    return dataclasses.replace(
+        build,
+        build="olat",
+        scenes=dataclasses.replace(
+            build.scenes, lights=LightSettings(count=(2, 6)), skies=SkySettings(share=0.5)
+        ),
+        renders=dataclasses.replace(
+            build.renders, noise_floor_db=42.0, max_spp=1024, per_light=True
+        ),
+        splits=dataclasses.replace(build.splits, scenes_per_shard=64),
+    )
+
+
 TRAINING_BUILDS = {
     "smoke": NamedBuild(settings=smoke, num_scenes=24, device="cpu"),
     "pretrain-256": NamedBuild(settings=pretrain_256, num_scenes=65_536),
     "finetune-512": NamedBuild(settings=finetune_512, num_scenes=16_384),
     "textured-256": NamedBuild(settings=textured_256, num_scenes=16_384),
     "sky-256": NamedBuild(settings=sky_256, num_scenes=65_536),
+    "olat": NamedBuild(settings=olat, num_scenes=2_048),
     "object-views": NamedBuild(settings=object_views, num_scenes=1_024),
 }
