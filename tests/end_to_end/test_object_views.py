@@ -17,6 +17,8 @@ from tests.command_line import run_program, trilight
 from tests.conftest import ROOT
 from tests.end_to_end.production_kit import SIXTEEN_SAMPLES
 
+ONE_VIEW = ("--set", "scenes.num_views=1")
+
 
 def _generate(out: Path, *words: str) -> None:
     fewer = ["--resolution", "32", "--set", "splits.scenes_per_shard=2", *SIXTEEN_SAMPLES]
@@ -32,9 +34,8 @@ def test_objects_alone_from_the_preset_to_the_exports(tmp_path: Path) -> None:
     result = trilight(["verify", str(made)])
     assert result.exit_code == 0, result.exception
     for sample in open_dataset(str(made)).samples("train"):
-        assert stands_alone(sample.scene) and [row.kind for row in sample.scene.objects] == [
-            "object"
-        ]
+        assert stands_alone(sample.scene)
+        assert [row.kind for row in sample.scene.objects] == ["object"]
         distance = np.linalg.norm(sample.scene.c2w[:, :3, 3], axis=1)
         np.testing.assert_allclose(distance, 1.6, rtol=1e-5)
         towards = sample.scene.c2w[:, :3, 3] / distance[:, None]
@@ -57,9 +58,7 @@ def test_objects_alone_from_the_preset_to_the_exports(tmp_path: Path) -> None:
 @pytest.mark.slow("commands")
 def test_the_page_relights_a_scene_one_light_at_a_time(tmp_path: Path) -> None:
     skies = ["--set", "scenes.skies.share=1", "--set", "scenes.skies.maps.height=16"]
-    _generate(
-        tmp_path / "data/olat", "olat", "--scenes", "1", "--set", "scenes.num_views=1", *skies
-    )
+    _generate(tmp_path / "data/olat", "olat", "--scenes", "1", *ONE_VIEW, *skies)
     assert trilight(["verify", str(tmp_path / "data/olat")]).exit_code == 0
     (block,) = re.findall(
         r"```python\n(.*?)```", (ROOT / "docs/how-to/olat.md").read_text(), re.DOTALL

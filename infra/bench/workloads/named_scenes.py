@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from infra.render.held_out_scenes import first_composed
-from pipeline.builds.training import object_views, smoke, textured_256
+from pipeline.builds.training import object_views, olat, smoke, textured_256
 from pipeline.exchange.gltf.read import SUFFIXES as GLTF_SUFFIXES
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.isolation import IsolatedChild
@@ -99,6 +99,11 @@ def object_alone(child: IsolatedChild, scene_index: int, num_views: int) -> Scen
     """
     settings = dataclasses.replace(object_views().scenes, num_views=num_views)
     return first_composed(child, settings, scene_index)
+
+
+def lights_apart(child: IsolatedChild, scene_index: int) -> Scene:
+    """Return a scene of the preset `olat` with one camera; as `object_alone`."""
+    return first_composed(child, dataclasses.replace(olat().scenes, num_views=1), scene_index)
 
 
 def _holds_a_scene(path: Path) -> bool:
