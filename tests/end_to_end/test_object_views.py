@@ -72,7 +72,9 @@ def test_the_page_relights_a_scene_one_light_at_a_time(tmp_path: Path) -> None:
     assert len(lights) == num_light_pictures(sample.scene) > 2
     np.testing.assert_array_equal(sum_of_lights(lights), sample.radiance_rgb[0])
     assert json.loads(printed) == [floor.noise_floor_db for floor in sample.views[0].lights]
-    relit = lights[0] * np.float32([4, 1, 0.2]) + np.float32(0.25) * lights[1:].sum(axis=0)
+    relit = lights[0] * np.array([4, 1, 0.2], np.float32) + np.float32(0.25) * lights[1:].sum(
+        axis=0
+    )
     with Image.open(tmp_path / "relit.png") as picture:
         difference = np.asarray(picture).astype(int) - preview_srgb8(relit)
     assert np.abs(difference).max() <= 1

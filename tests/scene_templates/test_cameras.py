@@ -41,7 +41,7 @@ def _unevenness(directions: NDArray) -> float:
 def test_views_of_a_sphere_are_more_even_than_random_ones(count: int) -> None:
     random = np.mean([_unevenness(_directions("random", count, seed)) for seed in range(8)])
     for path in ("sphere", "fibonacci"):
-        even = [_unevenness(_directions(path, count, seed)) for seed in range(8)]  # type: ignore[arg-type]
+        even = [_unevenness(_directions(path, count, seed)) for seed in range(8)]
         assert max(even) < random / 2, path
 
 
