@@ -211,9 +211,9 @@ def _accepted_view(
         at_cap=rendered.at_cap,
         seed=seed,
         camera_attempt=camera.attempt,
-        parts=rendered.part_floors
-        and {name: _part_floor(floor) for name, floor in rendered.part_floors.items()},
-        lights=rendered.light_floors and tuple(map(_part_floor, rendered.light_floors)),
+        parts={name: _part_floor(each) for name, each in (rendered.part_floors or {}).items()}
+        or None,
+        lights=tuple(map(_part_floor, rendered.light_floors or ())) or None,
     )
     return _AcceptedView(
         camera=camera,

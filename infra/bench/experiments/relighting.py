@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, percent
@@ -57,24 +58,20 @@ def _measure(target_db: float, context: BenchContext, trial: str) -> Figures:
     )
     settings = dataclasses.replace(olat().renders, resolution=px, noise_floor_db=target_db)
     view = context.child.call(render_shot, scene, settings)
+    assert view.light_floors is not None and view.lights_rgb is not None
     everywhere = np.ones((px, px), np.bool_)
 
-    def error_db(picture: np.ndarray, reference: RawReference) -> float:
+    def error_db(picture: NDArray[np.float32], reference: RawReference) -> float:
         return true_error_db(picture, reference, log10_radiance, everywhere)[0]
 
     gains = MOST_GAIN ** rng_for(index, "gains").uniform(-1, 1, (len(references), 1, 1, 3))
-    excess = np.array(
-        [
-            floor.log_db - error_db(light, reference)
-            for floor, light, reference in zip(
-                view.light_floors, view.lights_rgb, references, strict=True
-            )
-        ]
-    )
+    lights = zip(view.light_floors, view.lights_rgb, references, strict=True)
+    excess = np.array([floor.log_db - error_db(light, raw) for floor, light, raw in lights])
+    relit = (gains * view.lights_rgb).sum(axis=0).astype(np.float32)
     return {
         "core_s": view.core_s,
         "lights": len(references),
-        "relit_db": error_db((gains * view.lights_rgb).sum(axis=0), _sum(references, gains)),
+        "relit_db": error_db(relit, _sum(references, gains)),
         "stated_db": view.noise_floor_db,
         "true_db": error_db(view.radiance_rgb, _sum(references, np.ones_like(gains))),
         "missed": float((excess > _ALLOWED_DB).mean()),
@@ -83,7 +80,7 @@ def _measure(target_db: float, context: BenchContext, trial: str) -> Figures:
     }
 
 
-def _sum(references: Sequence[RawReference], gains: np.ndarray) -> RawReference:
+def _sum(references: Sequence[RawReference], gains: NDArray[np.float64]) -> RawReference:
     """Return the reference of lights that are scaled by gains [L, 1, 1, 3] and added."""
     a_rgb = (gains * np.stack([each.a_rgb for each in references])).sum(axis=0)
     b_rgb = (gains * np.stack([each.b_rgb for each in references])).sum(axis=0)
