@@ -104,13 +104,13 @@ def path_position(
         num_views: number of the scene's views.
         rng: of the scene, the same for all of its views: it turns the path.
     """
-    turn, height = rng.random(2).tolist()
+    azimuth_shift, height = rng.random(2).tolist()
     up = (view + 0.5) / num_views
     if path == "sphere":
-        return (_radical_inverse(view) + turn) % 1, up
+        return (_radical_inverse(view) + azimuth_shift) % 1, up
     if path == "fibonacci":
-        return (view * _GOLDEN + turn) % 1, up
-    return ((view + turn) / num_views, height) if path == "orbit" else None
+        return (view * _GOLDEN + azimuth_shift) % 1, up
+    return ((view + azimuth_shift) / num_views, height) if path == "orbit" else None
 
 
 def _radical_inverse(number: int) -> float:

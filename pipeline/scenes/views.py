@@ -131,10 +131,12 @@ def _proposal(scene: Scene, settings: SceneSettings, view: int, attempt: int) ->
     origin = scene.provenance
     template = origin.get("template", "unknown")
     names = (origin["scene_index"], origin["attempt"], view, attempt)
-    seed, purpose = origin["seed"], "camera"
+    seed = origin["seed"]
+    purpose = "camera"
     if (new := origin.get("new_cameras")) is not None:
         template = new["layout"]
-        seed, purpose = new["seed"], "new camera"
+        seed = new["seed"]
+        purpose = "new camera"
     if template not in TEMPLATES:
         raise Rejected(
             "no_layout", f"{template!r} is no layout that draws cameras; name one, or give cameras"
