@@ -41,6 +41,9 @@ class Family:
     def __post_init__(self) -> None:
         known = ", ".join(TEMPLATES)
         require(self.template in TEMPLATES, "template", self.template, f"one of {known}")
+        has_room = bool(TEMPLATES[self.template].parts) or self.num_objects == (1, 1)
+        expected = f"(1, 1) for {self.template}, which has no room to place more in"
+        require(has_room, "num_objects", self.num_objects, expected)
 
     @property
     def shell_triangles(self) -> int:
@@ -76,6 +79,17 @@ DEFAULT_FAMILIES = tuple(
 """The sizes are the published ones of most families."""
 
 
+def alone() -> Family:
+    """Return the family of one object within a sphere of radius 0.5 around the origin."""
+    return Family(
+        name="alone",
+        template="alone",
+        shell=SharedRoom(),
+        num_objects=(1, 1),
+        object_scale=(2.0, 2.0),
+    )
+
+
 def _itself(family: Family) -> Family:
     return family
 
@@ -83,7 +97,7 @@ def _itself(family: Family) -> Family:
 FAMILIES: Registry[Callable[[], Family]] = Registry(
     "family",
     Callable,
-    {family.name: partial(_itself, family) for family in DEFAULT_FAMILIES},
+    {**{family.name: partial(_itself, family) for family in DEFAULT_FAMILIES}, "alone": alone},
     decides=("data",),
 )
 """Functions that return a family, by its name. A build states its families in full and asks for no

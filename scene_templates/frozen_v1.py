@@ -76,7 +76,12 @@ SCENES_V1 = SceneSettings(
         num_inside=0,
     ),
     cameras=CameraSettings(
-        distance=(1.5, 2.0), target_jitter=0.2, up_jitter=0.1, fov_deg=(30.0, 60.0)
+        distance=(1.5, 2.0),
+        target_jitter=0.2,
+        up_jitter=0.1,
+        fov_deg=(30.0, 60.0),
+        path="random",
+        elevation_deg=None,
     ),
     views=ViewLaws(
         coverage_grid=32, min_coverage=0.02, min_lit=0.05, max_shell_back=0.1, min_depth=0.01

@@ -34,8 +34,9 @@ PALEST = 0.2
 class LightSettings:
     """Ranges and shares from which emitters are drawn."""
 
-    count: Annotated[Counts, Within(1, MOST_LIGHTS, unit="emitters")] = (1, 8)
-    """Minimum and maximum number of emitters; each count is equally likely."""
+    count: Annotated[Counts, Within(0, MOST_LIGHTS, unit="emitters")] = (1, 8)
+    """Minimum and maximum number of emitters; each count is equally likely. 0 is for
+    scenes that all have a sky."""
     total_emission: Annotated[Range, Within(1e-3, 1e9)] = (2500.0, 5000.0)
     """Range of the total radiance: each of n emitters gets a number from this range, divided by n.
     """

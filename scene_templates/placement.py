@@ -37,8 +37,8 @@ class PlacementSettings:
     """How objects are placed in the room."""
 
     orientation: Orientation = "uniform"
-    """Distribution of the objects' rotations: `uniform` on SO(3), or `euler` as published, which
-    favours the poles."""
+    """Distribution of the objects' rotations: `uniform` on SO(3), `euler` as published, which
+    favours the poles, or `kept` as in their files."""
     resting_share: Share = 0.5
     """Share of objects that rest on the floor; the others float. The published ones all float."""
     overlap_share: Share = 0.1
@@ -71,6 +71,7 @@ class ObjectSpace:
     parts: tuple[str, ...]
     """The shell parts that exist, the floor first."""
     planes: tuple[Plane, ...]
+    """The plane of each shell part."""
 
     @property
     def floor(self) -> Plane:
@@ -114,7 +115,7 @@ def sample_poses(
     Args:
         rng: where the numbers come from.
         settings: how objects are placed.
-        space: where.
+        space: where; without shell parts, in the middle of the world.
         shapes: what they look like.
         object_scale: range of the bounding spheres' diameters, before halving.
         overlaps: whether objects may meet.
@@ -148,6 +149,9 @@ def _sample_pose(
     """Draw a place for an object clear of others, or None where none was found."""
     rotation = sample_rotation(rng, settings.orientation)
     rests = bool(rng.random() < settings.resting_share)
+    if not space.parts:
+        pose = Pose(centre=np.zeros(3), radius=radius, rotation=rotation)
+        return None if any(shape.overlaps(pose, other, at) for other, at in obstacles) else pose
     points = radius * rotate_points(shape.points, rotation)
     low = np.full(3, -0.5)
     high = np.full(3, 0.5)

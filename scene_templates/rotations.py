@@ -5,12 +5,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Orientation = Literal["uniform", "euler"]
-"""`uniform` on SO(3), or three `euler` angles as published, which prefer the poles."""
+Orientation = Literal["uniform", "euler", "kept"]
+"""`uniform` on SO(3), three `euler` angles as published, which prefer the poles, or none."""
 
 
 def sample_rotation(rng: np.random.Generator, orientation: Orientation) -> NDArray[np.float64]:
-    """Return a random rotation [3, 3] of the stated distribution, not only yaw."""
+    """Return a random rotation [3, 3] as stated, not only yaw; `kept` is the identity."""
+    if orientation == "kept":
+        return np.eye(3)
     if orientation == "euler":
         return rotation_xyz(rng.uniform(-180, 180, size=3))
     return uniform_rotation(rng)

@@ -121,6 +121,8 @@ class SceneSettings:
         names = [family.name for family in self.families]
         require(len(set(names)) == len(names), "families", names, "unique names")
         self._check_budget()
+        is_lit = self.lights.count[0] > 0 or self.skies.share == 1
+        require(is_lit, "lights.count", self.lights.count, "at least 1, or skies.share of 1")
         for excursion in self.excursions:
             self._after(excursion)
 

@@ -21,7 +21,7 @@ class Template:
     name: str
     """Name by which `Family.template` refers to it."""
     parts: tuple[str, ...]
-    """Names of its shell parts (scene_templates.rooms.SIDES), the floor first."""
+    """Names of its shell parts (scene_templates.rooms.SIDES), the floor first; may be empty."""
     cameras: Sector
     """Directions from which it is seen."""
     lights: Sector
@@ -30,18 +30,23 @@ class Template:
     def __post_init__(self) -> None:
         """Raise TrilightError for parts that no room has."""
         known = set(self.parts) <= set(SIDES) and len(set(self.parts)) == len(self.parts)
-        expected = f"floor first, then any of {', '.join(SIDES)}, each once"
+        expected = f"none, or floor first, then any of {', '.join(SIDES)}, each once"
         name = f"parts of the template {self.name}"
-        require(known and tuple(self.parts[:1]) == ("floor",), name, self.parts, expected)
+        require(known and tuple(self.parts[:1]) in ((), ("floor",)), name, self.parts, expected)
 
     @property
     def shell_triangles(self) -> int:
         """Triangles of floor and walls: 128 each."""
         return len(PATCH_FACES) * len(self.parts)
 
-    def sample_camera(self, rng: np.random.Generator, settings: CameraSettings) -> CameraPose:
-        """Draw one camera."""
-        return sample_camera(rng, settings, self.cameras)
+    def sample_camera(
+        self,
+        rng: np.random.Generator,
+        settings: CameraSettings,
+        position: tuple[float, float] | None = None,
+    ) -> CameraPose:
+        """Draw one camera; `position` as `sample_camera` takes it."""
+        return sample_camera(rng, settings, self.cameras, position)
 
 
 PLANE = Template(
@@ -81,10 +86,19 @@ OPEN_BOX = Template(
 )
 """A floor and three walls without a ceiling, seen and lit through the open front (-Y) and top."""
 
+ALONE = Template(
+    name="alone",
+    parts=(),
+    # Nearer to a pole, +Z is no direction for a picture's top.
+    cameras=Sector(azimuth_deg=0, half_width_deg=180, elevation_deg=(-89, 89)),
+    lights=Sector(azimuth_deg=0, half_width_deg=180, elevation_deg=(-90, 90)),
+)
+"""One object in the middle of nothing, seen and lit from everywhere."""
+
 TEMPLATES: Registry[Template] = Registry(
     "template",
     Template,
-    {template.name: template for template in (PLANE, WALL, CORNER, OPEN_BOX)},
+    {template.name: template for template in (PLANE, WALL, CORNER, OPEN_BOX, ALONE)},
     decides=("data",),
 )
 """Every name that `Family.template` admits."""

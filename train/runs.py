@@ -104,7 +104,11 @@ def hits_256() -> TrainSettings:
 
 
 def paper_pretrain() -> TrainSettings:
-    """Return the first stage of the paper: 256 pixels, up to 1536 triangles."""
+    """Return the first stage of the paper: 256 pixels, up to 1536 triangles.
+
+    It follows the paper's text, 500,000 steps. The launcher that made the published Base says 1.3
+    million: `paper-pretrain-launcher`.
+    """
     return TrainSettings(
         run="paper-pretrain",
         model=base_model(),
@@ -129,6 +133,17 @@ def paper_pretrain() -> TrainSettings:
         checkpoint_every=1_000,
         keep_every=50_000,
         validation_scenes=256,
+    )
+
+
+def paper_pretrain_launcher() -> TrainSettings:
+    """Return the first stage with the 1.3 million steps of the published Base's launcher.
+
+    There the cosine ends after 1,208,000 steps, and the warm-up begins again; here one cosine has
+    all steps.
+    """
+    return dataclasses.replace(
+        paper_pretrain(), run="paper-pretrain-launcher", num_steps=1_300_000, keep_every=100_000
     )
 
 
@@ -250,6 +265,7 @@ RUNS: Registry[Callable[[], TrainSettings]] = Registry(
         "pretrain": pretrain,
         "finetune": finetune,
         "paper-pretrain": paper_pretrain,
+        "paper-pretrain-launcher": paper_pretrain_launcher,
         "paper-finetune": paper_finetune,
         "paper-pretrain-large": paper_pretrain_large,
         "paper-finetune-large": paper_finetune_large,

@@ -40,7 +40,7 @@ class AugmentationSettings:
     light_scale: Annotated[float, Within(1, 1000)] = 1.0
     """Scale all light by one log-uniform factor between 1 / light_scale and light_scale."""
     light_mix: Annotated[float, Within(1, 1000)] = 1.0
-    """Scale each light by a log-uniform factor of its own between 1 / light_mix and light_mix;
+    """Scale each light and the sky by a log-uniform factor of its own, 1 / light_mix to light_mix;
     above 1 it needs a dataset with a picture for each light (`per_light`)."""
     withheld_inputs: Share = 0.0
     """Probability that a view lacks an input of the view stage `hits`, drawn for each input;

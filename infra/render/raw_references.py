@@ -16,6 +16,8 @@ from pipeline.renders.camera import PixelCamera
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import Curve, secant_slope
 from pipeline.renders.settings import PASS_SPP, RenderSettings
+from pipeline.renders.tracer import Tracer
+from storage.records.lights import light_rows, num_light_pictures
 from storage.records.scene import Scene
 from storage.seeds import seed_for
 
@@ -49,8 +51,23 @@ def raw_reference(scene: Scene, camera: PixelCamera, spp: int, *name: int) -> Ra
         spp: samples per pixel of both halves together, a multiple of 128.
         name: numbers that the seeds are derived from.
     """
+    return _reference(_tracer(scene), camera, spp, *name)
+
+
+def light_references(scene: Scene, camera: PixelCamera, spp: int) -> list[RawReference]:
+    """Return a `raw_reference` of each light alone (storage.records.lights)."""
+    tracer = _tracer(scene)
+    rows: list[int | None] = list(light_rows(scene))
+    rows += [None] * (num_light_pictures(scene) - len(rows))
+    return [_reference(tracer.only_light(row), camera, spp) for row in rows]
+
+
+def _tracer(scene: Scene) -> Tracer:
     depths = {"max_depth": RenderSettings.max_depth, "rr_depth": RenderSettings.rr_depth}
-    tracer = load_tracer(scene, **depths)
+    return load_tracer(scene, **depths)
+
+
+def _reference(tracer: Tracer, camera: PixelCamera, spp: int, *name: int) -> RawReference:
     size = PASS_SPP[0]
     halves = []
     for half in range(2):

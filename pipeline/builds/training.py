@@ -26,8 +26,13 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.builds.settings import BuildSettings, NamedBuild
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.renders.settings import RenderSettings
-from scene_templates.families import DEFAULT_FAMILIES
-from scene_templates.settings import SceneSettings
+from scene_templates.cameras import CameraSettings
+from scene_templates.families import DEFAULT_FAMILIES, alone
+from scene_templates.lights import LightSettings
+from scene_templates.materials import MaterialSettings
+from scene_templates.placement import PlacementSettings
+from scene_templates.settings import SceneSettings, ViewLaws
+from scene_templates.skies.draw import SkyMapSettings
 from scene_templates.skies.settings import SkySettings
 from scene_templates.textures import TextureSettings
 from storage.dataset.settings import SplitSettings
@@ -90,10 +95,72 @@ def sky_256() -> BuildSettings:
     return dataclasses.replace(build, build="sky-256", scenes=scenes)
 
 
+def object_views() -> BuildSettings:
+    """One object with its own materials, alone below a sky: 24 views around it, 38 dB over it."""
+    build = smoke()
+    return dataclasses.replace(
+        build,
+        build="object-views",
+        assets=AssetSettings(budgets=(16_384, 8_192, 4_096, 2_048, 1_024, 512)),
+        scenes=SceneSettings(
+            families=(alone(),),
+            max_triangles=16_384,
+            enough_error=0.001,
+            num_views=24,
+            placement=PlacementSettings(orientation="kept", overlap_share=0.0),
+            materials=MaterialSettings(source="object"),
+            lights=LightSettings(count=(0, 0)),
+            # An object of radius 0.5 fills nine tenths of the width of its pictures.
+            cameras=CameraSettings(
+                distance=(1.6, 1.6),
+                target_jitter=0.0,
+                up_jitter=0.0,
+                fov_deg=(40.0, 40.0),
+                path="fibonacci",
+            ),
+            # Its views are the stated ones, whatever is seen from there.
+            views=ViewLaws(min_coverage=0.0, min_lit=0.0, max_shell_back=1.0),
+            skies=SkySettings(
+                share=1.0, over_lamps_log=(0.5, 2.0), maps=SkyMapSettings(height=128)
+            ),
+        ),
+        renders=dataclasses.replace(
+            build.renders,
+            resolution=512,
+            noise_floor_db=None,
+            noise_floor_objects_db=38.0,
+            max_spp=1024,
+            min_mean_radiance=0.0,
+        ),
+        splits=SplitSettings(scenes_per_shard=16, shards_per_cycle=64, held_out_objects=0.02),
+    )
+
+
+def olat() -> BuildSettings:
+    """One light at a time: rooms with 2 to 6 lamps, half of them below a sky too, each light alone.
+
+    Lamps are white, so that a reader colors them.
+    """
+    build = pretrain_256()
+    return dataclasses.replace(
+        build,
+        build="olat",
+        scenes=dataclasses.replace(
+            build.scenes, lights=LightSettings(count=(2, 6)), skies=SkySettings(share=0.5)
+        ),
+        renders=dataclasses.replace(
+            build.renders, noise_floor_db=42.0, max_spp=1024, per_light=True
+        ),
+        splits=dataclasses.replace(build.splits, scenes_per_shard=64),
+    )
+
+
 TRAINING_BUILDS = {
     "smoke": NamedBuild(settings=smoke, num_scenes=24, device="cpu"),
     "pretrain-256": NamedBuild(settings=pretrain_256, num_scenes=65_536),
     "finetune-512": NamedBuild(settings=finetune_512, num_scenes=16_384),
     "textured-256": NamedBuild(settings=textured_256, num_scenes=16_384),
     "sky-256": NamedBuild(settings=sky_256, num_scenes=65_536),
+    "olat": NamedBuild(settings=olat, num_scenes=2_048),
+    "object-views": NamedBuild(settings=object_views, num_scenes=1_024),
 }

@@ -8,7 +8,7 @@ from PIL import Image
 
 
 def encode_png(pixels: NDArray[np.uint8]) -> bytes:
-    """Return the PNG file of a picture, [H, W] grey or [H, W, 3] RGB."""
+    """Return the PNG file of a picture, [H, W] grey, [H, W, 3] RGB or [H, W, 4] RGBA."""
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, "PNG")
     return stream.getvalue()

@@ -41,8 +41,10 @@ from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tiles import TILE_PX, tile_means
 from pipeline.renders.view_pictures import (
+    Group,
     MeasuredLook,
     add_up,
+    floor_groups,
     put_together,
     require_bounded,
     require_finite,
@@ -76,6 +78,7 @@ class DevicePictures:
         self._resolution = camera.resolution
         self._names = settings.part_names
         self._quality = settings.denoiser
+        self._per_light = settings.per_light
         arrays = tracer.feature_arrays(camera, spp=settings.aux_spp)
         names = self._names or ("",)
         self._guides, masks = _guides(
@@ -101,7 +104,9 @@ class DevicePictures:
 
     def look(self, quality: Filtered) -> MeasuredLook:
         sums = _sums(self._samples)
-        kind = (self._names, self._resolution, quality != "off")
+        count = sum(len(tracer) - 3 for tracer in sums[0])
+        groups = floor_groups(count, self._names, per_light=self._per_light)
+        kind = (self._names, groups, self._resolution, quality != "off")
         filtered = self._denoise_raws(sums, quality, of_both=False)
         arrays = sums, filtered, self._guides, self._masks, self._logs
         numbers, self._logs = _estimate_error(KernelInputs(), *arrays, *kind)
@@ -113,7 +118,8 @@ class DevicePictures:
         floors = [self._floor(*each) for each in zip(errors, surprises, strict=True)]
         return MeasuredLook(
             floor=floors[0],
-            part_floors=dict(zip(self._names, floors[1:], strict=True)),
+            part_floors=dict(zip(self._names, floors[1:], strict=False)),
+            light_floors=floors[1 + len(self._names) :],
             changes=list(rows[:2].reshape(2, across, across) / TILE),
         )
 
@@ -195,13 +201,14 @@ def _estimate_error(
     masks: Any,
     logs: Sequence[Any],
     names: Sequence[str],
+    groups: Sequence[Group],
     resolution: int,
     is_filtered: bool,
 ) -> tuple[Any, list[Any]]:
     """Return rows of numbers of all tiles (Float64), and the log radiance of both halves.
 
-    The rows are sums: the changes of both halves, broken pixels, and three estimates of the picture
-    and of each part; then what is greatest: surprises of the same, and the brightest raw channel.
+    The rows are sums: the changes of both halves, broken pixels, and three estimates of each of
+    `floor_groups`; then what is greatest: surprises of the same, and the brightest raw channel.
     """
     raws = _means(sums, of_both=False)
     denoised = _clean_pictures(raws, filtered, guides, names, resolution) if is_filtered else raws
@@ -215,9 +222,8 @@ def _estimate_error(
         corrected = [choose(right, *each) for each in zip(raws, denoised, strict=True)]
     hit = (masks & 1) > 0
     rows = []
-    every = max(1, len(names))
-    for first, step in [(0, 1), *((part, every) for part in range(len(names)))]:
-        a, b, da, db = (mi.Color3d(add_up(each[first::step])) for each in (*raws, *corrected))
+    for group in groups:
+        a, b, da, db = (mi.Color3d(add_up(each[slice(*group)])) for each in (*raws, *corrected))
         rows.append(estimates(a, b, da, db, hit, is_filtered))
     brightest = functools.reduce(dr.maximum, [dr.max(part) for half in raws for part in half])
     adds = [*changes, _broken(sums), *(row for errors, _ in rows for row in errors)]

@@ -13,9 +13,10 @@ from pipeline.renders.device_memory import own_floats, own_integers
 from pipeline.renders.emitter_table import EmissionCone, EmitterTable
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
 from pipeline.renders.guide_table import GuideTable
-from pipeline.renders.sky_table import SkyTable, shining_sky, sky_share
+from pipeline.renders.sky_table import SkyTable, sky_share
 from pipeline.renders.surface_table import SurfacePoint, surface_table
 from pipeline.renders.tracer import split_triangles
+from storage.records.lights import shining_sky
 from storage.records.parts import part_names
 from storage.records.scene import Scene
 

@@ -7,8 +7,9 @@ A picture is sampled as two halves that share nothing. They are denoised apart t
 (pipeline.renders.noise_floor), until these reach their targets or the samples reach the cap
 (pipeline.renders.stopping); from the second measurement on, the tiles that need more samples get
 more (pipeline.renders.tiles). The picture itself is one denoise of the mean of all samples, which
-is better than the mean of two. With `per_light` all of this is done for each emitter alone, and the
-picture is their sum; with `split` direct and indirect light are kept apart, and it is theirs.
+is better than the mean of two. With `per_light` all of this is done for each emitter and the sky
+alone, and the picture is their sum; with `split` direct and indirect light are kept apart, and it
+is theirs.
 
 Mitsuba is imported inside functions only: `activate` must come first.
 """
@@ -33,8 +34,13 @@ from pipeline.renders.tiles import TileChoice
 from pipeline.renders.tracer import Tracer
 from pipeline.renders.view_pictures import MeasuredLook, ViewPictures
 from storage.conventions import HALF_FLOAT_MAX
-from storage.errors import Rejected, TrilightError
-from storage.records.lights import light_rows, rounded_to_half, sum_of_lights
+from storage.errors import Rejected
+from storage.records.lights import (
+    light_rows,
+    num_light_pictures,
+    rounded_to_half,
+    sum_of_lights,
+)
 from storage.records.parts import MAX_PICTURES
 from storage.records.scene import Scene
 from storage.renderer import Sampling
@@ -69,7 +75,6 @@ class SceneRenderer:
                 none), "no_surfaces" where all triangles emit (emitters are hidden, so every
                 picture would be black), "too_many_lights" where more than MAX_PICTURES would be
                 kept apart.
-            TrilightError: with `per_light`, where an environment lights the scene too.
         """
         require_surfaces(scene)
         self._settings = settings
@@ -146,6 +151,7 @@ class SceneRenderer:
             core_s=time.process_time() - self._began_s,
             hits=pictures.hits,
             part_floors=look.part_floors or None,
+            light_floors=look.light_floors or None,
             **stored,
         )
 
@@ -245,15 +251,12 @@ def _by_metric(floor: MeasuredFloor) -> Floors:
 
 
 def _tracers_of_lights(tracer: Tracer, scene: Scene, most: int) -> list[Tracer]:
-    if scene.environment is not None:
-        raise TrilightError(
-            "render settings: per_light is True and an environment lights the scene; expected "
-            "emitters alone, whose pictures add up to all light. Leave out --per-light."
-        )
+    count = num_light_pictures(scene)
+    if count > most:
+        raise Rejected("too_many_lights", f"{count} lights apart; at most {most}")
     rows = light_rows(scene)
-    if len(rows) > most:
-        raise Rejected("too_many_lights", f"{len(rows)} emitters apart; at most {most}")
-    return [tracer.only_light(row) for row in rows]
+    sky = [None] * (count - len(rows))
+    return [tracer.only_light(row) for row in (*rows, *sky)]
 
 
 def require_surfaces(scene: Scene) -> None:

@@ -1,7 +1,7 @@
 """Results of a renderer: progress, pictures that grow, and finished pictures."""
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar, cast
 
@@ -37,7 +37,8 @@ class RenderedView:
     hits: NDArray[np.bool_]
     """[R, R] true where the ray through a pixel's center hits geometry other than emitters."""
     lights_rgb: NDArray[np.float32] | None = None
-    """[L, R, R, 3] radiance of each emitter object alone, with `per_light`; rounded to half floats.
+    """[L, R, R, 3] radiance of each emitter object and then of the sky alone, with `per_light`;
+    rounded to half floats.
     `radiance_rgb` is their storage.records.lights.sum_of_lights in every bit."""
     parts_rgb: Parts | None = None
     """[R, R, 3] radiance of each part, with `split` or `split_lobes`; rounded to half floats. With
@@ -45,6 +46,8 @@ class RenderedView:
     `lights_rgb`, in every bit."""
     part_floors: Mapping[str, MeasuredFloor] | None = None
     """Measured error of each part, of all lights together."""
+    light_floors: Sequence[MeasuredFloor] | None = None
+    """Measured error of each of `lights_rgb`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -110,8 +110,8 @@ class RenderSettings:
     min_mean_radiance: Annotated[float, Within(0, HALF_FLOAT_MAX)] = 0.01
     """A view whose first samples are darker than this on average is rejected as black_view."""
     per_light: bool = False
-    """Render each emitter alone as well, and make the picture their sum (storage.records.lights).
-    It takes about as many times as long as there are emitters."""
+    """Render each emitter and the sky alone as well, each with its floors, and make the picture
+    their sum (storage.records.lights). It takes about as many times as long as there are lights."""
     split: bool = False
     """Store direct light (lamp, surface, camera) and indirect light apart as well, each with its
     floors, and make the picture their sum (storage.records.parts)."""

@@ -167,12 +167,6 @@ def _between(place: Any) -> tuple[Any, Any]:
     return mi.Int32(before), shifted - before
 
 
-def shining_sky(scene: Scene) -> Environment | None:
-    """Return the environment of a scene, or None where there is none, or one without any light."""
-    sky = scene.environment
-    return sky if sky is not None and sky.radiance_rgb.any() else None
-
-
 def sky_share(scene: Scene, sky: Environment) -> float:
     """Return the share of the picks that go to the environment: above 0, and 1 without lamps.
 

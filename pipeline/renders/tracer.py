@@ -75,11 +75,11 @@ class PassSum(Protocol):
 class Tracer(Protocol):
     """One loaded scene. Emitters are hidden from camera rays in everything that it returns."""
 
-    def only_light(self, row: int) -> "Tracer":
+    def only_light(self, row: int | None) -> "Tracer":
         """Return the same loaded scene in which only the emitter `objects[row]` is switched on.
 
-        The others stay where they are, black, and an environment is off. Equal seeds give equal
-        camera rays in both.
+        The others stay where they are, black, and an environment is off; None leaves only that on.
+        Equal seeds give equal camera rays in both.
 
         Raises:
             Rejected: "unlit_scene" where it has no area.

@@ -27,7 +27,9 @@ from pipeline.renders.kernel_scene import KernelParts, KernelScene
 from pipeline.renders.light_kernel import PhotonRecords, trace_light, trace_photons
 from pipeline.renders.path_kernel import trace
 from pipeline.renders.recorded_calls import KernelInputs, record_launches
+from pipeline.renders.sky_table import SkyTable
 from pipeline.renders.tracer import Chosen, Features, split_triangles
+from storage.records.lights import shining_sky
 from storage.records.scene import Scene
 from storage.seeds import seed_for
 
@@ -59,13 +61,16 @@ class VectorTracer:
         self._unit = SplatUnit(scene)
         self._guide = functools.cache(functools.partial(_learn_guide, scene, self._scene))
 
-    def only_light(self, row: int) -> "VectorTracer":
+    def only_light(self, row: int | None) -> "VectorTracer":
         _, emitters = split_triangles(self._record)
-        lit = self._record.object_index[emitters] == row
+        lit = self._record.object_index[emitters] == (-1 if row is None else row)
+        sky = shining_sky(self._record) if row is None else None
         tracer = copy.copy(self)
         tracer._scene = copy.copy(self._scene)
-        tracer._scene.emitters = EmitterTable(self._record, emitters, lit)
-        tracer._scene.sky = None
+        tracer._scene.emitters = EmitterTable(
+            self._record, emitters, lit, may_be_dark=sky is not None
+        )
+        tracer._scene.sky = None if sky is None else SkyTable(sky, 1.0)
         return tracer
 
     def split_lights(self, *, bounces: bool, lobes: bool) -> "VectorTracer":

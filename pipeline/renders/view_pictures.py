@@ -28,6 +28,8 @@ class MeasuredLook:
     """Stated error of the picture."""
     part_floors: Mapping[str, MeasuredFloor]
     """Stated error of each part that is stored, of all lights together."""
+    light_floors: Sequence[MeasuredFloor]
+    """Stated error of each light whose picture is stored; empty where they are together."""
     changes: Sequence[NDArray[np.float64]]
     """Mean squared change of the denoised log radiance of each tile since the look before, [T, T]
     for each half; the first look has none that means anything."""
@@ -83,6 +85,18 @@ def to_filter(pictures: Sequence[Any], names: Sequence[str]) -> Iterator[tuple[A
         yield add_up(lights), name
         if len(lights) > 1:
             yield from ((light, name) for light in lights)
+
+
+Group = tuple[int, int | None, int | None]
+"""Pictures of a view that are summed, as the numbers of a slice."""
+
+
+def floor_groups(num_pictures: int, names: Sequence[str], *, per_light: bool) -> tuple[Group, ...]:
+    """Return the sums of pictures whose error is stated: all, each part, then each light."""
+    every = max(1, len(names))
+    parts: list[Group] = [(part, None, every) for part in range(len(names))]
+    starts = range(0, num_pictures, every) if per_light else ()
+    return ((0, None, None), *parts, *((start, start + every, None) for start in starts))
 
 
 def put_together(

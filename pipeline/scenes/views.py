@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scenes.visibility import ViewFacts, Visibility
+from scene_templates.cameras import path_position
 from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
@@ -123,20 +124,29 @@ def _accepted_proposals(
 
 
 def _proposal(scene: Scene, settings: SceneSettings, view: int, attempt: int) -> ViewCamera:
-    """Return proposal number `attempt` of a view (scene_templates.cameras.sample_camera)."""
+    """Return proposal number `attempt` of a view (scene_templates.cameras.sample_camera).
+
+    The first proposal of a view stands on the path of the settings, if they have one.
+    """
     origin = scene.provenance
     template = origin.get("template", "unknown")
     names = (origin["scene_index"], origin["attempt"], view, attempt)
-    if (new := origin.get("new_cameras")) is None:
-        rng = rng_for(origin["seed"], "camera", *names)
-    else:
+    seed = origin["seed"]
+    purpose = "camera"
+    if (new := origin.get("new_cameras")) is not None:
         template = new["layout"]
-        rng = rng_for(new["seed"], "new camera", *names)
+        seed = new["seed"]
+        purpose = "new camera"
     if template not in TEMPLATES:
         raise Rejected(
             "no_layout", f"{template!r} is no layout that draws cameras; name one, or give cameras"
         )
-    pose = TEMPLATES[template].sample_camera(rng, settings.cameras)
+    position = None
+    if attempt == 0:
+        of_path = rng_for(seed, f"{purpose} path", *names[:2])
+        position = path_position(settings.cameras.path, view, settings.num_views, of_path)
+    rng = rng_for(seed, purpose, *names)
+    pose = TEMPLATES[template].sample_camera(rng, settings.cameras, position)
     return ViewCamera(
         c2w=pose.c2w.astype(np.float32), fov_deg=np.float32(pose.fov_deg), attempt=attempt
     )

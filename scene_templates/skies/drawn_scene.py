@@ -48,7 +48,8 @@ def scene_sky(
 
     Args:
         settings: the ranges to draw from.
-        emitters: [N, 3, 3] corners of the emitting triangles, around the middle of the room.
+        emitters: [N, 3, 3] corners of the emitting triangles, around the middle of the room; if
+            there are none, the drawn strength is the mean radiance of the sky.
         radiance_rgb: [N, 3] their radiance.
         scene_key: its attempt decides which sky, not whether there is one.
         user_skies: the user's own maps.
@@ -75,7 +76,8 @@ def scene_sky(
     azimuth_rad = float(rng.uniform(0, 2 * math.pi))
     is_seen = bool(rng.random() < settings.seen_share)
     mean = _mean_radiance(radiance)
-    target_radiance = over_lamps * lamp_irradiance(emitters, radiance_rgb) / math.pi
+    lamps = lamp_irradiance(emitters, radiance_rgb) if len(emitters) else math.pi
+    target_radiance = over_lamps * lamps / math.pi
     with np.errstate(over="ignore"):  # a scene's laws refuse infinite radiance by name
         scaled = (radiance * np.float32(target_radiance / mean)).astype(np.float32)
     environment = Environment(

@@ -21,7 +21,8 @@ class SkySettings:
     over_lamps_log: Annotated[Range, Within(1e-6, 1e6)] = (0.02, 1.0)
     """Range, log-uniform, of the irradiance that a sky of constant radiance, the mean of the map,
     has on a surface, over that of all emitters at the middle of the room on surfaces that face
-    them. It takes the place of `maps.mean_radiance`."""
+    them. It takes the place of `maps.mean_radiance`. In a scene without emitters it is the mean
+    radiance itself."""
     seen_share: Share = 0.0
     """Share of the skies that cameras see behind everything."""
     maps: SkyMapSettings = field(default_factory=SkyMapSettings)

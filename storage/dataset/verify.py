@@ -321,6 +321,12 @@ def _check_lights(sample: Sample, *, per_light: bool) -> Iterator[str]:
     if sample.lights_rgb is None:
         return
     for view, lights in enumerate(sample.lights_rgb):
+        floors = sample.views[view].lights
+        if floors is not None and len(floors) != len(lights):
+            yield (
+                f"sample {sample.key}: view {view} has {len(floors)} stated errors of lights; "
+                f"expected {len(lights)}, one for each"
+            )
         yield from _differing(
             f"sample {sample.key}: view {view} is not the sum of its lights",
             sum_of_lights(lights) != sample.radiance_rgb[view],

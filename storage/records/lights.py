@@ -1,6 +1,7 @@
 """Pictures by light: what each emitter adds, and the rule that their sum is the picture.
 
-Light i is the i-th object of kind `emitter`, in the order of `Scene.objects`. The member
+Light i is the i-th object of kind `emitter`, in the order of `Scene.objects`; a sky that shines is
+one more light, the last one. The member
 `0.lights.exr` of a sample holds the radiance of each alone, as channels `light<i>.R/G/B` of half
 floats. The picture is by definition what `sum_of_lights` returns of them, so a reader can turn
 lights off, brighten or colour them and knows the result to the rounding of the stored halves.
@@ -10,17 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import TrilightError
+from storage.records.environment import Environment
 from storage.records.exr import to_half
 from storage.records.layers import decode_layers, encode_layers
 from storage.records.scene import Scene
 
 MAX_LIGHTS = 64
-"""Most emitter objects whose pictures are kept apart: each takes as much room as a picture."""
+"""Most lights whose pictures are kept apart: each takes as much room as a picture."""
 
 
 def num_lights(scene: Scene) -> int:
     """Return the number of emitter objects."""
     return len(light_rows(scene))
+
+
+def num_light_pictures(scene: Scene) -> int:
+    """Return the number of lights whose pictures add up to that of a scene: the sky is one."""
+    return num_lights(scene) + (shining_sky(scene) is not None)
+
+
+def shining_sky(scene: Scene) -> Environment | None:
+    """Return the environment of a scene, or None where there is none, or one without any light."""
+    sky = scene.environment
+    return sky if sky is not None and sky.radiance_rgb.any() else None
 
 
 def light_rows(scene: Scene) -> tuple[int, ...]:
@@ -67,7 +80,7 @@ def decode_lights_exr(data: bytes, shape: tuple[int, int, int]) -> NDArray[np.fl
     """
     num, height, width = shape
     if num > MAX_LIGHTS:
-        raise TrilightError(f"lights: {num} emitters; expected at most {MAX_LIGHTS}.")
+        raise TrilightError(f"lights: {num} pictures; expected at most {MAX_LIGHTS}.")
     return decode_layers(data, _layers(num), (height, width), "lights")
 
 

@@ -3,7 +3,7 @@
     000000123.scene.safetensors   the arrays of the scene; with `.gz` in the profile `compact`
     000000123.json                schema version, objects, provenance, one record per view
     000000123.0.exr ...           linear radiance of each view, half-float RGB OpenEXR
-    000000123.0.lights.exr ...    optional: each emitter's part of it (storage.records.lights)
+    000000123.0.lights.exr ...    optional: each light's part of it (storage.records.lights)
     000000123.0.parts.exr ...     optional: direct, indirect, ... light (storage.records.parts)
     000000123.0.passes.exr ...    optional: what its pixels see (storage.records.passes.stored)
     __map-<sha256>__ ...          textures and environment map, where the scene has any: once in a
@@ -30,7 +30,7 @@ from storage.errors import TrilightError
 from storage.raycast.first_hits import require_row
 from storage.records.exr import decode_exr
 from storage.records.held_maps import HeldMaps
-from storage.records.lights import decode_lights_exr, encode_lights_exr, num_lights
+from storage.records.lights import decode_lights_exr, encode_lights_exr, num_light_pictures
 from storage.records.packed_maps import packed_maps, unpacked_maps
 from storage.records.parts import KNOWN_PARTS, Parts, decode_parts_exr, encode_parts_exr
 from storage.records.passes.stored import picture_passes
@@ -54,7 +54,7 @@ Plausible = Annotated[float, Within(-1000, 1000, low_open=True, high_open=True)]
 
 @dataclass(frozen=True, kw_only=True)
 class PartFloor:
-    """Stated errors of one layer of a picture, for all lights together."""
+    """Stated errors of one layer of a picture, for all lights together, or of one light."""
 
     noise_floor_db: Plausible
     """Stated error in dB, as psnr_log_db."""
@@ -88,6 +88,9 @@ class ViewRecord:
     parts: Mapping[str, PartFloor] | None = None
     """Floors of the parts that are stored, by name (storage.records.parts); a record that has none
     is written without this field."""
+    lights: tuple[PartFloor, ...] | None = None
+    """Floors of the lights that are stored, in their order (storage.records.lights); absent where
+    they are together, and from older sets."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,8 +111,9 @@ class Sample(SceneRecord):
     radiance_rgb: NDArray[np.float32]
     """[C, R, R, 3] linear radiance, one picture per camera of the scene."""
     lights_rgb: NDArray[np.float32] | None = None
-    """[C, L, R, R, 3] radiance of each emitter object alone, in the order of `scene.objects`; their
-    sum is the picture (storage.records.lights). None where the build keeps lights together."""
+    """[C, L, R, R, 3] radiance of each emitter object alone, in the order of `scene.objects`, and
+    last of a sky that shines; their sum is the picture (storage.records.lights). None where the
+    build keeps lights together."""
     parts_rgb: Parts | None = None
     """[C, R, R, 3] radiance of each part by its name, or [C, L, R, R, 3] where lights are apart;
     their sum is the picture, or that of the light (storage.records.parts). None where the build
@@ -250,7 +254,7 @@ def decode_lights(
     packed = _of_views("lights", views, members)
     if packed is None:
         return None
-    shape = (num_lights(scene), size[0], size[1])
+    shape = (num_light_pictures(scene), size[0], size[1])
     return np.stack([decode_lights_exr(data, shape) for data in packed])
 
 
@@ -261,7 +265,7 @@ def _decode_parts(
     if packed is None:
         return None
     lights_apart = any(suffix.endswith(".lights.exr") for suffix in members)
-    num = num_lights(record.scene) if lights_apart else None
+    num = num_light_pictures(record.scene) if lights_apart else None
     names = list(record.views[0].parts or ())
     size = radiance_rgb.shape[1], radiance_rgb.shape[2]
     by_view = [decode_parts_exr(data, names, size, num) for data in packed]

@@ -59,7 +59,14 @@ def _textured() -> Sample:
     rights = MapSource(name="n", licence="CC-BY-4.0", attribution="a", source_url="https://x.org")
     textures = tuple(dataclasses.replace(texture, source=rights) for texture in scene.textures)
     scene = dataclasses.replace(scene, textures=textures, environment=sky(source=rights))
-    return dataclasses.replace(_sample(), scene=scene)
+    plain = _sample()
+    assert plain.lights_rgb is not None and plain.parts_rgb is not None
+    lights, *parts = (  # the sky is one more light
+        np.concatenate([pictures, np.zeros_like(pictures)], axis=1)
+        for pictures in (plain.lights_rgb, *plain.parts_rgb.values())
+    )
+    by_name = dict(zip(_PARTS, parts, strict=True))
+    return dataclasses.replace(plain, scene=scene, lights_rgb=lights, parts_rgb=by_name)
 
 
 def _consumed(members: Members) -> str:

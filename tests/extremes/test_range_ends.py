@@ -86,6 +86,7 @@ BESIDE: dict[tuple[str, End], dict[str, Any]] = {
     },
     # 64 lights do not find places so far apart, and look 256 times for each
     ("lights.count", "high"): {"lights.spacing": 0.0},
+    ("lights.count", "low"): {"skies.share": 1.0},
     ("materials.roughness_log", "low"): {"materials.roughness_bias": 0.0},
     ("materials.roughness_bias", "high"): {"materials.roughness_log": [1.0, 2.0]},
 }  # fmt: skip

@@ -13,11 +13,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.sky_table import lamp_power, shining_sky, sky_share
+from pipeline.renders.sky_table import lamp_power, sky_share
 from pipeline.renders.tracer import split_triangles
 from storage.errors import Rejected
 from storage.optics.bsdf import Lobes, bsdf_lobes
 from storage.optics.multiscatter import Smith, scattered_again
+from storage.records.lights import shining_sky
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from tests.oracle.plugin_textures import (

@@ -65,7 +65,9 @@ class PluginTracer:
         self._features = _integrator(type="aov", aovs="albedo:albedo,normal:sh_normal")
         self._depth = _integrator(type="aov", aovs="depth:depth")
 
-    def only_light(self, row: int) -> "PluginTracer":
+    def only_light(self, row: int | None) -> "PluginTracer":
+        if row is None:
+            raise NotImplementedError("the stock scene has no sky without lamps")
         tracer = copy.copy(self)
         tracer._scene = plugin_scene(self._record, only_light=row)
         tracer._background = None

@@ -15,6 +15,7 @@ from scene_templates.layout import Layout, Pose
 from scene_templates.rooms import PatchPlacement
 from scene_templates.sample_layout import ScenePlan, sample_layout, scene_plan
 from scene_templates.settings import SceneSettings
+from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
 from storage.seeds import rng_for
 from storage.settings.changes import changed
@@ -22,6 +23,9 @@ from storage.settings.changes import changed
 DEFAULTS = SceneSettings(families=DEFAULT_FAMILIES)
 """What the training builds draw from; their budgets mean nothing where there are no meshes."""
 
+
+ROOMS = [name for name, template in TEMPLATES.items() if template.parts]
+"""The layouts that have a floor."""
 
 STILL = PatchPlacement(rotation_deg=(0, 0, 0), reach=1.0, scale=(1, 1, 1), translation=(0, 0, 0))
 """Of a floor or wall that stays as it is."""

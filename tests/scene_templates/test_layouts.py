@@ -33,6 +33,7 @@ from storage.seeds import rng_for
 from tests.for_each import for_each
 from tests.scene_templates.balls import (
     BALL,
+    ROOMS,
     STILL,
     Ball,
     Drawn,
@@ -61,7 +62,7 @@ def _sixty(name: str) -> list[Drawn]:
     return drawn_once(template_settings(name), 60)
 
 
-@for_each("name", TEMPLATES)
+@for_each("name", ROOMS)
 def test_objects_do_not_meet_nor_leave_the_room(name: str) -> None:
     overlapping = 0
     for one in _sixty(name):
@@ -129,7 +130,7 @@ def test_objects_that_cannot_fit_are_rejected_with_a_reason() -> None:
     assert len(one_drawn(overlapping, 0).layout.objects) == 3
 
 
-@for_each("name", TEMPLATES)
+@for_each("name", ROOMS)
 def test_emitters_hang_outside(name: str) -> None:
     counts = set()
     for one in _sixty(name):
@@ -152,7 +153,7 @@ def test_emitters_hang_outside(name: str) -> None:
     assert counts == set(range(1, 9))
 
 
-@for_each("name", TEMPLATES)
+@for_each("name", ROOMS)
 def test_emitters_keep_to_their_sector_and_apart(name: str) -> None:
     """Measured without jitter, as seen from the origin, on a sphere of radius 0.866."""
     settings = template_settings(name, {"lights.target_jitter": 0.0, "lights.count": [8, 8]})
@@ -215,7 +216,7 @@ def _shells(ranges: SharedRoom, name: str, count: int) -> list[tuple[ShellPart, 
     return [one.layout.shell for one in drawn(settings, count)]
 
 
-@for_each(("ranges", "name"), itertools.product([SQUARE, LOOSE], list(TEMPLATES)))
+@for_each(("ranges", "name"), itertools.product([SQUARE, LOOSE], ROOMS))
 def test_parts_are_flat_patches_of_128_faces_that_face_the_room(
     ranges: SharedRoom, name: str
 ) -> None:

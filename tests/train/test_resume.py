@@ -289,6 +289,10 @@ def test_contradictory_settings_are_refused(changes: dict[str, object], message:
 def test_the_paper_runs_are_the_papers() -> None:
     """Zeng et al. 2025, section 4, and the published configuration."""
     first, second = named_run("paper-pretrain"), named_run("paper-finetune")
+    longer = named_run("paper-pretrain-launcher")
+    assert (longer.run, longer.num_steps) == ("paper-pretrain-launcher", 1_300_000)
+    same = {"run": first.run, "num_steps": first.num_steps, "keep_every": first.keep_every}
+    assert settings_record(longer) | same == settings_record(first)
     assert (first.resolution, first.most_triangles, first.num_steps) == (256, 1536, 500_000)
     assert (first.scenes_per_step, first.views_per_scene) == (128, 2)
     assert (first.warmup_steps, first.learning_rate) == (8_000, 1e-4)

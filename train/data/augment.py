@@ -209,16 +209,19 @@ def scale_light(scene: TrainingScene, factor: float) -> TrainingScene:
 
 
 def mix_lights(scene: TrainingScene, factor_L: Tensor) -> TrainingScene:
-    """Return the scene with light i scaled by `factor_L[i]`.
+    """Return the scene with light i scaled by `factor_L[i]`; that of the sky is the last.
 
     Drops the pictures of single lights, which the scene must hold (`TrainingScene.lights_VLRR3`).
     """
     assert scene.lights_VLRR3 is not None
     factor_T = torch.cat([factor_L, torch.ones(1)])[scene.light_T]  # -1: belongs to no light
     mixed_VRR3 = torch.einsum("l,vlijc->vijc", factor_L, scene.lights_VLRR3)
+    tensors = _scale_emission(scene.tensors, factor_T)
+    if tensors.sky is not None:
+        tensors = dataclasses.replace(tensors, sky=scale_sky(tensors.sky, float(factor_L[-1])))
     return dataclasses.replace(
         scene,
-        tensors=_scale_emission(scene.tensors, factor_T),
+        tensors=tensors,
         target_VRR3=_log10(mixed_VRR3),
         lights_VLRR3=None,
         levels_L=None,

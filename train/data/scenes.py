@@ -42,7 +42,8 @@ class TrainingScene:
     light_T: Tensor
     """int64 index of each triangle's light (storage.records.lights), -1 for none."""
     lights_VLRR3: Tensor | None = None
-    """float32 linear radiance of each light alone, if requested; their sum is the picture."""
+    """float32 linear radiance of each light alone, if requested, the sky's last; their sum is the
+    picture."""
     levels_L: Tensor | None = None
     """float32 log10(1 + radiance) of every valid half float, if the target is not looked up yet
     (`with_target`); None otherwise."""

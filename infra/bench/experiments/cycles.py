@@ -1,5 +1,6 @@
 """Experiment `cycles`: Trilight's pictures compared with raw ones of Blender's Cycles."""
 
+import dataclasses
 from functools import partial
 
 import numpy as np
@@ -10,10 +11,12 @@ from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Poin
 from infra.bench.experiments.frontier import adaptive
 from infra.bench.workloads.cycles import render_with_cycles
 from infra.bench.workloads.judged_pictures import difference_db, shrink_reference
-from infra.bench.workloads.named_scenes import SKIES, given_scenes, mapped_scene
-from infra.bench.workloads.traced_pictures import render_shot
+from infra.bench.workloads.named_scenes import SKIES, given_scenes, mapped_scene, object_alone
+from infra.bench.workloads.traced_pictures import render_shot, render_shots
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera, raw_reference, true_error_db
+from pipeline.builds.training import object_views
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import USUAL_FLOOR_DB
@@ -25,6 +28,7 @@ PLAIN = "plain"
 TEXTURED = "textured"
 SKY = "sky"
 GIVEN = "given"
+OBJECT = "object"
 RESOLUTION = 64
 OUR_SHARE = 4
 """Samples of Trilight, in two halves, for each sample of Cycles, since they cost less."""
@@ -35,15 +39,22 @@ EXPOSED = 0.5
 AIM_DB = 36.0
 """Agreement by pixel that is aimed at, or Cycles' with itself less 1 dB where that is lower."""
 
+OBJECT_VIEWS = 4
+"""Views of each object alone."""
+
+SCRIPT_SPP = 128
+"""Samples of the denoised pictures of objects, as scripts for Blender have it: no stated error."""
+
 _BLOCK_PX = 8
 _MOST_SCENES = 10
 
 
 def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     kinds = [PLAIN, TEXTURED, SKY, *([GIVEN] if options.scenes else [])]
-    return [
+    points = [
         Point(name=kind, measure=partial(_measure, kind), kind=kind, judged=False) for kind in kinds
     ]
+    return [*points, Point(name=OBJECT, measure=_measure_object, kind=OBJECT, judged=False)]
 
 
 def _scene(context: BenchContext, kind: str, index: int) -> Scene:
@@ -69,6 +80,44 @@ def _measure(kind: str, context: BenchContext, trial: str) -> Figures:
         "core_s": core_s,
         **agreement_figures(ours, theirs),
         **_stated_figures(view, ours, theirs),
+    }
+
+
+def _measure_object(context: BenchContext, trial: str) -> Figures:
+    """Return figures of views of an object alone, per view, by both renderers.
+
+    Errors are over the pixels that show the object. One half of their reference is of our samples,
+    the other of Cycles': neither renderer is its own judge.
+    """
+    px = context.scale.picture_px
+    spp = context.scale.max_spp
+    views = range(OBJECT_VIEWS)
+    scene = object_alone(context.child, int(trial.split()[-1]), OBJECT_VIEWS)
+    settings = dataclasses.replace(object_views().renders, resolution=px)
+    ours = context.child.call(render_shots, scene, settings, OBJECT_VIEWS)
+    filtered, core_s = render_with_cycles(scene, px, SCRIPT_SPP, views=views, denoise=True)
+    raws, _ = render_with_cycles(scene, px, spp, seeds=(0, 1), views=views)
+    figures: dict[str, list[float]] = {"stated_objects_db": [], "ours_db": [], "theirs_db": []}
+    for view in views:
+        camera = PixelCamera(
+            c2w=scene.c2w[view].astype(np.float64),
+            fov_deg=float(scene.fov_deg[view]),
+            resolution=px,
+        )
+        raw = context.child.call(raw_reference, scene, camera, OUR_SHARE * spp, view)
+        a_rgb, b_rgb = (picture.astype(np.float64) for picture in raws[2 * view : 2 * view + 2])
+        if view == 0:
+            agreement = agreement_figures(raw, RawReference(a_rgb=a_rgb, b_rgb=b_rgb))
+        both = RawReference(a_rgb=(raw.a_rgb + raw.b_rgb) / 2, b_rgb=(a_rgb + b_rgb) / 2)
+        figures["stated_objects_db"].append(ours[view].object_noise_floor_db)
+        for name, picture in (("ours_db", ours[view].radiance_rgb), ("theirs_db", filtered[view])):
+            error_db, _ = true_error_db(picture, both, log10_radiance, ours[view].hits)
+            figures[name].append(error_db)
+    return {
+        "core_s": core_s / OBJECT_VIEWS,
+        "our_core_s": sum(view.core_s for view in ours) / OBJECT_VIEWS,
+        **agreement,
+        **{name: float(np.mean(values)) for name, values in figures.items()},
     }
 
 
@@ -118,8 +167,8 @@ EXPERIMENT = Experiment(
     name="cycles",
     title="Plain, textured and sky-lit scenes compared with Blender's Cycles",
     about="Raw samples of ours and a denoised picture against raw samples of Cycles, of sampled "
-    "scenes, of scenes with procedural surfaces, of scenes below skies, and of those in "
-    "`--scenes`; the first run installs Blender (GPL-3, 380 MB) in its own environment.",
+    "scenes, of scenes with procedural surfaces, of scenes below skies, of objects alone, and "
+    "of those in `--scenes`; the first run installs Blender (GPL-3, 380 MB) in an environment.",
     cost=Column(name="core-seconds of Cycles", figure="core_s"),
     error=Column(name="agreement without noise, linear dB", figure="noiseless_db"),
     better="higher",
@@ -135,6 +184,10 @@ EXPERIMENT = Experiment(
         Column(name="stated psnr_log_db", figure="stated_db"),
         Column(name="to our samples, dB", figure="to_ours_db"),
         Column(name="to Cycles' samples, dB", figure="to_theirs_db"),
+        Column(name="objects: core-seconds of ours a view", figure="our_core_s"),
+        Column(name="objects: stated over them, dB", figure="stated_objects_db"),
+        Column(name="objects: true error of ours, dB", figure="ours_db"),
+        Column(name="objects: that of Cycles denoised, dB", figure="theirs_db"),
     ),
     because="A sky a quarter turn off, a mirrored texture or colors decoded twice would each cost "
     "ten decibels and more. Where a picture is as far from Cycles' samples as from our own, its "

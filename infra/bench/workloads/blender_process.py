@@ -1,14 +1,15 @@
-"""Process that opens a Trilight USD file in Blender and renders its first view with Cycles.
+"""Process that opens a Trilight USD file in Blender and renders views of it with Cycles.
 
 Run by path with the Python of cycles.py, which has no module of Trilight:
 
     python -I blender_process.py FOLDER
 
 FOLDER/request.json holds the fields that cycles.py writes. FOLDER receives `picture<k>.npy` of each
-seed, float32 [R, R, 3] with the top row first, and `timing.json`.
+seed of each view, float32 [R, R, 3] with the top row first, and `timing.json`.
 """
 
 import importlib.util
+import itertools
 import json
 import sys
 import time
@@ -30,7 +31,9 @@ def main(folder: Path) -> None:
     set_up_cycles({**request, "seed": 0}, target)
     render(samples=1)  # builds the tree of triangles, which stays
     core_s = 0.0
-    for number, seed in enumerate(request["seeds"]):
+    shots = itertools.product(request["views"], request["seeds"])
+    for number, (view, seed) in enumerate(shots):
+        bpy.context.scene.camera = bpy.data.objects[f"camera_{view}"]
         bpy.context.scene.cycles.seed = seed
         core_s += render(samples=request["spp"])
         np.save(folder / f"picture{number}.npy", pixels(target), allow_pickle=False)

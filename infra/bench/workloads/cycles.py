@@ -1,4 +1,4 @@
-"""Renders the first view of a `Scene` with Blender's Cycles, by way of its USD, with the cost.
+"""Renders views of a `Scene` with Blender's Cycles, by way of its USD, with the cost.
 
 Blender is under the GPL, large, and exists for one version of Python. So it is never a dependency:
 a comparison installs it from the package index into the user's cache, in a separate environment,
@@ -44,21 +44,26 @@ def render_with_cycles(
     spp: int,
     *,
     seeds: Sequence[int] = (0,),
+    views: Sequence[int] = (0,),
+    denoise: bool = False,
     bounces: int = 8,
     threads: int | None = None,
 ) -> tuple[list[NDArray[np.float32]], float]:
-    """Render raw pictures of a scene's first view in a separate process.
+    """Render pictures of a scene in a separate process.
 
     Args:
         resolution: width and height in pixels.
         spp: samples per pixel; adaptive sampling is off.
+        seeds: of the samples, one for each picture of a view.
+        views: rows of the scene's cameras.
+        denoise: filter the pictures with Open Image Denoise, guided by albedo and normals.
         bounces: maximum number of bounces, in sum and of each kind; 8 is Mitsuba's max_depth of 10,
             and 0 direct light.
         threads: threads of Cycles; None for one for each core.
 
     Returns:
-        Linear radiance [R, R, 3] for each seed; and the CPU seconds of all renders, without reading
-        the file and building the tree of triangles.
+        Linear radiance [R, R, 3] for each seed of each view; and the CPU seconds of all
+        renders, without reading the file and building the tree of triangles.
 
     Raises:
         TrilightError: Blender cannot be installed (`blender_python`), or it failed.
@@ -69,9 +74,10 @@ def render_with_cycles(
         request = {
             "usd": str(folder / "scene.usdc"),
             "seeds": list(seeds),
+            "views": list(views),
             "resolution": resolution,
             "spp": spp,
-            "denoise": False,
+            "denoise": denoise,
             "bounces": bounces,
             "threads": threads or os.cpu_count() or 1,
         }
@@ -79,7 +85,7 @@ def render_with_cycles(
         run_blender(_SCRIPT, folder)
         pictures = [
             np.load(folder / f"picture{number}.npy", allow_pickle=False)
-            for number in range(len(seeds))
+            for number in range(len(seeds) * len(views))
         ]
         return pictures, json.loads((folder / "timing.json").read_text())["core_s"]
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from infra.render.held_out_scenes import first_composed
-from pipeline.builds.training import smoke, textured_256
+from pipeline.builds.training import object_views, olat, smoke, textured_256
 from pipeline.exchange.gltf.read import SUFFIXES as GLTF_SUFFIXES
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.isolation import IsolatedChild
@@ -89,6 +89,21 @@ def mapped_scene(child: IsolatedChild, name: str) -> Scene:
         }
         settings = changed(settings, sky)
     return first_composed(child, settings, number, seed=_MAPPED_SEED)
+
+
+def object_alone(child: IsolatedChild, scene_index: int, num_views: int) -> Scene:
+    """Return a scene of the preset `object-views`, composed in a render child.
+
+    Raises:
+        Rejected: every attempt at it was rejected.
+    """
+    settings = dataclasses.replace(object_views().scenes, num_views=num_views)
+    return first_composed(child, settings, scene_index)
+
+
+def lights_apart(child: IsolatedChild, scene_index: int) -> Scene:
+    """Return a scene of the preset `olat` with one camera; as `object_alone`."""
+    return first_composed(child, dataclasses.replace(olat().scenes, num_views=1), scene_index)
 
 
 def _holds_a_scene(path: Path) -> bool:

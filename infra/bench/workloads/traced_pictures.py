@@ -58,13 +58,18 @@ def fixed_samples(resolution: int, spp: int) -> RenderSettings:
 
 def render_shot(scene: Scene, settings: RenderSettings) -> RenderedView:
     """Return a scene's first view, always of one seed; runs in a render child."""
+    return render_shots(scene, settings, 1)[0]
+
+
+def render_shots(scene: Scene, settings: RenderSettings, count: int) -> list[RenderedView]:
+    """Return the first `count` views of a scene, always of one seed; runs in a render child."""
     small = dataclasses.replace(settings, resolution=_SMALL, max_spp=settings.min_spp)
-    pose = scene.c2w[0]
-    fov_deg = float(scene.fov_deg[0])
-    SceneRenderer(scene, small).render_view(pose, fov_deg, seed=0)  # compiles
+    poses = [(scene.c2w[view], float(scene.fov_deg[view])) for view in range(count)]
+    SceneRenderer(scene, small).render_view(*poses[0], seed=0)  # compiles
     if settings.denoiser != "off":
         warm_up_denoiser(settings.resolution, settings.denoiser)
-    return SceneRenderer(scene, settings).render_view(pose, fov_deg, SAMPLE_SEED)
+    renderer = SceneRenderer(scene, settings)
+    return [renderer.render_view(*pose, SAMPLE_SEED) for pose in poses]
 
 
 _RR_DEPTH = 5

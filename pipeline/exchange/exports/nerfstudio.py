@@ -1,6 +1,7 @@
 """nerfstudio export: one folder for each scene, with `transforms.json`, pictures and depths.
 
     KEY/transforms.json, KEY/images/VIEW.png, KEY/depths/VIEW.npy
+    KEY/{normals,albedos}/VIEW.png    of a scene that stands alone, whose images are RGBA
 
 Poses are camera to world, looking along -Z with +Y up, world +Z up. Depths are along the axis of
 the camera, in millimeters, since nerfstudio multiplies them by 0.001; 0 is unknown.
@@ -14,7 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.exchange.exports.pictures import write_json, write_png
+from pipeline.documents.png import encode_png
+from pipeline.exchange.exports.pictures import (
+    stands_alone,
+    surface_pictures,
+    write_json,
+    write_png,
+)
 from storage.atomic import write_atomically
 from storage.conventions import focal_px
 from storage.records.sample import Sample
@@ -37,7 +44,11 @@ def _frame(folder: Path, sample: Sample, view: int) -> dict[str, Any]:
     stream = io.BytesIO()
     np.save(stream, np.where(np.isfinite(depth), depth * _MM, np.float32(0)))
     write_atomically(folder / f"depths/{view}.npy", stream.getvalue())
-    write_png(folder / f"images/{view}.png", sample, view)
+    alone = stands_alone(scene)
+    write_png(folder / f"images/{view}.png", sample, view, alpha=alone)
+    surfaces = surface_pictures(sample, view) if alone else {}
+    for name, pixels in surfaces.items():
+        write_atomically(folder / f"{name}s/{view}.png", encode_png(pixels))
     focal = float(focal_px(float(scene.fov_deg[view]), resolution))
     return {
         "file_path": f"images/{view}.png",
@@ -49,4 +60,5 @@ def _frame(folder: Path, sample: Sample, view: int) -> dict[str, Any]:
         "cy": resolution / 2,
         "w": resolution,
         "h": resolution,
+        **{f"{name}_file_path": f"{name}s/{view}.png" for name in surfaces},
     }

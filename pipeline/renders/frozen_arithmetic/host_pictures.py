@@ -24,6 +24,7 @@ from pipeline.renders.tiles import tile_means
 from pipeline.renders.tracer import Features, Tracer
 from pipeline.renders.view_pictures import (
     MeasuredLook,
+    floor_groups,
     put_together,
     require_bounded,
     require_finite,
@@ -127,17 +128,16 @@ class HostPictures:
         corrected = pairs
         if error is not None and self._settings.denoiser != "off":
             corrected = keep_in_halves(pairs, error)
-        first, second = map(_half, corrected)
-        floors = [estimate_error(first, second, self.hits)]
-        for part in range(len(names)):
-            parts = [
-                _half((raw[part :: len(names)], rest[part :: len(names)]))
-                for raw, rest in corrected
-            ]
-            floors.append(estimate_error(parts[0], parts[1], self.hits))
+        floors = []
+        groups = floor_groups(len(pairs[0][0]), names, per_light=self._settings.per_light)
+        for group in groups:
+            chosen = slice(*group)
+            first, second = (_half((raw[chosen], rest[chosen])) for raw, rest in corrected)
+            floors.append(estimate_error(first, second, self.hits))
         return MeasuredLook(
             floor=floors[0],
-            part_floors=dict(zip(names, floors[1:], strict=True)),
+            part_floors=dict(zip(names, floors[1:], strict=False)),
+            light_floors=floors[1 + len(names) :],
             changes=self._changes.since([_half(pair) for pair in pairs]),
         )
 

@@ -98,7 +98,7 @@ REFUSED = {
     "submit generate-scenes smoke --where x": "submit generate-scenes: --shards-per-task, "
     "--at-once, --dry-run and the options of machines are those of submit slurm, kubernetes",
     "bench rungs-64": "experiment 'rungs-64' is unknown; expected one of cycles, frontier, gpu, "
-    "growth, loader, meshes, methods, paired-training",
+    "growth, loader, meshes, methods, paired-training, relighting",
 }
 """Values that the settings refuse, each named by its option, before anything is done."""
 

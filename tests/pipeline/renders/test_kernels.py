@@ -212,8 +212,8 @@ def test_device_arithmetic_gives_the_views_of_numpy_but_for_roundings(
 
 def _floors_db(view: RenderedView) -> list[float]:
     of_picture = view.noise_floor_db, view.noise_floor_linear_db, view.object_noise_floor_db
-    parts = (view.part_floors or {}).values()
-    return [*of_picture, *(db for floor in parts for db in dataclasses.astuple(floor))]
+    floors = [*(view.part_floors or {}).values(), *(view.light_floors or ())]
+    return [*of_picture, *(db for floor in floors for db in dataclasses.astuple(floor))]
 
 
 def _sums(tracer: Tracer, scene: Scene, first_seed: int) -> list[NDArray]:

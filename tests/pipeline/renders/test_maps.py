@@ -26,6 +26,7 @@ from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.raycast.first_hits import first_hits
 from storage.records.environment import Environment
+from storage.records.lights import light_rows
 from storage.records.lookup import environment_values, texture_values
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene, SceneObject
@@ -235,6 +236,23 @@ def test_a_lamp_alone_has_no_sky() -> None:
         for scene in (with_sky, without)
     )
     np.testing.assert_array_equal(below_sky, alone)
+
+
+def test_the_sky_alone_and_each_lamp_add_up_to_all_light() -> None:
+    """The same integral, by other samples; a sky that is seen is seen in its own picture alone."""
+    scene = open_scene(dataclasses.replace(smooth(), is_seen=True))
+    tracer = _tracer(scene)
+    *lamps, sky = (
+        render_passes(tracer.only_light(row), scene, first_seed=500, passes=8)
+        for row in (*light_rows(scene), None)
+    )
+    every = render_passes(tracer, scene, passes=8)
+    assert_same_light(np.sum([*lamps, sky], axis=0), every, name="sum")
+    with pytest.raises(AssertionError, match="without"):
+        assert_same_light(sky, every, name="without lamps")
+    nothing = (every.min(axis=0) > 0).all(axis=-1) & ~np.any(lamps, axis=(0, 1, 4))
+    assert nothing.any(), "the sky is seen where no lamp lights anything"
+    np.testing.assert_array_equal(nothing & tracer.hits(camera_of(scene, 32)), False)
 
 
 def _turned(seed: int) -> np.ndarray:

@@ -152,7 +152,7 @@ def test_too_many_pictures_are_rejected() -> None:
     lamps = [light(np.add(LAMP, [0.01 * i, 0, 0]), 1.0) for i in range(count)]
     scene = join([FLOOR, *lamps])
     SceneRenderer(scene, _with(SETTINGS, per_light=True))
-    with pytest.raises(Rejected, match=f"too_many_lights.*{count} emitters apart; at most 32"):
+    with pytest.raises(Rejected, match=f"too_many_lights.*{count} lights apart; at most 32"):
         SceneRenderer(scene, _with(SETTINGS, per_light=True, split=True))
 
 

@@ -21,7 +21,12 @@ from storage.conventions import look_at_c2w
 from storage.errors import Rejected
 from storage.metrics import psnr_log_db
 from storage.records.exr import decode_exr, encode_exr
-from storage.records.lights import light_rows, rounded_to_half, sum_of_lights
+from storage.records.lights import (
+    light_rows,
+    num_light_pictures,
+    rounded_to_half,
+    sum_of_lights,
+)
 from storage.records.scene import Scene, SceneObject
 from storage.settings.changes import changed
 from tests.for_each import for_each
@@ -35,6 +40,7 @@ from tests.pipeline.renders.sampling import (
     render_view,
 )
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene, sphere
+from tests.sky_maps import constant
 
 CHEAP = RenderSettings(resolution=32, noise_floor_db=60.0, min_spp=32, max_spp=32)
 
@@ -235,6 +241,19 @@ def test_the_stored_picture_is_the_sum_of_its_lights_in_the_order_of_objects() -
         assert np.argmax(light_rgb.mean(axis=(0, 1))) == np.argmax(colour)
 
 
+def test_a_sky_is_the_last_light() -> None:
+    scene = dataclasses.replace(lit_scene(), environment=constant(0.3))
+    view = render_view(scene, SETTINGS)
+    lights = _lights(view)
+    assert len(lights) == num_light_pictures(scene) == 4
+    np.testing.assert_array_equal(sum_of_lights(lights), view.radiance_rgb)
+    assert view.light_floors is not None and len(view.light_floors) == 4
+    without = _lights(render_view(lit_scene(), SETTINGS))
+    np.testing.assert_allclose(lights[:3].mean(axis=(1, 2)), without.mean(axis=(1, 2)), rtol=0.1)
+    black = dataclasses.replace(lit_scene(), environment=constant(0.0))
+    assert len(_lights(render_view(black, SETTINGS))) == num_light_pictures(black) == 3
+
+
 def test_doubling_one_light_doubles_its_picture_and_no_other() -> None:
     """Samples do not depend on a light's strength; twice a float is exact, in halves too."""
     once = _lights(render_view(lit_scene(), RAW))
@@ -294,8 +313,10 @@ def test_one_light_alone_is_the_picture_but_for_its_rounding() -> None:
     ]
     scene = join(parts, eye=(0, -3, 2))
     together = render_view(scene, dataclasses.replace(SETTINGS, per_light=False))
-    assert together.lights_rgb is None
+    assert together.lights_rgb is None and together.light_floors is None
     separate = render_view(scene, SETTINGS)
+    assert separate.light_floors is not None
+    assert [floor.log_db for floor in separate.light_floors] == [separate.noise_floor_db]
     np.testing.assert_array_equal(separate.radiance_rgb, rounded_to_half(together.radiance_rgb))
     assert separate.noise_floor_db == together.noise_floor_db
 

@@ -20,7 +20,6 @@ from pipeline.scenes.views import (
 from pipeline.scenes.visibility import Visibility
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings, ViewLaws
-from scene_templates.templates import TEMPLATES
 from storage.conventions import camera_rays, look_at_c2w
 from storage.errors import Rejected
 from storage.records.material import DIFFUSE, EMISSION, SPECULAR
@@ -29,6 +28,7 @@ from storage.records.scene_facts import lights, surfaces
 from storage.seeds import SceneKey
 from tests.pipeline.scenes.scene_facts import points_of, ray_distances, rows_of
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
+from tests.scene_templates.balls import ROOMS
 from tests.scenes_by_hand import tiny_scene
 from tests.sky_maps import constant, one_sun
 from tests.textured_by_hand import sky, textured_scene
@@ -171,8 +171,8 @@ KEY = SceneKey(7, 3)
 
 @pytest.fixture(scope="module", params=range(4))
 def scene(request: pytest.FixtureRequest) -> Scene:
-    """The first scene of one of the four layouts."""
-    name = sorted(TEMPLATES)[request.param]
+    """The first scene of one of the four rooms."""
+    name = sorted(ROOMS)[request.param]
     scenes = (first_scene(SMOKE, small_pool(), seed=0, scene_index=index) for index in range(40))
     return next(scene for scene in scenes if scene.provenance["template"] == name)
 

@@ -19,6 +19,8 @@ from storage.records.lights import (
     MAX_LIGHTS,
     decode_lights_exr,
     encode_lights_exr,
+    num_light_pictures,
+    num_lights,
     rounded_to_half,
     sum_of_lights,
 )
@@ -33,6 +35,7 @@ from storage.records.sample import PartFloor, Sample, decode_sample, decode_scen
 from storage.records.scene import SceneObject
 from tests.for_each import for_each
 from tests.scenes_by_hand import tiny_sample, tiny_scene
+from tests.sky_maps import constant
 
 SIZE = (16, 16)
 
@@ -95,6 +98,22 @@ def test_a_sample_with_lights_comes_back() -> None:
     with pytest.raises(TrilightError, match="1.lights.exr.*missing"):
         decode_sample(sample.key, members)
     assert decode_sample("000000000", encode_sample(tiny_sample())).lights_rgb is None
+
+
+def test_a_sky_is_one_more_light_of_a_sample() -> None:
+    scene = dataclasses.replace(_lit_sample().scene, environment=constant(0.5))
+    assert num_light_pictures(scene) == 3 and num_lights(scene) == 2
+    lights = rounded_to_half(np.stack([_noise(3, *SIZE), _noise(3, *SIZE)]))
+    pictures = np.stack([sum_of_lights(view) for view in lights])
+    views = [dataclasses.replace(view, lights=(FLOOR,) * 3) for view in _lit_sample().views]
+    whole = _lit_sample(scene=scene, lights_rgb=lights, radiance_rgb=pictures, views=tuple(views))
+    back = decode_sample(whole.key, encode_sample(whole))
+    np.testing.assert_array_equal(back.lights_rgb, lights)
+    assert back.views == whole.views
+    assert faults(back, per_light=True) == []
+    fewer = [dataclasses.replace(view, lights=(FLOOR,)) for view in views]
+    (first, second) = faults(dataclasses.replace(back, views=tuple(fewer)), per_light=True)
+    assert "view 0 has 1 stated errors of lights; expected 3" in first and "view 1" in second
 
 
 def test_verify_demands_the_sum_of_lights() -> None:

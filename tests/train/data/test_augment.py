@@ -34,12 +34,13 @@ from tests.model.hits.kit import corner, textured
 from tests.model.kit import hits_config, tiny_config
 from tests.pipeline.renders.sampling import Estimate, assert_agree, camera_of, render_blocks
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene
-from tests.sky_maps import smooth
+from tests.sky_maps import constant, smooth
 from tests.train.kit import bare_scene
 from tests.train.toy import toy_picture, toy_sample
 from train.data.augment import (
     augment_scene,
     mirror_scene,
+    mix_lights,
     move_scene,
     permute_channels,
     random_rotation,
@@ -135,6 +136,25 @@ def test_a_turned_vertex_takes_its_normal_along() -> None:
     assert torch.equal(turned.triangles_T33, -turned.normals_T33)
     for row in range(count):
         assert torch.equal(turned.triangles_T33[row], numbered[row].roll(-(row % 3), dims=0))
+
+
+def test_the_sky_is_mixed_as_the_last_light() -> None:
+    lamp = light([[0, 0, 2], [1, 0, 2], [0, 1, 2]], 3.0)
+    lit = join([quad(FLOOR, material(diffuse=0.5)), lamp])
+    lit = dataclasses.replace(lit, environment=constant(0.25))
+    alone = rng_for(0, "lights").uniform(0, 9, (1, 2, 16, 16, 3)).astype(np.float32)
+    whole = {"scene": lit, "radiance_rgb": alone.sum(axis=1), "lights_rgb": alone}
+    scene = training_scene(
+        dataclasses.replace(toy_sample(0, views=1), **whole), 16, lights_apart=True
+    )
+    mixed = mix_lights(scene, torch.tensor([1.0, 4.0]))
+    assert mixed.tensors.sky is not None
+    np.testing.assert_array_equal(
+        mixed.tensors.sky.radiance_rgb, np.full_like(constant(0.25).radiance_rgb, 1.0)
+    )
+    np.testing.assert_allclose(mixed.tensors.material_TM, scene.tensors.material_TM, atol=1e-6)
+    expected = np.log10(1 + alone[:, 0] + 4 * alone[:, 1])
+    np.testing.assert_allclose(mixed.target_VRR3, expected, atol=1e-6)
 
 
 def test_mixed_lights_and_their_pictures_are_as_much_stronger() -> None:

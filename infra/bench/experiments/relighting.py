@@ -1,0 +1,116 @@
+"""Experiment `relighting`: stated errors of single lights, and the true error of relit pictures.
+
+The reference of each light is raw samples of that light alone in two independent halves. Relit
+pictures and their references are sums of the same lights with the same gains.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from infra.bench.context import BenchContext
+from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, percent
+from infra.bench.workloads.named_scenes import lights_apart
+from infra.bench.workloads.traced_pictures import render_shot
+from infra.bench_options import BenchOptions
+from infra.render.raw_references import (
+    RawReference,
+    first_camera,
+    light_references,
+    true_error_db,
+)
+from pipeline.builds.training import olat
+from storage.conventions import log10_radiance
+from storage.seeds import rng_for
+
+TARGETS_DB = (38.0, 42.0, 46.0)
+
+MOST_GAIN = 4.0
+"""Gains of each light and channel are log-uniform between its inverse and it."""
+
+_ALLOWED_DB = 1.0
+"""A stated error that is better than the true one by more is a miss."""
+
+
+def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
+    default_db = olat().renders.noise_floor_db
+    return [
+        Point(
+            name=f"{target_db:.0f} dB",
+            measure=partial(_measure, target_db),
+            default=target_db == default_db,
+        )
+        for target_db in TARGETS_DB
+    ]
+
+
+def _measure(target_db: float, context: BenchContext, trial: str) -> Figures:
+    index = int(trial.split()[-1])
+    px = context.scale.resolution
+    spp = 4 * context.scale.reference_spp
+    scene = context.get_or_make(trial, lambda: lights_apart(context.child, index))
+    references = context.get_or_make(
+        (trial, "lights"),
+        lambda: context.child.call(light_references, scene, first_camera(scene, px), spp),
+    )
+    settings = dataclasses.replace(olat().renders, resolution=px, noise_floor_db=target_db)
+    view = context.child.call(render_shot, scene, settings)
+    assert view.light_floors is not None and view.lights_rgb is not None
+    everywhere = np.ones((px, px), np.bool_)
+
+    def error_db(picture: NDArray[np.float32], reference: RawReference) -> float:
+        return true_error_db(picture, reference, log10_radiance, everywhere)[0]
+
+    gains = MOST_GAIN ** rng_for(index, "gains").uniform(-1, 1, (len(references), 1, 1, 3))
+    lights = zip(view.light_floors, view.lights_rgb, references, strict=True)
+    excess = np.array([floor.log_db - error_db(light, raw) for floor, light, raw in lights])
+    relit = (gains * view.lights_rgb).sum(axis=0).astype(np.float32)
+    return {
+        "core_s": view.core_s,
+        "lights": len(references),
+        "relit_db": error_db(relit, _sum(references, gains)),
+        "stated_db": view.noise_floor_db,
+        "true_db": error_db(view.radiance_rgb, _sum(references, np.ones_like(gains))),
+        "missed": float((excess > _ALLOWED_DB).mean()),
+        "excess_db": float(excess.max()),
+        "caution_db": float(np.median(-excess)),
+    }
+
+
+def _sum(references: Sequence[RawReference], gains: NDArray[np.float64]) -> RawReference:
+    """Return the reference of lights that are scaled by gains [L, 1, 1, 3] and added."""
+    a_rgb = (gains * np.stack([each.a_rgb for each in references])).sum(axis=0)
+    b_rgb = (gains * np.stack([each.b_rgb for each in references])).sum(axis=0)
+    return RawReference(a_rgb=a_rgb, b_rgb=b_rgb)
+
+
+EXPERIMENT = Experiment(
+    name="relighting",
+    title="Scenes with one light at a time: stated errors of lights, true errors of relit pictures",
+    about="Scenes of the preset `olat`; each light is compared with raw samples of it alone, and "
+    "pictures with random gains of every light and channel with the same sums of raw samples.",
+    cost=Column(name="core-seconds a view", figure="core_s"),
+    error=Column(name="relit, true error, dB", figure="relit_db"),
+    better="higher",
+    columns=(
+        Column(name="relit, least, dB", figure="relit_db", over="least"),
+        Column(name="stated of the picture, dB", figure="stated_db"),
+        Column(name="true of the picture, dB", figure="true_db"),
+        Column(name="lights, mean", figure="lights", over="mean"),
+        Column(
+            name="lights over 1 dB worse than stated, %",
+            figure="missed",
+            over="mean",
+            then=percent,
+        ),
+        Column(name="worst light beyond its stated error, dB", figure="excess_db", over="most"),
+        Column(name="caution of stated errors of lights, dB", figure="caution_db"),
+    ),
+    because="A relit picture is as good as its lights: gains below 1 hide errors in log light, and "
+    "gains above 1 show them.",
+    points=_points,
+    trials=lambda scale, options: [f"scene {index}" for index in range(scale.scenes)],
+)
