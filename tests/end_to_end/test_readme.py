@@ -72,8 +72,11 @@ def _trilight_words(line: str) -> list[str]:
     return []
 
 
+SUBMISSIONS = [["submit", name] for name in ("slurm", "kubernetes", "make-by-array")]
+
+
 def _command(words: list[str]) -> tuple[str, ...]:
-    is_within = words[0] == "shards" or words[:2] == ["submit", "make-by-array"]
+    is_within = words[0] == "shards" or words[:2] in SUBMISSIONS
     return tuple(words[: 2 if is_within else 1])
 
 
@@ -91,7 +94,7 @@ def test_readme_and_tutorials_show_commands() -> None:
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_commands_and_their_options_exist(command: tuple[str, ...]) -> None:
     # names of options are cut off in narrow tables
-    ended = trilight([*command, "--help"], env={"COLUMNS": "300"})
+    ended = trilight([*command, "--help-all"], env={"COLUMNS": "300"})
     assert ended.exit_code == 0, command
     shown = ended.stdout
     for line in USED:
