@@ -34,11 +34,7 @@ TUTORIALS = [
         "your-own-objects",
         "train-and-judge",
         "look-around",
-        "read-the-reports",
         "stand-on-a-leaderboard",
-        "publish",
-        "a-cluster",
-        "mix-datasets",
         "blender-and-back",
     )
 ]
@@ -56,7 +52,8 @@ def _shell_lines(page: Path) -> list[str]:
     return shell_lines(text)
 
 
-PAGES = [README, ROOT / "CONTRIBUTING.md", SCRIPT, *sorted((ROOT / "docs").rglob("*.md"))]
+AGENTS = ROOT / "AGENTS.md"
+PAGES = [README, AGENTS, ROOT / "CONTRIBUTING.md", SCRIPT, *sorted((ROOT / "docs").rglob("*.md"))]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 SHOWN = re.findall(r"^    (trilight .*)$", "".join(e.read_text() for e in EXAMPLES), re.MULTILINE)
 USED = sorted({*SHOWN, *(line for page in PAGES for line in _shell_lines(page))})
@@ -111,7 +108,7 @@ def test_targets_of_make_exist() -> None:
             assert line.split()[1] in targets, line
 
 
-@pytest.mark.parametrize("page", [README, ROOT / "DECISIONS.md"], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [README, AGENTS, ROOT / "DECISIONS.md"], ids=lambda p: p.name)
 def test_links_lead_somewhere(page: Path) -> None:
     """Those between the pages of docs/ are held by its strict build."""
     for target in re.findall(r"\[[^\]]*\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text()):

@@ -86,7 +86,7 @@ def test_nothing_is_fetched_from_a_server(site: Path) -> None:
 
 @pytest.mark.slow("packaging")
 def test_files_beside_docs_are_pages_too(site: Path) -> None:
-    page = (site / "tutorials" / "a-cluster.html").read_text()
+    page = (site / "how-to" / "servers-and-clusters.html").read_text()
     assert 'href="../source/infra/slurm/generate.sbatch.html"' in page
     assert "SHARDS_PER_TASK" in (site / "source/infra/slurm/generate.sbatch.html").read_text()
 
