@@ -111,9 +111,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """Return an entry; raises TrilightError for a name that is not registered."""
         if name not in self:
             known = [*self._aliases, *self._entries]
-            raise TrilightError(
-                f"{self.what} {name!r} is unknown; {expected_one_of(name, known)}."
-            )
+            raise TrilightError(f"{self.what} {name!r} is unknown; {expected_one_of(name, known)}.")
         return self[name]
 
     def is_ours(self, name: str) -> bool:

@@ -25,9 +25,7 @@ from storage.errors import TrilightError
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 
-app = App(
-    name="shards", help_epilogue="", help_flags=HELP_FLAGS, group_commands=Group("Commands")
-)
+app = App(name="shards", help_epilogue="", help_flags=HELP_FLAGS, group_commands=Group("Commands"))
 
 _MOST_LISTED = 40
 """Maximum number of scenes in a printed list."""

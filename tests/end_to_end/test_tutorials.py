@@ -22,7 +22,6 @@ from storage.digests import sha256_of_file
 from storage.records.objects import write_objects_lock
 from storage.records.scene import Scene
 from tests.command_line import trilight
-from tests.conftest import ROOT
 from tests.end_to_end.production_kit import Step, steps_of, tutorial
 from tests.infra.viewer.served_kit import served
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, locked

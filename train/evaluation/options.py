@@ -63,7 +63,8 @@ class EvaluationOptions:
     """Network to evaluate, and the data to use."""
 
     checkpoint: str | None = None
-    """Folder of a run, model.safetensors, a checkpoint, or default for the included network; by default none. Without one, all methods are compared as by trilight leaderboard."""
+    """Folder of a run, model.safetensors, a checkpoint, or default for the included network; by
+    default none. Without one, all methods are compared as by trilight leaderboard."""
     data: tuple[str, ...]
     """Dataset (a folder or a URL), or shards by name or pattern."""
     other_networks: tuple[str, ...] = ()
