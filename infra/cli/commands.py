@@ -4,7 +4,7 @@ import sys
 from collections.abc import Collection
 from difflib import get_close_matches
 from importlib import metadata
-from typing import Any
+from typing import Any, ClassVar
 
 from cyclopts import App, CycloptsError, Group
 from cyclopts.exceptions import (
@@ -71,6 +71,9 @@ class Sections:
 class Program(App):
     """The command line, whose help shows everyday options and examples first."""
 
+    shows_all: ClassVar[bool] = False
+    """True while a command is run that asks for all options."""
+
     def __call__(self, tokens: Any = None, **options: Any) -> Any:
         """Run a command; remembers whether all options are to be shown."""
         words = sys.argv[1:] if tokens is None else tokens
@@ -91,9 +94,6 @@ class Program(App):
             console.print("".join(f"   {line}\n" for line in page.examples), highlight=False)
         if sections.hides_some:
             console.print(f"All options: trilight {name} {ALL_OPTIONS}\n", highlight=False)
-
-
-Program.shows_all = False
 
 
 def option_names(command: App, fields: Collection[str]) -> set[str]:
