@@ -32,6 +32,7 @@ LONG_SHARE = {"README.md": 0.03}
 
 def sentences_of(text: str) -> list[str]:
     """Return the sentences of a Markdown text."""
+    text = re.sub(r"\A---\n.*?\n---\n", "", text, flags=re.DOTALL)  # what the site reads
     for pattern in (r"```.*?```", r"^\s*\|.*$", r"^#.*$", r"!\[[^\]]*\]\([^)]*\)", r"^:::.*$"):
         text = re.sub(pattern, "", text, flags=re.DOTALL if "```" in pattern else re.MULTILINE)
     text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text)
