@@ -29,13 +29,13 @@ _NAMES_WIDTH = 27
 class Sections:
     """Formatter of cyclopts that prints each section of a help page."""
 
-    def __init__(self, shown: Collection[str] = ()) -> None:
+    def __init__(self, options: Collection[str] = ()) -> None:
         """Begin a page.
 
         Args:
-            shown: options that are printed; empty for all. Arguments always are.
+            options: names of the options that are printed; empty for all. Arguments always are.
         """
-        self._shown = shown
+        self._options = options
         self.hides_some = False
         """True once an option was left out."""
 
@@ -65,7 +65,7 @@ class Sections:
 
     def _is_shown(self, panel: HelpPanel, entry: HelpEntry) -> bool:
         is_option = panel.format == "parameter" and not entry.positional_label
-        return not is_option or not self._shown or entry.display_labels[0] in self._shown
+        return not is_option or not self._options or entry.display_labels[0] in self._options
 
 
 class Program(App):

@@ -25,7 +25,7 @@ def presets(output: OutputOptions) -> None:
         console.print()
 
 
-def _shown(name: str, aliases: Mapping[str, str]) -> str:
+def _name_for_people(name: str, aliases: Mapping[str, str]) -> str:
     """Return the name for people of a stored one, and the stored one where it is another."""
     alias = next((alias for alias, stored in aliases.items() if stored == name), None)
     return name if alias is None else f"{alias} (stored: {name})"
@@ -39,7 +39,7 @@ def _datasets() -> list[dict[str, Any]]:
         settings = build.settings()
         rows.append(
             {
-                "name": _shown(name, PRESETS),
+                "name": _name_for_people(name, PRESETS),
                 "scenes": build.num_scenes,
                 "views": settings.scenes.num_views,
                 "pixels": settings.renders.resolution,
@@ -58,7 +58,7 @@ def _trainings() -> list[dict[str, Any]]:
         settings = run()
         rows.append(
             {
-                "name": _shown(name, PRESETS),
+                "name": _name_for_people(name, PRESETS),
                 "pixels": settings.resolution,
                 "steps": settings.num_steps,
                 "scenes a step": settings.scenes_per_step,
@@ -71,7 +71,7 @@ def _trainings() -> list[dict[str, Any]]:
 def _networks() -> list[dict[str, Any]]:
     from infra.render.methods import BUILTIN_NETWORKS
 
-    return [{"name": _shown(name, NETWORKS)} for name in BUILTIN_NETWORKS]
+    return [{"name": _name_for_people(name, NETWORKS)} for name in BUILTIN_NETWORKS]
 
 
 def _sizes() -> list[dict[str, Any]]:
@@ -87,4 +87,4 @@ def _sources() -> list[dict[str, Any]]:
     from pipeline.objects.sources import SOURCES
 
     names = ("FOLDER", *(f"{name}:" for name in SOURCES))
-    return [{"name": _shown(name, OBJECTS)} for name in names]
+    return [{"name": _name_for_people(name, OBJECTS)} for name in names]
