@@ -120,6 +120,15 @@ def test_the_page_runs(tmp_path: Path) -> None:
     assert {"still.usdz", "still.exr", "network.png", "set", "run", "evaluation"} <= made
 
 
+@pytest.mark.slow("commands")
+def test_the_lines_of_the_readme_run(tmp_path: Path) -> None:
+    (code,) = _code((ROOT / "README.md").read_text())
+    assert len(code.strip().splitlines()) <= 10
+    (tmp_path / "program.py").write_text(code)
+    _require_runs(tmp_path, str(tmp_path / "program.py"))
+    assert (tmp_path / "knot.png").stat().st_size > 500
+
+
 def test_a_name_is_exported_as_its_import_calls_it(tmp_path: Path) -> None:
     module = tmp_path / "package.py"
     module.write_text(
