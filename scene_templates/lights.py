@@ -110,6 +110,7 @@ def _sample_center(
 def _sample_emitter(
     rng: np.random.Generator, settings: LightSettings, centre: NDArray[np.float64], count: int
 ) -> Emitter:
+    """Draw orientation, size, emission and tint at random."""
     # About its own middle, so that its distance is the one drawn.
     turned = rotate_points(
         TRIANGLE - TRIANGLE.mean(axis=0), sample_rotation(rng, settings.orientation)

@@ -10,7 +10,7 @@ Orientation = Literal["uniform", "euler"]
 
 
 def sample_rotation(rng: np.random.Generator, orientation: Orientation) -> NDArray[np.float64]:
-    """Return a rotation [3, 3] of the stated distribution."""
+    """Return a random rotation [3, 3] of the stated distribution, not only yaw."""
     if orientation == "euler":
         return rotation_xyz(rng.uniform(-180, 180, size=3))
     return uniform_rotation(rng)

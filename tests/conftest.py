@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from pipeline.renders.variant import llvm_libraries
+
 # No test asserts a time: a crowded machine must not fail what is right.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")
@@ -47,6 +49,12 @@ def shared() -> Path:
     if not (folder / "objects").is_dir():
         pytest.skip(f"no real objects: set TRILIGHT_SHARED ({folder} has no objects/)")
     return folder
+
+
+def pytest_configure() -> None:
+    """Name LLVM, which Dr.Jit loads when a test's module imports it, before any `activate`."""
+    for library in llvm_libraries()[:1]:
+        os.environ["DRJIT_LIBLLVM_PATH"] = str(library)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -1,9 +1,8 @@
 """The recipe: its name, its methods and its libraries' versions; loads no mesh library."""
 
-from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 
-from pipeline.assets.settings import Profile
+from pipeline.assets.settings import Decimator, Profile
 from storage.errors import TrilightError
 
 _LIBRARIES = ("embreex", "libigl", "numpy", "pymeshlab", "trimesh", "wasmtime")
@@ -38,31 +37,21 @@ READERS = 4
 """Version of the readers' results: part of cache keys and of no asset, so that a fixed reader reads
 its files again."""
 
-_WITHOUT_GPL = ("libigl_qslim", "meshoptimizer", "meshoptimizer_sloppy")
 
-_METHODS: Mapping[Profile, tuple[str, ...]] = {
-    "faithful": ("pymeshlab_collapse", "meshoptimizer", "meshoptimizer_sloppy"),
-    "uniform": (
-        "pymeshlab_uniform",
-        "pymeshlab_collapse",
-        "meshoptimizer",
-        "meshoptimizer_sloppy",
-    ),
-}
-"""Decimation methods in the order of trial: the next one runs where one crashes its child process,
-or where its result fails the quality checks."""
+def methods_of(profile: Profile, decimator: Decimator = "pymeshlab") -> tuple[str, ...]:
+    """Return the installed decimation methods in the order of trial; pymeshlab (GPL) is optional.
 
-
-def methods_of(profile: Profile) -> tuple[str, ...]:
-    """Return the installed methods of a profile; pymeshlab (GPL) is optional.
+    The next one runs where one crashes its child process, or its result fails the quality checks.
 
     Raises:
         TrilightError: `uniform` without pymeshlab, the only method that makes triangles even.
     """
-    if _installed_version("pymeshlab") != "absent":
-        return _METHODS[profile]
-    if profile == "uniform":
+    with_pymeshlab = _installed_version("pymeshlab") != "absent"
+    if profile == "uniform" and not with_pymeshlab:
         raise TrilightError(
             "profile uniform: pymeshlab is not installed; run `make setup`, or use faithful."
         )
-    return _WITHOUT_GPL
+    evenly = ("pymeshlab_uniform",) if profile == "uniform" else ()
+    use_pymeshlab = decimator == "pymeshlab" and with_pymeshlab
+    collapse = "pymeshlab_collapse" if use_pymeshlab else "libigl_qslim"
+    return (*evenly, collapse, "meshoptimizer", "meshoptimizer_sloppy")

@@ -14,7 +14,7 @@ from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.guards import check_raw
 from pipeline.assets.decimation.by_name import decimate, safe_method
 from pipeline.assets.recipe import methods_of
-from pipeline.assets.settings import AssetSettings
+from pipeline.assets.settings import AssetSettings, Profile
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
@@ -68,19 +68,19 @@ def load_scene_mesh(path: Path, settings: AssetSettings, remesh_faces: int | Non
     )
 
 
-def remesh(raw: TriangleMesh, num_faces: int) -> TriangleMesh:
-    """Return the surface with at most `num_faces` even triangles, in the units of the file.
+def remesh(raw: TriangleMesh, num_faces: int, profile: Profile = "uniform") -> TriangleMesh:
+    """Return the surface with at most `num_faces` triangles, in the units of the file.
 
     Raises:
         Rejected: "remesh_failed" where no method gives that many.
-        TrilightError: pymeshlab is not installed.
+        TrilightError: `uniform` without pymeshlab.
     """
     used = raw.positions[np.unique(raw.faces)]
     low = used.min(axis=0)
     high = used.max(axis=0)
     unit = clean(normalize(raw))
     if len(unit.faces):
-        for method in methods_of("uniform"):
+        for method in methods_of(profile):
             try:
                 result = decimate(unit, num_faces, safe_method(unit, method))
             except Rejected:

@@ -64,7 +64,7 @@ def prepare_assets(
     Raises:
         TrilightError: the store cannot be written, or a needed library is not installed.
     """
-    methods = methods_of(settings.profile)
+    methods = methods_of(settings.profile, settings.decimator)
     _LOG.info("prepare %d objects with %s", len(records), library_versions())
 
     def prepare(record: ObjectRecord) -> PreparedObject | Failure:

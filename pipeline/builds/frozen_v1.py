@@ -37,6 +37,7 @@ BUILD_V1 = BuildSettings(
     allowed_licences=_LICENCES,
     assets=AssetSettings(
         profile="faithful",
+        decimator="pymeshlab",
         budgets=(1400, 1000, 700, 500, 340, 240),
         epsilon=None,
         gate=GateSettings(

@@ -54,6 +54,7 @@ def pretrain_256() -> BuildSettings:
     return dataclasses.replace(
         build,
         build="pretrain-256",
+        assets=dataclasses.replace(build.assets, decimator="libigl"),
         renders=dataclasses.replace(build.renders, noise_floor_db=46.0, max_spp=4096, aux_spp=64),
         splits=SplitSettings(scenes_per_shard=256, shards_per_cycle=64, held_out_objects=0.02),
     )

@@ -7,9 +7,7 @@ material of the nearest old one, and smooth normals are computed again.
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.cleaning.clean import clean, normalize
-from pipeline.assets.decimation.by_name import decimate, safe_method
-from pipeline.assets.recipe import methods_of
+from pipeline.assets.scene_mesh import remesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.posing import without_slivers
@@ -108,21 +106,13 @@ def _reduce_piece(piece: ScenePiece, count: int) -> ScenePiece:
 
 
 def _decimate_mesh(piece: ScenePiece, count: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    raw = TriangleMesh(
-        positions=piece.mesh.positions.astype(np.float64), faces=piece.mesh.faces.astype(np.int64)
-    )
-    low = raw.positions.min(axis=0)
-    high = raw.positions.max(axis=0)
-    unit = clean(normalize(raw))
-    for method in methods_of("faithful"):
-        try:
-            decimated = decimate(unit, count, safe_method(unit, method))
-        except Rejected:
-            continue
-        if 0 < len(decimated.faces) <= count:
-            positions = decimated.positions * (high - low).max() + (low + high) / 2
-            return positions.astype(np.float32), decimated.faces.astype(np.uint32)
-    raise TrilightError(
-        f"{piece.entry.name}: no method gives at most {count} of its {len(raw.faces)} triangles; "
-        "choose a larger --budget."
-    )
+    faces = piece.mesh.faces.astype(np.int64)
+    raw = TriangleMesh(positions=piece.mesh.positions.astype(np.float64), faces=faces)
+    try:
+        reduced = remesh(raw, count, "faithful")
+    except Rejected as rejection:
+        raise TrilightError(
+            f"{piece.entry.name}: no method gives at most {count} of its {len(faces)} triangles; "
+            "choose a larger --budget."
+        ) from rejection
+    return reduced.positions.astype(np.float32), reduced.faces.astype(np.uint32)

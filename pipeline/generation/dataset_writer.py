@@ -240,7 +240,8 @@ class DatasetWriter:
     def unfinished_shards(self, requested: range | None = None) -> list[int]:
         """Return the unfinished or growing shards among the requested ones; by default of all.
 
-        The cost depends on the number of requested shards alone.
+        A resumed run skips the finished ones. The cost depends on the number of requested
+        shards alone.
         """
         self._shards.publish_all()
         self.refresh_plan()

@@ -1,11 +1,12 @@
 """Light tracing inside a kernel: paths from the emitters that are joined to the camera.
 
 It finds what the path tracer meets by luck only: light that a glossy surface throws on another one
-(caustics). A path has vertices x1..xk, of which the camera sees x1 and xk is on an emitter. The
-path tracer *hits* xk in a direction that it draws or *picks* it from the table of emitters; a light
-path sets out from xk and *lands* on x1. Whichever of the three finds a path is weighed by its
-density among those of all three (power heuristic, exponent 2: Veach and Guibas 1995): all light is
-counted once, mostly by the strategy that finds it best. With
+(caustics, which would be fireflies; no sample is clamped). A path has vertices x1..xk, of which the
+camera sees x1 and xk is on an emitter. The path tracer *hits* xk in a direction that it draws or
+*picks* it from the table of emitters; a light path sets out from xk and *lands* on x1. Whichever of
+the three finds a path is weighed by its density among those of all three (power heuristic, exponent
+2: Veach and Guibas 1995): all light is counted once, mostly by the strategy that finds it best.
+With
 
     P      pixels per area at x1              L      light paths for each sample of a pixel
     a, e   densities with which a light path picks xk (per area) and leaves it (per steradian)

@@ -88,7 +88,7 @@ def with_cameras(scene: Scene, cameras: Sequence[ViewCamera]) -> Scene:
 
 
 def visibility_problem(facts: ViewFacts, settings: ViewLaws, *, has_objects: bool) -> str | None:
-    """Return why a view is rejected, or None."""
+    """Return why a view is rejected, or None; a camera inside an object is too near."""
     if facts.depth < settings.min_depth:
         return "too near"
     if has_objects and facts.coverage < settings.min_coverage:

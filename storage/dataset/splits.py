@@ -1,9 +1,9 @@
 """Splits of objects and scenes, each from its own identity alone.
 
-An object's split is a hash of its cleaned geometry: copies under other names stay together, and
-adding objects moves none. A scene's split is that of its shard, by the shard's number, so a longer
-dataset begins with exactly the scenes of a shorter one. Where the shards are listed, since they are
-those of another dataset, the list says both.
+An object's split is a hash of its cleaned geometry: copies under other names stay together, so no
+object leaks from one split into another, and adding objects moves none. A scene's split is that of
+its shard, by the shard's number, so a longer dataset begins with exactly the scenes of a shorter
+one. Where the shards are listed, since they are those of another dataset, the list says both.
 """
 
 import dataclasses

@@ -108,6 +108,7 @@ def set_digests(name: str, root: Path) -> dict[str, Any]:
     typed = ["generate", preset, "--objects", source, "--out", str(root), "--resolution", "32"]
     typed += ["--scenes", str(num_scenes), "--noise-floor", "20"]
     typed += ["--set", f"splits.scenes_per_shard={per_shard}"]
+    typed += ["--set", "assets.decimator=pymeshlab"]
     subprocess.run([sys.executable, "-m", "trilight", *typed], check=True, capture_output=True)
     dataset = open_dataset(str(root))
     tars = {path.name: sha256_hex(path.read_bytes()) for path in sorted(root.rglob("*.tar"))}

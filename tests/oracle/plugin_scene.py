@@ -179,48 +179,37 @@ def _emitter(scene: Scene, triangles: NDArray[np.intp], side: int, *, on: bool) 
     properties["emitter"] = mi.load_dict(
         {"type": "area", "radiance": colour, "sampling_weight": power}
     )
-    mesh = mi.Mesh(
-        f"emitter{side}",
-        3 * len(triangles),
-        len(triangles),
-        props=properties,
-        has_vertex_texcoords=scene.uv is not None,
-    )
     twin = corners[:, ::side] + side * _TWIN_OFFSET * normal[:, None]
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = twin.astype(np.float32).ravel()
-    parameters["faces"] = np.arange(3 * len(triangles), dtype=np.uint32)
+    vertices = {"positions": twin.reshape(-1, 3)}
     if scene.uv is not None:
-        parameters["vertex_texcoords"] = scene.uv.reshape(-1, 3, 2)[triangles, ::side].ravel()
-    parameters.update()
+        vertices["texcoords"] = scene.uv.reshape(-1, 3, 2)[triangles, ::side].reshape(-1, 2)
+    faces = np.arange(3 * len(triangles)).reshape(-1, 3)
+    mesh = _build_mesh(f"emitter{side}", faces, properties, **vertices)
     _add_material(mesh, scene, triangles)
     return mesh
 
 
 def _mesh(scene: Scene, triangles: NDArray[np.intp], material: Any) -> Any:
     """Return triangles as a mesh; corners have texture coordinates of their own, if any."""
-    faces = scene.faces[triangles].ravel()
-    vertices = np.arange(len(scene.vertex_positions), dtype=np.uint32)
+    faces = scene.faces[triangles]
+    vertices = {"positions": scene.vertex_positions, "normals": scene.vertex_normals}
     if scene.uv is not None:
-        vertices, faces = faces, np.arange(len(faces), dtype=np.uint32)
+        vertices = {name: rows[faces.ravel()] for name, rows in vertices.items()}
+        vertices["texcoords"] = scene.uv.reshape(-1, 3, 2)[triangles].reshape(-1, 2)
+        faces = np.arange(faces.size, dtype=np.uint32).reshape(-1, 3)
     properties = mi.Properties()
     properties["bsdf"] = material
-    mesh = mi.Mesh(
-        "surfaces",
-        len(vertices),
-        len(triangles),
-        props=properties,
-        has_vertex_normals=True,
-        has_vertex_texcoords=scene.uv is not None,
-    )
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = scene.vertex_positions[vertices].ravel()
-    parameters["vertex_normals"] = scene.vertex_normals[vertices].ravel()
-    parameters["faces"] = faces
-    if scene.uv is not None:
-        parameters["vertex_texcoords"] = scene.uv.reshape(-1, 3, 2)[triangles].ravel()
-    parameters.update()
-    return mesh
+    return _build_mesh("surfaces", faces, properties, **vertices)
+
+
+def _build_mesh(name: str, faces: NDArray[Any], properties: Any, **rows: NDArray[Any]) -> Any:
+    from pipeline.renders.kernel_scene import build_mesh  # its types are those of the variant
+
+    flat: dict[str, Any] = {
+        f"vertex_{field}": each.astype(np.float32).ravel() for field, each in rows.items()
+    }
+    flat["faces"] = faces.astype(np.uint32).ravel()
+    return build_mesh(name, (len(rows["positions"]), len(faces)), properties, **flat)
 
 
 def _two_sided(material: dict[str, Any]) -> Any:

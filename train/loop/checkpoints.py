@@ -1,5 +1,8 @@
 """Checkpoints of a run: one safetensors file each, with the whole mutable state.
 
+That is weights, averages and the optimizer's state dict; no rng_state, since all randomness follows
+from seed and step.
+
 A checkpoint appears by rename, so that a kill while saving leaves the previous one intact. It also
 holds the settings, the digest of the data and the decisions about them (train.resume), so that a
 resume with others is detected; and its own sha256, because safetensors does not detect a weight

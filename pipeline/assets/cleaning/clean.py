@@ -67,7 +67,10 @@ def canonical(faces: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def geometry_sha256(mesh: TriangleMesh) -> str:
-    """Return the digest of a clean mesh, whatever the order and winding of its faces."""
+    """Return the digest of a clean mesh, equal for near-duplicates.
+
+    Order and winding of its faces do not count, nor do positions below the grid of the digest.
+    """
     cells = np.rint(mesh.positions * GRID).astype(np.int64)
     coarse = _keys((cells + (1 << _DIGEST_SHIFT >> 1)) >> _DIGEST_SHIFT)
     corners = np.unique(np.sort(coarse[mesh.faces], axis=1), axis=0)

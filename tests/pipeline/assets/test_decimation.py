@@ -5,13 +5,12 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import pymeshlab
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.assets.decimation.by_name import decimate, safe_method
-from pipeline.assets.decimation.pymeshlab_filters import REQUIRED_FILTERS
+from pipeline.assets.decimation.pymeshlab_filters import REQUIRED_FILTERS, pymeshlab
 from pipeline.assets.decimation.smallest import smallest_passing
 from pipeline.assets.environment import missing_filters
 from pipeline.assets.quality.distance import Surface

@@ -21,6 +21,7 @@ from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.quality.distance import Surface
 from pipeline.assets.recipe import RECIPE, methods_of
 from pipeline.assets.settings import AssetSettings, GateSettings
+from pipeline.builds.named import named_build
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.generation.environment import vector_extension
 from pipeline.generation.prepare_isolated import prepare_isolated
@@ -332,6 +333,9 @@ def test_faithful_works_without_pymeshlab_and_uniform_says_what_to_do(shared: Pa
     assert re.search("profile uniform.*pymeshlab is not installed.*faithful", told["refusal"])
     assert told["recipe"] == "assets-3 libigl" != RECIPE
     assert methods_of("faithful")[0] == "pymeshlab_collapse"
+    assert methods_of("faithful", named_build("pretrain-256").assets.decimator) == tuple(
+        told["methods"]
+    )
 
 
 _REASONS = (

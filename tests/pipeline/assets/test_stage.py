@@ -223,7 +223,7 @@ def test_a_verdict_is_kept_as_plain_text(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     if action != "refuse":  # an unusable object is refused whatever other methods there are
-        monkeypatch.setattr(stage, "methods_of", lambda profile: (FIRST,))
+        monkeypatch.setattr(stage, "methods_of", lambda profile, decimator: (FIRST,))
     bench.set(**{FIRST: action})
     prepared, (failure,) = hurried(cpu_s=1).run("knot.obj")
     assert (prepared, failure.reason) == ([], reason)
