@@ -127,7 +127,7 @@ class HostPictures:
         corrected = pairs
         if error is not None and self._settings.denoiser != "off":
             corrected = keep_in_halves(pairs, error)
-        first, second = map(_half, corrected)
+        self._halves = first, second = _half(corrected[0]), _half(corrected[1])
         floors = [estimate_error(first, second, self.hits)]
         for part in range(len(names)):
             parts = [
