@@ -93,9 +93,7 @@ def known(metric: str, looks: Sequence[Look]) -> list[Look]:
     return [
         look
         for look in looks
-        if 0
-        < look.figures[f"{metric}_open"]
-        <= MOST_OPEN[look.px] * look.figures[f"{metric}_true"]
+        if 0 < look.figures[f"{metric}_open"] <= MOST_OPEN[look.px] * look.figures[f"{metric}_true"]
     ]
 
 

@@ -142,13 +142,15 @@ class HostPictures:
         statement = statement_for(self._settings, self._samples)
         if statement is None:
             floors = [estimate_error(first, second, self.hits)]
+            expected = None
         else:
             (picture,) = self.finish()
             measures = {
                 name: measure_errors(first, second, picture, curve, self.hits, objects=objects)
                 for name, curve, objects in _METRICS
             }
-            floors = [statement.state(measures, len(picture), self._samples.spp)]
+            floor, expected = statement.state(measures, len(picture), self._samples.spp)
+            floors = [floor]
         for part in range(len(names)):
             parts = [
                 _half((raw[part :: len(names)], rest[part :: len(names)]))
@@ -158,6 +160,7 @@ class HostPictures:
         return MeasuredLook(
             floor=floors[0],
             part_floors=dict(zip(names, floors[1:], strict=True)),
+            expected=expected,
             changes=self._changes.since([_half(pair) for pair in pairs]),
         )
 
