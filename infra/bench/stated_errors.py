@@ -246,39 +246,44 @@ def _tables(looks: Sequence[Look]) -> Iterator[str]:
         yield from _parts(metric, mine, judging)
 
 
+_GROUPINGS: dict[str, Callable[[Look], str]] = {
+    "source": lambda look: look.source,
+    "layout": lambda look: look.family.partition("-")[0],
+    "kind": lambda look: look.kind,
+}
+"""Groups of pictures whose records are printed apart, and that are left out in turn."""
+
+
 def _parts(metric: str, mine: Sequence[Look], judging: Sequence[Look]) -> Iterator[str]:
     """Yield the record of the six measures by kind of picture, and under shifts."""
+    head = ["64 px", "128 px", "256 px"]
+    name = "six measures"
     yield from ("", "Six measures, by kind of picture:", "")
-    yield _line("pictures", "64 px", "128 px", "256 px")
+    yield _line("pictures", *head)
     yield "|---|---|---|---|"
-    some, stated = _shifted(metric, "six measures", mine, judging)
-    kinds: list[tuple[str, Callable[[Look], str]]] = [
-        ("source", lambda look: look.source),
-        ("layout", lambda look: look.family),
-        ("kind", lambda look: look.kind),
-        ("samples", lambda look: f"{look.figures['spp']:.0f}"),
-    ]
-    for label, of in kinds:
-        for value in sorted({of(look) for look in some if label != "samples"}) or ():
-            at = [row for row, look in enumerate(some) if of(look) == value]
-            chosen = [some[row] for row in at]
-            yield _line(f"{label} {value}", *_cells(metric, chosen, stated[at]))
+    some, stated = _shifted(metric, name, mine, judging)
+    for label, group in _GROUPINGS.items():
+        for value in sorted({group(look) for look in some}):
+            at = [row for row, look in enumerate(some) if group(look) == value]
+            yield _line(f"{label} {value}", *_cells(metric, [some[row] for row in at], stated[at]))
     at = stops(metric, some, stated)
     yield _line("where sampling stops", *_cells(metric, [some[row] for row in at], stated[at]))
     yield from (
         "",
-        "Under a shift, six measures, fitted and calibrated without what they judge:",
+        "Fitted and calibrated without the pictures that are judged, under a shift:",
         "",
     )
-    yield _line("left out", "64 px", "128 px", "256 px")
+    yield _line("left out", *head)
     yield "|---|---|---|---|"
     both = [*mine, *judging]
-    for label, of in kinds[:3]:
-        for value in sorted({of(look) for look in both}):
-            rest = [look for look in mine if of(look) != value]
-            left = [look for look in both if of(look) == value]
-            chosen, stated = _shifted(metric, "six measures", rest, left)
-            yield _line(f"{label} {value}", *_cells(metric, chosen, stated))
+    for label, group in _GROUPINGS.items():
+        for value in sorted({group(look) for look in both}):
+            rest = [look for look in mine if group(look) != value]
+            if len({look.layout for look in rest}) >= _LEAST_LAYOUTS:
+                left, stated = _shifted(
+                    metric, name, rest, [look for look in both if group(look) == value]
+                )
+                yield _line(f"{label} {value}", *_cells(metric, left, stated))
 
 
 if __name__ == "__main__":
