@@ -101,7 +101,8 @@ def main(words: Sequence[str]) -> None:
         rows_sha256=sha256_hex(rows.read_bytes()),
         layouts=len(fitting),
         versions=versions_of_pictures(),
-        spp=(min(samples), max(samples)),
+        # a choice of tiles may exceed a look's samples a little
+        spp=(min(samples), 32 * math.ceil((max(samples) + 1) / 32)),
         widths=(min(widths), max(widths)),
         metrics={metric: fit_metric(metric, looks) for metric in METRICS},
     )

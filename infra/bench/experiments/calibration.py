@@ -35,8 +35,8 @@ LOOKS = {64: (64, 128, 256), 128: (32, 64, 128, 256), 256: (32, 64, 128, 256)}
 
 KINDS = ("plain", "textured", "plain", "sky", "plain")
 USES = ("fit", "judge", "calibrate", "judge")
-REFERENCE_SPP = 2048
-"""Samples per pixel of a reference, of 128 or 256 pixels."""
+_REFERENCE_TIMES = 4
+"""Samples of a reference over those of the scale, whatever its width."""
 _WIDE = (0, 3, 6, 9)
 _WIDE_PERIOD = 11
 """Of so many layouts, these have pictures of 256 pixels too."""
@@ -117,7 +117,8 @@ def _record(context: BenchContext, trial: str) -> dict[tuple[int, int], Figures]
     )
     scene = _scene(child, index, KINDS[index % len(KINDS)])
     widest = 256 if has_wide(index) else 128
-    reference = load_or_render_reference(child, scene, first_camera(scene, widest), REFERENCE_SPP)
+    reference_spp = _REFERENCE_TIMES * context.scale.reference_spp
+    reference = load_or_render_reference(child, scene, first_camera(scene, widest), reference_spp)
     figures = dict[tuple[int, int], Figures]()
     for px in (px for px in LOOKS if px <= widest):
         settings = unreachable(smoke().renders, px, max(LOOKS[px]))

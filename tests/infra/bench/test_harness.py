@@ -248,6 +248,27 @@ def test_the_table_has_every_point_and_the_plot_every_kind(tmp_path: Path) -> No
         assert {(31, 119, 180), (255, 127, 14)} <= set(picture.convert("RGB").get_flattened_data())
 
 
+def test_a_run_of_versions_resumes_on_other_machines_commits_and_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = dataclasses.replace(
+        experiment("a", "killed"),
+        versions=lambda options: {"denoiser": "1"},
+        figures=("core_s", "db"),
+    )
+    out = tmp_path / "made-up.jsonl"
+    with pytest.raises(KeyboardInterrupt):
+        run(one, TINY, BenchOptions(), out)
+    monkeypatch.setattr(running, "machine_record", lambda device: {"commit": "another"})
+    resumed = run(one, TINY, BenchOptions(data="there"), out)
+    assert resumed.whole_trials() == ["a", "killed"]
+    assert [trial for trial, _ in calls].count("a") == len(FIGURES)
+    assert resumed.trials["a"]["cheap"] == {"core_s": 1.0, "db": 30.0}
+    other = dataclasses.replace(one, versions=lambda options: {"denoiser": "2"})
+    assert run(other, TINY, BenchOptions(data="there"), out) is not resumed
+    assert len(Store(out).runs()) == 2
+
+
 def test_a_name_that_is_there_twice_and_what_is_missing_are_named(tmp_path: Path) -> None:
     one = experiment("a")
     twice = dataclasses.replace(one, points=lambda *given: [*one.points(*given)] * 2)

@@ -154,7 +154,7 @@ def test_rows_come_to_a_file_that_pictures_are_stated_by(
     assert len(read_looks(rows)) == len(looks)
     main([str(rows)])
     statement = load_statement(file)
-    assert statement is not None and statement.spp == (32, 256) and statement.widths == (64, 256)
+    assert statement is not None and statement.spp == (32, 288) and statement.widths == (64, 256)
     text = page.read_text()
     assert text.startswith("# Head\n") and "stale" not in text and text.count("| six measures") == 2
 

@@ -77,11 +77,15 @@ def test_the_device_measures_what_numpy_measures(
     ]
     half = len(measured) // 2
     assert half > 1
+    first = dataclasses.astuple(measured[0]["log"])
+    expected = 2.05e-6, 3.77e-7, 1.49e-6, 3.46e-7, 3.98e-8, 0.0467, 0.645
+    # other processors trace other samples; another picture is a new calibration
+    np.testing.assert_allclose(first, expected, rtol=0.3, err_msg="raise calibrated_error._CODE")
     for numpys, ours in zip(measured[:half], measured[half:], strict=True):
         for metric in METRICS:
-            expected, found = (dataclasses.astuple(each[metric]) for each in (numpys, ours))
-            assert min(expected[:4]) > 0
-            np.testing.assert_allclose(found, expected, rtol=1e-3, err_msg=metric)
+            oracle, found = (dataclasses.astuple(each[metric]) for each in (numpys, ours))
+            assert min(oracle[:4]) > 0
+            np.testing.assert_allclose(found, oracle, rtol=1e-3, err_msg=metric)
     for one in views:
         assert one.expected_error is not None
         apart = one.expected_error.log_db - one.noise_floor_db
