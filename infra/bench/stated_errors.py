@@ -21,7 +21,6 @@ from infra.bench.store import Store
 from infra.bench.workloads.fitted_statement import (
     ALLOWED,
     GROUPS,
-    Judged,
     Look,
     Values,
     apply_weights,
@@ -194,18 +193,21 @@ def _calibrate(
     return list(judging), stated
 
 
-def _cells(metric: str, looks: Sequence[Look], stated: Values) -> Iterator[str]:
+def _cells(
+    metric: str, looks: Sequence[Look], stated: Values, *, intervals: bool = True
+) -> Iterator[str]:
     for px in (64, 128, 256):
         at = [row for row, look in enumerate(looks) if look.px == px]
-        yield _cell(judge(metric, [looks[row] for row in at], stated[at])) if at else "n/a"
-
-
-def _cell(judged: Judged) -> str:
-    low, high = judged.interval
-    return (
-        f"{100 * judged.over_1:.1f} ({100 * low:.1f} to {100 * high:.1f}); "
-        f"{100 * judged.over_3:.1f}; {judged.caution_db:.1f}"
-    )
+        if not at:
+            yield "n/a"
+            continue
+        judged = judge(metric, [looks[row] for row in at], stated[at])
+        low, high = judged.interval
+        interval = f" ({100 * low:.1f} to {100 * high:.1f})" if intervals else ""
+        yield (
+            f"{100 * judged.over_1:.1f}{interval}; {100 * judged.over_3:.1f}; "
+            f"{judged.caution_db:.1f}"
+        )
 
 
 def _line(*cells: str) -> str:
@@ -268,9 +270,15 @@ def _parts(metric: str, mine: Sequence[Look], judging: Sequence[Look]) -> Iterat
     for label, group in _GROUPINGS.items():
         for value in sorted({group(look) for look in some}):
             at = [row for row, look in enumerate(some) if group(look) == value]
-            yield _line(f"{label} {value}", *_cells(metric, [some[row] for row in at], stated[at]))
+            yield _line(
+                f"{label} {value}",
+                *_cells(metric, [some[row] for row in at], stated[at], intervals=False),
+            )
     at = stops(metric, some, stated)
-    yield _line("where sampling stops", *_cells(metric, [some[row] for row in at], stated[at]))
+    yield _line(
+        "where sampling stops",
+        *_cells(metric, [some[row] for row in at], stated[at], intervals=False),
+    )
     yield from (
         "",
         "Fitted and calibrated without the pictures that are judged, under a shift:",
@@ -286,7 +294,9 @@ def _parts(metric: str, mine: Sequence[Look], judging: Sequence[Look]) -> Iterat
                 rest_judged, stated = _calibrate(
                     metric, name, rest, [look for look in both if group(look) == value]
                 )
-                yield _line(f"{label} {value}", *_cells(metric, rest_judged, stated))
+                yield _line(
+                    f"{label} {value}", *_cells(metric, rest_judged, stated, intervals=False)
+                )
 
 
 if __name__ == "__main__":
