@@ -58,8 +58,9 @@ def render(
         threads: CPU threads; all cores by default.
 
     Returns:
-        `radiance_rgb` [R, R, 3] float32 linear radiance, its three floors, `spp` and more; with a
-        split also `parts_rgb` and `part_floors` by name.
+        `radiance_rgb` [R, R, 3] float32 linear radiance, its three floors, `spp` and more;
+        `expected_error` where the floors are calibrated; with a split also `parts_rgb` and
+        `part_floors` by name.
 
     Raises:
         TrilightError: an invalid number, or a scene that cannot be rendered.

@@ -82,6 +82,7 @@ BUILD_V1 = BuildSettings(
         split=False,
         split_lobes=False,
         arithmetic="numpy",
+        stated_error="bound",
     ),
     splits=SplitSettings(
         scenes_per_shard=256,

@@ -211,6 +211,7 @@ def _accepted_view(
         at_cap=rendered.at_cap,
         seed=seed,
         camera_attempt=camera.attempt,
+        expected=None if rendered.expected_error is None else _part_floor(rendered.expected_error),
         parts={name: _part_floor(each) for name, each in (rendered.part_floors or {}).items()}
         or None,
         lights=tuple(map(_part_floor, rendered.light_floors or ())) or None,

@@ -152,6 +152,7 @@ class SceneRenderer:
             hits=pictures.hits,
             part_floors=look.part_floors or None,
             light_floors=look.light_floors or None,
+            expected_error=look.expected,
             **stored,
         )
 

@@ -52,6 +52,9 @@ _METRICS = {
 }
 """The metric of each target (storage.metrics)."""
 
+StatedError = Literal["bound", "calibrated"]
+"""How errors are stated."""
+
 Arithmetic = Literal["numpy", "device"]
 """Where the pictures of a view are worked out."""
 
@@ -61,6 +64,7 @@ _LATER = {
     "split": False,
     "split_lobes": False,
     "arithmetic": "numpy",
+    "stated_error": "bound",
 }
 """Settings that no record holds at these values, so that digests of earlier builds stay."""
 
@@ -122,6 +126,9 @@ class RenderSettings:
     arithmetic: Arithmetic = "numpy"
     """Where means, corrections and stated errors are worked out: `device` keeps pictures where they
     are traced; `numpy` keeps the bytes of sets from before there was a choice."""
+    stated_error: StatedError = "bound"
+    """How errors are stated: `calibrated` by six measures and their record on other scenes
+    (pipeline.renders.calibrated_error), within its range; `bound` by estimate and allowances."""
 
     def __post_init__(self) -> None:
         _require(

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from infra.bench.experiments import methods
+from infra.bench.experiments.calibration import LOOKS
 from infra.bench.experiments.cycles import agreement_figures
 from infra.bench.experiments.frontier import cost_at_error
 from infra.bench.experiments.loader import read_figures
@@ -75,6 +76,13 @@ def test_every_kind_of_scene_agrees(tmp_path: Path) -> None:
     )
     for row in found.values():
         assert row.values["means of 8 x 8, dB"] > 25, "64 samples each; another scene has below 20"
+
+
+@pytest.mark.slow("benchmarks")
+def test_every_look_of_a_layout_is_a_row(tmp_path: Path) -> None:
+    found = measured_rows("calibration", tmp_path)
+    assert list(found) == [f"{px} px, {spp} samples" for px, spps in LOOKS.items() for spp in spps]
+    assert all(row.values["true, median millionths"] > 0 for row in found.values())
 
 
 LEVELS = [(float(1 << k), 2.0**k, 30 + 3.0 * k) for k in range(5)]
