@@ -78,6 +78,8 @@ BUILD_V1 = BuildSettings(
         per_light=False,
         split=False,
         split_lobes=False,
+        min_spp_px=128,
+        light_paths="view",
         arithmetic="numpy",
     ),
     splits=SplitSettings(

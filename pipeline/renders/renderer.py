@@ -54,7 +54,12 @@ class SceneRenderer:
     """A scene loaded once, for any number of views of it."""
 
     def __init__(
-        self, scene: Scene, settings: RenderSettings, *, shows_looks: bool = False
+        self,
+        scene: Scene,
+        settings: RenderSettings,
+        *,
+        shows_looks: bool = False,
+        light_seed: int | None = None,
     ) -> None:
         """Load a scene that passes `Scene.check`; `activate` must have been called.
 
@@ -63,6 +68,8 @@ class SceneRenderer:
             settings: how well.
             shows_looks: whether `view_steps` yields a `GrowingPicture` after each measurement by
                 which a target is missed; pictures stay the same, each look costs one denoise.
+            light_seed: of the light paths of all views, where the settings let them share these;
+                None: each view has its own.
 
         Raises:
             Rejected: "unlit_scene" where no emitter has an area (with `per_light`: where one has
@@ -90,6 +97,10 @@ class SceneRenderer:
         if settings.per_light:
             most = MAX_PICTURES // max(1, len(settings.part_names))
             self._tracers = _tracers_of_lights(self._tracer, scene, most)
+        self._light_seed = light_seed if settings.light_paths == "scene" else None
+        if self._light_seed is not None:
+            cameras = [self._camera(*view) for view in zip(scene.c2w, scene.fov_deg, strict=True)]
+            self._tracers = [tracer.for_views(cameras) for tracer in self._tracers]
 
     @property
     def tracer(self) -> Tracer:
@@ -118,11 +129,15 @@ class SceneRenderer:
         """Do what `render_view` does: yield after each pass of one half, and last the picture."""
         settings = self._settings
         self._began_s = time.process_time()
-        pose = np.asarray(c2w, np.float64)
-        camera = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
+        camera = self._camera(c2w, fov_deg)
         settled = settings.first_spp
         samples = DualBuffer(
-            self._tracers, camera, seed, first_spp=settled, max_spp=settings.max_spp
+            self._tracers,
+            camera,
+            seed,
+            first_spp=settled,
+            max_spp=settings.max_spp,
+            light_seed=self._light_seed,
         )
         first_pass_of_both = 2 * samples.pass_spp
         for _ in samples.passes_to(first_pass_of_both):
@@ -148,6 +163,10 @@ class SceneRenderer:
             part_floors=look.part_floors or None,
             **stored,
         )
+
+    def _camera(self, c2w: ArrayLike, fov_deg: float) -> PixelCamera:
+        pose = np.asarray(c2w, np.float64)
+        return PixelCamera(c2w=pose, fov_deg=float(fov_deg), resolution=self._settings.resolution)
 
     def _to_stored(self, pictures: NDArray[np.float32]) -> dict[str, Any]:
         """Return the pictures of a view by their fields: the sum of what is apart, as stored."""
