@@ -50,6 +50,7 @@ class ToStatedError:
             split=self.split,
             split_lobes=self.split_lobes,
             arithmetic="device",
+            stated_error="calibrated",
         )
 
 

@@ -81,6 +81,8 @@ BUILD_V1 = BuildSettings(
         min_spp_px=128,
         light_paths="view",
         arithmetic="numpy",
+        stated_error="bound",
+        picture_within_db=None,
     ),
     splits=SplitSettings(
         scenes_per_shard=256,

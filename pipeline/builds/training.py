@@ -49,6 +49,8 @@ def smoke() -> BuildSettings:
             max_spp=256,
             light_paths="scene",
             arithmetic="device",
+            stated_error="calibrated",
+            picture_within_db=2.0,
         ),
         splits=SplitSettings(scenes_per_shard=4),
     )

@@ -157,10 +157,11 @@ class SceneRenderer:
             noise_floor_db=floor.log_db,
             noise_floor_linear_db=floor.linear_db,
             object_noise_floor_db=floor.object_log_db,
-            at_cap=bool(gaps_db(settings.targets_db, _by_metric(floor))),
+            at_cap=bool(gaps_db(settings.targets_db, floor.by_metric)),
             core_s=time.process_time() - self._began_s,
             hits=pictures.hits,
             part_floors=look.part_floors or None,
+            expected_floor=floor.expected,
             **stored,
         )
 
@@ -192,7 +193,7 @@ class SceneRenderer:
 
     def _refuse_noisy(self, floor: MeasuredFloor) -> None:
         targets_db = self._settings.targets_db
-        floors_db = _by_metric(floor)
+        floors_db = floor.by_metric
         missed = [
             f"{metric} is {floors_db[metric]:.1f} dB; expected {targets_db[metric]:g}"
             for metric in gaps_db(targets_db, floors_db)
@@ -212,8 +213,8 @@ class SceneRenderer:
             quality = self._filter_of_halves(samples.spp)
             look = pictures.look(quality)
             tiles.learn(look.changes, samples, quality)
-            measured.append((samples.spp, _by_metric(look.floor)))
-            gaps = gaps_db(targets_db, _by_metric(look.floor))
+            measured.append((samples.spp, look.floor.by_metric))
+            gaps = gaps_db(targets_db, look.floor.by_metric)
             if not gaps or samples.spp >= max_spp:
                 return look
             goal = Goal(targets_db=targets_db, step=2 * samples.pass_spp, max_spp=max_spp)
@@ -253,14 +254,6 @@ class SceneRenderer:
     def _filter_of_halves(self, spp: int) -> Filtered:
         quality = self._settings.denoiser
         return "fast" if quality == "high" and spp <= _FAST_HALVES_SPP else quality
-
-
-def _by_metric(floor: MeasuredFloor) -> Floors:
-    return {
-        "psnr_log_db": floor.log_db,
-        "psnr_linear_db": floor.linear_db,
-        "object_psnr_log_db": floor.object_log_db,
-    }
 
 
 def _tracers_of_lights(tracer: Tracer, scene: Scene, most: int) -> list[Tracer]:

@@ -45,6 +45,8 @@ class DualBuffer:
         self._most = max_spp // 2
         self.sums = [[tracer.pass_sum(camera) for tracer in tracers] for _ in range(2)]
         """Of each half, and in it of each tracer."""
+        self.is_guided = False
+        """True once a pass may be guided."""
         self._spp, self._count = np.zeros((2, 2, camera.resolution, camera.resolution), np.int64)
         self._passes = 0
         self.count_over(np.ones(self._spp.shape[1:], bool))
@@ -118,6 +120,7 @@ class DualBuffer:
 
     def guide(self) -> None:
         """Let the passes from now on be guided (pipeline.renders.guide_table)."""
+        self.is_guided = True
         for tracers in self.sums:
             for tracer in tracers:
                 tracer.guide()

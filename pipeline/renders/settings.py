@@ -52,6 +52,9 @@ _METRICS = {
 LightPaths = Literal["view", "scene"]
 """Whose light paths a view has: its own, or those of all views of its scene."""
 
+StatedError = Literal["bound", "calibrated"]
+"""How errors are stated."""
+
 Arithmetic = Literal["numpy", "device"]
 """Where the pictures of a view are worked out."""
 
@@ -63,6 +66,8 @@ _LATER = {
     "arithmetic": "numpy",
     "min_spp_px": 128,
     "light_paths": "view",
+    "stated_error": "bound",
+    "picture_within_db": None,
 }
 """Settings that no record holds at these values, so that digests of earlier builds stay."""
 
@@ -130,6 +135,12 @@ class RenderSettings:
     arithmetic: Arithmetic = "numpy"
     """Where means, corrections and stated errors are worked out: `device` keeps pictures where they
     are traced; `numpy` keeps the bytes of sets from before there was a choice."""
+    stated_error: StatedError = "bound"
+    """How errors are stated: `calibrated` by six measures and their record on other scenes
+    (pipeline.renders.calibrated_error), within its range; `bound` by estimate and allowances."""
+    picture_within_db: Annotated[float, Within(0, MAX_DB, unit="dB")] | None = None
+    """Of `calibrated` errors: where the bound by the halves misses a target by more than this,
+    sampling goes on by it, without the picture itself; None takes a picture each time."""
 
     def __post_init__(self) -> None:
         _require(

@@ -38,7 +38,7 @@ from train.evaluation.cost_tables import COST_NOISE, on_front
 
 TINY = dataclasses.replace(
     QUICK, scenes=1, resolution=32, max_spp=128, reference_spp=128, picture_px=64, objects=1,
-    repeats=1, steps=2, held_out=2, growth=1,
+    repeats=1, steps=2, held_out=2, growth=1, layouts=1,
 )  # fmt: skip
 
 calls: list[tuple[str, str]] = []
@@ -113,7 +113,7 @@ def measured(folder: Path, *trials: str, data: str | None = None, warm_up: bool 
 def test_every_declaration_is_whole() -> None:
     found = every_experiment()
     assert sorted(found) == [
-        "cycles", "frontier", "gpu", "growth", "loader", "meshes", "methods", "paired-training"
+        "calibration", "cycles", "frontier", "gpu", "growth", "loader", "meshes", "methods", "paired-training"
     ]  # fmt: skip
     for name, one in found.items():
         with case(name):
