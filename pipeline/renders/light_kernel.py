@@ -106,10 +106,10 @@ def trace_light(
         landing = visible & (depth > 1) & (depth < scene.max_depth)
         mis_ratio = dr.minimum(dr.hypot(hit_mis_ratio, pick_mis_ratio), MAX_MIS_RATIO) / light_paths
         light = throughput * strength
-        for number in range(len(films)):
-            place = films[number], light_paths, vertex, mis_ratio, landing
+        for film, of_film in zip(films, splats, strict=True):
+            place = film, light_paths, vertex, mis_ratio, mi.Bool(landing)
             value, share, pixel, lands = _connect_to_camera(scene, parts, *place)
-            _add(splats[number], parts.by_lobe(light * value, share), pixel, lands)
+            _add(of_film, parts.by_lobe(light * value, share), pixel, lands)
         depth += 1
         active &= depth < scene.max_depth
         u_lobe = sampler.next_1d(active)
