@@ -1,11 +1,12 @@
 """`LandedLight`: what light paths throw on the pictures of a scene, traced once for all its views.
 
-A path costs four times as much to trace as to join to a camera. So views whose light paths have the
-same seed are joined to them together, as long as they wait for it. What a view gets does not depend
-on that: each picture has its own sums of whole numbers (pipeline.renders.film).
+A path takes more than twice as long to trace as to join to a camera. So views whose light paths
+have the same seed are joined to them together: those that wait get pictures that they may not need.
+What a view gets does not depend on that, to the last bit: each picture has its own sums of whole
+numbers (pipeline.renders.film).
 
-Errors of the views of a scene are then correlated. Those of one view are what they were: its light
-paths are as many, and as independent of its camera paths, of its passes and between its halves.
+Errors of the views of a scene are then correlated. Those of each view are what they were: it has as
+many light paths, its halves share none, and what it asks for does not depend on other views.
 """
 
 from collections.abc import Callable, Hashable, Sequence
