@@ -92,9 +92,7 @@ def run(
     return current
 
 
-def _conditions(
-    experiment: Experiment, scale: BenchScale, options: BenchOptions
-) -> dict[str, Any]:
+def _conditions(experiment: Experiment, scale: BenchScale, options: BenchOptions) -> dict[str, Any]:
     """Return the part of a plan that says under which conditions figures are measured."""
     if experiment.versions is not None:
         versions = dict(experiment.versions(options))

@@ -88,7 +88,7 @@ class Store:
         return Run(plan=plain, date=today)
 
     def add(self, run: Run, trial: str, point: str, figures: Figures) -> None:
-        """Write the figures of one point in one trial; their values alone if the plan names them."""
+        """Write the figures of one point in one trial; values alone if the plan names them."""
         names = run.plan.get("figures")
         kept = dict(figures) if names is None else [figures[name] for name in names if figures]
         self._write(run, {"trial": trial, "point": point, "figures": kept})

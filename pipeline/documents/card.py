@@ -12,6 +12,7 @@ from markupsafe import Markup
 from pipeline.documents.distributions import MEASURED, Distributions
 from pipeline.documents.pages import render_markdown
 from pipeline.documents.rights import Rights, hub_licence, licence_facts
+from pipeline.renders.calibrated_error import promise_sentence
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest
@@ -61,6 +62,7 @@ def encode_card(
         found=distributions,
         resolution=_setting(manifest.settings, "renders.resolution"),
         splits=_by_split(manifest, distributions),
+        promise=_promise(manifest, distributions),
         layouts=layouts,
         triangles=summary(distributions.all("triangles_per_scene")),
         maps=_maps(distributions),
@@ -119,7 +121,8 @@ def _by_split(manifest: Manifest, distributions: Distributions) -> list[Sequence
                 sum(shard.num_samples for shard in shards),
                 num_views,
                 len(shards),
-                *(_three(floors, name) if num_views else "" for name in ("median", "p5")),
+                _three(floors, "median") + _probably(distributions, split) if num_views else "",
+                _three(floors, "p5") if num_views else "",
                 f"{reached.mean():.0%}" if reached is not None and num_views else "",
                 f"{distributions.views_at_cap.get(split, 0) / max(num_views, 1):.0%}",
             )
@@ -130,6 +133,19 @@ def _by_split(manifest: Manifest, distributions: Distributions) -> list[Sequence
 def _three(floors: Mapping[str, Mapping[str, float]], statistic: str) -> str:
     log, linear, objects = (numbers[statistic] for numbers in floors.values())
     return f"{log:.1f} ({linear:.1f}, {objects:.1f})"
+
+
+def _promise(manifest: Manifest, distributions: Distributions) -> str:
+    """Return what calibrated errors promise; empty where no view states one."""
+    if not summary(distributions.all("expected_error_db"))["count"]:
+        return ""
+    return promise_sentence(int(_setting(manifest.settings, "renders.resolution")))
+
+
+def _probably(distributions: Distributions, split: str) -> str:
+    """Return the median of the expected errors of a split behind a comma; empty without one."""
+    expected = summary(distributions.values[split]["expected_error_db"])
+    return f", probably {expected['median']:.1f}" if expected["count"] else ""
 
 
 def _maps(distributions: Distributions) -> list[tuple[str, str]]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.builds.settings import BuildSettings
+from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.scenes.views import ViewCamera, cameras_of, cameras_of_view, with_cameras
@@ -213,6 +214,7 @@ def _accepted_view(
         at_cap=rendered.at_cap,
         seed=seed,
         camera_attempt=camera.attempt,
+        expected=None if rendered.expected_error is None else _rounded(rendered.expected_error),
         parts=_part_floors(rendered),
     )
     return _AcceptedView(
@@ -227,14 +229,15 @@ def _accepted_view(
 def _part_floors(rendered: RenderedView) -> dict[str, PartFloor] | None:
     if rendered.part_floors is None:
         return None
-    return {
-        name: PartFloor(
-            noise_floor_db=round(floor.log_db, 3),
-            noise_floor_linear_db=round(floor.linear_db, 3),
-            object_noise_floor_db=round(floor.object_log_db, 3),
-        )
-        for name, floor in rendered.part_floors.items()
-    }
+    return {name: _rounded(floor) for name, floor in rendered.part_floors.items()}
+
+
+def _rounded(floor: MeasuredFloor) -> PartFloor:
+    return PartFloor(
+        noise_floor_db=round(floor.log_db, 3),
+        noise_floor_linear_db=round(floor.linear_db, 3),
+        object_noise_floor_db=round(floor.object_log_db, 3),
+    )
 
 
 def _stack_parts(views: Sequence[Parts]) -> dict[str, NDArray[np.float32]]:

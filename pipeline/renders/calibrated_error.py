@@ -111,8 +111,8 @@ class CalibratedStatement:
 
     def state(
         self, measures: Mapping[str, ErrorMeasures], resolution: int, spp: int
-    ) -> MeasuredFloor:
-        """Return bounds and expected errors of a picture.
+    ) -> tuple[MeasuredFloor, MeasuredFloor]:
+        """Return what a picture's errors are calibrated to keep, and what they are expected to be.
 
         Args:
             measures: of the picture by metric.
@@ -129,7 +129,31 @@ class CalibratedStatement:
             for result, shifts in ((bound, metric.bound), (expected, metric.expected)):
                 shift_db = 0.0 if is_empty else shifts[group]
                 result[_FIELDS[name]] = min(MAX_DB, center_db + shift_db)
-        return MeasuredFloor(**bound, expected=MeasuredFloor(**expected))
+        return MeasuredFloor(**bound), MeasuredFloor(**expected)
+
+
+OUTSIDE = "other samples, widths, filters, layers or versions than measured, or guided paths"
+"""Reasons for the bound of noise_floor, for people."""
+
+
+def promise_sentence(resolution: int, metric: str = "log") -> str:
+    """Return what a stated error promises at a width, as measured on other scenes; in a sentence.
+
+    The width is the next one below that was judged, or the smallest.
+    """
+    statement = load_statement()
+    if statement is None:
+        return f"The stated error is a bound ({OUTSIDE})."
+    judged = statement.metrics[metric].judged
+    widths = sorted(map(int, judged))
+    width = max((px for px in widths if px <= resolution), default=widths[0])
+    found = judged[str(width)]
+    good = 100 - 100 * found.over_1
+    return (
+        f"Of a hundred pictures of scenes like those that calibrated it, {good:.0f} are at most "
+        f"1 dB worse, and half are {found.caution_db:.1f} dB better ({found.pictures} pictures of "
+        f"{found.layouts} layouts at {width} px)."
+    )
 
 
 def terms_of(found: ErrorMeasures, resolution: int, spp: float) -> dict[str, float]:

@@ -142,12 +142,15 @@ class DevicePictures:
         if statement is None:
             errors, surprises = rows[3:-1].reshape(2, -1, 3, across**2)
             floors = [self._floor(*each) for each in zip(errors, surprises, strict=True)]
+            expected = None
         else:
             measures = self._measures(totals.reshape(3, -1), rows[3:-1])
-            floors = [statement.state(measures, self._resolution, self._samples.spp)]
+            floor, expected = statement.state(measures, self._resolution, self._samples.spp)
+            floors = [floor]
         look = MeasuredLook(
             floor=floors[0],
             part_floors=dict(zip(self._names, floors[1:], strict=True)),
+            expected=expected,
             changes=list(rows[:2].reshape(2, across, across) / TILE),
         )
         return look, logs

@@ -69,9 +69,6 @@ class MeasuredFloor:
     """Stated error as psnr_linear_db, in dB: of radiance clamped to [0, 1]."""
     object_log_db: float
     """Stated error as object_psnr_log_db, in dB: over pixels that show geometry."""
-    expected: "MeasuredFloor | None" = None
-    """Errors that are as often better as worse, where those above are calibrated; None where they
-    are bounds."""
 
     @property
     def by_metric(self) -> dict[str, float]:

@@ -151,9 +151,7 @@ def error_measures(
     for first in range(0, len(flat), len(metrics[0])):
         rows = [dr.gather(mi.Float64, tiles, tile + (first + row) * across**2) for row in range(13)]
         left, probe, apart = rows[4:7], rows[7:10], rows[10:13]
-        sure = add_up(
-            [x * x + z * h - z * z for x, z, h in zip(left, probe, apart, strict=True)]
-        )
+        sure = add_up([x * x + z * h - z * z for x, z, h in zip(left, probe, apart, strict=True)])
         totals += [*rows[:4], sure / 3, add_up([dr.square(each) for each in apart]) / 12]
     rows_of_tiles = dr.block_sum(dr.block_sum(dr.concat(totals), across), across)
     return rows_of_tiles, [*surprises, dr.select(hit, surprises[0], 0)]

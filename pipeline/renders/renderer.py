@@ -161,7 +161,7 @@ class SceneRenderer:
             core_s=time.process_time() - self._began_s,
             hits=pictures.hits,
             part_floors=look.part_floors or None,
-            expected_floor=floor.expected,
+            expected_error=look.expected,
             **stored,
         )
 

@@ -186,6 +186,10 @@ def scene_values(record: SceneRecord) -> Mapping[str, Values]:
             )
             for name in names
         },
+        "expected_error_db": [
+            np.nan if view.expected is None else view.expected.noise_floor_db
+            for view in record.views
+        ],
     }
     return {name: np.asarray(entries, np.float32) for name, entries in values.items()}
 

@@ -44,7 +44,7 @@ MOST_OPEN = {64: 0.4, 128: 0.4, 256: 0.6}
 """Largest relative standard deviation of a true error that counts, by width in pixels."""
 
 _FOLDS = 8
-_RIDGE = 3.0
+_RIDGE = 10.0
 _GRID_DB = np.arange(4.0, -12.0, -0.05)
 
 
@@ -93,9 +93,7 @@ def known(metric: str, looks: Sequence[Look]) -> list[Look]:
     return [
         look
         for look in looks
-        if 0
-        < look.figures[f"{metric}_open"]
-        <= MOST_OPEN[look.px] * look.figures[f"{metric}_true"]
+        if 0 < look.figures[f"{metric}_open"] <= MOST_OPEN[look.px] * look.figures[f"{metric}_true"]
     ]
 
 
@@ -121,7 +119,8 @@ def fit_weights(
 ) -> tuple[float, dict[str, float]]:
     """Return intercept and weights by a ridge regression, weights of errors at least 0.
 
-    Rows weigh less the less their true error is known.
+    Few rows give the geometric mean of MEASURES. Rows weigh less the less their true error is
+    known.
     """
     rows = [terms(metric, look) for look in looks]
     names = list(rows[0])
@@ -133,8 +132,9 @@ def fit_weights(
     middle = float(np.average(target, weights=weight))
     root = np.sqrt(weight)[:, None]
     ridge = np.sqrt(_RIDGE) * np.eye(len(names))
+    equal = np.array([1 / len(MEASURES) if name in MEASURES else 0.0 for name in names])
     matrix = np.vstack([root * (design - center) / spread, ridge])
-    values = np.concatenate([root[:, 0] * (target - middle), np.zeros(len(names))])
+    values = np.concatenate([root[:, 0] * (target - middle), ridge @ (equal * spread)])
     free = ("hits", "samples", "width")
     least = [-np.inf if name in free else 0.0 for name in names]
     found = lsq_linear(matrix, values, bounds=(least, np.inf)).x / spread

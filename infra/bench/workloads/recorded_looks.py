@@ -184,7 +184,9 @@ def _other_figures(
     yield "raw", float(0.25 * np.square(curve(raw_a) - curve(raw_b)).mean())
     raw, denoised = 0.5 * (raw_a + raw_b), 0.5 * (den_a + den_b)
     slope = secant_slope(curve, denoised, raw)
-    of_halves = [slope * each for each in (den_a - raw_b, den_b - raw_a, raw_a - raw_b, den_a - den_b)]
+    of_halves = [
+        slope * each for each in (den_a - raw_b, den_b - raw_a, raw_a - raw_b, den_a - den_b)
+    ]
     for size in (2, 8):
         first, second, noise, apart = (_means_of_blocks(each, size) for each in of_halves)
         error = (first**2 + second**2 - noise**2) / 2 - apart**2 / 4

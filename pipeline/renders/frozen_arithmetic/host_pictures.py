@@ -141,13 +141,15 @@ class HostPictures:
         self._picture = None
         statement = statement_for(self._settings, self._samples)
         floors = [estimate_error(first, second, self.hits)]
+        expected = None
         if statement and not is_far(floors[0], self._settings, self._samples.spp):
             (picture,) = self.finish()
             measures = {
                 name: measure_errors(first, second, picture, curve, self.hits, objects=objects)
                 for name, curve, objects in _METRICS
             }
-            floors = [statement.state(measures, len(picture), self._samples.spp)]
+            floor, expected = statement.state(measures, len(picture), self._samples.spp)
+            floors = [floor]
         for part in range(len(names)):
             parts = [
                 _half((raw[part :: len(names)], rest[part :: len(names)]))
@@ -157,6 +159,7 @@ class HostPictures:
         return MeasuredLook(
             floor=floors[0],
             part_floors=dict(zip(names, floors[1:], strict=True)),
+            expected=expected,
             changes=self._changes.since([_half(pair) for pair in pairs]),
         )
 

@@ -113,7 +113,8 @@ def measured(folder: Path, *trials: str, data: str | None = None, warm_up: bool 
 def test_every_declaration_is_whole() -> None:
     found = every_experiment()
     assert sorted(found) == [
-        "calibration", "cycles", "frontier", "gpu", "growth", "loader", "meshes", "methods", "paired-training"
+        "calibration", "cycles", "frontier", "gpu", "growth", "loader", "meshes", "methods",
+        "paired-training",
     ]  # fmt: skip
     for name, one in found.items():
         with case(name):

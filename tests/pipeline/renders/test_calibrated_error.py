@@ -1,8 +1,9 @@
-"""The statement by six measures: on the device as in numpy, and the bound where it does not hold."""
+"""Statement by six measures: on the device as in numpy, and the bound where it is not known."""
 
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,8 +83,8 @@ def test_the_device_measures_what_numpy_measures(
             assert min(expected[:4]) > 0
             np.testing.assert_allclose(found, expected, rtol=1e-3, err_msg=metric)
     for one in views:
-        assert one.expected_floor is not None
-        apart = one.expected_floor.log_db - one.noise_floor_db
+        assert one.expected_error is not None
+        apart = one.expected_error.log_db - one.noise_floor_db
         assert apart == pytest.approx(3.5), "the shifts of narrow pictures"
 
 
@@ -101,12 +102,12 @@ def test_the_device_measures_what_numpy_measures(
 )
 @pytest.mark.usefixtures("llvm")
 def test_what_was_not_calibrated_has_the_bound(
-    measured: list[dict[str, ErrorMeasures]], changes: dict[str, object]
+    measured: list[dict[str, ErrorMeasures]], changes: dict[str, Any]
 ) -> None:
     settings = dataclasses.replace(SETTINGS, **changes)
     bound = dataclasses.replace(settings, stated_error="bound")
     found, before = (render_view(lit_scene(), each, 3) for each in (settings, bound))
-    assert found.expected_floor is None and not measured
+    assert found.expected_error is None and not measured
     assert found.noise_floor_db == before.noise_floor_db
 
 
@@ -145,8 +146,11 @@ def test_the_unbiased_measures_are_the_true_errors() -> None:
         return truth + bias + 0.5 * (raw - truth)
 
     raws = [truth + rng.normal(0, 0.05, truth.shape) for _ in range(2)]
-    a, b = (Half(raw_rgb=raw, denoised_rgb=denoise(raw)) for raw in raws)
-    picture = denoise((raws[0] + raws[1]) / 2)
+    a, b = (
+        Half(raw_rgb=raw.astype(np.float32), denoised_rgb=denoise(raw).astype(np.float32))
+        for raw in raws
+    )
+    picture = denoise((raws[0] + raws[1]) / 2).astype(np.float32)
     found = measure_errors(a, b, picture, clamped_radiance, np.ones((px, px), bool))
     noise = 0.25 * 0.05**2 / 2
     assert found.agreement == pytest.approx(noise, rel=0.02)
