@@ -86,13 +86,9 @@ def test_light_paths_are_those_of_other_views_and_of_no_other_half_or_pass(
 
     def sampled(seed: int, light_seed: int | None) -> list[tuple[int, int | None]]:
         asked.clear()
+        tracers: Any = [Recorder()]
         buffer = DualBuffer(
-            [Recorder()],
-            CAMERA,
-            seed,
-            first_spp=32,
-            max_spp=4096,
-            light_seed=light_seed,  # type: ignore[list-item]
+            tracers, CAMERA, seed, first_spp=32, max_spp=4096, light_seed=light_seed
         )
         for _ in (*buffer.passes_to(128), *buffer.passes_over([np.full((PX, PX), 2)] * 2)):
             pass
