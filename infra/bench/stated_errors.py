@@ -24,15 +24,15 @@ from infra.bench.workloads.fitted_statement import (
     Judged,
     Look,
     Values,
+    apply_weights,
     cross_fitted,
+    filter_known,
     fit_metric,
     fit_weights,
     judge,
-    known,
     largest_shift,
     six_terms,
     stops,
-    weighted,
 )
 from pipeline.renders.calibrated_error import (
     FILE,
@@ -119,7 +119,7 @@ def _db(figure: str, metric: str, look: Look, least: float = 0.0) -> float:
     return -10 * math.log10(max(error, LEAST_ERROR))
 
 
-def _floored(figure: str) -> Callable[[str, Look], float]:
+def _unbiased_db(figure: str) -> Callable[[str, Look], float]:
     """Return a statement of an unbiased figure: at least a quarter of the agreement."""
     return lambda metric, look: _db(figure, metric, look, look.figures[f"{metric}_agreement"] / 4)
 
@@ -127,10 +127,12 @@ def _floored(figure: str) -> Callable[[str, Look], float]:
 def _bernstein(metric: str, look: Look) -> float:
     """Return Maurer and Pontil's bound (2009) over the blocks of the estimate, at 95 %."""
     blocks = (look.px // 8) ** 2
-    found = {name: look.figures[f"{metric}_{name}"] for name in ("estimate", "se", "least", "most")}
+    values = {
+        name: look.figures[f"{metric}_{name}"] for name in ("estimate", "se", "least", "most")
+    }
     sure = math.log(2 / _BERNSTEIN)
-    bound = max(found["estimate"], 0.0) + found["se"] * math.sqrt(2 * sure)
-    bound += 7 * (found["most"] - found["least"]) * sure / (3 * (blocks - 1))
+    bound = max(values["estimate"], 0.0) + values["se"] * math.sqrt(2 * sure)
+    bound += 7 * (values["most"] - values["least"]) * sure / (3 * (blocks - 1))
     return -10 * math.log10(max(bound * 1e-6, LEAST_ERROR))
 
 
@@ -140,8 +142,8 @@ def _relative(metric: str, look: Look) -> float:
 
 ESTIMATORS: dict[str, Callable[[str, Look], float]] = {
     "bound (before)": lambda metric, look: look.figures[f"bound_{metric}"],
-    "cross-half estimate": _floored("estimate"),
-    "SURE": _floored("sure_1"),
+    "cross-half estimate": _unbiased_db("estimate"),
+    "SURE": _unbiased_db("sure_1"),
     "jackknife of four passes (64 samples)": lambda metric, look: _db("jackknife", metric, look),
     "empirical Bernstein": _bernstein,
     "agreement of the halves + 6 dB": lambda metric, look: _db("agreement", metric, look),
@@ -157,12 +159,12 @@ _ONE_LOOK = ("jackknife", "oracle")
 def _more_terms(metric: str, look: Look) -> dict[str, float]:
     """Return the terms of the statement of eleven measures."""
     more = {name: _db(name, metric, look) for name in ("raw", "fast", "most")}
-    more["estimate at 2 px"] = _floored("estimate_2")(metric, look)
+    more["estimate at 2 px"] = _unbiased_db("estimate_2")(metric, look)
     more["bound"] = look.figures[f"bound_{metric}"]
     return {**more, **six_terms(metric, look)}
 
 
-def _shifted(
+def _calibrate(
     metric: str,
     name: str,
     mine: Sequence[Look],
@@ -180,7 +182,7 @@ def _shifted(
     else:
         terms = six_terms if name.startswith("six") else _more_terms
         center = cross_fitted(metric, mine, terms)
-        stated = weighted(metric, fit_weights(metric, mine, terms), judging, terms)
+        stated = apply_weights(metric, fit_weights(metric, mine, terms), judging, terms)
     for group in GROUPS:
         at = [row for row, look in enumerate(mine) if group_of(look.px) == group]
         if not at:
@@ -197,11 +199,11 @@ def _cells(metric: str, looks: Sequence[Look], stated: Values) -> Iterator[str]:
         yield _cell(judge(metric, [looks[row] for row in at], stated[at])) if at else "n/a"
 
 
-def _cell(found: Judged) -> str:
-    low, high = found.interval
+def _cell(judged: Judged) -> str:
+    low, high = judged.interval
     return (
-        f"{100 * found.over_1:.1f} ({100 * low:.1f} to {100 * high:.1f}); "
-        f"{100 * found.over_3:.1f}; {found.caution_db:.1f}"
+        f"{100 * judged.over_1:.1f} ({100 * low:.1f} to {100 * high:.1f}); "
+        f"{100 * judged.over_3:.1f}; {judged.caution_db:.1f}"
     )
 
 
@@ -220,7 +222,7 @@ def _tables(looks: Sequence[Look]) -> Iterator[str]:
         "over layouts; share over 3 dB in %; median caution in dB."
     )
     for metric in ("log", "linear"):
-        counted = known(metric, looks)
+        counted = filter_known(metric, looks)
         mine = [look for look in counted if look.use != "judge"]
         judging = [look for look in counted if look.use == "judge"]
         left_out = 100 - 100 * len(counted) / len(looks)
@@ -234,7 +236,7 @@ def _tables(looks: Sequence[Look]) -> Iterator[str]:
         yield _line("statement", "64 px", "128 px", "256 px")
         yield "|---|---|---|---|"
         for name in (*ESTIMATORS, "six measures (now)", "eleven measures"):
-            some, stated = _shifted(metric, name, mine, judging)
+            some, stated = _calibrate(metric, name, mine, judging)
             yield _line(name, *_cells(metric, some, stated))
         yield from ("", "Statements as their authors have them:", "")
         yield _line("statement", "64 px", "128 px", "256 px")
@@ -261,7 +263,7 @@ def _parts(metric: str, mine: Sequence[Look], judging: Sequence[Look]) -> Iterat
     yield from ("", "Six measures, by kind of picture:", "")
     yield _line("pictures", *head)
     yield "|---|---|---|---|"
-    some, stated = _shifted(metric, name, mine, judging)
+    some, stated = _calibrate(metric, name, mine, judging)
     for label, group in _GROUPINGS.items():
         for value in sorted({group(look) for look in some}):
             at = [row for row, look in enumerate(some) if group(look) == value]
@@ -280,10 +282,10 @@ def _parts(metric: str, mine: Sequence[Look], judging: Sequence[Look]) -> Iterat
         for value in sorted({group(look) for look in both}):
             rest = [look for look in mine if group(look) != value]
             if len({look.layout for look in rest}) >= _LEAST_LAYOUTS:
-                left, stated = _shifted(
+                rest_judged, stated = _calibrate(
                     metric, name, rest, [look for look in both if group(look) == value]
                 )
-                yield _line(f"{label} {value}", *_cells(metric, left, stated))
+                yield _line(f"{label} {value}", *_cells(metric, rest_judged, stated))
 
 
 if __name__ == "__main__":

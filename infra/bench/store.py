@@ -90,8 +90,8 @@ class Store:
     def add(self, run: Run, trial: str, point: str, figures: Figures) -> None:
         """Write the figures of one point in one trial; values alone if the plan names them."""
         names = run.plan.get("figures")
-        kept = dict(figures) if names is None else [figures[name] for name in names if figures]
-        self._write(run, {"trial": trial, "point": point, "figures": kept})
+        stored = dict(figures) if names is None else [figures[name] for name in names if figures]
+        self._write(run, {"trial": trial, "point": point, "figures": stored})
 
     def leave_out(self, run: Run, trial: str, why: str) -> None:
         """Write that a trial counts for no point, and why."""

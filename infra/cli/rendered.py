@@ -119,7 +119,7 @@ def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
     print_rows("Rendered", rows)
     measure = " and ".join(str(picture.path) for picture in done.pictures.values())
     look = f"Look at {done.shot.png}; measure with {measure}"
-    _print_last(look, _floors([done]), _expected([done]))
+    _print_last(look, _floors([done]), _expected_errors([done]))
 
 
 def _describe(renderer: Renderer, facts: Facts) -> Rows:
@@ -170,7 +170,7 @@ def _floors(shots: Sequence[FinishedShot]) -> dict[str, list[float]]:
     return {metric: [float(facts[name]) for facts in traced] for name, metric in names}
 
 
-def _expected(shots: Sequence[FinishedShot]) -> list[float]:
+def _expected_errors(shots: Sequence[FinishedShot]) -> list[float]:
     """Return the expected errors of all pictures in dB; empty where one is not calibrated."""
     every = [shot.pictures["mitsuba"].facts for shot in shots if "mitsuba" in shot.pictures]
     name = _EXPECTED["noise_floor_db"]
@@ -211,7 +211,7 @@ def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: fl
     print_rows("Rendered", rows)
     folder = plan.output.folder
     look = f"Look at {plan.output.video or folder}; measure with the pictures in {folder}"
-    _print_last(look, floors, _expected(shots))
+    _print_last(look, floors, _expected_errors(shots))
 
 
 def _time_rows(plan: RenderPlan, shots: Sequence[FinishedShot]) -> Rows:

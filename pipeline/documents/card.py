@@ -12,7 +12,6 @@ from markupsafe import Markup
 from pipeline.documents.distributions import MEASURED, Distributions
 from pipeline.documents.pages import render_markdown
 from pipeline.documents.rights import Rights, hub_licence, licence_facts
-from pipeline.renders.calibrated_error import promise_sentence
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest
@@ -62,7 +61,7 @@ def encode_card(
         found=distributions,
         resolution=_setting(manifest.settings, "renders.resolution"),
         splits=_by_split(manifest, distributions),
-        promise=_promise(manifest, distributions),
+        states_expected=summary(distributions.all("expected_error_db"))["count"] > 0,
         layouts=layouts,
         triangles=summary(distributions.all("triangles_per_scene")),
         maps=_maps(distributions),
@@ -133,13 +132,6 @@ def _by_split(manifest: Manifest, distributions: Distributions) -> list[Sequence
 def _three(floors: Mapping[str, Mapping[str, float]], statistic: str) -> str:
     log, linear, objects = (numbers[statistic] for numbers in floors.values())
     return f"{log:.1f} ({linear:.1f}, {objects:.1f})"
-
-
-def _promise(manifest: Manifest, distributions: Distributions) -> str:
-    """Return what calibrated errors promise; empty where no view states one."""
-    if not summary(distributions.all("expected_error_db"))["count"]:
-        return ""
-    return promise_sentence(int(_setting(manifest.settings, "renders.resolution")))
 
 
 def _probably(distributions: Distributions, split: str) -> str:

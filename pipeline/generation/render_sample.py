@@ -214,7 +214,7 @@ def _accepted_view(
         at_cap=rendered.at_cap,
         seed=seed,
         camera_attempt=camera.attempt,
-        expected=None if rendered.expected_error is None else _rounded(rendered.expected_error),
+        expected=None if rendered.expected_error is None else _part_floor(rendered.expected_error),
         parts=_part_floors(rendered),
     )
     return _AcceptedView(
@@ -229,10 +229,10 @@ def _accepted_view(
 def _part_floors(rendered: RenderedView) -> dict[str, PartFloor] | None:
     if rendered.part_floors is None:
         return None
-    return {name: _rounded(floor) for name, floor in rendered.part_floors.items()}
+    return {name: _part_floor(floor) for name, floor in rendered.part_floors.items()}
 
 
-def _rounded(floor: MeasuredFloor) -> PartFloor:
+def _part_floor(floor: MeasuredFloor) -> PartFloor:
     return PartFloor(
         noise_floor_db=round(floor.log_db, 3),
         noise_floor_linear_db=round(floor.linear_db, 3),

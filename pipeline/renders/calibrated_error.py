@@ -86,9 +86,9 @@ class MetricStatement:
     judged: Mapping[str, JudgedShare]
     """Records by width in pixels."""
 
-    def center_db(self, found: ErrorMeasures, resolution: int, spp: float) -> float:
+    def center_db(self, measures: ErrorMeasures, resolution: int, spp: float) -> float:
         """Return the weighted mean in dB, without a shift."""
-        terms = terms_of(found, resolution, spp)
+        terms = terms_of(measures, resolution, spp)
         return self.intercept + sum(self.weights[name] * terms[name] for name in terms)
 
 
@@ -122,10 +122,10 @@ class CalibratedStatement:
         group = group_of(resolution)
         bound = dict[str, float]()
         expected = dict[str, float]()
-        for name, found in measures.items():
+        for name, measured in measures.items():
             metric = self.metrics[name]
-            is_empty = name == "object" and not found.hits
-            center_db = MAX_DB if is_empty else metric.center_db(found, resolution, spp)
+            is_empty = name == "object" and not measured.hits
+            center_db = MAX_DB if is_empty else metric.center_db(measured, resolution, spp)
             for result, shifts in ((bound, metric.bound), (expected, metric.expected)):
                 shift_db = 0.0 if is_empty else shifts[group]
                 result[_FIELDS[name]] = min(MAX_DB, center_db + shift_db)
@@ -147,31 +147,31 @@ def promise_sentence(resolution: int, metric: str = "log") -> str:
     judged = statement.metrics[metric].judged
     widths = sorted(map(int, judged))
     width = max((px for px in widths if px <= resolution), default=widths[0])
-    found = judged[str(width)]
-    good = 100 - 100 * found.over_1
+    record = judged[str(width)]
+    good = 100 - 100 * record.over_1
     return (
         f"Of a hundred pictures of scenes like those that calibrated it, {good:.0f} are at most "
-        f"1 dB worse, and half are {found.caution_db:.1f} dB better ({found.pictures} pictures of "
-        f"{found.layouts} layouts at {width} px)."
+        f"1 dB worse, and half are {record.caution_db:.1f} dB better "
+        f"({record.pictures} pictures of {record.layouts} layouts at {width} px)."
     )
 
 
-def terms_of(found: ErrorMeasures, resolution: int, spp: float) -> dict[str, float]:
+def terms_of(measures: ErrorMeasures, resolution: int, spp: float) -> dict[str, float]:
     """Return the terms of a statement by the names of their weights.
 
     Unbiased measures may be below 0 by chance: they are at least a quarter of the agreement.
     """
-    least = found.agreement / 4
+    least = measures.agreement / 4
     errors = {
-        "estimate": max(found.estimate, least),
-        "agreement": found.agreement,
-        "move": found.move,
-        "surprise": found.surprise,
-        "sure": max(found.sure / found.block_agreement, least),
+        "estimate": max(measures.estimate, least),
+        "agreement": measures.agreement,
+        "move": measures.move,
+        "surprise": measures.surprise,
+        "sure": max(measures.sure / measures.block_agreement, least),
     }
     return {
         **{name: -10 * math.log10(max(error, LEAST_ERROR)) for name, error in errors.items()},
-        "hits": 10 * math.log10(max(found.hits, _LEAST_HITS)),
+        "hits": 10 * math.log10(max(measures.hits, _LEAST_HITS)),
         "samples": math.log2(spp / 64),
         "width": math.log2(resolution / _NARROW_PX),
     }
@@ -250,7 +250,7 @@ def measures_of_totals(
         hits: share of the pixels that show geometry.
     """
     count = max(count, 1)
-    estimate, agreement, move, apart = (float(each) / count for each in totals[:4])
+    estimate, agreement, move, slope_agreement = (float(each) / count for each in totals[:4])
     sure, in_blocks = (float(each) / (BLOCK_PX**2 * count) for each in totals[4:])
     return ErrorMeasures(
         estimate=estimate,
@@ -258,6 +258,6 @@ def measures_of_totals(
         move=move,
         surprise=surprise / count,
         sure=sure,
-        block_agreement=in_blocks / apart if apart else 1.0,
+        block_agreement=in_blocks / slope_agreement if slope_agreement else 1.0,
         hits=hits,
     )

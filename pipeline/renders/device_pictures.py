@@ -133,8 +133,7 @@ class DevicePictures:
         picture = [] if statement is None else [self._filtered_picture()]
         arrays = _sums(self._samples), filtered, self._guides, self._masks, self._logs, picture
         numbers, logs = _estimate_error(KernelInputs(), *arrays, *kind)
-        found = read_numbers(numbers)
-        totals, tiles = np.split(found, [6 * len(METRICS) if picture else 0])
+        totals, tiles = np.split(read_numbers(numbers), [6 * len(METRICS) if picture else 0])
         rows = tiles.reshape(-1, len(self._counts[0]))
         require_finite(int(rows[2].sum()))
         require_bounded(float(rows[-1].max()))
@@ -279,8 +278,8 @@ def _estimate_error(
     for first, step in [(0, 1), *((part, every) for part in range(len(names)))]:
         a, b, da, db = (mi.Color3d(add_up(each[first::step])) for each in (*raws, *corrected))
         if finished:
-            own = mi.Color3d(dr.unravel(mi.Color3f, finished[0]))
-            measured, surprises = error_measures(a, b, da, db, own, hit, resolution)
+            denoised_both = mi.Color3d(dr.unravel(mi.Color3f, finished[0]))
+            measured, surprises = error_measures(a, b, da, db, denoised_both, hit, resolution)
             totals.append(measured)
             rows.append(([], surprises))
         else:

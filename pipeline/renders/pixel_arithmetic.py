@@ -130,14 +130,14 @@ def error_measures(
     for curve in (log10, _clamp):
         slope = _secant_slope(curve, denoised, raw)
         own_slope = _secant_slope(curve, picture, raw)
-        apart = own_slope * (denoised_a - denoised_b)
-        signed = own_slope * (picture - raw), own_slope * (a - b) / 2, apart
+        difference = own_slope * (denoised_a - denoised_b)
+        signed = own_slope * (picture - raw), own_slope * (a - b) / 2, difference
         metrics.append(
             [
                 channel_mean(dr.square(slope) * estimate),
                 channel_mean(dr.square(curve(denoised_a) - curve(denoised_b))) / 4,
                 channel_mean(dr.square(curve(picture) - curve(denoised))),
-                channel_mean(dr.square(apart)) / 4,
+                channel_mean(dr.square(difference)) / 4,
                 *(channel for color in signed for channel in (color.x, color.y, color.z)),
             ]
         )
@@ -150,9 +150,13 @@ def error_measures(
     totals: list[Any] = []
     for first in range(0, len(flat), len(metrics[0])):
         rows = [dr.gather(mi.Float64, tiles, tile + (first + row) * across**2) for row in range(13)]
-        left, probe, apart = rows[4:7], rows[7:10], rows[10:13]
-        sure = add_up([x * x + z * h - z * z for x, z, h in zip(left, probe, apart, strict=True)])
-        totals += [*rows[:4], sure / 3, add_up([dr.square(each) for each in apart]) / 12]
+        sure = add_up(
+            [
+                x * x + z * h - z * z
+                for x, z, h in zip(rows[4:7], rows[7:10], rows[10:], strict=True)
+            ]
+        )
+        totals += [*rows[:4], sure / 3, add_up([dr.square(each) for each in rows[10:]]) / 12]
     rows_of_tiles = dr.block_sum(dr.block_sum(dr.concat(totals), across), across)
     return rows_of_tiles, [*surprises, dr.select(hit, surprises[0], 0)]
 

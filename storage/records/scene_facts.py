@@ -187,8 +187,7 @@ def scene_values(record: SceneRecord) -> Mapping[str, Values]:
             for name in names
         },
         "expected_error_db": [
-            np.nan if view.expected is None else view.expected.noise_floor_db
-            for view in record.views
+            view.expected.noise_floor_db for view in record.views if view.expected is not None
         ],
     }
     return {name: np.asarray(entries, np.float32) for name, entries in values.items()}

@@ -118,12 +118,12 @@ def _record(context: BenchContext, trial: str) -> dict[tuple[int, int], Figures]
     scene = _scene(child, index, KINDS[index % len(KINDS)])
     widest = 256 if has_wide(index) else 128
     reference = load_or_render_reference(child, scene, first_camera(scene, widest), REFERENCE_SPP)
-    found = dict[tuple[int, int], Figures]()
+    figures = dict[tuple[int, int], Figures]()
     for px in (px for px in LOOKS if px <= widest):
         settings = unreachable(smoke().renders, px, max(LOOKS[px]))
         looks = child.call(record_looks, scene, settings, shrink_reference(reference, px), index)
-        found |= {(px, spp): look for spp, look in zip(LOOKS[px], looks, strict=True)}
-    return found
+        figures |= {(px, spp): look for spp, look in zip(LOOKS[px], looks, strict=True)}
+    return figures
 
 
 def _one_split() -> BuildSettings:

@@ -88,7 +88,7 @@ def true_db(metric: str, looks: Sequence[Look]) -> Values:
     return db
 
 
-def known(metric: str, looks: Sequence[Look]) -> list[Look]:
+def filter_known(metric: str, looks: Sequence[Look]) -> list[Look]:
     """Return the looks whose true error is known well enough."""
     return [
         look
@@ -106,9 +106,9 @@ def open_db(metric: str, looks: Sequence[Look]) -> Values:
 
 def six_terms(metric: str, look: Look) -> dict[str, float]:
     """Return the terms of the product's statement, by name."""
-    found = {name: look.figures[f"{metric}_{name}"] * 1e-6 for name in MEASURES}
+    errors = {name: look.figures[f"{metric}_{name}"] * 1e-6 for name in MEASURES}
     share = look.figures[f"{metric}_block_agreement"]
-    measures = ErrorMeasures(**found, block_agreement=share, hits=look.figures["hits"])
+    measures = ErrorMeasures(**errors, block_agreement=share, hits=look.figures["hits"])
     return terms_of(measures, look.px, look.figures["spp"])
 
 
@@ -137,11 +137,11 @@ def fit_weights(
     values = np.concatenate([root[:, 0] * (target - middle), ridge @ (equal * spread)])
     free = ("hits", "samples", "width")
     least = [-np.inf if name in free else 0.0 for name in names]
-    found = lsq_linear(matrix, values, bounds=(least, np.inf)).x / spread
-    return middle - float(found @ center), dict(zip(names, map(float, found), strict=True))
+    solution = lsq_linear(matrix, values, bounds=(least, np.inf)).x / spread
+    return middle - float(solution @ center), dict(zip(names, map(float, solution), strict=True))
 
 
-def weighted(
+def apply_weights(
     metric: str,
     fitted: tuple[float, Mapping[str, float]],
     looks: Sequence[Look],
@@ -167,7 +167,7 @@ def cross_fitted(
         rest = [look for look in looks if fold[look.layout] != number]
         if mine:
             fitted = fit_weights(metric, rest, terms)
-            stated[mine] = weighted(metric, fitted, [looks[row] for row in mine], terms)
+            stated[mine] = apply_weights(metric, fitted, [looks[row] for row in mine], terms)
     return stated
 
 
@@ -179,13 +179,13 @@ def stops(metric: str, looks: Sequence[Look], stated_db: Values) -> list[int]:
     views: dict[tuple[int, int], list[int]] = {}
     for row, look in enumerate(looks):
         views.setdefault((look.layout, look.px), []).append(row)
-    found = []
+    stopped = []
     for rows in views.values():
         ordered = sorted(rows, key=lambda row: looks[row].figures["spp"])
         for target_db in TARGETS_DB[metric]:
             reached = (row for row in ordered if stated_db[row] >= target_db)
-            found.append(next(reached, ordered[-1]))
-    return found
+            stopped.append(next(reached, ordered[-1]))
+    return stopped
 
 
 def largest_shift(
@@ -233,10 +233,11 @@ def judge(metric: str, looks: Sequence[Look], stated_db: Values) -> Judged:
 
 def fit_metric(metric: str, looks: Sequence[Look]) -> MetricStatement:
     """Return the statement of a metric, fitted and calibrated on the looks that do not judge."""
-    mine = [look for look in known(metric, looks) if look.use != "judge"]
+    mine = [look for look in filter_known(metric, looks) if look.use != "judge"]
     intercept, weights = fit_weights(metric, mine)
     crossed = cross_fitted(metric, mine)
-    bound, expected = {}, {}
+    bound = dict[str, float]()
+    expected = dict[str, float]()
     for group in GROUPS:
         at = [row for row, look in enumerate(mine) if group_of(look.px) == group]
         some = [mine[row] for row in at]
@@ -250,29 +251,29 @@ def fit_metric(metric: str, looks: Sequence[Look]) -> MetricStatement:
         expected=expected,
         judged={},
     )
-    return replace(statement, judged=_judged(metric, statement, looks))
+    return replace(statement, judged=_judge_widths(metric, statement, looks))
 
 
 def stated_by(metric: str, statement: MetricStatement, looks: Sequence[Look]) -> Values:
     """Return the bound of each look in dB."""
-    center = weighted(metric, (statement.intercept, statement.weights), looks)
+    center = apply_weights(metric, (statement.intercept, statement.weights), looks)
     shifts: Values = np.array([statement.bound[group_of(look.px)] for look in looks])
     return center + shifts
 
 
-def _judged(
+def _judge_widths(
     metric: str, statement: MetricStatement, looks: Sequence[Look]
 ) -> dict[str, JudgedShare]:
-    judging = [look for look in known(metric, looks) if look.use == "judge"]
-    found = {}
+    judging = [look for look in filter_known(metric, looks) if look.use == "judge"]
+    records = {}
     for px in sorted({look.px for look in judging}):
         some = [look for look in judging if look.px == px]
         result = judge(metric, some, stated_by(metric, statement, some))
-        found[str(px)] = JudgedShare(
+        records[str(px)] = JudgedShare(
             pictures=result.pictures,
             layouts=result.layouts,
             over_1=round(result.over_1, 4),
             over_3=round(result.over_3, 4),
             caution_db=round(result.caution_db, 2),
         )
-    return found
+    return records

@@ -75,9 +75,9 @@ def record_looks(
     renderer = _RecordingRenderer(scene, settings, reference, seed, looks)
     view = scene.c2w[0], float(scene.fov_deg[0])
     renderer.render_view(*view, seed)
-    others = SceneRenderer(scene, dataclasses.replace(settings, max_spp=_ONCE_SPP))
+    second_renderer = SceneRenderer(scene, dataclasses.replace(settings, max_spp=_ONCE_SPP))
     seeds = [seed_for(seed, "other picture", number) for number in range(_OTHER_PICTURES)]
-    pictures = [others.render_view(*view, each).radiance_rgb for each in seeds]
+    pictures = [second_renderer.render_view(*view, each).radiance_rgb for each in seeds]
     for name, curve in CURVES.items():
         pixels = np.ones(pictures[0].shape[:2], np.bool_)
         errors = [true_error(each, reference, curve, pixels)[0] for each in pictures]
@@ -125,7 +125,7 @@ class _RecordingPictures(HostPictures):
         if error is not None:
             fast = with_mean_of(keep_converged(fast, raw, error)[0], raw[0])[None]
         a, b = self._halves
-        found = {
+        row = {
             "spp": float(self._samples.spp),
             "hits": float(self.hits.mean()),
             "relative": 1e3 * _relative_error(a, b),
@@ -142,15 +142,15 @@ class _RecordingPictures(HostPictures):
             true, open_error = true_error(picture, self._reference, curve, pixels)
             errors = {name: getattr(measures, name) for name in MEASURES}
             errors |= {"true": true, "open": open_error}
-            found |= {f"{metric}_{name}": 1e6 * value for name, value in errors.items()}
-            found[f"{metric}_block_agreement"] /= 1e6  # a share
+            row |= {f"{metric}_{name}": 1e6 * value for name, value in errors.items()}
+            row[f"{metric}_block_agreement"] /= 1e6  # a share
         passes = self._passes() if self._samples.spp == _ONCE_SPP else None
         for name, curve in CURVES.items():
             values = dict(_other_figures(a, b, picture, fast[0], curve))
             values["jackknife"] = _jackknife(passes, self._features, curve) if passes else 0.0
             values["oracle"] = 0.0
-            found |= {f"{name}_{key}": 1e6 * value for key, value in values.items()}
-        self._recorded.append({name: float(f"{found[name]:.4g}") for name in FIGURES})
+            row |= {f"{name}_{key}": 1e6 * value for key, value in values.items()}
+        self._recorded.append({name: float(f"{row[name]:.4g}") for name in FIGURES})
         return look
 
 
@@ -161,8 +161,8 @@ def _relative_error(a: Half, b: Half) -> float:
     Monte Carlo global illumination", 2010), by which Mitsuba's pull request 1731 and Cycles stop.
     """
     mean = 0.5 * (a.raw_rgb.astype(np.float64) + b.raw_rgb)
-    apart = np.abs(mean - a.raw_rgb).sum(axis=-1)
-    return float((apart / np.sqrt(np.maximum(mean.sum(axis=-1), 1e-4))).mean())
+    difference = np.abs(mean - a.raw_rgb).sum(axis=-1)
+    return float((difference / np.sqrt(np.maximum(mean.sum(axis=-1), 1e-4))).mean())
 
 
 def _other_figures(
@@ -182,20 +182,20 @@ def _other_figures(
     yield "least", float(blocks.min())
     yield "most", float(blocks.max())
     yield "raw", float(0.25 * np.square(curve(raw_a) - curve(raw_b)).mean())
-    raw, denoised = 0.5 * (raw_a + raw_b), 0.5 * (den_a + den_b)
-    slope = secant_slope(curve, denoised, raw)
+    raw = 0.5 * (raw_a + raw_b)
+    slope = secant_slope(curve, 0.5 * (den_a + den_b), raw)
     of_halves = [
         slope * each for each in (den_a - raw_b, den_b - raw_a, raw_a - raw_b, den_a - den_b)
     ]
     for size in (2, 8):
-        first, second, noise, apart = (_means_of_blocks(each, size) for each in of_halves)
-        error = (first**2 + second**2 - noise**2) / 2 - apart**2 / 4
+        first, second, noise, difference = (_means_of_blocks(each, size) for each in of_halves)
+        error = (first**2 + second**2 - noise**2) / 2 - difference**2 / 4
         yield f"estimate_{size}", float(error.mean())
     slope = secant_slope(curve, picture, raw)
     of_picture = [slope * each for each in (picture - raw, 0.5 * (raw_a - raw_b), den_a - den_b)]
     for size in (1, 2):
-        left, probe, apart = (_means_of_blocks(each, size) for each in of_picture)
-        yield f"sure_{size}", float((left**2 + probe * apart - probe**2).mean())
+        residual, probe, difference = (_means_of_blocks(each, size) for each in of_picture)
+        yield f"sure_{size}", float((residual**2 + probe * difference - probe**2).mean())
     yield "fast", float(np.square(curve(picture) - curve(fast_rgb.astype(np.float64))).mean())
 
 

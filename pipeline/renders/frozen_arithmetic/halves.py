@@ -88,10 +88,10 @@ def measure_errors(
     denoised, raw = _means(a, b)
     picture = picture_rgb.astype(np.float64)
     slope = secant_slope(curve, picture, raw) * pixels[..., None]
-    left = slope * (picture - raw)
+    residual = slope * (picture - raw)
     probe = slope * (0.5 * (a.raw_rgb.astype(np.float64) - b.raw_rgb))
-    apart = slope * (a.denoised_rgb.astype(np.float64) - b.denoised_rgb)
-    blocks = [_block_means(values) for values in (left, probe, apart)]
+    difference = slope * (a.denoised_rgb.astype(np.float64) - b.denoised_rgb)
+    blocks = [_block_means(values) for values in (residual, probe, difference)]
     to_mean = BLOCK_PX**2 / count
 
     def over_pixels(values: NDArray[np.float64]) -> float:
@@ -99,7 +99,7 @@ def measure_errors(
 
     of_halves = [curve(half.denoised_rgb.astype(np.float64)) for half in (a, b)]
     agreement_in_blocks = 0.25 * np.square(blocks[2]).mean(axis=-1).sum() * to_mean
-    agreement_in_pixels = 0.25 * np.square(apart).mean(axis=-1).sum() / count
+    agreement_in_pixels = 0.25 * np.square(difference).mean(axis=-1).sum() / count
     return ErrorMeasures(
         estimate=float((squared_error(a, b, curve) * pixels).sum() / count),
         agreement=over_pixels(0.25 * np.square(of_halves[0] - of_halves[1])),

@@ -191,6 +191,7 @@ def test_a_picture_says_how_it_was_made(source: Path, network: Path, tmp_path: P
     assert set(json.loads(traced["settings"])) == {
         "resolution", "noise_floor_db", "min_spp", "max_spp", "reject_at_cap", "max_depth",
         "rr_depth", "aux_spp", "denoiser", "min_mean_radiance", "per_light", "arithmetic",
+        "stated_error",
     }  # fmt: skip
     assert "mitsuba_variant" in json.loads(traced["environment"])
     assert (drawn["engine"], drawn["checkpoint"]) == ("neural", "model.safetensors")
@@ -323,6 +324,19 @@ def test_a_target_governs_and_all_three_floors_are_said(source: Path, tmp_path: 
     both = printed(*words, "--noise-floor-objects", "95", "--max-spp", "8")
     assert "clamped to [0, 1]; reached 5 dB)" in both
     assert "geometry is seen; the cap came before 95 dB)" in both
+
+
+def test_a_promise_and_what_is_probable_are_said(source: Path, tmp_path: Path) -> None:
+    """At a width that is calibrated; elsewhere the bound is named."""
+    out = tmp_path / "x.exr"
+    words = (source, "--out", out, "--noise-floor", "5", "--max-spp", "128")
+    said = printed(*words, "--resolution", "64")
+    assert re.search(r"noise floor -?\d+\.\d dB, probably -?\d+\.\d \(linear ", said)
+    assert re.search(r"dB, probably -?\d+\.\d \(psnr_linear_db", said)
+    assert re.search(r"Of a hundred pictures .* \d+ are at most 1 dB worse, and half are", said)
+    assert header(out)["expected_error_db"] > header(out)["noise_floor_db"]
+    said = printed(source, "--out", tmp_path / "y.exr", "--resolution", "16", "--max-spp", "64")
+    assert "a bound: pictures like this one are not calibrated" in said
 
 
 def test_the_words_of_what_was_asked_give_the_picture_again(source: Path, tmp_path: Path) -> None:
