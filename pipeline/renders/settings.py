@@ -24,8 +24,8 @@ to 2 dB in the median pixel of the easy ones (study S3). The small ones are for 
 """
 
 FIRST_SPP = 64
-"""Samples of a picture before its floor is measured. With 32, in pictures of 256 pixels, 5 of 50
-floors that were reached at once were over 1 dB too good: no sample had met a glint (study S17)."""
+"""Samples of a picture before its bound is measured. With 32, in pictures of 256 pixels, 5 of 50
+bounds that were reached at once were over 1 dB too good: no sample had met a glint (study S17)."""
 
 MAX_RESOLUTION = 2048
 """Largest picture: one pass of 64 samples takes 3.3 GB there, and that grows with the area."""

@@ -19,7 +19,7 @@ from pipeline.renders.calibrated_error import (
 )
 from pipeline.renders.frozen_arithmetic.halves import Half, measure_errors
 from pipeline.renders.noise_floor import ErrorMeasures, clamped_radiance
-from pipeline.renders.settings import RenderSettings
+from pipeline.renders.settings import Arithmetic, RenderSettings
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.pipeline.renders.sampling import render_view
@@ -114,7 +114,7 @@ def test_what_was_not_calibrated_has_the_bound(
 @for_each("arithmetic", ["numpy", "device"])
 @pytest.mark.usefixtures("llvm")
 def test_far_from_its_targets_a_view_goes_on_by_its_halves(
-    measured: list[dict[str, ErrorMeasures]], arithmetic: str
+    measured: list[dict[str, ErrorMeasures]], arithmetic: Arithmetic
 ) -> None:
     """A target that nothing reaches, then one that is reached at once."""
     measured.clear()
