@@ -115,14 +115,14 @@ class DevicePictures:
         self._picture = None
         filtered = self._denoise_raws(_sums(self._samples), quality, of_both=False)
         if statement is None or self._settings.picture_within_db is not None:
-            look, logs = self._measured(filtered, quality, None)
+            look, logs = self._measure(filtered, quality, None)
             if statement is None or is_far(look.floor, self._settings, self._samples.spp):
                 self._logs = logs
                 return look
-        look, self._logs = self._measured(filtered, quality, statement)
+        look, self._logs = self._measure(filtered, quality, statement)
         return look
 
-    def _measured(
+    def _measure(
         self,
         filtered: list[list[Any]],
         quality: Filtered,

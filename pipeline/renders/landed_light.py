@@ -29,8 +29,8 @@ class LandedLight:
     def begin(self, camera: PixelCamera) -> None:
         """Begin a view; pictures of those that were begun before it are dropped."""
         self._waiting.pop(_name(camera), None)
-        asked = {_name(camera), *self._waiting}
-        self._kept = {key: kept for key, kept in self._kept.items() if key[0] in asked}
+        names = {_name(camera), *self._waiting}
+        self._kept = {key: picture for key, picture in self._kept.items() if key[0] in names}
 
     def take(
         self,
@@ -45,14 +45,16 @@ class LandedLight:
             paths: what tells these light paths from others.
             land: returns the picture of each of some cameras.
         """
-        if (kept := self._kept.pop((_name(camera), paths), None)) is not None:
-            return kept
+        picture = self._kept.pop((_name(camera), paths), None)
+        if picture is not None:
+            return picture
         waiting = self._waiting
         pixels = camera.resolution**2
         if (len(self._kept) + len(waiting)) * pixels > _MOST_PIXELS:
             waiting = {}
-        picture, *others = land([camera, *waiting.values()])
-        self._kept |= {(name, paths): other for name, other in zip(waiting, others, strict=True)}
+        pictures = iter(land([camera, *waiting.values()]))
+        picture = next(pictures)
+        self._kept |= {(name, paths): each for name, each in zip(waiting, pictures, strict=True)}
         return picture
 
 

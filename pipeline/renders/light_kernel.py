@@ -105,11 +105,8 @@ def trace_light(
         visible = active & (triangle < scene.num_surfaces)
         landing = visible & (depth > 1) & (depth < scene.max_depth)
         mis_ratio = dr.minimum(dr.hypot(hit_mis_ratio, pick_mis_ratio), MAX_MIS_RATIO) / light_paths
-        light = throughput * strength
-        for film, of_film in zip(films, splats, strict=True):
-            place = film, light_paths, vertex, mis_ratio, mi.Bool(landing)
-            value, share, pixel, lands = _connect_to_camera(scene, parts, *place)
-            _add(of_film, parts.by_lobe(light * value, share), pixel, lands)
+        place = light_paths, vertex, mis_ratio, landing
+        _join_to_cameras(scene, films, parts, splats, throughput * strength, place)
         depth += 1
         active &= depth < scene.max_depth
         u_lobe = sampler.next_1d(active)
@@ -136,6 +133,22 @@ def _leave_emitter(
     cosine = dr.abs(dr.dot(emitter.normal, direction))
     start = SurfacePoint(position=emitter.position, geometric_normal=emitter.normal)
     return start, direction, leaving, cosine / (emitter.area_pdf * leaving)
+
+
+def _join_to_cameras(
+    scene: KernelScene,
+    films: Sequence[Film],
+    parts: KernelParts,
+    splats: Sequence[Sequence[Splats]],
+    light: Any,
+    place: tuple[Any, ...],
+) -> None:
+    """Add the light (Color3f) that reaches a vertex to the pictures in which it shows."""
+    *vertex, landing = place
+    for film, sums in zip(films, splats, strict=True):
+        sight = mi.Bool(landing)  # each camera narrows its own
+        value, share, pixel, lands = _connect_to_camera(scene, parts, film, *vertex, sight)
+        _add(sums, parts.by_lobe(light * value, share), pixel, lands)
 
 
 def _add(splats: Sequence[Splats], values: list[Any], pixel: Any, active: Any) -> None:

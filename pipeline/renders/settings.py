@@ -139,8 +139,8 @@ class RenderSettings:
     """How errors are stated: `calibrated` by six measures and their record on other scenes
     (pipeline.renders.calibrated_error), within its range; `bound` by estimate and allowances."""
     picture_within_db: Annotated[float, Within(0, MAX_DB, unit="dB")] | None = None
-    """Of `calibrated` errors: where the bound by the halves misses a target by more than this,
-    sampling goes on by it, without the picture itself; None takes a picture each time."""
+    """Where the bound by the halves misses a target by more than this, sampling goes on by it,
+    without a picture to calibrate the error by; None takes a picture each time."""
 
     def __post_init__(self) -> None:
         _require(

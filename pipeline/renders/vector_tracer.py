@@ -148,7 +148,7 @@ class VectorTracer:
             numbers, count = self._numbers(camera, seed, spp)
             films = [self._film(each) for each in cameras]
             inputs = KernelInputs(self._scene, films, self._parts, self._unit, numbers)
-            landed: list[list[Any]] = _landed(inputs, camera.resolution, count)
+            landed: list[list[Any]] = _land(inputs, camera.resolution, count)
             return landed
 
         return self._landed.take(camera, (seed, spp, self._scene.guide is not None), land_on)
@@ -248,7 +248,7 @@ def land(objects: Any, resolution: int, count: int) -> list[list[Any]]:
 
 
 @record_launches
-def _landed(objects: Any, resolution: int, count: int) -> list[list[Any]]:
+def _land(objects: Any, resolution: int, count: int) -> list[list[Any]]:
     landed = land(objects, resolution, count)
     dr.eval(landed)
     return landed

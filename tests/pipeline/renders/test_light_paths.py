@@ -192,14 +192,14 @@ def test_views_of_a_scene_trace_their_light_paths_once(monkeypatch: pytest.Monke
         resolution=32, noise_floor_db=99.0, min_spp=64, max_spp=64, light_paths="scene"
     )
     joined = list[int]()
-    landed = vector_tracer._landed
+    landed = vector_tracer._land
 
     def counted(inputs: Any, *arguments: Any) -> Any:
         found = landed(inputs, *arguments)
         joined.append(len(found))
         return found
 
-    monkeypatch.setattr(vector_tracer, "_landed", counted)
+    monkeypatch.setattr(vector_tracer, "_land", counted)
 
     def views(light_seed: int | None, order: tuple[int, ...]) -> list[NDArray]:
         joined.clear()
