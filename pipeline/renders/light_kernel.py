@@ -141,13 +141,14 @@ def _join_to_cameras(
     parts: KernelParts,
     splats: Sequence[Sequence[Splats]],
     light: Any,
-    place: tuple[Any, ...],
+    place: tuple[Any, Vertex, Any, Any],
 ) -> None:
     """Add the light (Color3f) that reaches a vertex to the pictures in which it shows."""
-    *vertex, landing = place
+    light_paths, vertex, mis_ratio, landing = place
     for film, sums in zip(films, splats, strict=True):
         sight = mi.Bool(landing)  # each camera narrows its own
-        value, share, pixel, lands = _connect_to_camera(scene, parts, film, *vertex, sight)
+        joined = film, light_paths, vertex, mis_ratio, sight
+        value, share, pixel, lands = _connect_to_camera(scene, parts, *joined)
         _add(sums, parts.by_lobe(light * value, share), pixel, lands)
 
 
