@@ -29,6 +29,7 @@ from pipeline.renders.denoise_corrections import (
 from pipeline.renders.noise_floor import BLOCK_PX, ErrorMeasures, MeasuredFloor
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import PASS_SPP, RenderSettings
+from pipeline.renders.stopping import gaps_db
 from pipeline.renders.tiles import TILE_PX
 from storage.digests import canonical_json, sha256_hex
 from storage.metrics import MAX_DB
@@ -195,6 +196,20 @@ def statement_for(settings: RenderSettings, samples: DualBuffer) -> CalibratedSt
         return None
     ranges = (statement.spp, samples.spp), (statement.widths, settings.resolution)
     return statement if all(low <= value <= high for (low, high), value in ranges) else None
+
+
+def is_far(bound: MeasuredFloor, settings: RenderSettings, spp: int) -> bool:
+    """Return whether halves alone show that sampling goes on, so that no picture is needed.
+
+    Args:
+        bound: stated by the halves.
+        settings: targets, and how near to them a picture is asked for.
+        spp: samples per pixel so far; at the cap there is always a picture.
+    """
+    within_db = settings.picture_within_db
+    if within_db is None or spp >= settings.max_spp:
+        return False
+    return max(gaps_db(settings.targets_db, bound.by_metric).values(), default=0.0) > within_db
 
 
 @functools.cache

@@ -13,7 +13,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.calibrated_error import METRICS, measures_of_totals, statement_for
+from pipeline.renders.calibrated_error import (
+    METRICS,
+    CalibratedStatement,
+    is_far,
+    measures_of_totals,
+    statement_for,
+)
 from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoise_corrections import LEAST_PASSES
 from pipeline.renders.denoiser import denoise_arrays
@@ -107,16 +113,31 @@ class DevicePictures:
         return float(total) / (3 * resolution**2)
 
     def look(self, quality: Filtered) -> MeasuredLook:
-        sums = _sums(self._samples)
         statement = statement_for(self._settings, self._samples)
         self._picture = None
+        filtered = self._denoise_raws(_sums(self._samples), quality, of_both=False)
+        if statement is None or self._settings.picture_within_db is not None:
+            look, logs = self._measure(filtered, quality, None)
+            if statement is None or is_far(look.floor, self._settings, self._samples.spp):
+                self._logs = logs
+                return look
+        look, self._logs = self._measure(filtered, quality, statement)
+        return look
+
+    def _measure(
+        self,
+        filtered: list[list[Any]],
+        quality: Filtered,
+        statement: CalibratedStatement | None,
+    ) -> tuple[MeasuredLook, Any]:
+        """Return a look, by the halves alone without a statement, and the logs of both halves."""
+        sums = _sums(self._samples)
         count = sum(len(tracer) - 3 for tracer in sums[0])
         groups = floor_groups(count, self._names, per_light=self._settings.per_light)
         kind = (self._names, groups, self._resolution, quality != "off")
-        filtered = self._denoise_raws(sums, quality, of_both=False)
         picture = [] if statement is None else [self._filtered_picture()]
         arrays = sums, filtered, self._guides, self._masks, self._logs, picture
-        numbers, self._logs = _estimate_error(KernelInputs(), *arrays, *kind)
+        numbers, logs = _estimate_error(KernelInputs(), *arrays, *kind)
         totals, tiles = np.split(read_numbers(numbers), [6 * len(METRICS) if picture else 0])
         rows = tiles.reshape(-1, len(self._counts[0]))
         require_finite(int(rows[2].sum()))
@@ -130,13 +151,14 @@ class DevicePictures:
             measures = self._measures(totals.reshape(3, -1), rows[3:-1])
             floor, expected = statement.state(measures, self._resolution, self._samples.spp)
             floors = [floor]
-        return MeasuredLook(
+        look = MeasuredLook(
             floor=floors[0],
             part_floors=dict(zip(self._names, floors[1:], strict=False)),
             light_floors=floors[1 + len(self._names) :],
             expected=expected,
             changes=list(rows[:2].reshape(2, across, across) / TILE),
         )
+        return look, logs
 
     def finish(self) -> NDArray[np.float32]:
         pictures = read_numbers(self._filtered_picture())

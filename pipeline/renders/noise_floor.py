@@ -70,6 +70,15 @@ class MeasuredFloor:
     object_log_db: float
     """Stated error as object_psnr_log_db, in dB: over pixels that show geometry."""
 
+    @property
+    def by_metric(self) -> dict[str, float]:
+        """The three errors in dB by the name of their metric (storage.metrics)."""
+        return {
+            "psnr_log_db": self.log_db,
+            "psnr_linear_db": self.linear_db,
+            "object_psnr_log_db": self.object_log_db,
+        }
+
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorMeasures:

@@ -27,6 +27,7 @@ class DualBuffer:
         *,
         first_spp: int,
         max_spp: int,
+        light_seed: int | None = None,
     ) -> None:
         """Begin a view without any sample.
 
@@ -36,8 +37,10 @@ class DualBuffer:
             seed: of this view alone.
             first_spp: samples per pixel of the first measurement, both halves together.
             max_spp: the most that will be asked for.
+            light_seed: of the light paths, which other views may have too; None: `seed`.
         """
         self._seed = seed
+        self._light_seed = light_seed
         self._first = first_spp // 2
         self._most = max_spp // 2
         self.sums = [[tracer.pass_sum(camera) for tracer in tracers] for _ in range(2)]
@@ -106,8 +109,11 @@ class DualBuffer:
 
     def _add(self, half: int, size: int, chosen: Chosen) -> None:
         seed = seed_for(self._seed, "pass", self._passes, half)
+        light_seed = self._light_seed
+        if light_seed is not None:
+            light_seed = seed_for(light_seed, "pass", self._passes, half)
         for tracer in self.sums[half]:
-            tracer.add(seed=seed, spp=size, chosen=chosen)
+            tracer.add(seed=seed, spp=size, chosen=chosen, light_seed=light_seed)
         self._spp[half] += size if chosen is None else size * chosen
         self._count[half] += 1 if chosen is None else chosen
         self._mean_spp = None

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from pipeline.renders.calibrated_error import statement_for
+from pipeline.renders.calibrated_error import is_far, statement_for
 from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoise_corrections import (
     DARKER,
@@ -145,10 +145,9 @@ class HostPictures:
         self._halves = first, second = halves[0]
         self._picture = None
         statement = statement_for(self._settings, self._samples)
-        if statement is None:
-            floors = [estimate_error(*each, self.hits) for each in halves]
-            expected = None
-        else:
+        floors = [estimate_error(*each, self.hits) for each in halves]
+        expected = None
+        if statement and not is_far(floors[0], self._settings, self._samples.spp):
             (picture,) = self.finish()
             measures = {
                 name: measure_errors(first, second, picture, curve, self.hits, objects=objects)

@@ -91,11 +91,11 @@ LEVELS = [(float(1 << k), 2.0**k, 30 + 3.0 * k) for k in range(5)]
 
 def test_equal_error_lies_between_the_levels() -> None:
     for _, core_s, db in LEVELS:
-        assert cost_at_error(LEVELS, db) == (core_s, True)
-    core_s, is_reached = cost_at_error(LEVELS, 34.5)
-    assert is_reached and core_s == pytest.approx(2**1.5, rel=0.1)
-    assert cost_at_error(LEVELS, 50.0) == (LEVELS[-1][1], False)
-    assert cost_at_error(LEVELS, 20.0) == (LEVELS[0][1], False)
+        assert cost_at_error(LEVELS, db) == (core_s, 0)
+    core_s, bound = cost_at_error(LEVELS, 34.5)
+    assert not bound and core_s == pytest.approx(2**1.5, rel=0.1)
+    assert cost_at_error(LEVELS, 50.0) == (LEVELS[-1][1], 1)
+    assert cost_at_error(LEVELS, 20.0) == (LEVELS[0][1], -1)
 
 
 @pytest.mark.slow("benchmarks")

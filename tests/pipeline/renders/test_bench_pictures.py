@@ -54,11 +54,12 @@ def test_every_look_is_recorded_with_its_true_error() -> None:
 
 @pytest.mark.slow("references")
 @pytest.mark.usefixtures("llvm")
-def test_plain_mitsuba_comes_to_the_same_picture() -> None:
-    """With other samples of another sampler: its error falls with samples, towards our picture."""
+@pytest.mark.parametrize("sampler", ["independent", "multijitter"])
+def test_plain_mitsuba_comes_to_the_same_picture(sampler: str) -> None:
+    """With other samples: its error falls with samples, towards our picture."""
     scene = tiny_scene()
     ours = render_shot(scene, fixed_samples(32, 2048)).radiance_rgb
-    levels = render_levels(scene, 32, (16, 64, 1024), 5)
+    levels = render_levels(scene, 32, (16, 64, 1024), 5, sampler)
     assert [level.samples for level in levels] == [16, 64, 1024]
     assert levels[0].cpu_seconds
     errors = [psnr_log_db(level.radiance_rgb, ours) for level in levels]

@@ -19,7 +19,7 @@ from pipeline.renders.calibrated_error import (
 )
 from pipeline.renders.frozen_arithmetic.halves import Half, measure_errors
 from pipeline.renders.noise_floor import ErrorMeasures, clamped_radiance
-from pipeline.renders.settings import RenderSettings
+from pipeline.renders.settings import Arithmetic, RenderSettings
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.pipeline.renders.sampling import render_view
@@ -113,6 +113,24 @@ def test_what_was_not_calibrated_has_the_bound(
     found, before = (render_view(lit_scene(), each, 3) for each in (settings, bound))
     assert found.expected_error is None and not measured
     assert found.noise_floor_db == before.noise_floor_db
+
+
+@for_each("arithmetic", ["numpy", "device"])
+@pytest.mark.usefixtures("llvm")
+def test_far_from_its_targets_a_view_goes_on_by_its_halves(
+    measured: list[dict[str, ErrorMeasures]], arithmetic: Arithmetic
+) -> None:
+    """A target that nothing reaches, then one that is reached at once."""
+    measured.clear()
+    each_look = dataclasses.replace(SETTINGS, arithmetic=arithmetic)
+    near = dataclasses.replace(each_look, picture_within_db=2.0)
+    found, expected = (render_view(lit_scene(), settings, 3) for settings in (near, each_look))
+    assert len(measured) == 1 + 2, "at the cap alone, and at 128 and 256 samples"
+    assert found.noise_floor_db == expected.noise_floor_db
+    np.testing.assert_array_equal(found.radiance_rgb, expected.radiance_rgb)
+    measured.clear()
+    view = render_view(lit_scene(), dataclasses.replace(near, noise_floor_db=1.0), 3)
+    assert len(measured) == 1 and view.spp == near.first_spp and not view.at_cap
 
 
 def test_other_versions_and_damage(tmp_path: Path) -> None:
