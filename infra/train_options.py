@@ -24,7 +24,7 @@ class TrainOptions:
     """Training run, data and start."""
 
     run: str = "smoke"
-    """Training preset (a named set of settings), such as smoke or pretrain."""
+    """Training preset, such as tiny or pretrain; `trilight presets` lists them."""
     data: tuple[str, ...] = ("data/smoke",)
     """Dataset (a folder or a URL), or shards by name or pattern. Several are mixed by the setting
     data_weights; a pattern is such as s3://b/{train,validation}-{000000..000007}.tar."""

@@ -1,6 +1,6 @@
 """Loads a network from any source, without pickle.
 
-ours, shipped      builtin:hits (builtin: for short), builtin:tokens
+ours, shipped      builtin:hits (builtin: or default for short), builtin:tokens
 our own            model.safetensors of `trilight train`, or the folder that holds one
 checkpoints        a step of a run, or the folder of an unfinished run
 published, local   a folder with config.json and model.safetensors
@@ -34,6 +34,7 @@ from model.weights import (
     read_tensors,
     trained_range,
 )
+from storage.aliases import NETWORKS, stored_name
 from storage.atomic import write_atomically
 from storage.errors import TrilightError, expected_one_of
 from storage.records.safe_read import open_plain
@@ -105,7 +106,7 @@ def find_network(place: str | Path) -> NetworkFile:
     Raises:
         TrilightError: no such file, pickled code, or a damaged checkpoint.
     """
-    source = str(place)
+    source = stored_name(str(place), NETWORKS)
     if source.startswith(BUILTIN) and source not in BUILTIN_NETWORKS:
         raise TrilightError(
             f"checkpoint {source}: no such network comes along; "

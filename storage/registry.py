@@ -7,6 +7,7 @@ executors. Listing the table shows all of them.
 
 import re
 from collections.abc import Callable, Iterator, Mapping
+from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
 from storage.errors import TrilightError, expected_one_of
@@ -27,6 +28,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         entries: Mapping[str, Entry],
         *,
         decides: tuple[Decided, ...] = (),
+        aliases: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Begin a table.
 
@@ -36,11 +38,13 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             entries: our own.
             decides: what depends on its entries. Extensions that add to a table that decides
                 nothing are not recorded: they change how something is done, not what it means.
+            aliases: further names of our own entries; no list shows them.
         """
         self.what = what
         self._kind = kind
         self._decides = frozenset(decides)
         self._entries = dict(entries)
+        self._aliases = aliases
         self._origins: dict[str, Extension] = {}
 
     def register(self, name: str, entry: Entry) -> None:
@@ -62,7 +66,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
                 f"{self.what} {name!r}: not a valid name; expected up to 64 letters, digits and "
                 "_ . + : -"
             )
-        if name in self._entries:
+        if name in self:
             origin = self._origins.get(name)
             owner = origin.name if origin else "Trilight itself"
             raise TrilightError(f"{self.what} {name!r} is taken by {owner}; expected another name.")
@@ -105,21 +109,20 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
 
     def find(self, name: str) -> Entry:
         """Return an entry; raises TrilightError for a name that is not registered."""
-        if name not in self._entries:
-            raise TrilightError(
-                f"{self.what} {name!r} is unknown; {expected_one_of(name, self._entries)}."
-            )
-        return self._entries[name]
+        if name not in self:
+            known = [*self._aliases, *self._entries]
+            raise TrilightError(f"{self.what} {name!r} is unknown; {expected_one_of(name, known)}.")
+        return self[name]
 
     def is_ours(self, name: str) -> bool:
         """Return whether an entry comes with Trilight, and from no extension."""
-        return name in self._entries and name not in self._origins
+        return name in self and name not in self._origins
 
     def _remove(self, name: str) -> None:
         del self._entries[name], self._origins[name]
 
     def __getitem__(self, name: str) -> Entry:
-        return self._entries[name]
+        return self._entries[self._aliases.get(name, name)]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._entries)

@@ -18,6 +18,7 @@ from model.config import base as base_model
 from model.config import hits_base, hits_smoke
 from model.config import large as large_model
 from model.config import smoke as smoke_model
+from storage.aliases import PRESETS
 from storage.errors import TrilightError, expected_one_of
 from storage.registry import Registry
 from storage.settings.changes import changed
@@ -271,6 +272,7 @@ RUNS: Registry[Callable[[], TrainSettings]] = Registry(
         "paper-finetune-large": paper_finetune_large,
     },
     decides=("weights",),
+    aliases=PRESETS,
 )
 """Training presets by name."""
 

@@ -141,7 +141,7 @@ def _relative(metric: str, look: Look) -> float:
 
 
 ESTIMATORS: dict[str, Callable[[str, Look], float]] = {
-    "bound (before)": lambda metric, look: look.figures[f"bound_{metric}"],
+    "bound": lambda metric, look: look.figures[f"bound_{metric}"],
     "cross-half estimate": _unbiased_db("estimate"),
     "SURE": _unbiased_db("sure_1"),
     "jackknife of four passes (64 samples)": lambda metric, look: _db("jackknife", metric, look),
@@ -238,7 +238,7 @@ def _tables(looks: Sequence[Look]) -> Iterator[str]:
         )
         yield _line("statement", "64 px", "128 px", "256 px")
         yield "|---|---|---|---|"
-        for name in (*ESTIMATORS, "six measures (now)", "eleven measures"):
+        for name in (*ESTIMATORS, "six measures", "eleven measures"):
             some, stated = _calibrate(metric, name, mine, judging)
             yield _line(name, *_cells(metric, some, stated))
         yield from ("", "Statements as their authors have them:", "")

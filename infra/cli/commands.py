@@ -1,8 +1,10 @@
 """Table of the commands; the module of a command is imported when the command runs."""
 
+import sys
+from collections.abc import Collection
 from difflib import get_close_matches
 from importlib import metadata
-from typing import Any
+from typing import Any, ClassVar
 
 from cyclopts import App, CycloptsError, Group
 from cyclopts.exceptions import (
@@ -13,11 +15,12 @@ from cyclopts.exceptions import (
     UnknownOptionError,
     UnusedCliTokensError,
 )
-from cyclopts.help import HelpPanel
+from cyclopts.help import HelpEntry, HelpPanel
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from infra.cli.everyday import ALL_OPTIONS, EVERYDAY, HELP_FLAGS
 from storage.errors import expected_one_of
 
 _NAMES_WIDTH = 27
@@ -26,69 +29,138 @@ _NAMES_WIDTH = 27
 class Sections:
     """Formatter of cyclopts that prints each section of a help page."""
 
+    def __init__(self, options: Collection[str] = ()) -> None:
+        """Begin a page.
+
+        Args:
+            options: names of the options that are printed; empty for all. Arguments always are.
+        """
+        self._options = options
+        self.hides_some = False
+        """True once an option was left out."""
+
     def render_usage(self, console: Console, options: Any, usage: Any) -> None:
         """Print the usage line of a command."""
         console.print(Text(f"Usage: {usage}"))
 
     def __call__(self, console: Console, options: Any, panel: HelpPanel) -> None:
         """Print one section; nothing where it is empty."""
-        if not panel.entries:
+        entries = [entry for entry in panel.entries if self._is_shown(panel, entry)]
+        self.hides_some |= len(entries) < len(panel.entries)
+        if not entries:
             return
         console.print(Text(f"{panel.title}:", style="bold"))
         table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 1))
         table.add_column(width=1)
         table.add_column(style="cyan", max_width=_NAMES_WIDTH)
         table.add_column(ratio=1, overflow="fold")
-        for entry in panel.entries:
-            names = ", ".join(entry.display_labels_with_metavar)
+        for entry in entries:
+            names = ", ".join(entry.display_labels)
+            if panel.format == "parameter":  # further names keep working, and would only be read
+                metavar = "" if entry.positional_label else entry.metavar or ""
+                names = f"{entry.display_labels[0]} {metavar}".rstrip()
             table.add_row("", Text(names), entry.description or "")
         console.print(table)
         console.print()
 
+    def _is_shown(self, panel: HelpPanel, entry: HelpEntry) -> bool:
+        is_option = panel.format == "parameter" and not entry.positional_label
+        return not is_option or not self._options or entry.display_labels[0] in self._options
+
+
+class Program(App):
+    """The command line, whose help shows everyday options and examples first."""
+
+    shows_all: ClassVar[bool] = False
+    """True while a command is run that asks for all options."""
+
+    def __call__(self, tokens: Any = None, **options: Any) -> Any:
+        """Run a command; remembers whether all options are to be shown."""
+        words = sys.argv[1:] if tokens is None else tokens
+        Program.shows_all = ALL_OPTIONS in words
+        return super().__call__(tokens, **options)
+
+    def help_print(self, tokens: Any = None, *, console: Console | None = None) -> None:
+        """Print the help page of a command, and its examples."""
+        chain, apps, _ = self.parse_commands(tokens)
+        name = " ".join(chain)
+        page = EVERYDAY.get(name)
+        names = option_names(apps[-1], page.options) if page and not Program.shows_all else set()
+        sections = self.help_formatter = Sections(names)
+        console = console or self.console
+        super().help_print(tokens, console=console)
+        if page:
+            console.print(Text("Examples:", style="bold"))
+            console.print("".join(f"   {line}\n" for line in page.examples), highlight=False)
+        if sections.hides_some:
+            console.print(f"All options: trilight {name} {ALL_OPTIONS}\n", highlight=False)
+
+
+def option_names(command: App, fields: Collection[str]) -> set[str]:
+    """Return the shown names of the options that fill the named fields, and of --json."""
+    return {
+        argument.names[0]
+        for argument in command.assemble_argument_collection()
+        if fields and argument.field_info.name in (*fields, "json")
+    }
+
 
 COMMANDS = {
-    "doctor": "Check this machine: what is missing or slow, and how to fix it.",
-    "assets": "Turn objects into clean meshes within a budget or an error; writes quality.html.",
     "generate": "Turn objects into a verified dataset; run it again to resume.",
-    "submit": "Run generate remotely: by a Prefect server's workers, on Slurm or on Kubernetes.",
-    "revisit": "Render a finished dataset's scenes again with new cameras, lights or materials."
-    "\n\nPictures that stay the same are copied.",
+    "assets": "Turn objects into clean meshes within a budget or an error; writes quality.html.",
     "plan": "Measure a few scenes and predict time, bytes and cost with intervals.",
-    "render": "Render scenes: path traced to a measured noise floor, or by a network.",
-    "convert": "Convert scenes by file extension, and report what is lost.",
-    "export": "Write a dataset for other renderers, nerfstudio, COCO tools or Hugging Face.",
-    "push": "Upload a finished dataset, a network or a page to Hugging Face.",
-    "passes": "Write depth, normals, ids and more of stored scenes as OpenEXR.",
+    "status": "Report a dataset's progress, estimated finish and failures; needs no server.",
     "verify": "Check all hashes, members and rules of a dataset; exit 1 on problems."
     "\n\nAn unfinished dataset is checked as far as it exists; the exit status is 1 then too.",
+    "view": "Open a local page: a scene in 3D with its pictures, or a dataset.",
     "inspect": "Rewrite report, gallery and contact sheet, and print a summary."
     "\n\nFor the folder of a training run, its progress and last figures are printed."
     "\n\nFor a dataset that is read-only or on a server, only a summary is printed, unless --out "
     "names a folder. For a scene file, a summary and what its format lost are printed.",
-    "view": "Open a local page: a scene in 3D with its pictures, or a dataset.",
-    "model": "Print parameters, FLOPs and memory of a model size or a checkpoint.",
-    "status": "Report a dataset's progress, estimated finish and failures; needs no server.",
+    "render": "Render scenes: path traced to a stated error, or by a network.",
     "train": "Train a model; writes checkpoints, TensorBoard curves and a sheet of pictures."
     "\n\nTo train with processes on several machines, run torchrun -m trilight train ...",
     "evaluate": "Evaluate a network; writes evaluation.json, evaluation.md and sheets of pictures.",
     "leaderboard": "Compare all methods and networks on one dataset by error and cost."
     "\n\nWrites a table, a chart and rows; an interrupted run resumes.",
-    "bench": "Measure cost against error, or list the experiments; an interrupted run resumes.",
+    "convert": "Convert scenes by file extension, and report what is lost.",
+    "export": "Write a dataset for other renderers, nerfstudio, COCO tools or Hugging Face.",
+    "passes": "Write depth, normals, ids and more of stored scenes as OpenEXR.",
+    "push": "Upload a finished dataset, a network or a page to Hugging Face.",
+    "presets": "List the names that commands take: presets, networks, sizes, sources of objects.",
+    "submit": "Run generate remotely: on Slurm, on Kubernetes, or by a Prefect server's workers.",
+    "revisit": "Render a finished dataset's scenes again with new cameras, lights or materials."
+    "\n\nPictures that stay the same are copied.",
     "shards": "Make new datasets from finished ones.",
+    "bench": "Measure cost against error, or list the experiments; an interrupted run resumes.",
+    "model": "Print parameters, FLOPs and memory of a model size or a checkpoint.",
+    "doctor": "Check this machine: what is missing or slow, and how to fix it.",
 }
 """Help by command. A command is the function of its name in the module of its name; a group of
 commands is the `app` in that module."""
 
+SECTIONS = {
+    "Make": ("generate", "assets", "plan", "status", "verify"),
+    "Look": ("view", "inspect", "render"),
+    "Learn": ("train", "evaluate", "leaderboard"),
+    "Exchange": ("convert", "export", "passes", "push"),
+    "More": ("presets", "submit", "revisit", "shards", "bench", "model", "doctor"),
+}
+"""Commands of each section of `trilight -h`."""
+
 GROUPS = ("shards", "submit")
 """Commands with subcommands."""
 
-app = App(
+app = Program(
     name="trilight",
-    help="Make data for RenderFormer-style neural renderers, train them, and evaluate them.",
+    help="Make path-traced training data with a stated error; train and judge neural renderers.\n\n"
+    "First time? trilight generate tiny --out data/first\n"
+    "Then:       trilight view data/first",
     help_epilogue="Anywhere on the line: --extend FILE.py, a file of your own that adds layouts, "
     "presets, formats and more (docs/how-to).",
+    help_flags=HELP_FLAGS,
     help_format="plaintext",
-    help_formatter=Sections(),
+    group_commands=Group("Options", sort_key=99),
     version=lambda: f"trilight {metadata.version('trilight')}",
     version_format="plaintext",
     group_parameters=Group("Options"),
@@ -98,11 +170,22 @@ app = App(
     print_error=False,
 )
 """The whole command line."""
+_SECTION_OF = {
+    name: section
+    for rank, (title, names) in enumerate(SECTIONS.items())
+    for section in [Group(title, sort_key=rank)]
+    for name in names
+}
 for _rank, (_name, _help) in enumerate(COMMANDS.items()):
     _function = "app" if _name in GROUPS else _name
     _options: Any = {} if _name in GROUPS else {"help_epilogue": ""}  # groups state their own
     app.command(
-        f"{__package__}.{_name}:{_function}", name=_name, help=_help, sort_key=_rank, **_options
+        f"{__package__}.{_name}:{_function}",
+        name=_name,
+        help=_help,
+        sort_key=_rank,
+        group=_SECTION_OF[_name],
+        **_options,
     )
 app.register_install_completion_command(
     help="Let the tab key complete commands and options: --shell bash, zsh or fish."

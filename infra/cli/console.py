@@ -52,6 +52,8 @@ console = _TextConsole(stderr=False, highlight=False, markup=False, emoji=False)
 if not console.is_terminal and "COLUMNS" not in os.environ:
     console.width = 1000  # a log is searched by whole words, so that no line is wrapped
 
+_DIGEST = re.compile("[0-9a-f]{64}")
+
 _LEAST_RATED_S = 1.0
 """Seconds before a task's rate is printed."""
 
@@ -177,8 +179,12 @@ def print_rows(title: str, rows: Sequence[tuple[str, str]]) -> None:
     table.add_column(style="dim")
     table.add_column(overflow="fold")
     for name, value in rows:
-        table.add_row(name, Text(value))
+        if not _DIGEST.fullmatch(value):
+            table.add_row(name, Text(value))
     console.print(table)
+    for name, value in rows:
+        if _DIGEST.fullmatch(value):  # on one line, however narrow, so that it can be copied
+            console.print(Text(f"{name} {value}"), soft_wrap=True)
 
 
 def print_table(title: str, rows: Sequence[Mapping[str, object]]) -> None:

@@ -182,7 +182,7 @@ def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json
 def _next_steps(folder: DatasetFolder, statistics: Statistics) -> Iterator[Sequence[str]]:
     """Yield the next commands for a finished dataset; training only where it has such scenes."""
     yield ("verify", folder.display_name)
-    yield ("inspect", folder.display_name)
+    yield ("view", folder.display_name)
     if statistics.scenes_by_split.get("train") and _fits_training(read_head(folder.manifest)):
         yield ("train", _RUN, "--data", folder.display_name)
 

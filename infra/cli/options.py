@@ -34,7 +34,7 @@ from storage.settings.fields import (
     unwrap,
 )
 
-ALIASES = {
+SHOWN = {
     "allow_licences": "--allow-licence",
     "arc_deg": "--arc",
     "begin_with": "--from",
@@ -42,15 +42,22 @@ ALIASES = {
     "decisions": "--change",
     "error_db": "--error",
     "exposure_ev": "--exposure",
+    "LeaderboardOptions.scenes": "--max-scenes",
+    "LeaderboardOptions.width": "--resolution",
+    "InspectOptions.scenes": "--max-scenes",
     "hang_after_s": "--hang-after",
     "min_noise_floor_db": "--min-noise-floor",
+    "most_scenes": "--max-scenes",
     "most_unusable": "--skip-unusable",
     "noise_floor_db": "--noise-floor",
     "noise_floor_linear_db": "--noise-floor-linear",
     "noise_floor_objects_db": "--noise-floor-objects",
     "other_networks": "--beside",
+    "samples": "--probe-scenes",
+    "shards": "--range",
 }
-"""Second, shorter name of an option by its field; the first name is that of the field."""
+"""Name of an option that help shows, by field or Class.field, where the field's own name is not the
+best for people; that one works too."""
 
 _METAVARS = {int: "INT", float: "NUMBER"}
 _BY_DEFAULT = re.compile(r"; by default (.+?)\.(?=\s|$)")
@@ -115,10 +122,10 @@ def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> insp
     word: Any = bool if kind is bool else str  # numbers are read when the class is made
     if kind is str and not (choices or complete or takes_names(field.hint)):
         word = FileName
-    names = [option_of(field.name), *filter(None, [ALIASES.get(field.name)])]
+    names = dict.fromkeys([shown_name(field), option_of(field.name)])
     metavar = "CHOICE" if choices else _METAVARS.get(kind, "TEXT")
     declared = Parameter(
-        name=None if by_place else names,
+        name=None if by_place else tuple(names),
         help=_help(field, choices, several=several, required=required),
         group=group,
         metavar=None if kind is bool else "NAME=VALUE" if takes_names(field.hint) else metavar,
@@ -136,6 +143,12 @@ def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> insp
         default=inspect.Parameter.empty if required else None,
         annotation=Annotated[(list[word] if several else word) | None, declared],
     )
+
+
+def shown_name(field: FieldDescription) -> str:
+    """Return the name of a field's option that help shows."""
+    by_class = SHOWN.get(f"{field.owner.__name__}.{field.name}")
+    return by_class or SHOWN.get(field.name) or option_of(field.name)
 
 
 def _help(
@@ -182,7 +195,7 @@ def _settings(kind: type, words_by_name: Mapping[str, Any]) -> Any:
         name = re.match(r"\w+(?= is )", str(error))
         if name is None or name[0] not in fields:
             raise
-        raise TrilightError(option_of(name[0]) + str(error)[name.end() :]) from error
+        raise TrilightError(shown_name(fields[name[0]]) + str(error)[name.end() :]) from error
 
 
 def value_of(words: bool | str | Sequence[str], hint: Any) -> Any:

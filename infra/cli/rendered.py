@@ -131,7 +131,8 @@ def _describe(renderer: Renderer, facts: Facts) -> Rows:
         case PathTracer(settings=RenderSettings() as settings):
             floors = [_floor(settings, facts, name, metric) for name, metric in _FLOORS.items()]
             rows = [("noise floor", floors[0]), *(("", floor) for floor in floors[1:])]
-            rows.append(("", _meaning(settings, facts)))
+            if settings.stated_error == "calibrated":
+                rows.append(("", _meaning(settings, facts)))
             mean = f"{facts['mean_radiance']:.4g} (radiance), that of its samples"
             rows = [("samples per pixel", f"{facts['spp']}"), *rows, ("mean brightness", mean)]
             for part in settings.part_names:

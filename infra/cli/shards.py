@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cyclopts import App
+from cyclopts import App, Group
 
 from infra.cli.console import (
     first_words,
@@ -15,6 +15,7 @@ from infra.cli.console import (
     print_table,
     progress_bars,
 )
+from infra.cli.everyday import HELP_FLAGS
 from infra.cli.options import OutputOptions, command
 from pipeline.shards.derive import DeriveOptions
 from pipeline.shards.finished_dataset import open_finished
@@ -24,7 +25,7 @@ from storage.errors import TrilightError
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 
-app = App(name="shards", help_epilogue="")
+app = App(name="shards", help_epilogue="", help_flags=HELP_FLAGS, group_commands=Group("Commands"))
 
 _MOST_LISTED = 40
 """Maximum number of scenes in a printed list."""

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from cyclopts import App
+from cyclopts import App, Group
 
 from infra.cli.changes import BaseSettings, with_base_settings
 from infra.cli.console import (
@@ -17,6 +17,7 @@ from infra.cli.console import (
     print_rows,
     progress_bars,
 )
+from infra.cli.everyday import HELP_FLAGS
 from infra.cli.options import OutputOptions, command
 from pipeline.executors.array_job import ArrayJob, DatasetByArray, array_job
 from pipeline.executors.kubernetes_array import (
@@ -36,31 +37,33 @@ from storage.settings.ranges import Within
 if TYPE_CHECKING:
     from pipeline.flows.submission import RunStatus, SubmittedRun
 
-app = App(name="submit", usage="trilight submit FLOW BUILD [OPTIONS]")
+app = App(
+    name="submit",
+    usage="trilight submit SCHEDULER PRESET [OPTIONS]",
+    group_commands=Group("Schedulers"),
+    help_epilogue="",
+    help_flags=HELP_FLAGS,
+)
 BY_ARRAY = "make-by-array"
 """Flow that submits an array to a scheduler and shows the progress of its tasks."""
 SLURM = "slurm"
-ARRAYS = (SLURM, "kubernetes")
-"""Schedulers that take an array of tasks."""
+KUBERNETES = "kubernetes"
 FLOWS = ("generate-scenes", "prepare-assets", "build-dataset")
 """Flows that take the options of `trilight generate`."""
 
 
 @checked()
 class SubmitOptions:
-    """Flow or scheduler."""
+    """Flow."""
 
     flow: str
-    """Flow: generate-scenes, prepare-assets, build-dataset or make-by-array; or slurm, or
-    kubernetes. The last two need no server, and submit the missing shards as an array."""
+    """Scheduler above, or a flow of a Prefect server: generate-scenes, prepare-assets,
+    build-dataset."""
 
     def __post_init__(self) -> None:
-        if self.flow not in (*FLOWS, *ARRAYS):
-            served = ", ".join((*FLOWS, BY_ARRAY))
-            raise TrilightError(
-                f"flow {self.flow!r} is unknown; expected one of {served}, or of "
-                f"{', '.join(ARRAYS)}."
-            )
+        if self.flow not in FLOWS:
+            known = ", ".join((SLURM, KUBERNETES, *FLOWS, BY_ARRAY))
+            raise TrilightError(f"flow {self.flow!r} is unknown; expected one of {known}.")
 
 
 @checked()
@@ -75,16 +78,22 @@ class FlowRunOptions:
 
 @checked()
 class ArrayOptions:
-    """Array (slurm or kubernetes)."""
+    """Array of tasks."""
 
     shards_per_task: Annotated[int | None, Within(1, 10**6, unit="shards")] = None
     """Number of shards of an array task; by default as few as 1000 tasks allow."""
     at_once: Annotated[int | None, Within(1, 10**6, unit="tasks")] = None
     """Maximum number of tasks at the same time; by default the cluster decides."""
-    sbatch: tuple[str, ...] = ()
-    """slurm: further options of sbatch, such as --sbatch=--partition=cpu; by default none."""
     dry_run: bool = False
     """Write the files and print the commands, but submit nothing."""
+
+
+@checked()
+class SlurmOptions:
+    """Slurm."""
+
+    sbatch: tuple[str, ...] = ()
+    """Further options of sbatch, such as --sbatch=--partition=cpu; by default none."""
 
 
 @app.default
@@ -94,26 +103,38 @@ def submit(
     runs: FlowRunOptions,
     order: DatasetOrder,
     base: BaseSettings,
+    output: OutputOptions,
+) -> None:
+    _submit_flow(submission.flow, order, base, runs, output)
+
+
+@app.command(name=SLURM, help="Submit the missing shards to Slurm, as an array of tasks.")
+@command("build")
+def submit_to_slurm(
+    order: DatasetOrder,
+    base: BaseSettings,
+    array: ArrayOptions,
+    batch: SlurmOptions,
+    output: OutputOptions,
+) -> None:
+    order = with_base_settings(order, base)
+    submit_to_array(order, array, batch, as_json=output.json)
+
+
+@app.command(name=KUBERNETES, help="Submit the missing shards to Kubernetes, as an indexed job.")
+@command("build")
+def submit_to_kubernetes(
+    order: DatasetOrder,
+    base: BaseSettings,
     array: ArrayOptions,
     machines: KubernetesOptions,
     output: OutputOptions,
 ) -> None:
-    if submission.flow in ARRAYS:
-        order = with_base_settings(order, base)
-        submit_to_array(order, submission.flow, array, machines, as_json=output.json)
-        return
-    if (array, machines) != (ArrayOptions(), KubernetesOptions()):
-        raise TrilightError(
-            f"submit {submission.flow}: --shards-per-task, --at-once, --dry-run and the options of "
-            f"machines are those of submit {', '.join(ARRAYS)}; leave them out."
-        )
-    _submit_flow(submission.flow, order, base, runs, output)
+    order = with_base_settings(order, base)
+    submit_to_array(order, array, machines, as_json=output.json)
 
 
-@app.command(
-    name=BY_ARRAY,
-    help="Have a Prefect worker submit the missing shards as an array.",
-)
+@app.command(name=BY_ARRAY, help="Have a Prefect worker submit the missing shards as an array.")
 @command("build")
 def submit_by_array(
     order: DatasetByArray, base: BaseSettings, runs: FlowRunOptions, output: OutputOptions
@@ -136,16 +157,14 @@ def _submit_flow(
 
 
 def submit_to_array(
-    order: DatasetOrder, on: str, array: ArrayOptions, machines: KubernetesOptions, *, as_json: bool
+    order: DatasetOrder,
+    array: ArrayOptions,
+    options: SlurmOptions | KubernetesOptions,
+    *,
+    as_json: bool,
 ) -> None:
     """Submit the missing shards of a dataset and print the job; raises TrilightError."""
-    if on == SLURM and machines != KubernetesOptions():
-        raise TrilightError(
-            "submit slurm: --image, --where and the other options of machines are those of "
-            "submit kubernetes; leave them out, and use --sbatch."
-        )
-    if on != SLURM and array.sbatch:
-        raise TrilightError(f"submit {on}: --sbatch is an option of submit slurm; leave it out.")
+    on = SLURM if isinstance(options, SlurmOptions) else KUBERNETES
     first_words(f"Looking for what is missing of {order.place}", silent=as_json)
     job = array_job(order, per_task=array.shards_per_task, at_once=array.at_once, on=on)
     if not job.tasks:
@@ -157,11 +176,11 @@ def submit_to_array(
         return
     numbers = number_ranges(job.tasks)
     record: dict[str, Any] = {"array": numbers, "shards_per_task": job.per_task}
-    if on == SLURM:
-        name = None if array.dry_run else submit_array(job, array.sbatch)
-        line = _slurm_line(job, array.sbatch)
+    if isinstance(options, SlurmOptions):
+        name = None if array.dry_run else submit_array(job, options.sbatch)
+        line = _slurm_line(job, options.sbatch)
     else:
-        manifest = (write_job_file if array.dry_run else submit_job)(job, machines)
+        manifest = (write_job_file if array.dry_run else submit_job)(job, options)
         name = manifest.parent.name
         words = create_command(manifest)
         line = shlex.join(words)

@@ -11,12 +11,15 @@ from storage.markdown import table
 
 _HEAD = """# Command line
 
-Made from the classes of settings that the commands take, which are also what is
-checked and what Prefect's forms show: an option has the name of the field that it fills, `-` for
-`_`, and a second, shorter word where one is given. An option that may be repeated is written once
-for each value: `--data A --data B`. What the settings within settings are, which `--set` changes,
-is in [settings.md](settings.md).
+Every command and option. `trilight COMMAND -h` shows the everyday options and examples, and
+`--help-all` what is here. Where two names are given, both work. An option that may be repeated is
+written once for each value: `--data A --data B`. `--set` changes the [settings](settings.md).
 """
+
+_ORDER = "generate"
+"""Command whose options others take too."""
+_MANY = 10
+"""Number of options that two commands share before they are printed once."""
 
 
 @dataclass(frozen=True)
@@ -73,11 +76,19 @@ def _option(argument: Any) -> Option:
 def command_line_page() -> str:
     """Return every command with its options, as --help shows them."""
     parts = [_HEAD]
-    for command in every_command():
+    commands = every_command()
+    shared = next(set(command.options) for command in commands if command.name == _ORDER)
+    for command in commands:
         parts.append(f"## `trilight {command.name}`\n\n{command.help}\n")
+        options = command.options
+        if command.name != _ORDER and len(shared.intersection(options)) > _MANY:
+            parts.append(f"It takes these options of [generate](#trilight-{_ORDER}) too:\n")
+            names = [option.names[0] for option in options if option in shared]
+            parts.append(", ".join(f"`{name}`" for name in names) + "\n")
+            options = tuple(option for option in options if option not in shared)
         rows = [
             (f"`{', '.join(option.names)}`", option.takes, option.help.replace("|", "\\|"))
-            for option in command.options
+            for option in options
         ]
         parts.append(table(("option", "takes", "meaning"), rows) + "\n")
     return "\n".join(parts)

@@ -11,6 +11,7 @@ from pipeline.builds.training import TRAINING_BUILDS
 from pipeline.objects.generated import BENCHMARK
 from pipeline.objects.generated import PREFIX as BUILTIN
 from pipeline.renders.settings import NoiseTargets
+from storage.aliases import OBJECTS, PRESETS, stored_name
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
 from storage.registry import Registry
@@ -22,6 +23,7 @@ BUILDS: Registry[NamedBuild] = Registry(
     NamedBuild,
     {**TRAINING_BUILDS, **RENDERFORMER_BUILDS, **JUDGING_BUILDS},
     decides=("data",),
+    aliases=PRESETS,
 )
 """Builds by the name that the command line takes."""
 
@@ -99,6 +101,7 @@ def object_source(settings: BuildSettings, objects: str | None) -> str:
     Raises:
         TrilightError: the build is frozen with another source than the given one.
     """
+    objects = objects and stored_name(objects, OBJECTS)
     if settings.source is None:
         # An evaluated network may have been trained on the built-in objects.
         return objects or (BENCHMARK if settings.splits.one_split else BUILTIN)

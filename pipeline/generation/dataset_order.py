@@ -28,34 +28,30 @@ class DatasetOrder:
     """The dataset to make, the range of its shards, and how."""
 
     build: str = "smoke"
-    """Name of a build (a named set of settings), such as smoke or pretrain-256."""
+    """Dataset preset, such as tiny or pretrain-256; `trilight presets` lists them."""
     objects: str | None = None
-    """Source of 3D objects: a folder or a URL, builtin:, objaverse:, or env:TRILIGHT_SOURCE_NAME,
-    which reads the source from that environment variable of the worker. By default the source that
-    the build requires, or else builtin:."""
+    """Source of 3D objects: a folder, a URL, procedural:, objaverse:, or env:TRILIGHT_SOURCE_NAME,
+    the variable of a worker that holds the source; by default the preset's, or procedural:."""
     out: str | None = None
-    """Folder for the dataset, on the machine that makes it, or a bucket such as s3://bucket/folder;
-    by default data/BUILD. Machines that write to one bucket at the same time should make different
-    shards, or they make the same scenes twice."""
+    """Folder or bucket (s3://bucket/folder) for the dataset, on the machine that makes it; by
+    default data/BUILD."""
     scenes: Annotated[int | None, Within(1, MOST_SCENES, unit="scenes")] = None
-    """Number of scenes; by default the build's. With a larger number, the same command lets the
-    dataset grow."""
+    """Number of scenes; a larger one lets a dataset grow; by default the preset's."""
     seed: Seed | None = None
-    """Seed of objects, scenes, cameras and samples; by default the build's."""
+    """Seed of objects, scenes, cameras and samples; by default the preset's."""
     resolution: Resolution | None = None
-    """Width of a picture in pixels; by default the build's."""
+    """Width of an image in pixels; by default the preset's."""
     noise_floor_db: NoiseFloor | None = None
-    """Sampling stops at this measured noise floor in dB (psnr_log_db; higher is cleaner); by
-    default the build's, unless another floor is asked for. Of several, all are reached."""
+    """Target for the stated error in dB (psnr_log_db; higher is cleaner), where sampling stops; by
+    default the preset's, unless another target is given. Of several, all are reached."""
     noise_floor_linear_db: NoiseFloor | None = None
-    """Sampling stops at this floor as psnr_linear_db, of radiance clamped to [0, 1], 5 to 10 dB
-    below psnr_log_db in most pictures; by default the build's, unless another floor is asked
-    for."""
+    """The same as psnr_linear_db, of radiance clamped to [0, 1]; by default the preset's, unless
+    another target is given."""
     noise_floor_objects_db: NoiseFloor | None = None
-    """Sampling stops at this floor as object_psnr_log_db, in which empty background does not
-    count; by default the build's, unless another floor is asked for."""
+    """The same as object_psnr_log_db, which leaves out empty background; by default the preset's,
+    unless another target is given."""
     allow_licences: tuple[str, ...] = ()
-    """Licences to allow in addition to the build's; by default there are none."""
+    """Licences to allow in addition to the preset's; by default there are none."""
     licence: str | None = None
     """Licence of object files that state none; by default such files count as your own work."""
     textures: str | None = None
@@ -68,12 +64,10 @@ class DatasetOrder:
     """Licence of textures and maps of folders without a catalogue; by default such files count as
     your own work."""
     workers: Annotated[int | None, Within(1, 1024, unit="processes")] = None
-    """Number of render processes, which share the cores; by default one, or four for each GPU, or
-    as many as its memory holds."""
+    """Number of render processes, which share the cores; by default one, or up to four a GPU."""
     device: Device | None = None
-    """Device that renders: cpu, gpu, or auto, a GPU where one gives the right picture of a small
-    scene. It is chosen when a dataset begins and stands in its manifest; by default cpu for smoke
-    and the frozen builds, auto for others."""
+    """Device that renders: cpu, gpu, or auto (a GPU that renders a test scene correctly). The first
+    run of a dataset decides; by default cpu for tiny and frozen presets, auto for others."""
     failure_budget: Share = 0.1
     """Share of scenes that may fail for good before the run stops."""
     accept_environment: bool = False
@@ -95,7 +89,7 @@ class DatasetOrder:
     """Range A:B of the shards to make, from A up to but not including B; by default all. The run
     that makes the last missing shard finishes the dataset."""
     changes: Mapping[str, Any] = field(default_factory=dict)
-    """Changes to the build's settings, by dotted name, such as scenes.lights.coloured_share=0.5
+    """Changes to the preset's settings, by dotted name, such as scenes.lights.coloured_share=0.5
     (values are JSON); by default there are none."""
 
     def __post_init__(self) -> None:

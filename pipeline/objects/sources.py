@@ -24,6 +24,7 @@ from pipeline.objects.listing import SUFFIXES, CountDone, Fetched, Listing
 from pipeline.objects.local.folder import list_folder
 from pipeline.objects.objaverse.source import list_objaverse
 from pipeline.objects.remote.source import list_remote
+from storage.aliases import OBJECTS, stored_name
 from storage.cache import cache_folder
 from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
@@ -208,7 +209,7 @@ def list_objects(
 
     Args:
         source: a folder; `http(s)://`, `s3://`, `gs://`, `hf://` or `file://` and a folder;
-            `builtin:` or `builtin:N`; `objaverse:` and uids, a file of uids, or categories. A
+            `procedural:` or `procedural:N`; `objaverse:` and uids, a file of uids, or categories. A
             folder lists the rows of its `objects.jsonl` or `objects.csv`, or else its object
             files. `env:NAME` is the content of the environment variable NAME, which no message
             quotes; NAME begins with VARIABLES.
@@ -221,6 +222,7 @@ def list_objects(
             licence identifier is malformed, or is stated where the source states its own; a package
             is missing, or a server does not answer.
     """
+    source = stored_name(source, OBJECTS)
     with _resolve_source(source) as value:
         listing = _query_source(value, work_dir, licence, allowed_licences)
     assert listing is not None

@@ -75,8 +75,6 @@ class Statistics:
             ("views", f"{self.num_views}"),
             ("noise floor", _spread(self.noise_floor_db, "psnr_log_db")),
             *expected,
-            ("linear noise floor", _spread(self.noise_floor_linear_db, "psnr_linear_db")),
-            ("noise floor of objects", _spread(self.object_noise_floor_db, "object_psnr_log_db")),
             *(
                 (f"noise floor, {part}", _spread(floors_db, "psnr_log_db"))
                 for part, floors_db in self.part_noise_floor_db.items()

@@ -175,7 +175,8 @@ def test_the_top_level_holds_what_the_design_names() -> None:
     allowed = {
         *PACKAGES, "tests", "docs", "examples", "requirements", "README.md", "LICENSE",
         "CONTRIBUTING.md", "DECISIONS.md", "MANIFEST.in", "Makefile", "pyproject.toml",
-        "prefect.yaml", "mkdocs.yml",
+        "prefect.yaml", "mkdocs.yml", "AGENTS.md", "CHANGELOG.md",
+        "CITATION.cff",
     }  # fmt: skip
     top = {line.split("/")[0] for line in tracked.splitlines()}
     assert {name for name in top if not name.startswith(".")} <= allowed

@@ -62,7 +62,7 @@ def test_the_readme_serves_runs_and_stops_as_is_done_here() -> None:
     """`served` runs what `make serve` and `make stop` run; the line between is run below."""
     serve, run, submit, stop = documented_serving()
     assert run.startswith("prefect deployment run generate-scenes/local ")
-    assert submit.startswith("trilight submit generate-scenes smoke --scenes 64 --out ")
+    assert submit.startswith("trilight submit generate-scenes tiny --scenes 64 --out ")
     for line, last in ((serve, START), (stop, STOP)):
         # under `make test` a make that is called says in which folder it works
         make = ["make", "--dry-run", "--no-print-directory", "--old-file", "setup"]

@@ -34,11 +34,7 @@ TUTORIALS = [
         "your-own-objects",
         "train-and-judge",
         "look-around",
-        "read-the-reports",
         "stand-on-a-leaderboard",
-        "publish",
-        "a-cluster",
-        "mix-datasets",
         "blender-and-back",
     )
 ]
@@ -56,7 +52,8 @@ def _shell_lines(page: Path) -> list[str]:
     return shell_lines(text)
 
 
-PAGES = [README, ROOT / "CONTRIBUTING.md", SCRIPT, *sorted((ROOT / "docs").rglob("*.md"))]
+AGENTS = ROOT / "AGENTS.md"
+PAGES = [README, AGENTS, ROOT / "CONTRIBUTING.md", SCRIPT, *sorted((ROOT / "docs").rglob("*.md"))]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 SHOWN = re.findall(r"^    (trilight .*)$", "".join(e.read_text() for e in EXAMPLES), re.MULTILINE)
 USED = sorted({*SHOWN, *(line for page in PAGES for line in _shell_lines(page))})
@@ -72,8 +69,11 @@ def _trilight_words(line: str) -> list[str]:
     return []
 
 
+SUBMISSIONS = [["submit", name] for name in ("slurm", "kubernetes", "make-by-array")]
+
+
 def _command(words: list[str]) -> tuple[str, ...]:
-    is_within = words[0] == "shards" or words[:2] == ["submit", "make-by-array"]
+    is_within = words[0] == "shards" or words[:2] in SUBMISSIONS
     return tuple(words[: 2 if is_within else 1])
 
 
@@ -91,7 +91,7 @@ def test_readme_and_tutorials_show_commands() -> None:
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_commands_and_their_options_exist(command: tuple[str, ...]) -> None:
     # names of options are cut off in narrow tables
-    ended = trilight([*command, "--help"], env={"COLUMNS": "300"})
+    ended = trilight([*command, "--help-all"], env={"COLUMNS": "300"})
     assert ended.exit_code == 0, command
     shown = ended.stdout
     for line in USED:
@@ -108,7 +108,7 @@ def test_targets_of_make_exist() -> None:
             assert line.split()[1] in targets, line
 
 
-@pytest.mark.parametrize("page", [README, ROOT / "DECISIONS.md"], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [README, AGENTS, ROOT / "DECISIONS.md"], ids=lambda p: p.name)
 def test_links_lead_somewhere(page: Path) -> None:
     """Those between the pages of docs/ are held by its strict build."""
     for target in re.findall(r"\[[^\]]*\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text()):

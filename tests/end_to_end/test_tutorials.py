@@ -1,4 +1,4 @@
-"""The tutorials of looking, judging, publishing and mixing: every step of them, on toy scenes.
+"""The tutorials of looking and comparing: every step of them, on toy scenes.
 
 The toy sets stand where the pages before have made theirs; test_readme runs all pages from the
 first on, as a reader does.
@@ -7,26 +7,21 @@ first on, as a reader does.
 import contextlib
 import csv
 import dataclasses
-import os
 import re
 import shlex
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from infra.release.__main__ import main as release
 from infra.viewer.deferred_handlers import page_of
 from infra.viewer.open_source import open_handlers
 from pipeline.builds.named import named_build
-from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_of_file
 from storage.records.objects import write_objects_lock
 from storage.records.scene import Scene
-from tests.command_line import run_program, trilight
-from tests.conftest import ROOT
+from tests.command_line import trilight
 from tests.end_to_end.production_kit import Step, steps_of, tutorial
 from tests.infra.viewer.served_kit import served
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, locked
@@ -83,14 +78,13 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Return a reader's folder, with what the pages before have made; it is the working one."""
     desk = tmp_path_factory.mktemp("desk")
     toys(desk / "data" / "mine", train=3, validation=1, **SMOKE)
-    toys(desk / "data" / "array", train=3, validation=0)
     with contextlib.chdir(desk):
         began = "train smoke --data data/mine --out runs/mine --steps 2".split()
         assert trilight([*began, *SMALL]).exit_code == 0
         yield desk
 
 
-def do(step: Step, desk: Path) -> None:
+def do(step: Step) -> None:
     """Do what a page says."""
     if step.language == "python":
         text = step.text.replace("resolution=64", f"resolution={PX}")
@@ -99,15 +93,9 @@ def do(step: Step, desk: Path) -> None:
     words = shlex.split(TOYS.get(step.text, step.text))
     if words[:2] == ["trilight", "view"]:
         look(words[2])
-    elif words[0] == "trilight":
-        run(words[1:])
-    elif words[:2] == ["make", "release"]:
-        place = desk / words[2].removeprefix("RELEASE=")
-        toys(place / "dataset", train=1, validation=1)
-        release(place, 1)
     else:
-        assert words[0] in ("cd", "python"), step.text
-        apart(step.text, desk)
+        assert words[0] == "trilight", step.text
+        run(words[1:])
 
 
 def run(words: list[str]) -> None:
@@ -126,32 +114,24 @@ def look(source: str) -> None:
         assert status == 200 and told, source
 
 
-def apart(line: str, desk: Path) -> None:
-    """Run a line of a shell in a process of its own."""
-    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    run_program(["sh", "-c", line], desk, PATH=path, PYTHONPATH=str(ROOT))
-
-
 @pytest.mark.parametrize(
     ("page", "made"),
     [
-        ("look-around", ["data/corners/report.html", "data/files/more/room.usdz"]),
-        ("read-the-reports", ["data/mine/templates.png", "data/mine/report.html"]),
+        (
+            "look-around",
+            ["data/corners/report.html", "data/files/more/room.usdz", "data/mine/templates.png"],
+        ),
         ("stand-on-a-leaderboard", ["boards/mine/leaderboard.png", "data/for-others/views.csv"]),
-        ("publish", ["data/small/gallery/index.html", "data/hub/manifest.json"]),
-        ("mix-datasets", ["runs/mixed/model.safetensors"]),
         ("../how-to/coming-from-scripts", ["data/v1-energon/.nv-meta/split.yaml"]),
     ],
 )
 def test_every_step_of_a_page_does_what_is_said(page: str, made: list[str], desk: Path) -> None:
     for step in steps_of(tutorial(page)):
-        do(step, desk)
+        do(step)
     for name in made:
         assert (desk / name).stat().st_size > 0, name
     if page == "stand-on-a-leaderboard":
         require_board(desk / "boards" / "mine" / "leaderboard.csv")
-    if page == "publish":
-        assert not verify_dataset(desk / "data" / "hub").problems
 
 
 def require_board(path: Path) -> None:

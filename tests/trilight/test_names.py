@@ -105,7 +105,8 @@ CODE = _code((ROOT / "docs/reference/python.md").read_text())
 
 
 def test_the_page_is_a_program() -> None:
-    assert len(CODE) == 4
+    assert len(CODE) == 6
+    assert all(len(block.strip().splitlines()) <= 12 for block in CODE)
     compile("\n".join(CODE), "python.md", "exec")
 
 
@@ -117,6 +118,15 @@ def test_the_page_runs(tmp_path: Path) -> None:
     _require_runs(tmp_path, str(program))
     made = {path.name for path in tmp_path.iterdir()}
     assert {"still.usdz", "still.exr", "network.png", "set", "run", "evaluation"} <= made
+
+
+@pytest.mark.slow("commands")
+def test_the_lines_of_the_readme_run(tmp_path: Path) -> None:
+    (code,) = _code((ROOT / "README.md").read_text())
+    assert len(code.strip().splitlines()) <= 10
+    (tmp_path / "program.py").write_text(code)
+    _require_runs(tmp_path, str(tmp_path / "program.py"))
+    assert (tmp_path / "knot.png").stat().st_size > 500
 
 
 def test_a_name_is_exported_as_its_import_calls_it(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
+from storage.aliases import NETWORKS, stored_name
 from storage.errors import TrilightError
 from storage.settings.described import checked
 from storage.settings.fields import option_of
@@ -52,14 +53,18 @@ class LeaderboardOptions:
     out: Path = Path("leaderboard")
     """Folder for table, chart and rows; with existing rows a run resumes."""
 
+    def __post_init__(self) -> None:
+        stored = tuple(stored_name(each, NETWORKS) for each in self.checkpoint)
+        object.__setattr__(self, "checkpoint", stored)  # each network once, under one name
+
 
 @checked()
 class EvaluationOptions:
     """Network to evaluate, and the data to use."""
 
     checkpoint: str | None = None
-    """Folder of a run, model.safetensors, a checkpoint, or builtin: for the network that comes with
-    Trilight; by default none. Without one, all methods are compared as by trilight leaderboard."""
+    """Folder of a run, model.safetensors, a checkpoint, or default for the included network; by
+    default none. Without one, all methods are compared as by trilight leaderboard."""
     data: tuple[str, ...]
     """Dataset (a folder or a URL), or shards by name or pattern."""
     other_networks: tuple[str, ...] = ()

@@ -1,6 +1,7 @@
 """What every command has in common: help that says all, completion, a version, near names."""
 
 import io
+import json
 import os
 import re
 import shlex
@@ -13,16 +14,20 @@ from typing import Annotated, Any, Literal, Optional
 import pytest
 
 from infra.cli import console
-from infra.cli.commands import COMMANDS
-from infra.cli.options import ALIASES, choices_of, is_repeated, takes_names, value_of
+from infra.cli.commands import COMMANDS, SECTIONS
+from infra.cli.everyday import EVERYDAY
+from infra.cli.options import choices_of, is_repeated, takes_names, value_of
 from infra.cli.options import kind_of as kind_of_field
 from infra.setup.command_line_page import every_command
 from infra.setup.generated_pages import PAGES
+from model.config import SIZES
+from pipeline.builds.named import BUILDS
 from pipeline.shards.expression import TEXTS, condition, kind_of
 from storage.records.quantities import QUANTITIES
 from storage.settings.fields import option_of
 from tests.command_line import run_program, trilight
 from tests.for_each import case
+from train.runs import RUNS
 
 ALL = {found.name: found for found in every_command()}
 TYPED = "pre"
@@ -43,7 +48,7 @@ def test_every_option_says_what_it_is_and_its_default() -> None:
     """At 80 columns no text is lost: Rich would take `[builtin:]` for a style and drop it."""
     for name in ALL:
         with case(name):
-            shown = trilight([*name.split(), "-h"], env={"COLUMNS": "80"}).stdout
+            shown = trilight([*name.split(), "--help-all"], env={"COLUMNS": "80"}).stdout
             assert shown.startswith(f"Usage: trilight {name} ")
             assert max(map(len, shown.splitlines())) <= 80
             for option in ALL[name].options:
@@ -53,8 +58,59 @@ def test_every_option_says_what_it_is_and_its_default() -> None:
                 assert said or not option.takes, f"{option.names}: {option.help}"
                 assert set(option.help.split()) <= set(shown.split()), option.names
                 if option.names[0].startswith("--"):
-                    assert option.names[0] == option_of(option.field)
-                assert option.names[1:] == tuple(filter(None, [ALIASES.get(option.field)]))
+                    assert option.names[-1] == option_of(option.field)
+
+
+def test_help_shows_everyday_options_and_three_examples_first() -> None:
+    assert set(EVERYDAY) == set(ALL)
+    for name, page in EVERYDAY.items():
+        with case(name):
+            shown = trilight([*name.split(), "-h"], env={"COLUMNS": "80"}).stdout
+            assert len(page.examples) == 3
+            options = {option.field: option for option in ALL[name].options}
+            assert set(page.options) <= set(options)
+            for option in options.values():
+                is_argument = not option.names[0].startswith("--")
+                everyday = not page.options or option.field in (*page.options, "json")
+                listed = re.search(rf"^   {option.names[0]}(?![\w-])", shown, re.MULTILINE)
+                assert bool(listed) == (is_argument or everyday), option.names
+            assert ("--help-all" in shown) == (len(page.options) > 0)
+            for example in page.examples:
+                assert f"   {example}\n" in shown
+                words = shlex.split(example)[1:]
+                known = {each for option in options.values() for each in option.names}
+                typed = {word.split("=")[0] for word in words if word.startswith("--")}
+                assert typed <= {*known, "--extend"}
+
+
+def test_what_concerns_other_schedulers_is_not_in_the_help_of_slurm() -> None:
+    shown = trilight(["submit", "slurm", "--help-all"]).stdout
+    assert "--sbatch" in shown
+    assert not re.search("--(image|deployment|memory-gib|no-watch)", shown)
+
+
+def test_the_first_page_has_five_sections_and_a_first_command() -> None:
+    shown = trilight([]).stdout
+    assert "First time? trilight generate tiny --out" in shown
+    for title, names in SECTIONS.items():
+        assert f"\n{title}:\n" in shown
+        assert all(re.search(rf"^   {name} ", shown, re.MULTILINE) for name in names)
+    assert sorted(sum(SECTIONS.values(), ())) == sorted(COMMANDS)
+
+
+def test_presets_lists_what_there_is_by_its_name_for_people() -> None:
+    shown = trilight(["presets"], env={"COLUMNS": "120"}).stdout
+    for name in (*BUILDS, *RUNS, *SIZES, "tiny (stored: smoke)", "default (stored: builtin:)"):
+        assert name in shown
+    assert json.loads(trilight(["presets", "--json"]).stdout)["datasets"][0]["scenes"] == 24
+
+
+def test_a_digest_is_on_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    out = io.StringIO()
+    narrow = console._TextConsole(file=out, width=60, markup=False)
+    monkeypatch.setattr(console, "console", narrow)
+    console.print_rows("title", [("a long name of a digest", "ab" * 32), ("other", "words")])
+    assert f"a long name of a digest {'ab' * 32}\n" in out.getvalue()
 
 
 def test_no_words_are_a_question_for_help_and_the_version_is_a_number() -> None:
@@ -67,9 +123,10 @@ def test_no_words_are_a_question_for_help_and_the_version_is_a_number() -> None:
 
 
 MISTAKES = {
-    "evaluat": "command 'evaluat' is unknown; did you mean evaluate? Expected one of doctor,",
+    "evaluat": "command 'evaluat' is unknown; did you mean evaluate? Expected one of generate,",
     "shards merg": "shards: command 'merg' is unknown; did you mean merge?",
     "generate smoke --objekts x": "option '--objekts' is unknown; did you mean --objects?",
+    "submit slurm smoke --image x": "submit slurm: option '--image' is unknown",
     "verify": "verify: DATASET is missing; expected: Dataset, a folder",
     "generate smoke --seed": "generate: --seed has no value; expected: Seed of objects",
     "generate smoke --seed 1 --seed 2": "generate: --seed is given twice; expected it once.",
@@ -81,8 +138,8 @@ MISTAKES = {
 PRICE = "expected a number from 0 to 1000 USD per core-hour."
 REFUSED = {
     "generate smoke --scenes 0": "--scenes is 0; expected a whole number from 1 to 1000000000",
-    "generate smoke --noise-floor nan": "--noise-floor-db is nan; expected a number above 0",
-    "render x --out y.exr --exposure -99": "--exposure-ev is -99",
+    "generate smoke --noise-floor nan": "--noise-floor is nan; expected a number above 0",
+    "render x --out y.exr --exposure -99": "--exposure is -99",
     "plan smoke --price -1": f"--price is -1.0; {PRICE}",
     "plan smoke --price nan": f"--price is nan; {PRICE}",
     "status nowhere --price inf": f"--price is inf; {PRICE}",
@@ -91,12 +148,7 @@ REFUSED = {
     "model huge": "model 'huge': neither a size nor a checkpoint here",
     "model large --resolution 72": "--resolution is 72; expected a multiple of 64",
     "model smoke --publish x": "model: --publish needs a checkpoint",
-    "submit x smoke": "flow 'x' is unknown; expected one of generate-scenes, prepare-assets, "
-    "build-dataset, make-by-array, or of slurm",
-    "submit slurm smoke --image x": "submit slurm: --image, --where and the other options of "
-    "machines are those of submit kubernetes; leave them out, and use --sbatch",
-    "submit generate-scenes smoke --where x": "submit generate-scenes: --shards-per-task, "
-    "--at-once, --dry-run and the options of machines are those of submit slurm, kubernetes",
+    "submit x smoke": "flow 'x' is unknown; expected one of slurm, kubernetes, generate-scenes",
     "bench rungs-64": "experiment 'rungs-64' is unknown; expected one of cycles, frontier, gpu, "
     "growth, loader, meshes, methods, paired-training, relighting",
 }

@@ -187,7 +187,7 @@ def test_refusals(tools: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "kubectl refused (AlreadyExists)" in trilight(words).mistake
     monkeypatch.setenv("PATH", "/nowhere")
     assert "no kubectl here" in trilight(words).mistake
-    assert "--sbatch is an option of submit slurm" in trilight([*words, "--sbatch=-x"]).mistake
+    assert "'--sbatch' is unknown" in trilight([*words, "--sbatch=-x"]).mistake
 
 
 def test_status_prints_what_any_scheduler_needs(
