@@ -13,7 +13,7 @@ from infra.render.quality import MOST_TRACED_SPP, ToStatedError
 from infra.render.sources import own_camera
 from infra.torch_library import require_torch
 from pipeline.renders.results import RenderedView
-from pipeline.renders.settings import NoiseTargets
+from pipeline.renders.settings import NoiseTargets, RenderSettings, StatedError
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX, preview_srgb8
 from storage.errors import TrilightError
@@ -32,6 +32,7 @@ def render(
     noise_floor_linear_db: float | None = None,
     noise_floor_objects_db: float | None = None,
     max_spp: int = MOST_TRACED_SPP,
+    stated_error: StatedError = RenderSettings.stated_error,
     split: bool = False,
     split_lobes: bool = False,
     seed: int = 0,
@@ -51,6 +52,7 @@ def render(
         noise_floor_linear_db: the same for psnr_linear_db; all given floors are reached.
         noise_floor_objects_db: the same for object_psnr_log_db: pixels that show geometry.
         max_spp: sampling also stops at this many samples per pixel.
+        stated_error: `bound`, or `calibrated` for floors that are calibrated on other scenes.
         split: also return direct and indirect light, whose sum is the picture.
         split_lobes: also return the light of the diffuse and of the specular lobe of the visible
             surface; with `split` there are four layers.
@@ -58,8 +60,9 @@ def render(
         threads: CPU threads; all cores by default.
 
     Returns:
-        `radiance_rgb` [R, R, 3] float32 linear radiance, its three floors, `spp` and more; with a
-        split also `parts_rgb` and `part_floors` by name.
+        `radiance_rgb` [R, R, 3] float32 linear radiance, its three floors, `spp` and more;
+        `expected_error` where the floors are calibrated; with a split also `parts_rgb` and
+        `part_floors` by name.
 
     Raises:
         TrilightError: an invalid number, or a scene that cannot be rendered.
@@ -72,6 +75,7 @@ def render(
         noise_floor_linear_db=noise_floor_linear_db,
         noise_floor_objects_db=noise_floor_objects_db,
         max_spp=max_spp,
+        stated_error=stated_error,
         split=split,
         split_lobes=split_lobes,
         seed=seed,
@@ -89,6 +93,7 @@ def render_views(
     noise_floor_linear_db: float | None = None,
     noise_floor_objects_db: float | None = None,
     max_spp: int = MOST_TRACED_SPP,
+    stated_error: StatedError = RenderSettings.stated_error,
     split: bool = False,
     split_lobes: bool = False,
     seed: int = 0,
@@ -99,8 +104,9 @@ def render_views(
     Args:
         scene: a scene that passes `Scene.check`.
         views: cameras, as rows of `scene.c2w`; all by default.
-        resolution, noise_floor_db, noise_floor_linear_db, noise_floor_objects_db, max_spp, split,
-            split_lobes, seed, threads: as in `render`, which documents results and errors.
+        resolution, noise_floor_db, noise_floor_linear_db, noise_floor_objects_db, max_spp,
+            stated_error, split, split_lobes, seed, threads: as in `render`, which documents results
+            and errors.
     """
     from infra.render.path_tracer import PathTracer, RenderChild
     from pipeline.renders.variant import choose_variant
@@ -113,7 +119,13 @@ def render_views(
         linear_db=noise_floor_linear_db,
         objects_db=noise_floor_objects_db,
     )
-    quality = ToStatedError(targets=targets, max_spp=max_spp, split=split, split_lobes=split_lobes)
+    quality = ToStatedError(
+        targets=targets,
+        max_spp=max_spp,
+        stated_error=stated_error,
+        split=split,
+        split_lobes=split_lobes,
+    )
     child = RenderChild(choose_variant("auto"), threads)
     tracer = PathTracer(child, quality, resolution, seed=seed)
     with contextlib.closing(tracer):

@@ -51,15 +51,17 @@ class BenchScale:
     """Number of scenes on which paired trainings are evaluated."""
     growth: int
     """Number of sizes that growth is measured at, each four times the one before."""
+    layouts: int
+    """Number of layouts of the calibration."""
 
 
 FULL = BenchScale(
     name="full", scenes=20, resolution=128, max_spp=1024, reference_spp=512, picture_px=256,
-    objects=24, repeats=3, steps=2000, held_out=64, growth=5,
+    objects=24, repeats=3, steps=2000, held_out=64, growth=5, layouts=400,
 )  # fmt: skip
 QUICK = BenchScale(
     name="quick", scenes=3, resolution=64, max_spp=256, reference_spp=128, picture_px=128,
-    objects=5, repeats=1, steps=100, held_out=16, growth=3,
+    objects=5, repeats=1, steps=100, held_out=16, growth=3, layouts=2,
 )  # fmt: skip
 
 
@@ -145,6 +147,11 @@ class Experiment:
     """Name of a trial's cluster: trials of one cluster are alike; by default none is."""
     warm_up: bool = False
     """True for an additional first trial that is not counted, if all trials are repeats."""
+    figures: tuple[str, ...] = ()
+    """Names of the figures, where rows hold their values alone; a trial may lack all of them."""
+    versions: Callable[[BenchOptions], Mapping[str, str]] | None = None
+    """Function that returns all that figures depend on, where a run may resume on other machines
+    and commits; None where figures are of one machine, one commit and all options."""
     needs: tuple[Literal["torch", "blender", "data"], ...] = ()
     """Requirements on the machine or the options."""
 

@@ -72,11 +72,10 @@ def run(
     points = _points_of(experiment, scale, options)
     plan = {
         "experiment": experiment.name,
-        "scale": dataclasses.asdict(scale),
-        "options": public_options(options),
-        "machine": machine_record(device_of(options) if "torch" in experiment.needs else "cpu"),
+        **_conditions(experiment, scale, options),
         "points": [point.record() for point in points],
         "trials": list(experiment.trials(scale, options)),
+        **({"figures": list(experiment.figures)} if experiment.figures else {}),
     }
     store = Store(out)
     current = store.begin(plan)
@@ -91,6 +90,18 @@ def run(
     plot(experiment, current, out.with_suffix(".png"))
     store.end(current, time.perf_counter() - began, notes)
     return current
+
+
+def _conditions(experiment: Experiment, scale: BenchScale, options: BenchOptions) -> dict[str, Any]:
+    """Return the part of a plan that says under which conditions figures are measured."""
+    if experiment.versions is not None:
+        versions = dict(experiment.versions(options))
+        return {"scale": {"name": scale.name}, "options": {}, "machine": {"versions": versions}}
+    return {
+        "scale": dataclasses.asdict(scale),
+        "options": public_options(options),
+        "machine": machine_record(device_of(options) if "torch" in experiment.needs else "cpu"),
+    }
 
 
 def _points_of(experiment: Experiment, scale: BenchScale, options: BenchOptions) -> list[Point]:

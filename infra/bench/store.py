@@ -88,8 +88,10 @@ class Store:
         return Run(plan=plain, date=today)
 
     def add(self, run: Run, trial: str, point: str, figures: Figures) -> None:
-        """Write the figures of one point in one trial."""
-        self._write(run, {"trial": trial, "point": point, "figures": dict(figures)})
+        """Write the figures of one point in one trial; values alone if the plan names them."""
+        names = run.plan.get("figures")
+        stored = dict(figures) if names is None else [figures[name] for name in names if figures]
+        self._write(run, {"trial": trial, "point": point, "figures": stored})
 
     def leave_out(self, run: Run, trial: str, why: str) -> None:
         """Write that a trial counts for no point, and why."""
@@ -109,7 +111,10 @@ class Store:
 
 def _take(run: Run, record: Mapping[str, Any]) -> None:
     if "figures" in record:
-        run.trials.setdefault(record["trial"], {})[record["point"]] = record["figures"]
+        figures = record["figures"]
+        if isinstance(figures, list):
+            figures = dict(zip(run.plan["figures"], figures, strict=bool(figures)))
+        run.trials.setdefault(record["trial"], {})[record["point"]] = figures
     elif "left_out" in record:
         run.left_out[record["trial"]] = record["left_out"]
     else:

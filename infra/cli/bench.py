@@ -91,7 +91,9 @@ def _print_run(experiment: "Experiment", run: "Run") -> None:
             table.add_row(Text(line[0]), *map(Text, line[columns]))
         console.print(table)
     machine = run.plan["machine"]
-    measured_on = (machine.get("gpu"), machine["processor"], f"{machine['cores']} cores")
+    measured_on = [str(machine[name]) for name in ("gpu", "processor") if name in machine]
+    if "cores" in machine:
+        measured_on += [f"{machine['cores']} cores", f"commit {machine['commit']}"]
     notes = [
         experiment.because,
         *run.notes,
@@ -99,8 +101,7 @@ def _print_run(experiment: "Experiment", run: "Run") -> None:
             f"{count} of {len(run.plan['trials'])} trials left out: {why}"
             for why, count in Counter(run.left_out.values()).items()
         ),
-        f"{run.plan['scale']['name']}, {run.date}, {', '.join(filter(None, measured_on))}, "
-        f"commit {machine['commit']}",
+        ", ".join([run.plan["scale"]["name"], run.date, *measured_on]),
     ]
     for note in filter(None, notes):
         console.print(Text(note), soft_wrap=True)

@@ -151,6 +151,11 @@ def _as_json(
         "distributions": distributions.as_json(),
         "licences": Counter(entry.licence for entry in distributions.objects),
         "noise_floor_db": _round_db(statistics.noise_floor_db),
+        **(
+            {}
+            if statistics.expected_error_db is None
+            else {"expected_error_db": _round_db(statistics.expected_error_db)}
+        ),
         "noise_floor_linear_db": _round_db(statistics.noise_floor_linear_db),
         "object_noise_floor_db": _round_db(statistics.object_noise_floor_db),
         "part_noise_floor_db": {

@@ -13,6 +13,7 @@ from infra.render.networks import NetworkRenderer
 from infra.render.path_tracer import PathTracer
 from infra.render.plan import RenderPlan
 from infra.render.run import FinishedShot, RenderResult
+from pipeline.renders.calibrated_error import OUTSIDE, promise_sentence
 from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.settings import RenderSettings
 from storage.renderer import Facts, Renderer
@@ -25,6 +26,13 @@ _FLOORS = {
     "object_noise_floor_db": "object_psnr_log_db",
 }
 """Metric by the name of the stated error (noise floor) of a path traced picture."""
+
+_EXPECTED = {
+    "noise_floor_db": "expected_error_db",
+    "noise_floor_linear_db": "expected_error_linear_db",
+    "object_noise_floor_db": "object_expected_error_db",
+}
+"""Expected error by the name of the stated one."""
 
 _FILTERS = {"fast": "one fast denoise", "high": "one denoise", "off": "not denoised"}
 
@@ -110,7 +118,8 @@ def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
     rows += [("wall time", f"{seconds:.1f} s"), ("scene digest", done.scene_sha256)]
     print_rows("Rendered", rows)
     measure = " and ".join(str(picture.path) for picture in done.pictures.values())
-    _print_last(f"Look at {done.shot.png}; measure with {measure}", _floors([done]))
+    look = f"Look at {done.shot.png}; measure with {measure}"
+    _print_last(look, _floors([done]), _expected_errors([done]))
 
 
 def _describe(renderer: Renderer, facts: Facts) -> Rows:
@@ -122,6 +131,8 @@ def _describe(renderer: Renderer, facts: Facts) -> Rows:
         case PathTracer(settings=RenderSettings() as settings):
             floors = [_floor(settings, facts, name, metric) for name, metric in _FLOORS.items()]
             rows = [("noise floor", floors[0]), *(("", floor) for floor in floors[1:])]
+            if settings.stated_error == "calibrated":
+                rows.append(("", _meaning(settings, facts)))
             mean = f"{facts['mean_radiance']:.4g} (radiance), that of its samples"
             rows = [("samples per pixel", f"{facts['spp']}"), *rows, ("mean brightness", mean)]
             for part in settings.part_names:
@@ -137,11 +148,19 @@ def _floor(settings: RenderSettings, facts: Facts, name: str, metric: str) -> st
     """Return the text of one noise floor, and whether its target was reached."""
     floor_db = float(facts[name])
     target_db = settings.targets_db.get(metric)
-    text = f"{floor_db:.1f} dB ({metric}{_MEANING.get(metric, '')}"
+    probably = f", probably {float(facts[e]):.1f}" if (e := _EXPECTED[name]) in facts else ""
+    text = f"{floor_db:.1f} dB{probably} ({metric}{_MEANING.get(metric, '')}"
     if target_db is None:
         return f"{text})"
     reached = floor_db >= target_db or not facts["at_cap"]  # facts are rounded
     return f"{text}; {'reached' if reached else 'the cap came before'} {target_db:g} dB)"
+
+
+def _meaning(settings: RenderSettings, facts: Facts) -> str:
+    """Return what a noise floor promises, in one sentence."""
+    if _EXPECTED["noise_floor_db"] in facts:
+        return promise_sentence(settings.resolution)
+    return f"a bound: pictures like this one are not calibrated ({OUTSIDE})"
 
 
 def _floors(shots: Sequence[FinishedShot]) -> dict[str, list[float]]:
@@ -152,12 +171,22 @@ def _floors(shots: Sequence[FinishedShot]) -> dict[str, list[float]]:
     return {metric: [float(facts[name]) for facts in traced] for name, metric in names}
 
 
-def _print_last(look: str, floors: Mapping[str, Sequence[float]]) -> None:
+def _expected_errors(shots: Sequence[FinishedShot]) -> list[float]:
+    """Return the expected errors of all pictures in dB; empty where one is not calibrated."""
+    every = [shot.pictures["mitsuba"].facts for shot in shots if "mitsuba" in shot.pictures]
+    name = _EXPECTED["noise_floor_db"]
+    return [float(facts[name]) for facts in every] if all(name in f for f in every) else []
+
+
+def _print_last(
+    look: str, floors: Mapping[str, Sequence[float]], expected: Sequence[float]
+) -> None:
     """Print the file to look at, and all three noise floors, since one alone means little."""
     if floors:
+        probably = f", probably {np.median(expected):.1f}" if expected else ""
         log, linear, objects = (np.median(values) for values in floors.values())
         which = "noise floor" if len(floors["psnr_log_db"]) == 1 else "median noise floor"
-        look += f"; {which} {log:.1f} dB (linear {linear:.1f}, objects {objects:.1f})"
+        look += f"; {which} {log:.1f} dB{probably} (linear {linear:.1f}, objects {objects:.1f})"
     console.print(f"\n{look}", style="bold")
 
 
@@ -182,8 +211,8 @@ def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: fl
     rows.append(("wall time", f"{seconds:.1f} s"))
     print_rows("Rendered", rows)
     folder = plan.output.folder
-    look = plan.output.video or folder
-    _print_last(f"Look at {look}; measure with the pictures in {folder}", floors)
+    look = f"Look at {plan.output.video or folder}; measure with the pictures in {folder}"
+    _print_last(look, floors, _expected_errors(shots))
 
 
 def _time_rows(plan: RenderPlan, shots: Sequence[FinishedShot]) -> Rows:

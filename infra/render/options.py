@@ -14,7 +14,15 @@ from infra.render.quality import (
 )
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.renders.preview import MOST_SPP, usual_filter
-from pipeline.renders.settings import Filtered, NoiseFloor, NoiseTargets, Resolution, Samples
+from pipeline.renders.settings import (
+    Filtered,
+    NoiseFloor,
+    NoiseTargets,
+    RenderSettings,
+    Resolution,
+    Samples,
+    StatedError,
+)
 from storage.errors import TrilightError
 from storage.metrics import MAX_DB
 from storage.settings.described import checked
@@ -50,6 +58,9 @@ class RenderOptions:
     none."""
     max_spp: Samples = MOST_TRACED_SPP
     """mitsuba: maximum number of samples per pixel."""
+    stated_error: StatedError = RenderSettings.stated_error
+    """mitsuba: what a noise floor is: a bound, or calibrated on other scenes, beside an expected
+    error."""
     spp: Annotated[int | None, Within(1, MOST_SPP, unit="samples")] = None
     """mitsuba: samples per pixel of a preview with one denoise; by default sampling goes on to the
     noise floor. The error of a preview is not measured."""
@@ -120,6 +131,7 @@ class RenderOptions:
                 objects_db=self.noise_floor_objects_db,
             ),
             max_spp=self.max_spp,
+            stated_error=self.stated_error,
             split=self.split,
             split_lobes=self.split_lobes,
         )
@@ -130,6 +142,7 @@ class RenderOptions:
             "--noise-floor": self.noise_floor_db,
             "--noise-floor-linear": self.noise_floor_linear_db,
             "--noise-floor-objects": self.noise_floor_objects_db,
+            "--stated-error": None if self.stated_error == "bound" else self.stated_error,
             "--split": self.split or None,
             "--split-lobes": self.split_lobes or None,
         }

@@ -244,11 +244,24 @@ def image_of(picture: GrowingPicture | RenderedView | Preview) -> Image:
     )
 
 
+def _expected_facts(view: RenderedView) -> dict[str, Fact]:
+    """Return the expected errors; empty where the stated ones are bounds."""
+    expected = view.expected_error
+    if expected is None:
+        return {}
+    return {
+        "expected_error_db": round(expected.log_db, 3),
+        "expected_error_linear_db": round(expected.linear_db, 3),
+        "object_expected_error_db": round(expected.object_log_db, 3),
+    }
+
+
 def _measured_facts(view: RenderedView) -> Mapping[str, Fact]:
     facts: dict[str, Fact] = {
         "noise_floor_db": round(view.noise_floor_db, 3),
         "noise_floor_linear_db": round(view.noise_floor_linear_db, 3),
         "object_noise_floor_db": round(view.object_noise_floor_db, 3),
+        **_expected_facts(view),
         "at_cap": int(view.at_cap),
         "mean_radiance": float(f"{view.radiance_rgb.mean(dtype='float64'):.6g}"),
     }

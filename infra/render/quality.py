@@ -9,6 +9,7 @@ from pipeline.renders.settings import (
     Filtered,
     NoiseTargets,
     RenderSettings,
+    StatedError,
 )
 
 USUAL_TARGETS = NoiseTargets(log_db=USUAL_FLOOR_DB)
@@ -30,6 +31,7 @@ class ToStatedError:
     """True to keep diffuse and specular light apart."""
     max_depth: int = RenderSettings.max_depth
     """Maximum length of a path in edges; 2 is direct light."""
+    stated_error: StatedError = RenderSettings.stated_error
 
     def settings(self, resolution: int) -> RenderSettings:
         """Return the settings at a width in pixels, of a picture that may be dark.
@@ -50,6 +52,7 @@ class ToStatedError:
             split=self.split,
             split_lobes=self.split_lobes,
             arithmetic="device",
+            stated_error=self.stated_error,
         )
 
 

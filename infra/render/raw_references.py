@@ -80,13 +80,15 @@ def _reference(tracer: Tracer, camera: PixelCamera, spp: int, *name: int) -> Raw
     return RawReference(a_rgb=halves[0], b_rgb=halves[1])
 
 
-def true_error_db(
+def true_error(
     picture_rgb: NDArray[np.float32],
     reference: RawReference,
     curve: Curve,
     pixels: NDArray[np.bool_],
 ) -> tuple[float, float]:
-    """Return a picture's error in dB, and its standard deviation in dB by the reference's noise.
+    """Return a picture's mean squared error, and its standard deviation by the reference's noise.
+
+    The error may be below 0 by chance.
 
     Args:
         picture_rgb: [R, R, 3] linear radiance.
@@ -96,13 +98,24 @@ def true_error_db(
     """
     picture = picture_rgb.astype(np.float64)
     mean = 0.5 * (reference.a_rgb + reference.b_rgb)
+    noise = 0.5 * (reference.a_rgb - reference.b_rgb)
     weight = np.square(secant_slope(curve, picture, mean)) * pixels[..., None] / (3 * pixels.sum())
-    error = float((weight * (picture - reference.a_rgb) * (picture - reference.b_rgb)).sum())
-    # With M the mean of both halves, A = M + n and B = M - n; e = P - M is the picture's error. So
-    # (P - A)(P - B) = (e - n)(e + n) = e^2 - n^2, and a pixel's variance is about (e^2 + n^2) n^2:
-    # the error times the noise (e n)^2, and the noise's own n^4. Pixels are independent.
-    noise_sq = np.square(0.5 * (reference.a_rgb - reference.b_rgb))
-    variance = np.square(weight) * (np.square(picture - mean) + noise_sq) * noise_sq
-    spread = float(np.sqrt(variance.sum()))
+    error = float((weight * (np.square(picture - mean) - np.square(noise))).sum())
+    # With M = T + m the mean of both halves, A = M + n and B = M - n, where m and n are independent
+    # and of one variance v. With e = P - T, (P - A)(P - B) = (e - m)^2 - n^2 has the variance
+    # 4 e^2 v + 4 v^2, which is 4 (P - M)^2 n^2 on average. The channels of a pixel have the same
+    # paths, so their products are added before they are squared. Pixels are independent.
+    products = (weight * (picture - mean) * noise).sum(axis=-1)
+    return error, float(2 * np.sqrt(np.square(products).sum()))
+
+
+def true_error_db(
+    picture_rgb: NDArray[np.float32],
+    reference: RawReference,
+    curve: Curve,
+    pixels: NDArray[np.bool_],
+) -> tuple[float, float]:
+    """Return `true_error` and its standard deviation in dB; the same arguments."""
+    error, spread = true_error(picture_rgb, reference, curve, pixels)
     error = max(error, LEAST_ERROR)
     return -10 * np.log10(error), 10 * np.log10(1 + spread / error)

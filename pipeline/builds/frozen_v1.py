@@ -81,7 +81,11 @@ BUILD_V1 = BuildSettings(
         per_light=False,
         split=False,
         split_lobes=False,
+        min_spp_px=128,
+        light_paths="view",
         arithmetic="numpy",
+        stated_error="bound",
+        picture_within_db=None,
     ),
     splits=SplitSettings(
         scenes_per_shard=256,

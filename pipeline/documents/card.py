@@ -61,6 +61,7 @@ def encode_card(
         found=distributions,
         resolution=_setting(manifest.settings, "renders.resolution"),
         splits=_by_split(manifest, distributions),
+        states_expected=summary(distributions.all("expected_error_db"))["count"] > 0,
         layouts=layouts,
         triangles=summary(distributions.all("triangles_per_scene")),
         maps=_maps(distributions),
@@ -119,7 +120,8 @@ def _by_split(manifest: Manifest, distributions: Distributions) -> list[Sequence
                 sum(shard.num_samples for shard in shards),
                 num_views,
                 len(shards),
-                *(_three(floors, name) if num_views else "" for name in ("median", "p5")),
+                _three(floors, "median") + _probably(distributions, split) if num_views else "",
+                _three(floors, "p5") if num_views else "",
                 f"{reached.mean():.0%}" if reached is not None and num_views else "",
                 f"{distributions.views_at_cap.get(split, 0) / max(num_views, 1):.0%}",
             )
@@ -130,6 +132,12 @@ def _by_split(manifest: Manifest, distributions: Distributions) -> list[Sequence
 def _three(floors: Mapping[str, Mapping[str, float]], statistic: str) -> str:
     log, linear, objects = (numbers[statistic] for numbers in floors.values())
     return f"{log:.1f} ({linear:.1f}, {objects:.1f})"
+
+
+def _probably(distributions: Distributions, split: str) -> str:
+    """Return the median of the expected errors of a split behind a comma; empty without one."""
+    expected = summary(distributions.values[split]["expected_error_db"])
+    return f", probably {expected['median']:.1f}" if expected["count"] else ""
 
 
 def _maps(distributions: Distributions) -> list[tuple[str, str]]:

@@ -206,17 +206,19 @@ def _floors_by_split(distributions: Distributions) -> Table:
     for split in distributions.splits:
         floors = distributions.values[split]["noise_floor_db"]
         numbers = summary(floors)
+        expected = summary(distributions.values[split]["expected_error_db"])
         reached = distributions.reaches_targets(split)
         rows.append(
             [
                 split,
                 len(floors),
                 *(_statistic(numbers, name, 1) for name in ("median", "p5")),
+                _statistic(expected, "median", 1) if expected["count"] else "",
                 "" if reached is None else _share(int(reached.sum()), len(floors)),
                 _share(distributions.views_at_cap.get(split, 0), len(floors)),
             ]
         )
-    head = ["views", "median dB", "p5 dB", "reach the target", "at the cap"]
+    head = ["views", "median dB", "p5 dB", "expected, median dB", "reach the target", "at the cap"]
     return Table(["split"], head, rows)
 
 

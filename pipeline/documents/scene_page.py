@@ -21,7 +21,7 @@ from storage.records.environment import Environment
 from storage.records.map_facts import sky_facts
 from storage.records.material import DIFFUSE
 from storage.records.objects import Failure
-from storage.records.sample import PartFloor, Sample
+from storage.records.sample import PartFloor, Sample, error_text
 from storage.records.scene import Scene
 from storage.records.scene_facts import cameras, lights, surfaces
 from storage.records.texture import TEXTURED, MapSource, Texture
@@ -97,7 +97,7 @@ def _pictures(sample: Sample) -> Iterator[Figure]:
     for view, (picture, record) in enumerate(zip(sample.radiance_rgb, sample.views, strict=True)):
         mark = ", at the cap" if record.at_cap else ""
         mark += f", shown {-np.log2(gain):.1f} stops darker" if gain < 1 else ""
-        caption = f"view {view}: {float(record.noise_floor_db):.1f} dB, {record.spp} spp{mark}"
+        caption = f"view {view}: {error_text(record)}, {record.spp} spp{mark}"
         yield Figure(png_uri(preview(picture * gain, _PICTURE_PX)), f"view {view}", caption)
 
 

@@ -15,7 +15,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.sampled import described_shards
 from storage.dataset.statistics import Statistics
-from storage.records.sample import Sample
+from storage.records.sample import Sample, error_text
 
 _TILE_PX = 192
 _MARGIN_PX = 8
@@ -119,7 +119,7 @@ def _draw_cell(sheet: Image.Image, sample: Sample, split: str, left_px: int, top
         x = left_px + view * _TILE_PX
         sheet.paste(_tile(picture), (x, top + _CAPTION_PX))
         mark = " (cap)" if record.at_cap else ""
-        floor = f"{record.noise_floor_db:.1f} dB, {record.spp} spp{mark}"
+        floor = f"{error_text(record)}, {record.spp} spp{mark}"
         _write(sheet, x, top + 33, floor, 11, _FAINT)
 
 

@@ -118,7 +118,10 @@ def render_sample(
     kept_pictures = render_input.kept_pictures
     num_kept = kept_pictures.num_views if kept_pictures else 0
     visibility = Visibility(scene)
-    renderer = SceneRenderer(scene, settings.renders) if num_kept < scene.num_views else None
+    renderer = None
+    if num_kept < scene.num_views:
+        light_seed = seed_for(settings.seed, "light paths", int(key))
+        renderer = SceneRenderer(scene, settings.renders, light_seed=light_seed)
 
     def render_view(view: int) -> _AcceptedView:
         if kept_pictures and view < num_kept:
@@ -211,6 +214,7 @@ def _accepted_view(
         at_cap=rendered.at_cap,
         seed=seed,
         camera_attempt=camera.attempt,
+        expected=None if rendered.expected_error is None else _part_floor(rendered.expected_error),
         parts={name: _part_floor(each) for name, each in (rendered.part_floors or {}).items()}
         or None,
         lights=tuple(map(_part_floor, rendered.light_floors or ())) or None,

@@ -13,11 +13,19 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.renders.calibrated_error import (
+    METRICS,
+    CalibratedStatement,
+    is_far,
+    measures_of_totals,
+    statement_for,
+)
 from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoise_corrections import LEAST_PASSES
 from pipeline.renders.denoiser import denoise_arrays
 from pipeline.renders.noise_floor import (
     LINEAR_STANDARD_ERRORS,
+    ErrorMeasures,
     MeasuredFloor,
     estimate_noise_floor_db,
 )
@@ -28,6 +36,7 @@ from pipeline.renders.pixel_arithmetic import (
     choose,
     clean,
     converged_mask,
+    error_measures,
     estimates,
     log10,
     reduce_tiles,
@@ -78,7 +87,8 @@ class DevicePictures:
         self._resolution = camera.resolution
         self._names = settings.part_names
         self._quality = settings.denoiser
-        self._per_light = settings.per_light
+        self._settings = settings
+        self._picture: Any = None
         arrays = tracer.feature_arrays(camera, spp=settings.aux_spp)
         names = self._names or ("",)
         self._guides, masks = _guides(
@@ -103,32 +113,77 @@ class DevicePictures:
         return float(total) / (3 * resolution**2)
 
     def look(self, quality: Filtered) -> MeasuredLook:
+        statement = statement_for(self._settings, self._samples)
+        self._picture = None
+        filtered = self._denoise_raws(_sums(self._samples), quality, of_both=False)
+        if statement is None or self._settings.picture_within_db is not None:
+            look, logs = self._measure(filtered, quality, None)
+            if statement is None or is_far(look.floor, self._settings, self._samples.spp):
+                self._logs = logs
+                return look
+        look, self._logs = self._measure(filtered, quality, statement)
+        return look
+
+    def _measure(
+        self,
+        filtered: list[list[Any]],
+        quality: Filtered,
+        statement: CalibratedStatement | None,
+    ) -> tuple[MeasuredLook, Any]:
+        """Return a look, by the halves alone without a statement, and the logs of both halves."""
         sums = _sums(self._samples)
         count = sum(len(tracer) - 3 for tracer in sums[0])
-        groups = floor_groups(count, self._names, per_light=self._per_light)
+        groups = floor_groups(count, self._names, per_light=self._settings.per_light)
         kind = (self._names, groups, self._resolution, quality != "off")
-        filtered = self._denoise_raws(sums, quality, of_both=False)
-        arrays = sums, filtered, self._guides, self._masks, self._logs
-        numbers, self._logs = _estimate_error(KernelInputs(), *arrays, *kind)
-        rows = read_numbers(numbers).reshape(-1, len(self._counts[0]))
+        picture = [] if statement is None else [self._filtered_picture()]
+        arrays = sums, filtered, self._guides, self._masks, self._logs, picture
+        numbers, logs = _estimate_error(KernelInputs(), *arrays, *kind)
+        totals, tiles = np.split(read_numbers(numbers), [6 * len(METRICS) if picture else 0])
+        rows = tiles.reshape(-1, len(self._counts[0]))
         require_finite(int(rows[2].sum()))
         require_bounded(float(rows[-1].max()))
         across = self._resolution // TILE_PX
-        errors, surprises = rows[3:-1].reshape(2, -1, 3, across**2)
-        floors = [self._floor(*each) for each in zip(errors, surprises, strict=True)]
-        return MeasuredLook(
+        if statement is None:
+            errors, surprises = rows[3:-1].reshape(2, -1, 3, across**2)
+            floors = [self._floor(*each) for each in zip(errors, surprises, strict=True)]
+            expected = None
+        else:
+            measures = self._measures(totals.reshape(3, -1), rows[3:-1])
+            floor, expected = statement.state(measures, self._resolution, self._samples.spp)
+            floors = [floor]
+        look = MeasuredLook(
             floor=floors[0],
             part_floors=dict(zip(self._names, floors[1:], strict=False)),
             light_floors=floors[1 + len(self._names) :],
+            expected=expected,
             changes=list(rows[:2].reshape(2, across, across) / TILE),
         )
+        return look, logs
 
     def finish(self) -> NDArray[np.float32]:
-        sums = _sums(self._samples)
-        kind = (self._names, self._resolution, self._quality != "off")
-        filtered = self._denoise_raws(sums, self._quality, of_both=True)
-        pictures = _finish(KernelInputs(), sums, filtered, self._guides, *kind)
-        return read_numbers(pictures).reshape(-1, self._resolution, self._resolution, 3)
+        pictures = read_numbers(self._filtered_picture())
+        return pictures.reshape(-1, self._resolution, self._resolution, 3)
+
+    def _filtered_picture(self) -> Any:
+        """Return the pictures of all samples of this look (Float), one after another."""
+        if self._picture is None:
+            sums = _sums(self._samples)
+            kind = (self._names, self._resolution, self._quality != "off")
+            filtered = self._denoise_raws(sums, self._quality, of_both=True)
+            self._picture = _finish(KernelInputs(), sums, filtered, self._guides, *kind)
+        return self._picture
+
+    def _measures(
+        self, totals: NDArray[np.float64], surprises: NDArray[np.float64]
+    ) -> dict[str, ErrorMeasures]:
+        """Return the measures of each metric, from totals [3, 6] and largest surprises [3, T]."""
+        share = float(self.hits.mean())
+        return {
+            name: measures_of_totals(added, float(most.max()), int(count.sum()), share)
+            for name, added, most, count in zip(
+                METRICS, totals, surprises, self._counts, strict=True
+            )
+        }
 
     def _floor(self, errors: NDArray[np.float64], most: NDArray[np.float64]) -> MeasuredFloor:
         """Return the floor of estimates and surprises of tiles [3, T]: log, linear, of objects."""
@@ -200,6 +255,7 @@ def _estimate_error(
     guides: dict[str, Any],
     masks: Any,
     logs: Sequence[Any],
+    finished: list[Any],
     names: Sequence[str],
     groups: Sequence[Group],
     resolution: int,
@@ -209,6 +265,8 @@ def _estimate_error(
 
     The rows are sums: the changes of both halves, broken pixels, and three estimates of each of
     `floor_groups`; then what is greatest: surprises of the same, and the brightest raw channel.
+    With `finished`, one denoise of all samples, the totals of `error_measures` come first, and no
+    estimates.
     """
     raws = _means(sums, of_both=False)
     denoised = _clean_pictures(raws, filtered, guides, names, resolution) if is_filtered else raws
@@ -221,16 +279,24 @@ def _estimate_error(
         right = converged_mask(picture[0], picture[1], error, resolution)
         corrected = [choose(right, *each) for each in zip(raws, denoised, strict=True)]
     hit = (masks & 1) > 0
-    rows = []
+    totals = []
+    rows: list[tuple[list[Any], list[Any]]] = []
     for group in groups:
         a, b, da, db = (mi.Color3d(add_up(each[slice(*group)])) for each in (*raws, *corrected))
-        rows.append(estimates(a, b, da, db, hit, is_filtered))
+        if finished:
+            denoised_both = mi.Color3d(dr.unravel(mi.Color3f, finished[0]))
+            measured, surprises = error_measures(a, b, da, db, denoised_both, hit, resolution)
+            totals.append(measured)
+            rows.append(([], surprises))
+        else:
+            rows.append(estimates(a, b, da, db, hit, is_filtered))
     brightest = functools.reduce(dr.maximum, [dr.max(part) for half in raws for part in half])
     adds = [*changes, _broken(sums), *(row for errors, _ in rows for row in errors)]
     most = [*(row for _, surprises in rows for row in surprises), brightest]
     dr.eval(new_logs)
     sums_of_tiles = reduce_tiles(adds, dr.ReduceOp.Add, resolution)
-    return dr.concat([sums_of_tiles, reduce_tiles(most, dr.ReduceOp.Max, resolution)]), new_logs
+    most_of_tiles = reduce_tiles(most, dr.ReduceOp.Max, resolution)
+    return dr.concat([*totals, sums_of_tiles, most_of_tiles]), new_logs
 
 
 @record_launches

@@ -65,25 +65,25 @@ from pipeline.renders.surface_table import SurfacePoint
 @dr.syntax
 def trace_light(
     scene: KernelScene,
-    film: Film,
+    films: Sequence[Film],
     parts: KernelParts,
     light_paths: Any,
     emitter: EmitterPoint,
     u_direction: Any,
     sampler: Any,
-    splats: Sequence[Splats],
+    splats: Sequence[Sequence[Splats]],
 ) -> None:
     """Add the light that lands to `splats`: radiance times the samples of a pixel.
 
     Args:
         scene: the scene.
-        film: the camera.
+        films: the cameras that each path is joined to.
         parts: what is kept apart; all light that lands is indirect.
         light_paths: Float, light paths for each sample of a pixel, the same as of `trace`.
         emitter: where the path of each lane begins.
         u_direction: Point2f, uniform, for the directions in which they leave.
         sampler: mi.Sampler with a lane for each path.
-        splats: the sum of each lobe, or of both.
+        splats: for each camera, the sum of each lobe, or of both.
     """
     start, direction, leaving, inverse_pdf = _leave_emitter(scene, emitter, u_direction)
     active = mi.Bool((leaving > 0) & (dr.max(emitter.radiance) > 0))
@@ -106,9 +106,8 @@ def trace_light(
         visible = active & (triangle < scene.num_surfaces)
         landing = visible & (depth > 1) & (depth < scene.max_depth)
         mis_ratio = dr.minimum(dr.hypot(hit_mis_ratio, pick_mis_ratio), MAX_MIS_RATIO) / light_paths
-        place = film, light_paths, vertex, mis_ratio, landing
-        value, share, pixel, landing = _connect_to_camera(scene, parts, *place)
-        _add(splats, parts.by_lobe(throughput * strength * value, share), pixel, landing)
+        place = light_paths, vertex, mis_ratio, landing
+        _join_to_cameras(scene, films, parts, splats, throughput * strength, place)
         depth += 1
         active &= depth < scene.max_depth
         u_lobe = sampler.next_1d(active)
@@ -135,6 +134,23 @@ def _leave_emitter(
     cosine = dr.abs(dr.dot(emitter.normal, direction))
     start = SurfacePoint(position=emitter.position, geometric_normal=emitter.normal)
     return start, direction, leaving, cosine / (emitter.area_pdf * leaving)
+
+
+def _join_to_cameras(
+    scene: KernelScene,
+    films: Sequence[Film],
+    parts: KernelParts,
+    splats: Sequence[Sequence[Splats]],
+    light: Any,
+    place: tuple[Any, Vertex, Any, Any],
+) -> None:
+    """Add the light (Color3f) that reaches a vertex to the pictures in which it shows."""
+    light_paths, vertex, mis_ratio, landing = place
+    for film, sums in zip(films, splats, strict=True):
+        sight = mi.Bool(landing)  # each camera narrows its own
+        joined = film, light_paths, vertex, mis_ratio, sight
+        value, share, pixel, lands = _connect_to_camera(scene, parts, *joined)
+        _add(sums, parts.by_lobe(light * value, share), pixel, lands)
 
 
 def _add(splats: Sequence[Splats], values: list[Any], pixel: Any, active: Any) -> None:

@@ -70,6 +70,42 @@ class MeasuredFloor:
     object_log_db: float
     """Stated error as object_psnr_log_db, in dB: over pixels that show geometry."""
 
+    @property
+    def by_metric(self) -> dict[str, float]:
+        """The three errors in dB by the name of their metric (storage.metrics)."""
+        return {
+            "psnr_log_db": self.log_db,
+            "psnr_linear_db": self.linear_db,
+            "object_psnr_log_db": self.object_log_db,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorMeasures:
+    """Measures of the squared error of one picture in one curve, as means over its pixels.
+
+    The picture D is one denoise of the raw mean X of both halves; M is the mean of both denoised
+    halves.
+    """
+
+    estimate: float
+    """The unbiased estimate of the module's head, of M; by chance below 0."""
+    agreement: float
+    """Variance of M by the difference of the two denoised halves."""
+    move: float
+    """Squared difference between D and M."""
+    surprise: float
+    """Largest squared difference between X and M in a pixel, shared by all pixels."""
+    sure: float
+    """Stein's estimate of D's error, with the difference of the halves as the probe: the mean of
+    (D - X)^2 + z (D(A) - D(B)) - z^2, z = (A - B) / 2. Differences are averaged over blocks of
+    BLOCK_PX before they are squared; by chance below 0."""
+    block_agreement: float
+    """Agreement of differences that are averaged so, as a part of `agreement`; it restores what the
+    average over blocks takes from `sure`."""
+    hits: float
+    """Share of the pixels of the picture that show geometry."""
+
 
 def estimate_noise_floor_db(
     mean_error: float,

@@ -5,7 +5,7 @@ taken over tiles of 64 pixels, then over rows of tiles: in their own order, but 
 Pictures are Color3f, what is worked out of them is Float64, pixel by pixel.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -101,22 +101,76 @@ def estimates(
     """
     raw = (a + b) / 2
     denoised = (denoised_a + denoised_b) / 2
-    estimate = dr.square(denoised_a - b) + dr.square(denoised_b - a) - dr.square(a - b)
-    estimate = estimate / 2 - dr.square(denoised_a - denoised_b) / 4
+    estimate = _half_estimate(a, b, denoised_a, denoised_b)
     errors = []
     surprises = []
     for curve in (log10, _clamp):
         if is_filtered:
-            least = SMALLEST_STEP * (1 + dr.abs(denoised))
-            step = raw - denoised
-            step = dr.select(dr.abs(step) < least, least, step)
-            slope = (curve(denoised + step) - curve(denoised)) / step
+            slope = _secant_slope(curve, denoised, raw)
             errors.append(channel_mean(dr.square(slope) * estimate))
         else:
             errors.append(channel_mean(dr.square(curve(a) - curve(b))) / 2)
         surprises.append(channel_mean(dr.square(curve(raw) - curve(denoised))))
     of_objects = [dr.select(hit, values[0], 0) for values in (errors, surprises)]
     return [*errors, of_objects[0]], [*surprises, of_objects[1]]
+
+
+def error_measures(
+    a: Any, b: Any, denoised_a: Any, denoised_b: Any, picture: Any, hit: Any, resolution: int
+) -> tuple[Any, list[Any]]:
+    """Return the totals of `measures_of_totals`, of one metric after another, and surprises.
+
+    The pictures (Color3d) are those of `Half`, and one denoise of all samples.
+    """
+    raw = (a + b) / 2
+    denoised = (denoised_a + denoised_b) / 2
+    estimate = _half_estimate(a, b, denoised_a, denoised_b)
+    metrics = []
+    surprises = []
+    for curve in (log10, _clamp):
+        slope = _secant_slope(curve, denoised, raw)
+        own_slope = _secant_slope(curve, picture, raw)
+        difference = own_slope * (denoised_a - denoised_b)
+        signed = own_slope * (picture - raw), own_slope * (a - b) / 2, difference
+        metrics.append(
+            [
+                channel_mean(dr.square(slope) * estimate),
+                channel_mean(dr.square(curve(denoised_a) - curve(denoised_b))) / 4,
+                channel_mean(dr.square(curve(picture) - curve(denoised))),
+                channel_mean(dr.square(difference)) / 4,
+                *(channel for color in signed for channel in (color.x, color.y, color.z)),
+            ]
+        )
+        surprises.append(channel_mean(dr.square(curve(raw) - curve(denoised))))
+    metrics.append([dr.select(hit, each, 0) for each in metrics[0]])
+    flat = [each for values in metrics for each in values]
+    tiles = reduce_tiles(flat, dr.ReduceOp.Add, resolution)
+    across = resolution // TILE_PX
+    tile = dr.arange(mi.UInt32, across**2)
+    totals: list[Any] = []
+    for first in range(0, len(flat), len(metrics[0])):
+        rows = [dr.gather(mi.Float64, tiles, tile + (first + row) * across**2) for row in range(13)]
+        sure = add_up(
+            [
+                x * x + z * h - z * z
+                for x, z, h in zip(rows[4:7], rows[7:10], rows[10:], strict=True)
+            ]
+        )
+        totals += [*rows[:4], sure / 3, add_up([dr.square(each) for each in rows[10:]]) / 12]
+    rows_of_tiles = dr.block_sum(dr.block_sum(dr.concat(totals), across), across)
+    return rows_of_tiles, [*surprises, dr.select(hit, surprises[0], 0)]
+
+
+def _half_estimate(a: Any, b: Any, denoised_a: Any, denoised_b: Any) -> Any:
+    estimate = dr.square(denoised_a - b) + dr.square(denoised_b - a) - dr.square(a - b)
+    return estimate / 2 - dr.square(denoised_a - denoised_b) / 4
+
+
+def _secant_slope(curve: Callable[[Any], Any], first: Any, second: Any) -> Any:
+    least = SMALLEST_STEP * (1 + dr.abs(first))
+    step = second - first
+    step = dr.select(dr.abs(step) < least, least, step)
+    return (curve(first + step) - curve(first)) / step
 
 
 def log10(radiance: Any) -> Any:

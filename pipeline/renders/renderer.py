@@ -60,7 +60,12 @@ class SceneRenderer:
     """A scene loaded once, for any number of views of it."""
 
     def __init__(
-        self, scene: Scene, settings: RenderSettings, *, shows_looks: bool = False
+        self,
+        scene: Scene,
+        settings: RenderSettings,
+        *,
+        shows_looks: bool = False,
+        light_seed: int | None = None,
     ) -> None:
         """Load a scene that passes `Scene.check`; `activate` must have been called.
 
@@ -69,6 +74,8 @@ class SceneRenderer:
             settings: how well.
             shows_looks: whether `view_steps` yields a `GrowingPicture` after each measurement by
                 which a target is missed; pictures stay the same, each look costs one denoise.
+            light_seed: of the light paths of all views, where the settings let them share these;
+                None: each view has its own.
 
         Raises:
             Rejected: "unlit_scene" where no emitter has an area (with `per_light`: where one has
@@ -95,6 +102,10 @@ class SceneRenderer:
         if settings.per_light:
             most = MAX_PICTURES // max(1, len(settings.part_names))
             self._tracers = _tracers_of_lights(self._tracer, scene, most)
+        self._light_seed = light_seed if settings.light_paths == "scene" else None
+        if self._light_seed is not None:
+            cameras = [self._camera(*view) for view in zip(scene.c2w, scene.fov_deg, strict=True)]
+            self._tracers = [tracer.for_views(cameras) for tracer in self._tracers]
 
     @property
     def tracer(self) -> Tracer:
@@ -123,11 +134,15 @@ class SceneRenderer:
         """Do what `render_view` does: yield after each pass of one half, and last the picture."""
         settings = self._settings
         self._began_s = time.process_time()
-        pose = np.asarray(c2w, np.float64)
-        camera = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
+        camera = self._camera(c2w, fov_deg)
         settled = settings.first_spp
         samples = DualBuffer(
-            self._tracers, camera, seed, first_spp=settled, max_spp=settings.max_spp
+            self._tracers,
+            camera,
+            seed,
+            first_spp=settled,
+            max_spp=settings.max_spp,
+            light_seed=self._light_seed,
         )
         first_pass_of_both = 2 * samples.pass_spp
         for _ in samples.passes_to(first_pass_of_both):
@@ -147,13 +162,18 @@ class SceneRenderer:
             noise_floor_db=floor.log_db,
             noise_floor_linear_db=floor.linear_db,
             object_noise_floor_db=floor.object_log_db,
-            at_cap=bool(gaps_db(settings.targets_db, _by_metric(floor))),
+            at_cap=bool(gaps_db(settings.targets_db, floor.by_metric)),
             core_s=time.process_time() - self._began_s,
             hits=pictures.hits,
             part_floors=look.part_floors or None,
             light_floors=look.light_floors or None,
+            expected_error=look.expected,
             **stored,
         )
+
+    def _camera(self, c2w: ArrayLike, fov_deg: float) -> PixelCamera:
+        pose = np.asarray(c2w, np.float64)
+        return PixelCamera(c2w=pose, fov_deg=float(fov_deg), resolution=self._settings.resolution)
 
     def _to_stored(self, pictures: NDArray[np.float32]) -> dict[str, Any]:
         """Return the pictures of a view by their fields: the sum of what is apart, as stored."""
@@ -179,7 +199,7 @@ class SceneRenderer:
 
     def _refuse_noisy(self, floor: MeasuredFloor) -> None:
         targets_db = self._settings.targets_db
-        floors_db = _by_metric(floor)
+        floors_db = floor.by_metric
         missed = [
             f"{metric} is {floors_db[metric]:.1f} dB; expected {targets_db[metric]:g}"
             for metric in gaps_db(targets_db, floors_db)
@@ -199,8 +219,8 @@ class SceneRenderer:
             quality = self._filter_of_halves(samples.spp)
             look = pictures.look(quality)
             tiles.learn(look.changes, samples, quality)
-            measured.append((samples.spp, _by_metric(look.floor)))
-            gaps = gaps_db(targets_db, _by_metric(look.floor))
+            measured.append((samples.spp, look.floor.by_metric))
+            gaps = gaps_db(targets_db, look.floor.by_metric)
             if not gaps or samples.spp >= max_spp:
                 return look
             goal = Goal(targets_db=targets_db, step=2 * samples.pass_spp, max_spp=max_spp)
@@ -240,14 +260,6 @@ class SceneRenderer:
     def _filter_of_halves(self, spp: int) -> Filtered:
         quality = self._settings.denoiser
         return "fast" if quality == "high" and spp <= _FAST_HALVES_SPP else quality
-
-
-def _by_metric(floor: MeasuredFloor) -> Floors:
-    return {
-        "psnr_log_db": floor.log_db,
-        "psnr_linear_db": floor.linear_db,
-        "object_psnr_log_db": floor.object_log_db,
-    }
 
 
 def _tracers_of_lights(tracer: Tracer, scene: Scene, most: int) -> list[Tracer]:

@@ -30,6 +30,9 @@ class RenderedView:
     """Measured error as psnr_linear_db, in dB; more is better."""
     object_noise_floor_db: float
     """Measured error as object_psnr_log_db over `hits`, in dB; more is better."""
+    expected_error: MeasuredFloor | None = None
+    """Errors that are as often better as worse, in dB, where the three above are calibrated bounds
+    (pipeline.renders.calibrated_error); None where they are bounds by estimate and allowances."""
     at_cap: bool
     """True if sampling ended at max_spp with a floor below its target."""
     core_s: float

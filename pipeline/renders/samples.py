@@ -27,6 +27,7 @@ class DualBuffer:
         *,
         first_spp: int,
         max_spp: int,
+        light_seed: int | None = None,
     ) -> None:
         """Begin a view without any sample.
 
@@ -36,12 +37,16 @@ class DualBuffer:
             seed: of this view alone.
             first_spp: samples per pixel of the first measurement, both halves together.
             max_spp: the most that will be asked for.
+            light_seed: of the light paths, which other views may have too; None: `seed`.
         """
         self._seed = seed
+        self._light_seed = light_seed
         self._first = first_spp // 2
         self._most = max_spp // 2
         self.sums = [[tracer.pass_sum(camera) for tracer in tracers] for _ in range(2)]
         """Of each half, and in it of each tracer."""
+        self.is_guided = False
+        """True once a pass may be guided."""
         self._spp, self._count = np.zeros((2, 2, camera.resolution, camera.resolution), np.int64)
         self._passes = 0
         self.count_over(np.ones(self._spp.shape[1:], bool))
@@ -104,14 +109,18 @@ class DualBuffer:
 
     def _add(self, half: int, size: int, chosen: Chosen) -> None:
         seed = seed_for(self._seed, "pass", self._passes, half)
+        light_seed = self._light_seed
+        if light_seed is not None:
+            light_seed = seed_for(light_seed, "pass", self._passes, half)
         for tracer in self.sums[half]:
-            tracer.add(seed=seed, spp=size, chosen=chosen)
+            tracer.add(seed=seed, spp=size, chosen=chosen, light_seed=light_seed)
         self._spp[half] += size if chosen is None else size * chosen
         self._count[half] += 1 if chosen is None else chosen
         self._mean_spp = None
 
     def guide(self) -> None:
         """Let the passes from now on be guided (pipeline.renders.guide_table)."""
+        self.is_guided = True
         for tracers in self.sums:
             for tracer in tracers:
                 tracer.guide()

@@ -24,11 +24,8 @@ to 2 dB in the median pixel of the easy ones (study S3). The small ones are for 
 """
 
 FIRST_SPP = 64
-"""Samples of a picture before its floor is measured. With 32, in pictures of 256 pixels, 5 of 50
-floors that were reached at once were over 1 dB too good: no sample had met a glint (study S17)."""
-
-_MANY_PIXELS_PX = 128
-"""A narrower picture has too few pixels for FIRST_SPP samples of each to tell its error."""
+"""Samples of a picture before its bound is measured. With 32, in pictures of 256 pixels, 5 of 50
+bounds that were reached at once were over 1 dB too good: no sample had met a glint (study S17)."""
 
 MAX_RESOLUTION = 2048
 """Largest picture: one pass of 64 samples takes 3.3 GB there, and that grows with the area."""
@@ -52,6 +49,12 @@ _METRICS = {
 }
 """The metric of each target (storage.metrics)."""
 
+LightPaths = Literal["view", "scene"]
+"""Whose light paths a view has: its own, or those of all views of its scene."""
+
+StatedError = Literal["bound", "calibrated"]
+"""How errors are stated."""
+
 Arithmetic = Literal["numpy", "device"]
 """Where the pictures of a view are worked out."""
 
@@ -61,6 +64,10 @@ _LATER = {
     "split": False,
     "split_lobes": False,
     "arithmetic": "numpy",
+    "min_spp_px": 128,
+    "light_paths": "view",
+    "stated_error": "bound",
+    "picture_within_db": None,
 }
 """Settings that no record holds at these values, so that digests of earlier builds stay."""
 
@@ -87,9 +94,10 @@ class RenderSettings:
     """Sampling also goes on until the floor as object_psnr_log_db reaches this: that of pixels
     which show geometry, so that empty background does not count."""
     min_spp: Samples
-    """Samples per pixel, both halves together, before the floor of a picture of 128 pixels or more
-    is measured first; a smaller one takes as many times more as it is narrower, up to `max_spp`:
-    128 at 64 pixels for 64, since fewer pixels meet fewer of the rare bright paths."""
+    """Samples per pixel, both halves together, before the floor of a picture of `min_spp_px` pixels
+    or more is measured first; a smaller one takes as many times more as it is narrower, up to
+    `max_spp`: 128 at 64 pixels for 64 at 128, since fewer pixels meet fewer of the rare bright
+    paths."""
     max_spp: Samples
     """The cap: sampling stops here whatever the floors are. It bounds the mean over the pixels that
     show anything; those that need most may get twice as many."""
@@ -119,9 +127,20 @@ class RenderSettings:
     """Store what the diffuse and what the specular lobe of the visible surface reflects apart as
     well; with `split` there are four parts."""
 
+    min_spp_px: Resolution = 128
+    """Width in pixels from which `min_spp` samples of each tell the error of a picture."""
+    light_paths: LightPaths = "view"
+    """`scene` traces the light paths of a build once for all views of a scene: their errors go
+    together, and each alone is what it was."""
     arithmetic: Arithmetic = "numpy"
     """Where means, corrections and stated errors are worked out: `device` keeps pictures where they
     are traced; `numpy` keeps the bytes of sets from before there was a choice."""
+    stated_error: StatedError = "bound"
+    """How errors are stated: `calibrated` by six measures and their record on other scenes
+    (pipeline.renders.calibrated_error), within its range; `bound` by estimate and allowances."""
+    picture_within_db: Annotated[float, Within(0, MAX_DB, unit="dB")] | None = None
+    """Where the bound by the halves misses a target by more than this, sampling goes on by it,
+    without a picture to calibrate the error by; None takes a picture each time."""
 
     def __post_init__(self) -> None:
         _require(
@@ -147,7 +166,7 @@ class RenderSettings:
     @property
     def first_spp(self) -> int:
         """Samples per pixel before the first measurement, both halves together."""
-        narrower = max(1, math.ceil(_MANY_PIXELS_PX / self.resolution))
+        narrower = max(1, math.ceil(self.min_spp_px / self.resolution))
         return min(self.min_spp * narrower, self.max_spp)
 
     @property

@@ -4,7 +4,7 @@ The tests have another one, Mitsuba's stock path integrator (tests/oracle): an i
 estimates the same integral.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -45,10 +45,12 @@ Chosen = NDArray[np.bool_] | None
 class PassSum(Protocol):
     """The growing sum of the passes of one view, in the memory where they are traced."""
 
-    def add(self, *, seed: int, spp: int, chosen: Chosen = None) -> None:
+    def add(
+        self, *, seed: int, spp: int, chosen: Chosen = None, light_seed: int | None = None
+    ) -> None:
         """Add all samples of one pass: `Tracer.radiance` times `spp`.
 
-        It may return before they are traced.
+        It may return before they are traced. With `light_seed` its light paths have that seed.
         """
 
     def guide(self) -> None:
@@ -91,6 +93,13 @@ class Tracer(Protocol):
         Args:
             bounces: keep direct and indirect light apart.
             lobes: keep the diffuse and the specular lobe of the visible surface apart.
+        """
+
+    def for_views(self, cameras: Sequence[PixelCamera]) -> "Tracer":
+        """Return the same loaded scene, which traces light paths of one seed once for all views.
+
+        Args:
+            cameras: of the views, in the order in which they will be asked for.
         """
 
     def radiance(

@@ -30,6 +30,9 @@ class MeasuredLook:
     """Stated error of each part that is stored, of all lights together."""
     light_floors: Sequence[MeasuredFloor]
     """Stated error of each light whose picture is stored; empty where they are together."""
+    expected: MeasuredFloor | None = None
+    """Error of the picture that is as often better as worse, where the stated one is calibrated
+    (pipeline.renders.calibrated_error); None where it is the bound of noise_floor."""
     changes: Sequence[NDArray[np.float64]]
     """Mean squared change of the denoised log radiance of each tile since the look before, [T, T]
     for each half; the first look has none that means anything."""

@@ -46,6 +46,8 @@ class Statistics:
     """Stated error of each view [views] as object_psnr_log_db."""
     at_cap: NDArray[np.bool_]
     """[views] whether sampling ended at the cap."""
+    expected_error_db: NDArray[np.float64] | None = None
+    """Expected error of each view [views] as psnr_log_db; None where a view states none."""
     part_noise_floor_db: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     """[views] psnr_log_db of each part that is stored; empty where none is."""
 
@@ -60,6 +62,10 @@ class Statistics:
         excursions = _counts(self.scenes_by_excursion)
         beyond = [("beyond the range", excursions)] if excursions else []
         sample = of_how_many(self.num_scenes_read, self.num_scenes)
+        expected_db = self.expected_error_db
+        expected = (
+            [] if expected_db is None else [("expected error", _spread(expected_db, "psnr_log_db"))]
+        )
         kb_per_scene = self.num_bytes / max(self.num_scenes, 1) / 1e3
         return [
             ("scenes", f"{self.num_scenes} ({_counts(self.scenes_by_split)})"),
@@ -68,6 +74,7 @@ class Statistics:
             *([("what follows is", sample)] if sample else []),
             ("views", f"{self.num_views}"),
             ("noise floor", _spread(self.noise_floor_db, "psnr_log_db")),
+            *expected,
             *(
                 (f"noise floor, {part}", _spread(floors_db, "psnr_log_db"))
                 for part, floors_db in self.part_noise_floor_db.items()
@@ -107,6 +114,7 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
         noise_floor_linear_db=np.asarray(tally.views["noise_floor_linear_db"]),
         object_noise_floor_db=np.asarray(tally.views["object_noise_floor_db"]),
         at_cap=np.asarray(tally.views["at_cap"], np.bool_),
+        expected_error_db=np.asarray(tally.expected) if tally.expects_all() else None,
         part_noise_floor_db=tally.parts_of_all(),
     )
 
@@ -130,6 +138,7 @@ class _Tally:
     views: Mapping[str, "array[float]"] = field(
         default_factory=lambda: {name: array("d") for name in _OF_VIEWS}
     )
+    expected: "array[float]" = field(default_factory=lambda: array("d"))
     parts: dict[str, "array[float]"] = field(default_factory=dict)
     scene_members: dict[str, str] = field(default_factory=dict)
 
@@ -138,8 +147,14 @@ class _Tally:
         for view in views:
             for name, column in self.views.items():
                 column.append(view[name])
+            if "expected" in view:
+                self.expected.append(view["expected"]["noise_floor_db"])
             for name, part in view.get("parts", {}).items():
                 self.parts.setdefault(name, array("d")).append(part["noise_floor_db"])
+
+    def expects_all(self) -> bool:
+        """Return whether every view states an expected error, and there is a view."""
+        return 0 < len(self.expected) == len(self.views["spp"])
 
     def parts_of_all(self) -> dict[str, NDArray[np.float64]]:
         """Return the floors of the parts, where every view has all of them."""

@@ -44,6 +44,7 @@ QUANTITIES: Mapping[str, Quantity] = {
     "noise_floor_db": Quantity("noise floor, dB", 1, "view"),
     "noise_floor_linear_db": Quantity("noise floor as linear PSNR, dB", 1, "view"),
     "object_noise_floor_db": Quantity("noise floor over geometry, dB", 1, "view"),
+    "expected_error_db": Quantity("expected error, dB", 1, "view"),
     "spp": Quantity("samples per pixel", 0, "view"),
     "camera_attempt": Quantity("cameras rejected before", 0, "view"),
 }

@@ -54,10 +54,10 @@ Plausible = Annotated[float, Within(-1000, 1000, low_open=True, high_open=True)]
 
 @dataclass(frozen=True, kw_only=True)
 class PartFloor:
-    """Stated errors of one layer of a picture, for all lights together, or of one light."""
+    """Errors of a picture, of one layer of it for all lights together, or of one light."""
 
     noise_floor_db: Plausible
-    """Stated error in dB, as psnr_log_db."""
+    """Error in dB, as psnr_log_db."""
     noise_floor_linear_db: Plausible
     """The same error as psnr_linear_db."""
     object_noise_floor_db: Plausible
@@ -85,12 +85,21 @@ class ViewRecord:
     """Seed of the view's samples."""
     camera_attempt: int
     """Number of cameras that were rejected before this one."""
+    expected: PartFloor | None = None
+    """Errors that are as often better as worse, where the noise floors are calibrated bounds; a
+    record whose floors are bounds by estimate and allowances is written without this field."""
     parts: Mapping[str, PartFloor] | None = None
     """Floors of the parts that are stored, by name (storage.records.parts); a record that has none
     is written without this field."""
     lights: tuple[PartFloor, ...] | None = None
     """Floors of the lights that are stored, in their order (storage.records.lights); absent where
     they are together, and from older sets."""
+
+
+def error_text(view: ViewRecord) -> str:
+    """Return the stated error of a view and the expected one, as `38.2 dB, probably 40.5`."""
+    probably = "" if view.expected is None else f", probably {view.expected.noise_floor_db:.1f}"
+    return f"{view.noise_floor_db:.1f} dB{probably}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -186,6 +186,9 @@ def scene_values(record: SceneRecord) -> Mapping[str, Values]:
             )
             for name in names
         },
+        "expected_error_db": [
+            view.expected.noise_floor_db for view in record.views if view.expected is not None
+        ],
     }
     return {name: np.asarray(entries, np.float32) for name, entries in values.items()}
 

@@ -7,6 +7,7 @@ faces away. Its sums of passes are in numpy's memory: those of the kernel are co
 """
 
 import copy
+from collections.abc import Sequence
 from typing import Any
 
 import mitsuba as mi
@@ -27,7 +28,9 @@ class HostSum:
         self._total = np.zeros((camera.resolution, camera.resolution, 3))
         self._squares = np.zeros((camera.resolution, camera.resolution))
 
-    def add(self, *, seed: int, spp: int, chosen: Chosen = None) -> None:
+    def add(
+        self, *, seed: int, spp: int, chosen: Chosen = None, light_seed: int | None = None
+    ) -> None:
         means = self._tracer.radiance(self._camera, seed=seed, spp=spp, chosen=chosen)
         mean = means.astype(np.float64)
         self._total += spp * mean
@@ -75,6 +78,9 @@ class PluginTracer:
 
     def split_lights(self, *, bounces: bool, lobes: bool) -> "PluginTracer":
         raise NotImplementedError("the stock integrator returns all light together")
+
+    def for_views(self, cameras: Sequence[PixelCamera]) -> "PluginTracer":
+        return self
 
     def radiance(
         self, camera: PixelCamera, *, seed: int, spp: int, chosen: Chosen = None

@@ -6,10 +6,11 @@ denoising, whose noise cancels. The renderers are measured alternately on every 
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import (
@@ -30,9 +31,14 @@ from infra.bench.workloads.named_scenes import given_scenes
 from infra.bench.workloads.traced_pictures import render_levels, render_shot
 from infra.bench_options import BenchOptions
 from infra.render.methods import SAMPLE_SEED
-from infra.render.raw_references import RawReference, first_camera, true_error_db
+from infra.render.raw_references import (
+    LEAST_ERROR,
+    RawReference,
+    first_camera,
+    true_error_db,
+)
 from pipeline.builds.training import pretrain_256
-from pipeline.renders.noise_floor import clamped_radiance
+from pipeline.renders.noise_floor import clamped_radiance, secant_slope
 from pipeline.renders.settings import USUAL_FLOOR_DB, RenderSettings
 from storage.conventions import log10_radiance
 from storage.renderer import Image
@@ -45,7 +51,11 @@ REFERENCE_PX = 256
 
 OURS = "Trilight, stated errors"
 STATED = "Trilight, other widths"
-PLAIN = "plain Mitsuba"
+PLAIN = {"independent": "plain Mitsuba", "multijitter": "plain Mitsuba, multijitter"}
+"""Kinds of points by the sampler of plain Mitsuba: its default one, and its best stratified one."""
+
+_SINGLE_PIXEL = 0.5
+"""Share of the squared error from which one pixel decides what a picture costs."""
 
 
 def adaptive(target_db: float, resolution: int, max_spp: int) -> RenderSettings:
@@ -60,8 +70,8 @@ def adaptive(target_db: float, resolution: int, max_spp: int) -> RenderSettings:
 
 
 def plain_spps(scale: BenchScale) -> tuple[int, ...]:
-    """Return the numbers of samples of plain Mitsuba, up to four times our cap."""
-    return tuple(64 << step for step in range((4 * scale.max_spp // 64).bit_length()))
+    """Return the numbers of samples of plain Mitsuba: squares, up to 16 times our cap."""
+    return tuple(4**power for power in range(3, 1 + int(math.log2(16 * scale.max_spp) / 2)))
 
 
 def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
@@ -85,7 +95,12 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
         if px != scale.resolution
     ]
     plain = [
-        Point(name=f"mitsuba {spp}", measure=partial(_measure_plain, spp), kind=PLAIN)
+        Point(
+            name=f"mitsuba {sampler} {spp}",
+            measure=partial(_measure_plain, sampler, spp),
+            kind=kind,
+        )
+        for sampler, kind in PLAIN.items()
         for spp in plain_spps(scale)
     ]
     return [*ours, *stated, *plain]
@@ -98,18 +113,51 @@ def _trials(scale: BenchScale, options: BenchOptions) -> list[str]:
 
 def _measure_ours(settings: RenderSettings, context: BenchContext, trial: str) -> Figures:
     view = context.child.call(render_shot, context.scene(trial), settings)
-    judged = figures(view, shrink_reference(_reference(context, trial), settings.resolution))
+    reference = shrink_reference(_reference(context, trial), settings.resolution)
+    judged = figures(view, reference)
     costs_and_errors = {"core_s": view.core_s, "db": judged["log_true_db"], **judged}
     if settings.resolution == context.scale.resolution:
-        levels = _plain_levels(context, trial).values()
-        steps = [(each["spp"], each["core_s"], each["db"]) for each in levels]
-        core_s, is_reached = cost_at_error(steps, costs_and_errors["db"])
-        costs_and_errors |= {"times": core_s / view.core_s, "bound": float(not is_reached)}
+        costs_and_errors |= _beside_plain(
+            costs_and_errors,
+            worst_pixel_share(view.radiance_rgb, reference),
+            {sampler: _plain_levels(sampler, context, trial) for sampler in PLAIN},
+        )
     return costs_and_errors
 
 
-def _measure_plain(spp: int, context: BenchContext, trial: str) -> Figures:
-    return _plain_levels(context, trial)[spp]
+def _beside_plain(
+    ours: Figures, worst_pixel: float, plain: Mapping[str, Mapping[int, Figures]]
+) -> dict[str, float]:
+    """Return what plain Mitsuba costs at the error of our picture, as times of our cost.
+
+    `times` is that of the cheaper sampler. Where one pixel decides, the figures have other names,
+    so that no median counts it.
+
+    Args:
+        ours: figures of our picture.
+        worst_pixel: share of its squared error.
+        plain: figures of plain Mitsuba's pictures by sampler and samples.
+    """
+    costs = dict[str, tuple[float, int]]()
+    for sampler, levels in plain.items():
+        steps = [(each["spp"], each["core_s"], each["db"]) for each in levels.values()]
+        core_s, bound = cost_at_error(steps, ours["db"])
+        costs[sampler] = core_s / ours["core_s"], bound
+        near = min(levels.values(), key=lambda each: abs(each["db"] - ours["db"]))
+        worst_pixel = max(worst_pixel, near["worst_pixel"])
+    times, bound = min(costs.values())
+    single = worst_pixel > _SINGLE_PIXEL
+    named = {"times": times, **{f"times_{name}": cost for name, (cost, _) in costs.items()}}
+    return {
+        "single_pixel": float(single),
+        **{f"{name}{'_of_one_pixel' if single else ''}": value for name, value in named.items()},
+        "at_least": float(bound > 0),
+        "at_most": float(bound < 0),
+    }
+
+
+def _measure_plain(sampler: str, spp: int, context: BenchContext, trial: str) -> Figures:
+    return _plain_levels(sampler, context, trial)[spp]
 
 
 def _reference(context: BenchContext, trial: str) -> RawReference:
@@ -118,19 +166,20 @@ def _reference(context: BenchContext, trial: str) -> RawReference:
     return load_or_render_reference(context.child, scene, camera, context.scale.reference_spp)
 
 
-def _plain_levels(context: BenchContext, trial: str) -> dict[int, dict[str, float]]:
+def _plain_levels(sampler: str, context: BenchContext, trial: str) -> dict[int, dict[str, float]]:
     """Return the figures of plain Mitsuba by samples per pixel, ascending."""
 
     def render() -> dict[int, dict[str, float]]:
         px = context.scale.resolution
         spps = plain_spps(context.scale)
-        levels = context.child.call(render_levels, context.scene(trial), px, spps, SAMPLE_SEED)
+        scene = context.scene(trial)
+        levels = context.child.call(render_levels, scene, px, spps, SAMPLE_SEED, sampler)
         reference = shrink_reference(_reference(context, trial), px)
         return {
             spp: plain_figures(level, reference) for spp, level in zip(spps, levels, strict=True)
         }
 
-    return context.get_or_make(("plain", trial), render)
+    return context.get_or_make(("plain", sampler, trial), render)
 
 
 def plain_figures(level: Image, reference: RawReference) -> dict[str, float]:
@@ -144,15 +193,26 @@ def plain_figures(level: Image, reference: RawReference) -> dict[str, float]:
         "db": db,
         "linear_true_db": linear_db,
         "log_open_db": open_db,
+        "worst_pixel": worst_pixel_share(level.radiance_rgb, reference),
     }
 
 
-def cost_at_error(levels: Sequence[tuple[float, float, float]], db: float) -> tuple[float, bool]:
-    """Return the CPU seconds at which a path tracer reaches an error, and whether it does.
+def worst_pixel_share(picture_rgb: NDArray[np.float32], reference: RawReference) -> float:
+    """Return which share of a picture's squared error (log) its worst pixel has, at most 1."""
+    picture = picture_rgb.astype(np.float64)
+    mean = 0.5 * (reference.a_rgb + reference.b_rgb)
+    weight = np.square(secant_slope(log10_radiance, picture, mean))
+    squared = (weight * (picture - reference.a_rgb) * (picture - reference.b_rgb)).mean(axis=-1)
+    worst = float(squared.max())
+    return worst / max(float(squared.sum()), worst, LEAST_ERROR)
+
+
+def cost_at_error(levels: Sequence[tuple[float, float, float]], db: float) -> tuple[float, int]:
+    """Return the CPU seconds at which a path tracer reaches an error, and what bound that is.
 
     Between two levels dB are linear in log2 of the samples, and CPU seconds linear in the samples.
-    Outside the measured range the nearest level counts: its cost is a lower bound if no level is
-    good enough, and an upper bound if all are better.
+    Outside the measured range the nearest level counts: its cost is a lower bound (1) if no level
+    is good enough, and an upper bound (-1) if all are better; 0 is no bound.
 
     Args:
         levels: samples per pixel, CPU seconds and psnr_log_db, rising in samples; at least one.
@@ -160,15 +220,15 @@ def cost_at_error(levels: Sequence[tuple[float, float, float]], db: float) -> tu
     """
     row = next((row for row, (_, _, level_db) in enumerate(levels) if level_db >= db), None)
     if row is None:
-        return levels[-1][1], False
+        return levels[-1][1], 1
     spp_above, core_s_above, db_above = levels[row]
     if row == 0:
-        return core_s_above, db_above == db
+        return core_s_above, -1 if db_above > db else 0
     spp_below, core_s_below, db_below = levels[row - 1]
     fraction = (db - db_below) / (db_above - db_below)
     spp = spp_below * 2 ** (fraction * math.log2(spp_above / spp_below))
     slope = (core_s_above - core_s_below) / (spp_above - spp_below)
-    return core_s_below + slope * (spp - spp_below), True
+    return core_s_below + slope * (spp - spp_below), 0
 
 
 _STATED: tuple[tuple[str, str, Over, Callable[[float], float] | None], ...] = (
@@ -200,15 +260,20 @@ EXPERIMENT = Experiment(
         Column(name="linear, dB", figure="linear_true_db"),
         Column(name="Mitsuba's cost at equal error, times", figure="times"),
         Column(name="least times", figure="times", over="least"),
-        Column(name="of them bounds, %", figure="bound", over="mean", then=percent),
+        *(Column(name=f"{sampler}, times", figure=f"times_{sampler}") for sampler in PLAIN),
+        Column(name="lower bounds, %", figure="at_least", over="mean", then=percent),
+        Column(name="upper bounds, %", figure="at_most", over="mean", then=percent),
+        Column(name="one pixel decides, %", figure="single_pixel", over="mean", then=percent),
         *_WRONG,
         Column(name="hit the sample limit, %", figure="at_cap", over="mean", then=percent),
         Column(name="what the reference leaves open, median dB", figure="log_open_db"),
     ),
     because="Mitsuba's cost at equal error is the median over the scenes of its core-seconds, "
-    "interpolated between its numbers of samples, divided by ours; where it cannot be interpolated "
-    "it is a bound. A stated error is wrong where the true one is more than 1 dB (3 dB) worse; "
-    "intervals are over scenes. Caution is by how much a picture is better than stated.",
+    "interpolated between its numbers of samples, divided by ours; the better of its samplers "
+    "counts. Where it cannot be interpolated it is a bound. Scenes in which one pixel has over "
+    "half of the squared error are left out of it. A stated error is wrong where the true one is "
+    "more than 1 dB (3 dB) worse; intervals are over scenes. Caution is by how much a picture is "
+    "better than stated.",
     points=_points,
     trials=_trials,
 )

@@ -4,7 +4,7 @@ CPU seconds of ours are those of sampling, guide pictures, measuring the stated 
 denoise. Loading the scene is not counted; kernels are warm.
 
 The other setup is that of a user of plain Mitsuba: the stock `path` integrator with its defaults,
-the `independent` sampler, and Open Image Denoise once. Material and emitters are those of
+one of its samplers, and Open Image Denoise once. Material and emitters are those of
 tests/oracle/plugin_scene.py, which only a checkout has: without its one texture rough metals would
 lose light, and no number of samples would give the right picture. Emitters are sampled by their
 power, which is not Mitsuba's default, and the denoiser reads Trilight's guide pictures: both favor
@@ -76,35 +76,35 @@ _RR_DEPTH = 5
 """Default of Mitsuba."""
 
 
+_PASS_SPP = 256
+"""Samples of a pixel that Mitsuba holds in memory at once; a picture is stratified over all."""
+
+
 def render_levels(
-    scene: Scene, resolution: int, levels_spp: tuple[int, ...], seed: int
+    scene: Scene, resolution: int, levels_spp: tuple[int, ...], seed: int, sampler: str
 ) -> list[Image]:
-    """Render a scene's first view with each number of samples; no sample is traced twice.
+    """Render a scene's first view with each number of samples.
 
     CPU seconds are those of the samples, the guide pictures, and one denoise.
 
     Args:
         resolution: width in pixels.
-        levels_spp: ascending samples per pixel. Mitsuba is called once for the samples that each
-            level adds, since calls with few samples are up to a tenth slower.
+        levels_spp: samples per pixel, at most 256 or multiples of it. Each picture has its own:
+            several with fewer samples would be stratified less finely.
+        sampler: plugin of Mitsuba.
     """
     camera = first_camera(scene, resolution)
-    _Plain(scene).radiance(camera, seed_for(seed, "plain warm-up"), levels_spp[0])
+    _Plain(scene, sampler).radiance(camera, seed_for(seed, "plain warm-up"), levels_spp[0])
     warm_up_denoiser(resolution)
-    plain = _Plain(scene)
-    features, core_s = _features(scene, camera)
-    total = np.zeros((resolution, resolution, 3))
-    before = 0
+    plain = _Plain(scene, sampler)
+    features, features_core_s = _features(scene, camera)
     levels = []
     for spp in levels_spp:
         started = time.process_time()
-        total += (spp - before) * plain.radiance(camera, seed_for(seed, "plain", spp), spp - before)
-        core_s += time.process_time() - started
-        started = time.process_time()
-        picture = denoise((total / spp).astype(np.float32), features, "high")
-        finished_core_s = core_s + time.process_time() - started
-        levels.append(Image(radiance_rgb=picture, samples=spp, cpu_seconds=finished_core_s))
-        before = spp
+        raw = plain.radiance(camera, seed_for(seed, "plain", spp), spp)
+        picture = denoise(raw, features, "high")
+        core_s = features_core_s + time.process_time() - started
+        levels.append(Image(radiance_rgb=picture, samples=spp, cpu_seconds=core_s))
     return levels
 
 
@@ -134,10 +134,11 @@ def _oracle(name: str) -> Any:
 class _Plain:
     """Mitsuba scene with its integrator."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, sampler: str) -> None:
         import mitsuba  # not before `activate`, which says where compiled kernels are kept
 
         self._mi = mitsuba
+        self._sampler = sampler
         self._scene = _oracle("plugin_scene").plugin_scene(scene)
         self._sensor = _oracle("plugin_tracer").stock_sensor
         self._path = mitsuba.load_dict(
@@ -146,16 +147,17 @@ class _Plain:
                 "max_depth": RenderSettings.max_depth,
                 "rr_depth": _RR_DEPTH,
                 "hide_emitters": True,
+                "samples_per_pass": _PASS_SPP,
             }
         )
 
-    def radiance(self, camera: PixelCamera, seed: int, spp: int) -> NDArray[np.float64]:
+    def radiance(self, camera: PixelCamera, seed: int, spp: int) -> NDArray[np.float32]:
         """Return the mean of `spp` samples, [R, R, 3]."""
         picture = self._mi.render(
             self._scene,
-            sensor=self._sensor(camera, {"type": "independent", "sample_count": spp}),
+            sensor=self._sensor(camera, {"type": self._sampler, "sample_count": spp}),
             integrator=self._path,
             seed=self._mi.UInt32(seed),
             spp=spp,
         )
-        return np.array(picture, np.float64)
+        return np.array(picture, np.float32)

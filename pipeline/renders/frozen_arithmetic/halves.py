@@ -9,6 +9,7 @@ from pipeline.renders.noise_floor import (
     BLOCK_PX,
     LINEAR_STANDARD_ERRORS,
     Curve,
+    ErrorMeasures,
     MeasuredFloor,
     clamped_radiance,
     estimate_noise_floor_db,
@@ -67,6 +68,58 @@ def surprises(a: Half, b: Half, curve: Curve) -> NDArray[np.float64]:
     denoised, raw = _means(a, b)
     squared: NDArray[np.float64] = np.square(curve(raw) - curve(denoised)).mean(axis=-1)
     return squared
+
+
+def measure_errors(
+    a: Half, b: Half, picture_rgb: NDArray[np.float32], curve: Curve, hits: NDArray[np.bool_],
+    *, objects: bool = False,
+) -> ErrorMeasures:  # fmt: skip
+    """Return what the halves say of the error of the picture of both.
+
+    Args:
+        a, b: halves that share no sample, denoised apart.
+        picture_rgb: [R, R, 3] one denoise of the mean of both.
+        curve: tone curve in which errors are taken.
+        hits: [R, R] pixels that show geometry.
+        objects: count these pixels alone.
+    """
+    pixels = hits if objects else np.ones_like(hits)
+    count = max(int(pixels.sum()), 1)
+    denoised, raw = _means(a, b)
+    picture = picture_rgb.astype(np.float64)
+    slope = secant_slope(curve, picture, raw) * pixels[..., None]
+    residual = slope * (picture - raw)
+    probe = slope * (0.5 * (a.raw_rgb.astype(np.float64) - b.raw_rgb))
+    difference = slope * (a.denoised_rgb.astype(np.float64) - b.denoised_rgb)
+    blocks = [_block_means(values) for values in (residual, probe, difference)]
+    to_mean = BLOCK_PX**2 / count
+
+    def over_pixels(values: NDArray[np.float64]) -> float:
+        return float((values.mean(axis=-1) * pixels).sum() / count)
+
+    of_halves = [curve(half.denoised_rgb.astype(np.float64)) for half in (a, b)]
+    agreement_in_blocks = 0.25 * np.square(blocks[2]).mean(axis=-1).sum() * to_mean
+    agreement_in_pixels = 0.25 * np.square(difference).mean(axis=-1).sum() / count
+    return ErrorMeasures(
+        estimate=float((squared_error(a, b, curve) * pixels).sum() / count),
+        agreement=over_pixels(0.25 * np.square(of_halves[0] - of_halves[1])),
+        move=over_pixels(np.square(curve(picture) - curve(denoised))),
+        surprise=float((surprises(a, b, curve) * pixels).max() / count),
+        sure=float(
+            (np.square(blocks[0]) + blocks[1] * blocks[2] - np.square(blocks[1]))
+            .mean(axis=-1).sum() * to_mean
+        ),
+        block_agreement=float(agreement_in_blocks / agreement_in_pixels)
+        if agreement_in_pixels
+        else 1.0,
+        hits=float(hits.mean()),
+    )  # fmt: skip
+
+
+def _block_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    across = len(values) // BLOCK_PX
+    means: NDArray[np.float64] = values.reshape(across, BLOCK_PX, across, BLOCK_PX, 3).mean((1, 3))
+    return means
 
 
 def _means(a: Half, b: Half) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from pipeline.renders.calibrated_error import is_far, statement_for
 from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoise_corrections import (
     DARKER,
@@ -17,7 +18,8 @@ from pipeline.renders.denoise_corrections import (
     STANDS_OUT,
 )
 from pipeline.renders.denoiser import denoise
-from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error
+from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error, measure_errors
+from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tiles import tile_means
@@ -31,6 +33,13 @@ from pipeline.renders.view_pictures import (
     to_filter,
 )
 from storage.conventions import log10_radiance
+
+_METRICS = (
+    ("log", log10_radiance, False),
+    ("linear", clamped_radiance, False),
+    ("object", log10_radiance, True),
+)
+"""Name, curve, and whether pixels of objects alone count, of each metric."""
 
 Pictures = NDArray[np.float32]
 """[P, R, R, 3] pictures of the parts of light of one view."""
@@ -115,6 +124,7 @@ class HostPictures:
         self.hits = tracer.hits(camera)
         self.visible = _visible_pixels(self._features)
         self._changes = LogChanges()
+        self._picture: NDArray[np.float32] | None = None
 
     @staticmethod
     def mean_radiance(samples: DualBuffer) -> float:
@@ -128,20 +138,37 @@ class HostPictures:
         corrected = pairs
         if error is not None and self._settings.denoiser != "off":
             corrected = keep_in_halves(pairs, error)
-        floors = []
-        groups = floor_groups(len(pairs[0][0]), names, per_light=self._settings.per_light)
-        for group in groups:
+        halves = []
+        for group in floor_groups(len(pairs[0][0]), names, per_light=self._settings.per_light):
             chosen = slice(*group)
-            first, second = (_half((raw[chosen], rest[chosen])) for raw, rest in corrected)
-            floors.append(estimate_error(first, second, self.hits))
+            halves.append([_half((raw[chosen], rest[chosen])) for raw, rest in corrected])
+        self._halves = first, second = halves[0]
+        self._picture = None
+        statement = statement_for(self._settings, self._samples)
+        floors = [estimate_error(*each, self.hits) for each in halves]
+        expected = None
+        if statement and not is_far(floors[0], self._settings, self._samples.spp):
+            (picture,) = self.finish()
+            measures = {
+                name: measure_errors(first, second, picture, curve, self.hits, objects=objects)
+                for name, curve, objects in _METRICS
+            }
+            floor, expected = statement.state(measures, len(picture), self._samples.spp)
+            floors = [floor]
         return MeasuredLook(
             floor=floors[0],
             part_floors=dict(zip(names, floors[1:], strict=False)),
             light_floors=floors[1 + len(names) :],
+            expected=expected,
             changes=self._changes.since([_half(pair) for pair in pairs]),
         )
 
     def finish(self) -> NDArray[np.float32]:
+        if self._picture is None:
+            self._picture = self._filtered_picture()
+        return self._picture
+
+    def _filtered_picture(self) -> NDArray[np.float32]:
         raw = self._means.mean()
         error = self._means.standard_error()
         parts = self._denoise(raw, self._settings.denoiser)

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from infra.bench.experiments import methods
+from infra.bench.experiments.calibration import LOOKS
 from infra.bench.experiments.cycles import agreement_figures
 from infra.bench.experiments.frontier import cost_at_error
 from infra.bench.experiments.loader import read_figures
@@ -77,24 +78,32 @@ def test_every_kind_of_scene_agrees(tmp_path: Path) -> None:
         assert row.values["means of 8 x 8, dB"] > 25, "64 samples each; another scene has below 20"
 
 
+@pytest.mark.slow("benchmarks")
+def test_every_look_of_a_layout_is_a_row(tmp_path: Path) -> None:
+    found = measured_rows("calibration", tmp_path)
+    assert list(found) == [f"{px} px, {spp} samples" for px, spps in LOOKS.items() for spp in spps]
+    assert all(row.values["true, median millionths"] > 0 for row in found.values())
+
+
 LEVELS = [(float(1 << k), 2.0**k, 30 + 3.0 * k) for k in range(5)]
 """Samples, core-seconds and dB."""
 
 
 def test_equal_error_lies_between_the_levels() -> None:
     for _, core_s, db in LEVELS:
-        assert cost_at_error(LEVELS, db) == (core_s, True)
-    core_s, is_reached = cost_at_error(LEVELS, 34.5)
-    assert is_reached and core_s == pytest.approx(2**1.5, rel=0.1)
-    assert cost_at_error(LEVELS, 50.0) == (LEVELS[-1][1], False)
-    assert cost_at_error(LEVELS, 20.0) == (LEVELS[0][1], False)
+        assert cost_at_error(LEVELS, db) == (core_s, 0)
+    core_s, bound = cost_at_error(LEVELS, 34.5)
+    assert not bound and core_s == pytest.approx(2**1.5, rel=0.1)
+    assert cost_at_error(LEVELS, 50.0) == (LEVELS[-1][1], 1)
+    assert cost_at_error(LEVELS, 20.0) == (LEVELS[0][1], -1)
 
 
 @pytest.mark.slow("benchmarks")
 def test_our_renderer_beside_plain_mitsuba(tmp_path: Path) -> None:
     found = measured_rows("frontier", tmp_path)
     db = {name: row.values["psnr_log_db, dB"] for name, row in found.items()}
-    assert db["mitsuba 512"] > db["mitsuba 64"] > 20  # a picture of something else has below 20
+    plain = [db[f"mitsuba multijitter {spp}"] for spp in (512, 64)]
+    assert plain[0] > plain[1] > 20  # a picture of something else has below 20
     ours = found["trilight 46 dB"].values
     assert ours["Mitsuba's cost at equal error, times"] > 0
     assert 0 <= ours["log: over 1 dB worse than stated, %"] <= 100

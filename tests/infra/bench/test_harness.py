@@ -38,7 +38,7 @@ from train.evaluation.cost_tables import COST_NOISE, on_front
 
 TINY = dataclasses.replace(
     QUICK, scenes=1, resolution=32, max_spp=128, reference_spp=128, picture_px=64, objects=1,
-    repeats=1, steps=2, held_out=2, growth=1,
+    repeats=1, steps=2, held_out=2, growth=1, layouts=1,
 )  # fmt: skip
 
 calls: list[tuple[str, str]] = []
@@ -113,8 +113,8 @@ def measured(folder: Path, *trials: str, data: str | None = None, warm_up: bool 
 def test_every_declaration_is_whole() -> None:
     found = every_experiment()
     assert sorted(found) == [
-        "cycles", "frontier", "gpu", "growth", "loader", "meshes", "methods", "paired-training",
-        "relighting",
+        "calibration", "cycles", "frontier", "gpu", "growth", "loader", "meshes", "methods",
+        "paired-training", "relighting",
     ]  # fmt: skip
     for name, one in found.items():
         with case(name):
@@ -246,6 +246,27 @@ def test_the_table_has_every_point_and_the_plot_every_kind(tmp_path: Path) -> No
     plot(grown, found, path)
     with Image.open(path) as picture:
         assert {(31, 119, 180), (255, 127, 14)} <= set(picture.convert("RGB").get_flattened_data())
+
+
+def test_a_run_of_versions_resumes_on_other_machines_commits_and_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = dataclasses.replace(
+        experiment("a", "killed"),
+        versions=lambda options: {"denoiser": "1"},
+        figures=("core_s", "db"),
+    )
+    out = tmp_path / "made-up.jsonl"
+    with pytest.raises(KeyboardInterrupt):
+        run(one, TINY, BenchOptions(), out)
+    monkeypatch.setattr(running, "machine_record", lambda device: {"commit": "another"})
+    resumed = run(one, TINY, BenchOptions(data="there"), out)
+    assert resumed.whole_trials() == ["a", "killed"]
+    assert [trial for trial, _ in calls].count("a") == len(FIGURES)
+    assert resumed.trials["a"]["cheap"] == {"core_s": 1.0, "db": 30.0}
+    other = dataclasses.replace(one, versions=lambda options: {"denoiser": "2"})
+    assert run(other, TINY, BenchOptions(data="there"), out) is not resumed
+    assert len(Store(out).runs()) == 2
 
 
 def test_a_name_that_is_there_twice_and_what_is_missing_are_named(tmp_path: Path) -> None:

@@ -325,6 +325,21 @@ def test_a_target_governs_and_all_three_floors_are_said(source: Path, tmp_path: 
     assert "geometry is seen; the cap came before 95 dB)" in both
 
 
+def test_a_promise_and_what_is_probable_are_said(source: Path, tmp_path: Path) -> None:
+    """Where they are asked for, at a width that is calibrated; elsewhere the bound is named."""
+    out = tmp_path / "x.exr"
+    words = (source, "--out", out, "--noise-floor", "5", "--max-spp", "128")
+    assert "probably" not in printed(*words, "--resolution", "64")
+    calibrated = (*words, "--stated-error", "calibrated")
+    said = printed(*calibrated, "--resolution", "64")
+    assert re.search(r"noise floor -?\d+\.\d dB, probably -?\d+\.\d \(linear ", said)
+    assert re.search(r"dB, probably -?\d+\.\d \(psnr_linear_db", said)
+    assert re.search(r"Of a hundred pictures .* \d+ are at most 1 dB worse, and half are", said)
+    assert header(out)["expected_error_db"] > header(out)["noise_floor_db"]
+    said = printed(*calibrated, "--resolution", "16")
+    assert "a bound: pictures like this one are not calibrated" in said
+
+
 def test_the_words_of_what_was_asked_give_the_picture_again(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "x.exr"
     asked = RenderOptions(

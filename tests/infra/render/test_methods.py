@@ -18,7 +18,7 @@ from infra.render.networks import (
 )
 from infra.render.path_tracer import MOST_SCENES, PathTracer, RenderChild, RenderWorker
 from infra.render.quality import FixedSamples, ToStatedError
-from infra.render.raw_references import RawReference, true_error_db
+from infra.render.raw_references import RawReference, true_error, true_error_db
 from model.config import hits_smoke
 from model.neural_renderer import NeuralRenderer
 from pipeline.exchange.open_scene import SceneSource
@@ -123,6 +123,26 @@ def test_noise_of_the_reference_does_not_count() -> None:
         assert 0.2 < open_db < 0.8, "and it says how much that is"
         plain = metric(picture, (0.5 * (halves.a_rgb + halves.b_rgb)).astype(np.float32))
         assert plain < exact - 5, "the mean of the halves would have hidden the picture's error"
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.03])
+def test_what_a_reference_leaves_open_is_how_far_its_errors_spread(noise: float) -> None:
+    """Of a known picture, where the error is far above the noise and where it is far below.
+
+    The channels of a pixel have one noise, as those of a path do.
+    """
+    rng = np.random.default_rng(3)
+    picture = (_truth() + rng.normal(0, 0.01, (HALF_PX, HALF_PX, 3))).astype(np.float32)
+    found, opens = [], []
+    for _ in range(200):
+        a, b = (_truth() + rng.normal(0, noise, (HALF_PX, HALF_PX, 1)) for _ in range(2))
+        error, spread = true_error(
+            picture, RawReference(a_rgb=a, b_rgb=b), clamped_radiance, EVERYWHERE
+        )
+        found.append(error)
+        opens.append(spread)
+    assert np.mean(found) == pytest.approx(1e-4, rel=0.1)
+    assert np.sqrt(np.mean(np.square(opens))) == pytest.approx(np.std(found), rel=0.15)
 
 
 def test_two_renderers_without_noise() -> None:

@@ -19,11 +19,13 @@ from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.distributions import Distributions, dataset_distributions
 from pipeline.documents.rights import encode_licences, rights_of
 from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.statistics import dataset_statistics
 from storage.errors import TrilightError
 from storage.markdown import code, front_matter, plain, text
 from storage.records.objects import read_objects_lock, write_objects_lock
 from storage.records.profiles import Profile
 from storage.records.quantities import QUANTITIES, STATISTICS, summary
+from storage.records.sample import PartFloor, error_text
 from tests.for_each import with_folders
 from tests.pipeline.documents.dataset_by_hand import (
     edit_manifest,
@@ -103,6 +105,7 @@ VALUES: list[tuple[str, Sequence[float]]] = [
     ("noise_floor_db", [38, 38, 42, 42, 41.5, 41.5, 41.5, 41.5, 44, 44]),
     ("noise_floor_linear_db", [33.25] * 10),
     ("object_noise_floor_db", [40.5] * 10),
+    ("expected_error_db", []),
     ("coverage", [0.25] * 8 + [0.5] * 2),
     ("spp", [256, 256] + [128] * 8),
     ("camera_attempt", [0] * 4 + [0, 0, 2, 2] + [0] * 2),
@@ -255,6 +258,29 @@ def test_the_body_counts_by_split_and_licence(tmp_path: Path) -> None:
     assert dataset.digest in body
     rights = rights_of(read_objects_lock(dataset.folder.objects_lock))
     assert "attribution, changes" in encode_licences(rights).decode()
+
+
+def test_expected_errors_stand_beside_the_promised_ones(tmp_path: Path) -> None:
+    """In card, statistics and captions; without them neither says a word of them."""
+    expected = PartFloor(
+        noise_floor_db=43.25, noise_floor_linear_db=35.0, object_noise_floor_db=42.0
+    )
+    stated = sample(0, tiny_scene())
+    views = tuple(dataclasses.replace(view, expected=expected) for view in stated.views)
+    both = {"stated": dataclasses.replace(stated, views=views), "bounds": stated}
+    said = {}
+    for name, one in both.items():
+        dataset = write_dataset(tmp_path / name, {"train-000000.tar": [one]})
+        read = dataset.read_samples(dataset.manifest.shards[0], [one.key])
+        (again,) = read
+        assert again.views == one.views
+        rows = dict(dataset_statistics(dataset).lines())
+        assert ("expected error" in rows) == (name == "stated")
+        said[name] = card_of(dataset)[1] + error_text(again.views[0])
+    assert "| 41.5 (33.2, 40.5), probably 43.2 | 41.5 (33.2, 40.5) |" in said["stated"]
+    assert said["stated"].endswith("41.5 dB, probably 43.2")
+    assert "calibrated on other scenes" in said["stated"]
+    assert "probably" not in said["bounds"]
 
 
 @pytest.mark.parametrize("profiles", [["lossless"] * 2, ["compact"] * 2, ["lossless", "compact"]])

@@ -6,6 +6,7 @@ import trimesh
 
 from infra.bench.workloads.coarser_meshes import picture_db
 from infra.bench.workloads.judged_pictures import shrink_reference
+from infra.bench.workloads.recorded_looks import FIGURES, record_looks, unreachable
 from infra.bench.workloads.traced_pictures import fixed_samples, render_levels, render_shot
 from infra.render.raw_references import raw_reference
 from pipeline.foreign.mesh import TriangleMesh
@@ -32,13 +33,33 @@ def test_a_small_reference_is_that_of_its_own_width() -> None:
     assert np.median(ratio) == pytest.approx(1, abs=0.03)
 
 
+@pytest.mark.usefixtures("llvm")
+def test_every_look_is_recorded_with_its_true_error() -> None:
+    scene = sampled_like_scene(np.random.default_rng(5), num_views=1)
+    settings = unreachable(fixed_samples(64, 64), 64, 256)
+    reference = raw_reference(scene, camera_of(scene, 64), 512, 1)
+    looks = record_looks(scene, settings, reference, 3)
+    # tiles may get a little more than was asked for
+    assert [look["spp"] for look in looks] == pytest.approx([64, 128, 256], rel=0.05)
+    assert {name for look in looks for name in look} == set(FIGURES)
+    view = render_shot(scene, settings)
+    assert looks[-1]["hits"] == pytest.approx(view.hits.mean(), rel=1e-3)
+    for name in ("log_true", "linear_true", "log_agreement"):
+        assert looks[0][name] > looks[-1][name] > 0, name
+    once = [(look["log_jackknife"] > 0, look["linear_oracle"] > 0) for look in looks]
+    assert once == [(True, True), (False, False), (False, False)]
+    # three other pictures of as many samples: equal errors but for chance
+    assert 0.3 < looks[0]["log_oracle"] / looks[0]["log_true"] < 3
+
+
 @pytest.mark.slow("references")
 @pytest.mark.usefixtures("llvm")
-def test_plain_mitsuba_comes_to_the_same_picture() -> None:
-    """With other samples of another sampler: its error falls with samples, towards our picture."""
+@pytest.mark.parametrize("sampler", ["independent", "multijitter"])
+def test_plain_mitsuba_comes_to_the_same_picture(sampler: str) -> None:
+    """With other samples: its error falls with samples, towards our picture."""
     scene = tiny_scene()
     ours = render_shot(scene, fixed_samples(32, 2048)).radiance_rgb
-    levels = render_levels(scene, 32, (16, 64, 1024), 5)
+    levels = render_levels(scene, 32, (16, 64, 1024), 5, sampler)
     assert [level.samples for level in levels] == [16, 64, 1024]
     assert levels[0].cpu_seconds
     errors = [psnr_log_db(level.radiance_rgb, ours) for level in levels]

@@ -23,7 +23,7 @@ from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tiles import TileChoice
-from pipeline.renders.tracer import Chosen, Features
+from pipeline.renders.tracer import Features
 from tests.pipeline.renders.sampling import camera_of, render_view
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 
@@ -210,9 +210,9 @@ def test_the_standard_error_is_that_between_passes() -> None:
     samples = DualBuffer([tracer], camera, 3, first_spp=32, max_spp=256)
     for (total,) in samples.sums:
 
-        def remembered(*, seed: int, spp: int, chosen: Chosen = None, add: Any = total.add) -> None:
+        def remembered(*, seed: int, spp: int, add: Any = total.add, **rest: Any) -> None:
             asked.append((seed, spp))
-            add(seed=seed, spp=spp, chosen=chosen)
+            add(seed=seed, spp=spp, **rest)
 
         total.add = remembered  # type: ignore[method-assign]
     for _ in samples.passes_to(128):

@@ -9,9 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders import vector_tracer
+from pipeline.renders.camera import PixelCamera
 from pipeline.renders.device_memory import read_back
 from pipeline.renders.film import Film, Splats, SplatUnit
 from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.settings import RenderSettings
 from pipeline.renders.vector_tracer import (
     VectorTracer,
     even_numbers,
@@ -133,6 +136,84 @@ def test_a_caustic_has_a_fraction_of_the_noise() -> None:
     assert_agree(together, alone)
     direct = render_blocks(scene, max_depth=2, rr_depth=2, passes=4)
     assert (together.mean - direct.mean).max() > 0.2 * direct.mean.max()
+
+
+_SEEDS = ((11, 5), (12, 6), (13, 7))
+"""Of the camera paths and of the light paths of three passes."""
+
+
+def _orbit() -> tuple[Scene, list[PixelCamera]]:
+    """A scene with three cameras around it."""
+    scene = _ball(0.3)
+    turns = [np.eye(4) for _ in range(3)]
+    for turn, angle in zip(turns, (0, 0.4, 2.0), strict=True):
+        turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    poses = np.stack([turn @ scene.c2w[0] for turn in turns]).astype(np.float32)
+    scene = dataclasses.replace(scene, c2w=poses, fov_deg=np.repeat(scene.fov_deg, 3))
+    return scene, [camera_of(scene, 32, view) for view in range(3)]
+
+
+@pytest.mark.parametrize("lobes", [False, True])
+def test_joined_to_all_cameras_at_once_light_paths_show_what_they_show_alone(lobes: bool) -> None:
+    """To the last bit: which views wait, and which have been rejected, decides nothing."""
+    scene, cameras = _orbit()
+
+    def seen(views: list[int], known: int) -> dict[int, NDArray]:
+        tracer = VectorTracer(scene, max_depth=10, rr_depth=2)
+        tracer = tracer.split_lights(bounces=lobes, lobes=lobes).for_views(cameras[:known])
+        pictures = {}
+        for view in views:
+            total = tracer.pass_sum(cameras[view])
+            for seed, light_seed in _SEEDS:
+                total.add(seed=seed, spp=16, light_seed=light_seed)
+            pictures[view] = total.read()
+        return pictures
+
+    alone = seen([0, 1, 2], 0)
+    for views, known in (([0, 1, 2], 3), ([2, 0], 3), ([0, 2, 1], 2)):
+        for view, picture in seen(views, known).items():
+            np.testing.assert_array_equal(picture, alone[view])
+
+
+def test_light_paths_of_another_seed_are_those_of_a_pass_of_that_seed() -> None:
+    scene, (camera, *_) = _orbit()
+    tracer = VectorTracer(scene, max_depth=10, rr_depth=2)
+    same, other, usual = (tracer.pass_sum(camera) for _ in range(3))
+    same.add(seed=3, spp=16, light_seed=3)
+    other.add(seed=3, spp=16, light_seed=4)
+    usual.add(seed=3, spp=16)
+    np.testing.assert_array_equal(same.read(), usual.read())
+    assert (other.read() != usual.read()).any()
+
+
+def test_views_of_a_scene_trace_their_light_paths_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, _ = _orbit()
+    settings = RenderSettings(
+        resolution=32, noise_floor_db=99.0, min_spp=64, max_spp=64, light_paths="scene"
+    )
+    joined = list[int]()
+    landed = vector_tracer._land
+
+    def counted(inputs: Any, *arguments: Any) -> Any:
+        found = landed(inputs, *arguments)
+        joined.append(len(found))
+        return found
+
+    monkeypatch.setattr(vector_tracer, "_land", counted)
+
+    def views(light_seed: int | None, order: tuple[int, ...]) -> list[NDArray]:
+        joined.clear()
+        renderer = SceneRenderer(scene, settings, light_seed=light_seed)
+        poses = ((scene.c2w[view], float(scene.fov_deg[view]), view) for view in order)
+        return [renderer.render_view(*pose).radiance_rgb for pose in poses]
+
+    together = views(5, (0, 1, 2))
+    passes = 4  # two of 16 samples for each half
+    assert joined == [3] * passes
+    np.testing.assert_array_equal(views(5, (2,)), together[2:])
+    assert (np.array(views(6, (0,))) != together[0]).any()
+    views(None, (0, 1))
+    assert not joined, "each view has its own"
 
 
 def _means(

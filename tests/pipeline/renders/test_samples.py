@@ -75,6 +75,32 @@ def test_passes_are_the_largest_that_fit_and_weigh_by_their_samples() -> None:
     assert [float(half.mean()) for half in means.half_means()] == [expected, expected]
 
 
+def test_light_paths_are_those_of_other_views_and_of_no_other_half_or_pass(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Halves share nothing, or the stated error would not see what they share."""
+    asked = list[tuple[int, int | None]]()
+    monkeypatch.setattr(
+        HostSum, "add", lambda _, *, seed, light_seed, **rest: asked.append((seed, light_seed))
+    )
+
+    def sampled(seed: int, light_seed: int | None) -> list[tuple[int, int | None]]:
+        asked.clear()
+        tracers: Any = [Recorder()]
+        buffer = DualBuffer(
+            tracers, CAMERA, seed, first_spp=32, max_spp=4096, light_seed=light_seed
+        )
+        for _ in (*buffer.passes_to(128), *buffer.passes_over([np.full((PX, PX), 2)] * 2)):
+            pass
+        return asked.copy()
+
+    first, second = sampled(1, 9), sampled(2, 9)
+    lights = [light for _, light in first]
+    assert lights == [light for _, light in second]
+    assert len({*lights, *(seed for seed, _ in first + second)}) == 3 * len(first)
+    assert {light for _, light in sampled(1, None)} == {None}
+
+
 GOOD: dict[str, Any] = {
     "resolution": 64, "noise_floor_db": 40.0, "min_spp": 128, "max_spp": 512,
 }  # fmt: skip
@@ -99,6 +125,9 @@ def test_a_narrow_picture_has_more_samples_before_the_first_look() -> None:
                                        (96, 4096, 128), (8, 64, 64)):  # fmt: skip
         settings = {**GOOD, "resolution": resolution, "min_spp": 64, "max_spp": max_spp}
         assert RenderSettings(**settings).first_spp == first, (resolution, max_spp)
+    for resolution, first in ((512, 32), (256, 32), (128, 64), (64, 128)):
+        settings = {**GOOD, "resolution": resolution, "min_spp": 32, "min_spp_px": 256}
+        assert RenderSettings(**settings).first_spp == first, resolution
 
 
 def test_targets_go_by_the_name_of_their_metric() -> None:
