@@ -148,8 +148,9 @@ def _join_to_cameras(
     light_paths, vertex, mis_ratio, landing = place
     for film, sums in zip(films, splats, strict=True):
         sight = mi.Bool(landing)  # each camera narrows its own
-        joined = film, light_paths, vertex, mis_ratio, sight
-        value, share, pixel, lands = _connect_to_camera(scene, parts, *joined)
+        value, share, pixel, lands = _connect_to_camera(
+            scene, parts, film, light_paths, vertex, mis_ratio, sight
+        )
         _add(sums, parts.by_lobe(light * value, share), pixel, lands)
 
 

@@ -141,8 +141,9 @@ class HostPictures:
         halves = []
         for group in floor_groups(len(pairs[0][0]), names, per_light=self._settings.per_light):
             chosen = slice(*group)
-            halves.append([_half((raw[chosen], rest[chosen])) for raw, rest in corrected])
-        self._halves = first, second = halves[0]
+            a, b = (_half((raw[chosen], rest[chosen])) for raw, rest in corrected)
+            halves.append((a, b))
+        first, second = halves[0]
         self._picture = None
         statement = statement_for(self._settings, self._samples)
         floors = [estimate_error(*each, self.hits) for each in halves]
