@@ -143,7 +143,8 @@ class HostPictures:
             chosen = slice(*group)
             a, b = (_half((raw[chosen], rest[chosen])) for raw, rest in corrected)
             halves.append((a, b))
-        first, second = halves[0]
+        self._halves = halves[0]  # a subclass of the benchmark reads them
+        first, second = self._halves
         self._picture = None
         statement = statement_for(self._settings, self._samples)
         floors = [estimate_error(*each, self.hits) for each in halves]
