@@ -196,7 +196,9 @@ def summaries(values: list[float]) -> list[float]:
 
 
 def test_the_count_of_wrong_errors_is_that_of_the_rows() -> None:
-    said = re.search(r"of (\d+) images of unseen scenes, (\d+) were over 1 dB", README.read_text())
+    said = re.search(
+        r"of (\d+) images of 30 unseen layouts, (\d+) were over 1 dB", README.read_text()
+    )
     assert said is not None
     rows = map(json.loads, (RESULTS / "calibration.jsonl").read_text().splitlines())
     wrong = [row["figures"]["log_over_1"] for row in rows if "point" in row]

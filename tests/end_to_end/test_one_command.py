@@ -34,7 +34,7 @@ def test_real_objects_with_their_licences(trilight: Trilight, shared: Path, tmp_
 
 
 BAD_INPUT = [
-    (("generate", "nonsense"), "build 'nonsense' is unknown; expected one of smoke"),
+    (("generate", "nonsense"), "build 'nonsense' is unknown; expected one of tiny, smoke"),
     (("generate", "smoke", "--objects", "nowhere"), "nowhere"),
     (("generate", "smoke", "--objects", "broken"), "none was accepted"),
     (("generate", "smoke", "--objects", "twice"), "objects.jsonl:2: uid 'a' is already used"),
@@ -43,7 +43,7 @@ BAD_INPUT = [
     (("generate", "smoke", "--runner", "ray"), "--runner is 'ray'"),
     (("generate", "smoke", "--runner", "dask"), "--address is None"),
     (("generate", "smoke", "--address", "tcp://127.0.0.1:9"), "--runner is threads"),
-    (("generate", "smoke", "--shards", "7"), "shards is '7'"),
+    (("generate", "smoke", "--shards", "7"), "--range is '7'"),
     (("generate", "smoke", "--scenes", "8", "--shards", "2:4"), "one that begins below 2"),
     (
         ("generate", "smoke", "--objects", "env:TRILIGHT_SOURCE_X"),

@@ -85,7 +85,7 @@ EXAMPLES: dict[type, Any] = {
     PlacementSettings: SMOKE.scenes.placement,
     MaterialSettings: SMOKE.scenes.materials,
     LightSettings: SMOKE.scenes.lights,
-    CameraSettings: SMOKE.scenes.cameras,
+    CameraSettings: dataclasses.replace(SMOKE.scenes.cameras, elevation_deg=(0.0, 60.0)),
     ViewLaws: SMOKE.scenes.views,
     TextureSettings: TextureSettings(),
     SurfaceMapSettings: SurfaceMapSettings(),

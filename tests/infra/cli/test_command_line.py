@@ -149,8 +149,8 @@ REFUSED = {
     "model large --resolution 72": "--resolution is 72; expected a multiple of 64",
     "model smoke --publish x": "model: --publish needs a checkpoint",
     "submit x smoke": "flow 'x' is unknown; expected one of slurm, kubernetes, generate-scenes",
-    "bench rungs-64": "experiment 'rungs-64' is unknown; expected one of cycles, frontier, gpu, "
-    "growth, loader, meshes, methods, paired-training, relighting",
+    "bench rungs-64": "experiment 'rungs-64' is unknown; expected one of calibration, cycles, "
+    "frontier, gpu, growth, loader, meshes, methods, paired-training, relighting",
 }
 """Values that the settings refuse, each named by its option, before anything is done."""
 

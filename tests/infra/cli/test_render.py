@@ -439,12 +439,12 @@ def test_the_costs_of_this_machine_choose(
 
 REFUSED = {
     "--engine cycles": "--engine is 'cycles'; expected one of mitsuba, neural, both",
-    "--exposure 33": "--exposure-ev is 33.0; expected a number from -32 to 32 stops",
+    "--exposure 33": "--exposure is 33.0; expected a number from -32 to 32 stops",
     "--orbit 3": "expected a folder, X.mp4 or X.webp",
     "--orbit 3 --cameras a.json": "expected no --orbit beside it",
     "--resolution 20": "resolution is 20; expected a multiple of 8",
     "--max-spp 100": "max_spp 100; expected multiples of 8",
-    "--noise-floor-objects loud": "--noise-floor-objects-db is 'loud'",
+    "--noise-floor-objects loud": "--noise-floor-objects is 'loud'",
     "--threads 0": "--threads is 0",
     "--split --engine neural": "a network makes all light together",
     "--checkpoint model.safetensors": "expected --engine neural or both beside it",

@@ -54,7 +54,7 @@ def scene() -> Scene:
 class _Renderer:
     """Refuses its second and third picture, which are of view 1; all others are grey."""
 
-    def __init__(self, scene: Scene, settings: object) -> None:
+    def __init__(self, scene: Scene, settings: object, light_seed: int | None) -> None:
         self.turns = 0
 
     def view_steps(
