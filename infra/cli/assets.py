@@ -47,7 +47,7 @@ class AssetOptions:
     """Objects and meshes."""
 
     source: str
-    """Source of 3D objects: a folder or a URL, builtin:, or objaverse:."""
+    """Source of 3D objects: a folder or a URL, procedural:, or objaverse:."""
     out: Path
     """Folder that receives the meshes."""
     budget: Annotated[int | None, _LEVELS] = None

@@ -33,7 +33,7 @@ class StatusOptions:
     shards_per_task: Annotated[int, Within(1, 10**6, unit="shards")] = 1
     """Number of shards of a task; --missing then prints numbers of tasks."""
     lines: bool = False
-    """Print missing shards as ranges A:B, one a line, for generate --shards."""
+    """Print missing shards as ranges A:B, one a line, for generate --range."""
 
     def __post_init__(self) -> None:
         if self.shards_per_task != 1 and not self.missing:

@@ -48,13 +48,13 @@ class RenderOptions:
     resolution: Resolution | None = None
     """Width of a picture in pixels; by default 512, or the training width of a pure network."""
     noise_floor_db: NoiseFloor | None = None
-    """mitsuba: stop at this noise floor (psnr_log_db; higher is cleaner); by default 40, unless
-    another floor is given. Of several floors, all are reached."""
+    """mitsuba: stop at this stated error (psnr_log_db; higher is cleaner); by default 40, unless
+    another target is given. Of several, all are reached."""
     noise_floor_linear_db: NoiseFloor | None = None
-    """mitsuba: stop at this noise floor as psnr_linear_db (radiance within [0, 1]); by default
+    """mitsuba: stop at this stated error as psnr_linear_db (radiance within [0, 1]); by default
     none. In most pictures it is 5 to 10 dB below psnr_log_db."""
     noise_floor_objects_db: NoiseFloor | None = None
-    """mitsuba: stop at this noise floor as object_psnr_log_db (without background); by default
+    """mitsuba: stop at this stated error as object_psnr_log_db (without background); by default
     none."""
     max_spp: Samples = MOST_TRACED_SPP
     """mitsuba: maximum number of samples per pixel."""
@@ -63,7 +63,7 @@ class RenderOptions:
     error."""
     spp: Annotated[int | None, Within(1, MOST_SPP, unit="samples")] = None
     """mitsuba: samples per pixel of a preview with one denoise; by default sampling goes on to the
-    noise floor. The error of a preview is not measured."""
+    stated error. The error of a preview is not measured."""
     seconds: Annotated[float | None, Within(0, 1e9, low_open=True, unit="seconds")] = None
     """mitsuba: best preview within these seconds a picture after start-up; by default none."""
     error_db: Annotated[float | None, Within(0, MAX_DB, unit="dB")] = None

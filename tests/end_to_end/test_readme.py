@@ -145,7 +145,6 @@ def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
         fewer = "--scenes 8 --resolution 64 --set splits.scenes_per_shard=1"
         fewer += f" {' '.join(SIXTEEN_SAMPLES)}"
         command = command.replace("--scenes 64", fewer)
-        command = command.replace("/mine", "/readme")
         # set-up would lead the environment, which is lent, to the copy
         lent = "--old-file .venv/.dataset-ready"
         command = command.replace("make dataset", f"make {lent} dataset SCENES=1")

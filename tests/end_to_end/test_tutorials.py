@@ -37,8 +37,8 @@ TOYS = {
     "trilight shards select data/mine --template corner --where 'lights_per_scene >= 3'      "
     "--out data/corners": "trilight shards select data/mine --split train "
     "--template toy --out data/corners",
-    "trilight assets builtin:12 --out data/watertight --budget 1188 --watertight": "trilight "
-    "assets builtin:3 --out data/watertight --budget 1188 --watertight",
+    "trilight assets procedural:12 --out data/watertight --budget 1188 --watertight": "trilight "
+    "assets procedural:3 --out data/watertight --budget 1188 --watertight",
     "trilight generate renderformer-v1-256 --objects data/watertight --out data/v1 --scenes 128": ""
     "trilight generate renderformer-v1-256 --objects data/watertight --out data/v1 --scenes 1 "
     "--resolution 16 --noise-floor 5 --set splits.scenes_per_shard=1 --set splits.one_split=true",
