@@ -255,8 +255,9 @@ _GROUPINGS: dict[str, Callable[[Look], str]] = {
     "source": lambda look: look.source,
     "layout": lambda look: look.family.partition("-")[0],
     "kind": lambda look: look.kind,
+    "width": lambda look: f"{look.px} px",
 }
-"""Groups of pictures whose records are printed apart, and that are left out in turn."""
+"""Groups of pictures that are left out in turn; all but the last have records of their own."""
 
 
 def _parts(metric: str, mine: Sequence[Look], judging: Sequence[Look]) -> Iterator[str]:
@@ -267,7 +268,7 @@ def _parts(metric: str, mine: Sequence[Look], judging: Sequence[Look]) -> Iterat
     yield _line("pictures", *head)
     yield "|---|---|---|---|"
     some, stated = _calibrate(metric, name, mine, judging)
-    for label, group in _GROUPINGS.items():
+    for label, group in [*_GROUPINGS.items()][:-1]:
         for value in sorted({group(look) for look in some}):
             at = [row for row, look in enumerate(some) if group(look) == value]
             yield _line(

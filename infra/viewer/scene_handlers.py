@@ -273,6 +273,7 @@ def _job_record(job: RenderJob, reference: RenderJob | None) -> Mapping[str, Any
             "core_s": image.cpu_seconds,
             "scene_core_s": job.scene_core_s,
             "floor_db": image.stated_error_db,
+            "expected_db": image.facts.get("expected_error_db"),
             "says": image.remark,
             "notes": list(job.notes),
             "agreement_db": agreement_db(job, reference),

@@ -2,7 +2,7 @@
 
 Six measures that the halves of a picture give (`ErrorMeasures`) are put together as a weighted
 geometric mean, in dB: no single noisy one carries the statement, and each error that grows lowers
-it. Weights and shifts are read from stated_errors.json, which `python -m infra.setup.stated_errors`
+it. Weights and shifts are read from stated_errors.json, which `python -m infra.bench.stated_errors`
 fits on the rows of `trilight bench calibration`. With other versions than those rows have, and
 outside of their range, the bound of pipeline.renders.noise_floor is stated instead.
 """

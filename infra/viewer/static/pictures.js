@@ -233,7 +233,10 @@ function figures(told) {
   const parts = [];
   if (told.core_s != null) parts.push(`${seconds(told.core_s)} core-s`);
   if (told.spp) parts.push(`${told.spp} spp`);
-  if (told.floor_db != null) parts.push(`stated ${told.floor_db.toFixed(1)} dB`);
+  if (told.floor_db != null) {
+    const probably = told.expected_db == null ? "" : `, probably ${told.expected_db.toFixed(1)}`;
+    parts.push(`stated ${told.floor_db.toFixed(1)} dB${probably}`);
+  }
   if (told.agreement_db != null) parts.push(`${told.agreement_db.toFixed(1)} dB to ${truth(told)}`);
   return parts.join(", ");
 }

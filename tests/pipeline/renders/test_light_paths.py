@@ -14,6 +14,7 @@ from pipeline.renders.device_memory import read_back
 from pipeline.renders.film import Film, Splats, SplatUnit
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.vector_tracer import (
     VectorTracer,
@@ -22,6 +23,8 @@ from pipeline.renders.vector_tracer import (
     trace_camera_paths,
 )
 from storage.conventions import camera_rays
+from storage.metrics import psnr_log_db
+from storage.records.lights import sum_of_lights
 from storage.records.scene import Scene
 from tests.pipeline.renders.sampling import (
     Estimate,
@@ -31,6 +34,7 @@ from tests.pipeline.renders.sampling import (
     render_blocks,
 )
 from tests.pipeline.renders.scene_kit import Part, box, join, light, material, quad, sphere
+from tests.pipeline.renders.test_renderer import lit_scene
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -214,6 +218,23 @@ def test_views_of_a_scene_trace_their_light_paths_once(monkeypatch: pytest.Monke
     assert (np.array(views(6, (0,))) != together[0]).any()
     views(None, (0, 1))
     assert not joined, "each view has its own"
+
+
+def test_lamps_apart_share_the_light_paths_of_a_scene() -> None:
+    scene = lit_scene()
+    settings = RenderSettings(
+        resolution=32, noise_floor_db=99.0, min_spp=64, max_spp=64, light_paths="scene"
+    )
+
+    def view(*, per_light: bool) -> RenderedView:
+        told = dataclasses.replace(settings, per_light=per_light)
+        renderer = SceneRenderer(scene, told, light_seed=5)
+        return renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), 0)
+
+    lamps, whole = view(per_light=True), view(per_light=False)
+    assert lamps.lights_rgb is not None
+    np.testing.assert_array_equal(sum_of_lights(lamps.lights_rgb), lamps.radiance_rgb)
+    assert psnr_log_db(lamps.radiance_rgb, whole.radiance_rgb) > whole.noise_floor_db
 
 
 def _means(
