@@ -11,6 +11,7 @@ from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.rotations import uniform_rotation
 from scene_templates.settings import SceneSettings
 from storage.errors import TrilightError
+from storage.records.material import DIFFUSE, EMISSION, SPECULAR
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import ARRAY_FIELDS, Scene
 from tests.pipeline.renders.sampling import assert_agree, render_blocks
@@ -95,6 +96,34 @@ def test_rendering_commutes_with_motion() -> None:
     # Frames around normals turn differently, so that the same seed means other samples.
     here = render_blocks(scene, first_seed=99, passes=8)
     assert_agree(render_blocks(there, passes=8), here)
+
+
+def test_rendering_commutes_with_a_mirror_and_with_an_exchange_of_channels() -> None:
+    scene, flip, order = _scene(0), np.diag([-1.0, 1.0, 1.0]), np.array([2, 0, 1])
+    pose = scene.c2w.copy()
+    pose[:, :3, :3] = flip @ pose[:, :3, :3] @ flip
+    pose[:, 0, 3] *= -1
+    mirrored = dataclasses.replace(
+        scene,
+        vertex_positions=(scene.vertex_positions @ flip).astype(np.float32),
+        vertex_normals=(scene.vertex_normals @ flip).astype(np.float32),
+        faces=scene.faces[:, [0, 2, 1]],
+        c2w=pose,
+    )
+    recoloured = scene.materials.copy()
+    for part in (DIFFUSE, SPECULAR, EMISSION):
+        recoloured[:, part] = recoloured[:, part][:, order]
+    here = render_blocks(scene, first_seed=99, passes=8)
+    for other, seen in (
+        (mirrored, np.s_[:, ::-1]),
+        (dataclasses.replace(scene, materials=recoloured), np.s_[..., np.argsort(order)]),
+    ):
+        other.check()
+        there = render_blocks(other, passes=8)
+        back = dataclasses.replace(there, mean=there.mean[seen], error=there.error[seen])
+        assert_agree(back, here)
+        with pytest.raises(AssertionError, match="of what is allowed"):
+            assert_agree(there, here)
 
 
 def test_what_a_camera_sees_commutes_with_motion() -> None:
