@@ -377,25 +377,6 @@ def test_resumed_after_every_step_is_uninterrupted(
     assert again.folder.weights.read_bytes() == whole.folder.weights.read_bytes()
 
 
-def test_a_run_goes_on_past_a_damaged_checkpoint_to_the_same_weights(
-    dataset: Dataset, tmp_path: Path
-) -> None:
-    settings = tiny_run(num_steps=8, checkpoints_kept=3)
-    whole = trained(settings, dataset, tmp_path)
-    weights, path = (
-        whole.folder.weights.read_bytes(),
-        path_of_step(whole.folder.checkpoints, 8),
-    )
-    flip_a_bit(path)
-    with pytest.raises(TrilightError, match=f"{path} is not readable"):
-        open_network(path)
-    notes = Heard()
-    again = trained(settings, dataset, tmp_path, resume=True, workers=1, progress=notes)
-    assert [str(path) in text for text in notes.notes] == [True]
-    assert again.folder.weights.read_bytes() == weights
-    assert open_network(path).config == settings.model, "it was written again"
-
-
 def test_a_network_with_windows_is_trained(dataset: Dataset, tmp_path: Path) -> None:
     """As the large one is: a DPT on windows, whole ones and shifted ones."""
     model = dataclasses.replace(
