@@ -288,7 +288,10 @@ def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) 
     trained(tiny_run(model=first, num_steps=4), dataset, tmp_path / "first")
     second = tiny_run(from_weights=True, learning_rate=1e-12, warmup_steps=0, num_steps=4)
     place = str(tmp_path / "first")
-    trained(second, dataset, tmp_path / "second", start=StartOptions(begin_with=place))
+    result = trained(second, dataset, tmp_path / "second", start=StartOptions(begin_with=place))
+    (event,) = result.history
+    digest = json.loads(result.folder.settings.read_text())["begun_with_sha256"]
+    assert event.after == {"run": "tiny", "step": 4, "sha256": digest}
     before, after = (open_network(tmp_path / name) for name in ("first", "second"))
     assert after.config == first
     for name, weight in after.state_dict().items():

@@ -3,7 +3,6 @@
 Closed forms, a slow twin, and nothing where there is no sky.
 """
 
-import dataclasses
 import warnings
 from collections.abc import Callable
 
@@ -30,7 +29,6 @@ from storage.records.lookup import environment_values
 from storage.records.scene import Scene
 from storage.records.sky_texels import row_solid_angles, texel_means
 from tests.for_each import for_each
-from tests.laws.test_rigid_motion import moved
 from tests.model.hits.kit import FLOOR, corner, direct, lit_scene, traced
 from tests.model.kit import awake, hits_config, render, tiny_config
 from tests.pipeline.renders.scene_kit import join, material, quad, sphere
@@ -151,18 +149,6 @@ def test_a_sky_joins_the_unit_and_what_triangles_receive() -> None:
     dark = scene_light(lit_scene(corner(radiance=0.0, sky=constant((1.0, 0.0, 0.0)))))
     assert dark.mean_3[0] > 0.1
     assert dark.mean_3[1] == pytest.approx(0.03 * dark.mean_3[0], rel=1e-5)
-
-
-def test_scene_and_sky_turned_together_look_the_same() -> None:
-    """The noise too turns with them, but where a ray meets a rim."""
-    rotation = uniform_rotation(np.random.default_rng(2))
-    scene = corner(sky=smooth())
-    sky = scene.environment
-    assert sky is not None
-    turned = dataclasses.replace(sky, rotation=(rotation @ sky.rotation).astype(np.float32))
-    there = dataclasses.replace(moved(scene, rotation, [0.3, -0.2, 0.1]), environment=turned)
-    before, after = direct(traced(scene)), direct(traced(there))
-    assert np.mean(np.abs(before - after).max(axis=-1) > 1e-3) < 0.02
 
 
 @for_each("sky", [one_sun(1e6), constant(1e9), constant(1e-9, height=1)])
