@@ -32,11 +32,8 @@ from storage.settings.changes import changed
 from tests.for_each import for_each
 from tests.pipeline.renders.guided_scenes import mirrors
 from tests.pipeline.renders.sampling import (
-    assert_agree,
-    blocks_of,
     camera_of,
     printed_by,
-    render_passes,
     render_view,
 )
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene, sphere
@@ -278,20 +275,6 @@ def test_lights_apart_add_up_to_one_denoised_picture() -> None:
     np.testing.assert_allclose(
         render_view(scene, SETTINGS).radiance_rgb, expected, rtol=2 * 2**-11, atol=1e-6
     )
-
-
-def test_the_sum_is_the_picture_of_all_lights_at_once(llvm: None) -> None:
-    """The same integral, by other samples: raw means of 8 x 8 blocks agree within their errors."""
-    scene = lit_scene()
-    tracer = load_tracer(scene, max_depth=6, rr_depth=5)
-    lights = [tracer.only_light(row) for row in light_rows(scene)]
-    separate = blocks_of(
-        np.sum([render_passes(one, scene, passes=12) for one in lights], axis=0), 8
-    )
-    together = blocks_of(render_passes(tracer, scene, passes=12), 8)
-    assert_agree(separate, together)
-    # and the errors are small enough to tell: the lights' own share is far larger
-    assert np.median(np.hypot(separate.error, together.error)) < 0.02 * together.mean.mean()
 
 
 def test_a_light_that_is_off_still_casts_a_shadow_and_is_still_hidden() -> None:
