@@ -1,6 +1,6 @@
 """Skies: directions drawn as their density says, light at hits, and networks that know them.
 
-Closed forms, a slow twin, and nothing where there is no sky.
+Closed forms, and nothing where there is no sky. Beside the path tracer: tests/laws.
 """
 
 import warnings
@@ -32,7 +32,7 @@ from tests.for_each import for_each
 from tests.model.hits.kit import FLOOR, corner, direct, lit_scene, traced
 from tests.model.kit import awake, hits_config, render, tiny_config
 from tests.pipeline.renders.scene_kit import join, material, quad, sphere
-from tests.sky_maps import as_sky, centres, constant, night, one_sun, six_poles, smooth
+from tests.sky_maps import as_sky, constant, night, one_sun, six_poles, smooth
 from train.data.augment import mirror_sky, permute_sky_channels, rotate_sky, scale_sky
 
 
@@ -90,46 +90,6 @@ def _seen(lit: LitScene, targets: list[list[float]]) -> Points:
     points = lit.points(hits.triangle[met], hits.uv[:, met], rays[:, met].astype(np.float32))
     assert len(met) == len(targets)
     return points
-
-
-def _irradiance_twin(scene: Scene, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return irradiance over pi: texel by texel, with one shadow ray each."""
-    lit, sky = lit_scene(scene), scene.environment
-    assert sky is not None
-    fine = 64
-    angles, total = row_solid_angles(fine), np.zeros(3)
-    local = centres(fine)
-    for row in range(fine):
-        for direction in local[row] @ sky.rotation.astype(np.float64).T:
-            cosine = float(normal @ direction)
-            if cosine <= 0:
-                continue
-            start = np.array([place + 1e-4 * normal], np.float32)
-            free = lit.everything.is_free(
-                start, direction[None].astype(np.float32), np.array([1e6], np.float32)
-            )
-            total += environment_values(sky, direction) * (free[0] * cosine * angles[row] / np.pi)
-    return total
-
-
-@pytest.mark.slow("training")
-@for_each("sky", [smooth(), one_sun(1e6)])
-def test_light_of_a_sky_is_that_of_all_its_texels_with_shadows(sky: Environment) -> None:
-    scene = corner(sky=sky)
-    lit = lit_scene(scene)
-    points = _seen(lit, [[0.9, -0.6, 0.0], [-0.9, 0.6, 0.0], [0.6, 1.5, 1.2]])
-    found, count = np.zeros((3, 3)), 64
-    rng = np.random.default_rng(0)
-    for _ in range(count):
-        light = no_light(points)
-        shift = rng.random((2, 3), np.float32)
-        add_sky_light(light, lit, points, None, shift, 0, rays=8, lobe_rays=0)
-        found += light.diffuse / count
-    for point in range(3):
-        expected = _irradiance_twin(scene, points.position[:, point], points.normal[:, point])
-        assert expected.max() > 0.02
-        # 512 rays: 3 % where half of a smooth sky is hidden; a sun's texel is read once by the twin
-        assert found[:, point] == pytest.approx(expected, rel=0.08, abs=0.01 * expected.max())
 
 
 def test_scenes_without_a_sky_stay_as_they_are_to_the_bit() -> None:
