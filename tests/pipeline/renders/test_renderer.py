@@ -46,11 +46,11 @@ GROWING = dataclasses.replace(CHEAP, min_spp=16, max_spp=256)
 """Its first look is at 64 samples: the picture is narrow."""
 
 
-def simple_scene(radiance: float = 20.0) -> Scene:
+def simple_scene() -> Scene:
     parts = [
         quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], material(diffuse=[0.7, 0.5, 0.3])),
         sphere([0, 0, 0.5], 0.5, material(diffuse=0.4, specular=0.4, roughness=0.5), rings=8),
-        light([[-0.5, -1.5, 2], [0.5, -1.5, 2], [0, -1, 2.4]], radiance),
+        light([[-0.5, -1.5, 2], [0.5, -1.5, 2], [0, -1, 2.4]], 20.0),
     ]
     return join(parts, eye=(0, -3, 2), target=(0, 0, 0.4), fov_deg=45)
 
@@ -180,24 +180,15 @@ def test_the_measured_floor_is_below_the_true_agreement_here() -> None:
         assert true_db - 10 < view.noise_floor_db < true_db
 
 
-def test_pictures_without_right_light_are_rejected() -> None:
-    scene = simple_scene()
-    renderer = SceneRenderer(scene, CHEAP)
+def test_a_camera_that_looks_away_and_a_lamp_of_no_triangles_are_rejected() -> None:
+    """What else cannot be lit or held is in tests/extremes/test_renders.py."""
     away = look_at_c2w(eye=[0, -3, 2], target=[0, -9, 4], up=[0, 0, 1])
     with pytest.raises(Rejected, match="black_view"):
-        renderer.render_view(away, 40.0, seed=0)
-    for radiance, reason in ((1e-3, "black_view"), (3e38, "nonfinite"), (1e8, "radiance_overflow")):
-        with pytest.raises(Rejected, match=reason):  # before the denoiser hides it
-            render_view(simple_scene(radiance=radiance), CHEAP)
-    with pytest.raises(Rejected, match="no_surfaces"):
-        SceneRenderer(join([light([[0, 0, 1], [1, 0, 1], [0, 1, 1]], 1.0)]), CHEAP)
+        SceneRenderer(simple_scene(), CHEAP).render_view(away, 40.0, seed=0)
     empty = SceneObject(name="nothing", kind="emitter")
     no_triangles = dataclasses.replace(lit_scene(), objects=(*lit_scene().objects, empty))
     with pytest.raises(Rejected, match="unlit_scene"):
         SceneRenderer(no_triangles, SETTINGS)
-    scene.vertex_positions[-3:] = [[0, 0, 1], [1, 0, 1], [2, 0, 1]]
-    with pytest.raises(Rejected, match="unlit_scene"):  # its lamp has no area
-        SceneRenderer(scene, CHEAP)
 
 
 SETTINGS = dataclasses.replace(CHEAP, per_light=True)
