@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 
 _READ_ONLY = "It cannot be written there: choose a folder for report and sheet with --out."
+_STATED = ("noise_floor_db", "expected_error_db", "noise_floor_linear_db", "object_noise_floor_db")
 
 
 @checked()
@@ -150,17 +151,8 @@ def _as_json(
         "dataset_digest": opened.digest,
         "distributions": distributions.as_json(),
         "licences": Counter(entry.licence for entry in distributions.objects),
-        "noise_floor_db": _round_db(statistics.noise_floor_db),
-        **(
-            {}
-            if statistics.expected_error_db is None
-            else {"expected_error_db": _round_db(statistics.expected_error_db)}
-        ),
-        "noise_floor_linear_db": _round_db(statistics.noise_floor_linear_db),
-        "object_noise_floor_db": _round_db(statistics.object_noise_floor_db),
-        "part_noise_floor_db": {
-            part: _round_db(floors_db) for part, floors_db in statistics.part_noise_floor_db.items()
-        },
+        **_round_all({name: getattr(statistics, name) for name in _STATED}),
+        "part_noise_floor_db": _round_all(statistics.part_noise_floor_db),
         "objects_by_split": Counter(entry.split for entry in distributions.objects),
         "rejections": [list(row) for row in count_by_reason(distributions.failures)],
         "scenes_by_split": statistics.scenes_by_split,
@@ -186,5 +178,12 @@ def _print_summary(
     print_rows(title, rows)
 
 
-def _round_db(floors_db: NDArray[np.float64]) -> list[float]:
-    return [round(float(value), 2) for value in floors_db]
+def _round_all(
+    errors_db: Mapping[str, NDArray[np.float64] | None],
+) -> dict[str, list[float]]:
+    """Return errors in dB as JSON values; those that are not stated are left out."""
+    return {
+        name: [round(float(value), 2) for value in values]
+        for name, values in errors_db.items()
+        if values is not None
+    }

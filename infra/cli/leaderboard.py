@@ -1,5 +1,6 @@
 """`trilight leaderboard`: compares methods and networks on one dataset by error and cost."""
 
+import dataclasses
 from typing import Any
 
 from infra.cli.console import (
@@ -66,8 +67,6 @@ def _row(standing: Any) -> dict[str, str]:
 
 
 def _plain(board: Any) -> list[dict[str, Any]]:
-    import dataclasses
-
     return [
         {
             "width": one.width,

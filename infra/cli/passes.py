@@ -36,15 +36,8 @@ class PassOptions:
 def passes(options: PassOptions, output: OutputOptions) -> None:
     names = pass_names(name for words in options.passes for name in words.split(","))
     first_words(f"Writing {', '.join(names)} to {options.out}", silent=output.json)
-    from pipeline.exchange.pass_files import PassFileOptions, write_passes
+    from pipeline.exchange.pass_files import write_passes
 
-    selection = PassFileOptions(
-        names=names,
-        scene=options.scene,
-        view=options.view,
-        resolution=options.resolution,
-        rays_a_side=options.rays_a_side,
-    )
     files: list[Path] = []
     with progress_bars() as bars:
         task = bars.add_task("views", total=None, note="", visible=not output.json)
@@ -53,7 +46,16 @@ def passes(options: PassOptions, output: OutputOptions) -> None:
             files.append(path)
             bars.advance(task)
 
-        notes = write_passes(options.source, options.out, selection, done=on_file)
+        notes = write_passes(
+            options.source,
+            options.out,
+            names,
+            scene=options.scene,
+            view=options.view,
+            resolution=options.resolution,
+            rays_a_side=options.rays_a_side,
+            done=on_file,
+        )
     record = {"files": list(map(str, files)), "notes": list(notes), "passes": names}
     rows = [("written", f"{len(files)} files"), ("passes", ", ".join(names))]
     print_result("Passes", rows, record, notes=notes, as_json=output.json)

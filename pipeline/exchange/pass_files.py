@@ -17,22 +17,6 @@ _RESOLUTION = 256
 """Width and height in pixels for scenes without pictures."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PassFileOptions:
-    """Options of `write_passes`: the passes and views to write."""
-
-    names: Sequence[str]
-    """Names of the passes to write."""
-    scene: str | None
-    """Key of the only scene, with or without zeros before it; None for all."""
-    view: int | None
-    """The only view; None for all."""
-    resolution: int | None
-    """Width and height in pixels; None for that of the dataset's pictures, or 256."""
-    rays_a_side: int
-    """Rays along each side of a pixel."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _NamedScene:
     """A scene of a source with its file name."""
@@ -44,7 +28,15 @@ class _NamedScene:
 
 
 def write_passes(
-    source: str, out: Path, options: PassFileOptions, *, done: Callable[[Path], None]
+    source: str,
+    out: Path,
+    names: Sequence[str],
+    *,
+    scene: str | None,
+    view: int | None,
+    resolution: int | None,
+    rays_a_side: int,
+    done: Callable[[Path], None],
 ) -> tuple[str, ...]:
     """Write `SCENE.VIEW.passes.exr` into a folder for each chosen view; return notes.
 
@@ -54,7 +46,11 @@ def write_passes(
     Args:
         source: a dataset (folder or URL), or a scene in any form that `trilight convert` reads.
         out: the folder, which is created.
-        options: the passes and views.
+        names: of the passes.
+        scene: key of the only scene, with or without zeros before it; None for all.
+        view: the only view; None for all.
+        resolution: width and height in pixels; None for that of the dataset's pictures, or 256.
+        rays_a_side: rays along each side of a pixel.
         done: called with each written file.
 
     Raises:
@@ -62,18 +58,17 @@ def write_passes(
             cannot be written.
     """
     notes: list[str] = []
-    for named in _scenes(source, options.scene):
+    for named in _scenes(source, scene):
         notes += named.notes
-        views = range(named.scene.num_views) if options.view is None else [options.view]
-        for view in views:
-            require_row("view", view, named.scene.num_views)
-            path = out / f"{named.name}.{view}.passes.exr"
+        for row in range(named.scene.num_views) if view is None else [view]:
+            require_row("view", row, named.scene.num_views)
+            path = out / f"{named.name}.{row}.passes.exr"
             data = passes_exr(
                 named.scene,
-                options.names,
-                view=view,
-                resolution=options.resolution or named.resolution,
-                rays_a_side=options.rays_a_side,
+                names,
+                view=row,
+                resolution=resolution or named.resolution,
+                rays_a_side=rays_a_side,
             )
             write_atomically(path, data)
             done(path)

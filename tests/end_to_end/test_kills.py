@@ -5,7 +5,6 @@ import json
 import os
 import pty
 import shlex
-import shutil
 import signal
 import subprocess
 import threading
@@ -18,7 +17,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.isolation import is_transient
 from storage.dataset.dataset import open_dataset
 from storage.dataset.manifest import shard_row
 from storage.dataset.verify import verify_dataset
@@ -30,8 +28,6 @@ from tests.end_to_end.conftest import (
     wait_until_nobody_is_left,
 )
 from tests.end_to_end.production_kit import call, postgres, served, start_served, stop_served
-from tests.for_each import for_each
-from tests.pipeline.documents.dataset_by_hand import five_scenes
 
 ARGUMENTS = (
     "generate", "smoke", "--objects", "builtin:12", "--scenes", "8",
@@ -114,39 +110,6 @@ def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path, whole: Whole) -
         os.utime(left, (0, 0))
     assert _start(tmp_path / "killed", 2, environment).wait() == 0
     assert not list((tmp_path / "killed").rglob("*.part"))
-
-
-@pytest.mark.slow("kills")
-@pytest.mark.timeout(3600)
-def test_kills_of_children_end_in_the_same_digest(tmp_path: Path, whole: Whole) -> None:
-    """While meshes are made, with an empty store, and while pictures are; fork servers too.
-
-    Two kills of meshes: a dataset is begun without an object whose children were killed three times
-    (tests/pipeline/generation/test_poison.py), and all kills may hit the same one.
-    """
-    rng, out, cache = np.random.default_rng(0), tmp_path / "killed", tmp_path / "cache"
-    mark, environment = marked_environment()
-    environment["TRILIGHT_CACHE"] = str(cache)
-
-    def num_scenes() -> int:
-        return sum(len(log.read_text().splitlines()) for log in (out / "logs").glob("*.jsonl"))
-
-    run, killed = _start(out, 2, environment), Counter[str]()
-    moments = [("meshes", at) for at in (2, 7)] + [("scenes", at) for at in (1, 3, 5, 7)]
-    for what, at in moments:
-        while (num_meshes(cache) if what == "meshes" else num_scenes()) < at:
-            if run.poll() is not None:  # three kills of one set-up end a run; it goes on
-                run = _start(out, 2, environment)
-            time.sleep(0.02)
-        if what == "meshes":
-            assert num_meshes(cache) < num_meshes(whole.cache)
-        killed[what] += kill_one("multiprocessing.forkserver", mark, rng)
-    run.wait()
-    assert _start(out, 2, environment).wait() == 0
-    assert min(killed["meshes"], killed["scenes"]) > 0
-    assert [row for row in open_dataset(str(out)).failures() if is_transient(row.reason)] == []
-    assert open_dataset(str(out)).digest == whole.digest
-    wait_until_nobody_is_left(mark)
 
 
 @pytest.mark.slow("kills")
@@ -268,34 +231,6 @@ def _wrong_now(out: Path, whole: Path) -> Iterator[str]:
     for path in out.glob("*.jsonl"):
         for line in path.read_text().splitlines():
             json.loads(line)
-
-
-DAMAGES: dict[str, tuple[str, bytes | None]] = {
-    "FileNotFoundError": ("train-000009.tar", b""),
-    "train-000000.tar": ("train-000000.tar", b"half"),
-    "train-000000.tar is listed and not there": ("train-000000.tar", None),
-    "manifest.json: all of it is not JSON": ("manifest.json", b"{"),
-    "JSONDecodeError": ("failures.jsonl", b'{"stage"'),
-}
-"""What must never be seen, by what the watcher says of it: a file, and its bytes, if any."""
-
-
-@for_each("told", ["", *DAMAGES])
-def test_the_watcher_tells_what_must_not_be_seen(tmp_path: Path, told: str) -> None:
-    out, whole = tmp_path / "set", tmp_path / "whole"
-    five_scenes(whole)
-    shutil.copytree(whole, out)
-    if told:
-        name, content = DAMAGES[told]
-        (out / name).unlink(missing_ok=True)
-        if content is not None:
-            (out / name).write_bytes(content)
-    with _watched(out, whole) as wrong:
-        deadline = time.monotonic() + (60 if told else 3 * LOOK_EVERY_S)
-        while not wrong and time.monotonic() < deadline:
-            time.sleep(0.01)
-    assert bool(wrong) == bool(told)
-    assert all(told in line for line in wrong), wrong
 
 
 @pytest.mark.slow("kills")

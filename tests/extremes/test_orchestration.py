@@ -14,7 +14,6 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -84,21 +83,6 @@ def test_more_workers_than_shards_or_scenes_do_no_harm(
     scenes.clear()
     plain = make_dataset(tiny_order(out=str(tmp_path / "plain"), scenes=8), Undocumented())
     assert outcome.digest == plain.digest
-
-
-def test_as_many_makers_at_once_as_there_are_scenes(
-    tmp_path: Path, scenes: list[tuple[str, int]]
-) -> None:
-    """Four runs on one folder, one range each or all of it: nothing is made twice."""
-
-    def make(shards: str | None) -> str:
-        order = tiny_order(out=str(tmp_path / "set"), scenes=4, shards=shards)
-        return make_dataset(order, Undocumented()).digest
-
-    with ThreadPoolExecutor(4) as makers:
-        list(makers.map(make, (None, "0:1", None, "0:9")))
-    assert sorted(scene for _, scene in scenes) == [0, 1, 2, 3]
-    assert verify_dataset(tmp_path / "set").problems == []
 
 
 def test_empty_and_broken_ranges_are_refused_by_name() -> None:

@@ -44,6 +44,7 @@ from storage.seeds import SceneKey
 from storage.settings.changes import changed
 from storage.settings.fields import FieldDescription
 from tests.extremes.test_ranges import FIELDS, SMOKE, End
+from tests.extremes.test_scenes import require_laws
 from tests.for_each import case, for_each
 from tests.model.kit import FAMILIES, attend_reference, awake, random_scene, tiny_config
 from tests.pipeline.renders.scene_kit import join, light, material, quad
@@ -138,7 +139,7 @@ def _require_scene_or_reason(
             assert rejection.reason == NO_SCENE.get((name, end)), rejection
         else:
             assert (name, end) not in NO_SCENE
-            scene.check()
+            require_laws(scene, wanted)
 
 
 SCENE_REASONS = ("no_room", "over_budget", "no_faces", "no_camera", "emitter_inside")
@@ -163,7 +164,7 @@ def test_scenes_at_several_ends_keep_their_laws_or_have_a_reason(
     except TrilightError:
         reject()  # laws between fields
     try:
-        compose_scene(wanted, pool, SceneKey(0, 0)).check()
+        require_laws(compose_scene(wanted, pool, SceneKey(0, 0)), wanted)
     except Rejected as rejection:
         assert rejection.reason in SCENE_REASONS, rejection
 

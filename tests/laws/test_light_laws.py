@@ -108,21 +108,6 @@ def test_light_scales_exactly() -> None:
     np.testing.assert_array_equal(pictures[1], 2 * pictures[0])
 
 
-def test_light_adds_up() -> None:
-    """Two emitters that do not shade each other give the sum of their pictures."""
-    lights = [
-        light(LIGHT, [4.0, 1.0, 0.5]),
-        light(LIGHT + np.array([1.5, 0.5, 0.4]), [0.2, 1.0, 3.0]),
-    ]
-    floor, ball = quad(FLOOR, material(diffuse=0.5, specular=0.3, roughness=0.5)), _ball()
-    first, second, both = (
-        render_blocks(join([floor, ball, *chosen], eye=(0, -3, 2)), first_seed=seed, passes=8)
-        for seed, chosen in enumerate([lights[:1], lights[1:], lights])
-    )
-    total = Estimate(mean=first.mean + second.mean, error=np.hypot(first.error, second.error))
-    assert_agree(both, total)
-
-
 def test_an_emitter_is_hidden_from_the_camera_but_seen_in_a_mirror() -> None:
     radiance = 3.0
     mirror = quad(FLOOR, material(specular=1.0, roughness=0.01))

@@ -158,19 +158,8 @@ def test_lobes_add_up_to_the_material_and_never_exceed_one() -> None:
     )
 
 
-CASES = [(0.01, 0.02), (0.1, 0.3), (0.5, 1.0), (1.0, 0.02), (1.0, 0.7)]
-"""Roughness and cosine."""
-
 TRACERS = [load_tracer, pytest.param(PluginTracer, marks=pytest.mark.slow("statistics"))]
 EAVG: dict[Any, float] = {load_tracer: 0.409, PluginTracer: 0.377}
-
-
-def plate(roughness: float, cosine: float) -> Scene:
-    """A white mirror of 30 x 30 in a furnace, seen at an angle."""
-    corners = [[-15, -15, 0], [15, -15, 0], [15, 15, 0], [-15, 15, 0]]
-    eye = 3 * np.array([0.0, -np.sqrt(1 - cosine**2), cosine])
-    mirror = quad(corners, material(specular=1.0, roughness=roughness))
-    return join([mirror, furnace()], eye=eye, target=(0, 1e-4, 0), fov_deg=0.5)
 
 
 def ball(roughness: float) -> Scene:
@@ -179,23 +168,12 @@ def ball(roughness: float) -> Scene:
     return join([mirror, furnace()], eye=(0, -3, 0), fov_deg=20)
 
 
-def mean_radiance(scene: Scene, tracer: Tracer, passes: int = 8, resolution: int = 16) -> float:
+def mean_radiance(scene: Scene, tracer: Tracer) -> float:
     """Return the mean over what the surface, whose albedo is 1, covers of the picture."""
-    camera = camera_of(scene, resolution)
-    pictures = [tracer.radiance(camera, seed=k, spp=64) for k in range(passes)]
+    camera = camera_of(scene, 32)
+    pictures = [tracer.radiance(camera, seed=k, spp=64) for k in range(4)]
     covered = tracer.features(camera, spp=64).albedo.mean()
     return float(np.mean(pictures) / covered)
-
-
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("tracer", TRACERS)
-def test_a_white_mirror_returns_all_light(tracer: Any) -> None:
-    """Smooth and rough, head-on and grazing; test_ggx has the roughnesses between."""
-    for roughness, cosine in CASES:
-        scene = plate(roughness, cosine)
-        mean = mean_radiance(scene, tracer(scene, max_depth=2, rr_depth=5))
-        # Measured: 0.1 %, noise and table together, of the 1 % that is allowed.
-        assert abs(mean - 1) < 0.003, (roughness, cosine)
 
 
 @pytest.mark.usefixtures("llvm")
@@ -205,7 +183,7 @@ def test_single_scattering_would_lose_most_of_it(
 ) -> None:
     """A ball returns all; without the scale a ball of roughness 1 shows Eavg of either table."""
     scene = ball(1.0)
-    mean = mean_radiance(scene, tracer(scene, max_depth=2, rr_depth=5), passes=4, resolution=32)
+    mean = mean_radiance(scene, tracer(scene, max_depth=2, rr_depth=5))
     # The rims of facets reflect to below themselves: another 0.1 %.
     assert abs(mean - 1) < 0.003
 
@@ -214,6 +192,6 @@ def test_single_scattering_would_lose_most_of_it(
 
     monkeypatch.setattr(surface_table, "scattered_again", nothing)
     monkeypatch.setattr(plugin_scene, "scattered_again", nothing)
-    mean = mean_radiance(scene, tracer(scene, max_depth=2, rr_depth=5), passes=4, resolution=32)
+    mean = mean_radiance(scene, tracer(scene, max_depth=2, rr_depth=5))
     # 96 facets around are a little off the sphere.
     assert mean == pytest.approx(EAVG[tracer], abs=0.004)

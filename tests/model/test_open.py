@@ -198,7 +198,7 @@ def _no_route(*words: Any, **named: Any) -> None:
 
 def test_a_name_that_is_plainly_a_path_asks_no_hub(monkeypatch: pytest.MonkeyPatch) -> None:
     _stand_in_hub(monkeypatch, pytest.fail, pytest.fail)
-    for name in ("runs/nosuch", "mine/model.safetensors"):
+    for name in ("runs/nosuch", "mine/model.safetensors", "/nowhere", "weights.pt"):
         with pytest.raises(TrilightError, match=f"checkpoint {name}: no such file or folder"):
             find_network(name)
 
@@ -218,12 +218,6 @@ def test_without_the_hub_library_the_way_out_is_named(monkeypatch: pytest.Monkey
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(TrilightError, match="huggingface_hub, which would fetch it, is not"):
         open_network(PUBLISHED[0])
-
-
-@for_each("source", ["nowhere/at/all", "/nowhere", "weights.pt"])
-def test_a_missing_file_is_not_asked_of_the_hub(source: str) -> None:
-    with pytest.raises(TrilightError, match="no such file or folder"):
-        open_network(source)
 
 
 @for_each("name", ["pytorch_model.bin", "weights.pt", "renamed.safetensors"])

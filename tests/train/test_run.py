@@ -288,7 +288,10 @@ def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) 
     trained(tiny_run(model=first, num_steps=4), dataset, tmp_path / "first")
     second = tiny_run(from_weights=True, learning_rate=1e-12, warmup_steps=0, num_steps=4)
     place = str(tmp_path / "first")
-    trained(second, dataset, tmp_path / "second", start=StartOptions(begin_with=place))
+    result = trained(second, dataset, tmp_path / "second", start=StartOptions(begin_with=place))
+    (event,) = result.history
+    digest = json.loads(result.folder.settings.read_text())["begun_with_sha256"]
+    assert event.after == {"run": "tiny", "step": 4, "sha256": digest}
     before, after = (open_network(tmp_path / name) for name in ("first", "second"))
     assert after.config == first
     for name, weight in after.state_dict().items():
@@ -375,25 +378,6 @@ def test_resumed_after_every_step_is_uninterrupted(
             trained(settings, dataset, out, resume=step > 1, progress=StopAfterEachStep())
     again = trained(settings, dataset, out, resume=True)
     assert again.folder.weights.read_bytes() == whole.folder.weights.read_bytes()
-
-
-def test_a_run_goes_on_past_a_damaged_checkpoint_to_the_same_weights(
-    dataset: Dataset, tmp_path: Path
-) -> None:
-    settings = tiny_run(num_steps=8, checkpoints_kept=3)
-    whole = trained(settings, dataset, tmp_path)
-    weights, path = (
-        whole.folder.weights.read_bytes(),
-        path_of_step(whole.folder.checkpoints, 8),
-    )
-    flip_a_bit(path)
-    with pytest.raises(TrilightError, match=f"{path} is not readable"):
-        open_network(path)
-    notes = Heard()
-    again = trained(settings, dataset, tmp_path, resume=True, workers=1, progress=notes)
-    assert [str(path) in text for text in notes.notes] == [True]
-    assert again.folder.weights.read_bytes() == weights
-    assert open_network(path).config == settings.model, "it was written again"
 
 
 def test_a_network_with_windows_is_trained(dataset: Dataset, tmp_path: Path) -> None:

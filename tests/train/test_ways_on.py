@@ -232,16 +232,6 @@ def test_ten_skipped_steps_go_on_by_a_decision(
     assert [event.step for event in rewound.history] == [2, 2]
 
 
-def test_a_second_stage_says_where_its_weights_come_from(
-    dataset: Dataset, short: RunFolder, tmp_path: Path
-) -> None:
-    settings = wsd(from_weights=True, num_steps=2)
-    second = run(settings, dataset, tmp_path, begin_with=str(short.root))
-    (event,) = second.history
-    record = json.loads(second.folder.settings.read_text())
-    assert event.after == {"run": "tiny", "step": 5, "sha256": record["begun_with_sha256"]}
-
-
 def test_a_branch_takes_other_data_and_other_pictures(dataset: Dataset, tmp_path: Path) -> None:
     """With the optimiser's memories, at the steps of the run; a running mean may begin, too."""
     run(wsd(ema_decay=0.0), dataset, tmp_path / "first")

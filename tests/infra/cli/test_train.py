@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import shlex
 import signal
 import subprocess
@@ -33,10 +32,8 @@ from tests.train.toy import write_toy_dataset
 from train.evaluation.metrics import Lead
 from train.folder import RunFolder
 from train.loop.interrupts import SAVED_STATUS
-from train.monitoring.rows import read_rows
 from train.runs import RUNS, named_run
 
-TRILIGHT = [sys.executable, "-m", "trilight"]
 TINY = {
     "resolution": 16,
     "model.width": 36,
@@ -92,31 +89,10 @@ def command(tmp_path: Path) -> list[str]:
     return words + [part for name, value in TINY.items() for part in ("--set", f"{name}={value}")]
 
 
-@pytest.mark.slow("kills")
-def test_a_run_that_is_stopped_says_what_goes_on_and_that_does(
-    command: list[str], tmp_path: Path
-) -> None:
-    """As printed, in a folder with a blank in its name; threads wait without burning a core."""
-    out = tmp_path / "my runs" / "first"
-    words, mistake = _stopped_after(command, out, 1)
-    assert "Stopping after this step" in words
-    assert "the data has no validation split" in words
-    assert "GOMP_SPINCOUNT = '0'" in mistake, "libgomp itself says so, as torch loads it"
-    found = re.search(r"training: stopped at step (\d+), nothing is lost\. To go on: (.*)", mistake)
-    assert found, mistake
-    (saved,) = saved_steps(out / "checkpoints")
-    assert int(found[1]) == saved
-    name, *again = shlex.split(found[2])
-    assert (name, again) == ("trilight", [*command, "--resume"])
-    _, mistake = _stopped_after(again, out, saved + 1)
-    assert found[2] in mistake, "once more the same, with one --resume"
-    assert saved_steps(out / "checkpoints")[-1] > saved
-
-
 def test_a_run_that_is_stopped_says_what_goes_on(
     command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In this process; the slow test types what is said here, in real ones."""
+    """Typed again as printed; real processes that are stopped are those of test_processes."""
     out = tmp_path / "my runs" / "first"
     monkeypatch.setattr(sys, "argv", ["trilight", *command, "--resume"])
     advance = _BarProgress.advance
@@ -137,27 +113,6 @@ def test_a_run_that_is_stopped_says_what_goes_on(
     (saved,) = saved_steps(out / "checkpoints")
     again = shlex.join(["trilight", *command, "--resume"])
     assert ended.mistake.endswith(f"stopped at step {saved}, nothing is lost. To go on: {again}")
-
-
-def _stopped_after(arguments: list[str], out: Path, step: int) -> tuple[str, str]:
-    """Return what a run says, and what on stderr, that gets Ctrl-C when its log has a step."""
-    unset = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    started = subprocess.Popen(
-        [*TRILIGHT, *arguments],
-        cwd=ROOT,
-        env=unset | {"OMP_DISPLAY_ENV": "verbose", "OMP_NUM_THREADS": "1", "COLUMNS": "200"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    while started.poll() is None and not any(
-        row["step"] >= step for row in read_rows(out / "metrics.jsonl")
-    ):
-        time.sleep(0.05)
-    started.send_signal(signal.SIGINT)
-    words, mistake = started.communicate()
-    assert started.returncode == SAVED_STATUS, mistake
-    return words, mistake
 
 
 def test_a_second_ctrl_c_ends_a_step_that_does_not(tmp_path: Path) -> None:

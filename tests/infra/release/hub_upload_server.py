@@ -1,16 +1,8 @@
-"""As much of the Hugging Face hub as an upload asks for; what is committed lies in a folder.
-
-    python -m tests.infra.release.hub_upload_server FOLDER -- COMMAND ...
-
-runs a command that finds it in place of the hub, so that an upload can be rehearsed offline.
-"""
+"""As much of the Hugging Face hub as an upload asks for; what is committed lies in a folder."""
 
 import base64
 import json
 import os
-import subprocess
-import sys
-import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -124,19 +116,3 @@ def settings_of(url: str, token: str, home: Path) -> dict[str, str]:
     kept = {name: value for name, value in os.environ.items() if not name.startswith("HF_")}
     quiet = {"HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_PROGRESS_BARS": "1"}
     return {**kept, **quiet, "HF_ENDPOINT": url, "HF_TOKEN": token, "HF_HOME": str(home)}
-
-
-def rehearse(root: Path, command: list[str]) -> int:
-    """Run a command beside the server, and return its exit status."""
-    root.mkdir(parents=True, exist_ok=True)
-    token = "hf_rehearsal"
-    with hub_for_uploads(root, token) as (url, _), tempfile.TemporaryDirectory() as home:
-        return subprocess.run(
-            command, env=settings_of(url, token, Path(home)), check=False
-        ).returncode
-
-
-if __name__ == "__main__":
-    if sys.argv[2:3] != ["--"] or not sys.argv[3:]:
-        raise SystemExit("expected FOLDER -- COMMAND ...")
-    raise SystemExit(rehearse(Path(sys.argv[1]), sys.argv[3:]))

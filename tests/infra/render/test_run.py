@@ -9,7 +9,6 @@ import pytest
 from PIL import Image as Picture
 
 from infra.render import look as look_module
-from infra.render.comparison import comparison_sheet
 from infra.render.look import Look, enlarge, enlargement, tone_mapped
 from infra.render.networks import RendererHere, SceneHere
 from infra.render.output_paths import OutputPaths, output_paths, write_video
@@ -176,21 +175,6 @@ def test_small_pictures_are_enlarged_by_whole_numbers() -> None:
             for row in range(factor):
                 for column in range(factor):
                     np.testing.assert_array_equal(found[row::factor, column::factor], pixels)
-
-
-def test_the_captions_of_a_small_comparison_are_whole() -> None:
-    for exposure_ev in [0.0, -1.5]:
-        with case(exposure_ev):
-            dark, bright = (np.full((64, 64, 3), value, np.float32) for value in (0.1, 9.0))
-            sheet = comparison_sheet(dark, bright, Look(exposure_ev=exposure_ev)).astype(int)
-            assert sheet.shape == (24 + 256, 3 * 256 + 2 * 8, 3)
-            for column in range(3):
-                left = column * (256 + 8)
-                strip = sheet[:24, left : left + 256 + 8]
-                text = (strip.sum(axis=-1) < 3 * 128).any(axis=0)
-                # as tall as in the sheets of evaluate, and none under the next caption or cut off
-                assert (strip.sum(axis=-1) < 3 * 128).any(axis=1).sum() >= 10
-                assert text.any() and not text[256:].any() and not text[-20:].any()
 
 
 def test_the_film_like_curve_keeps_what_the_plain_one_clips() -> None:

@@ -1,9 +1,8 @@
 """Skies: directions drawn as their density says, light at hits, and networks that know them.
 
-Closed forms, a slow twin, and nothing where there is no sky.
+Closed forms, and nothing where there is no sky. Beside the path tracer: tests/laws.
 """
 
-import dataclasses
 import warnings
 from collections.abc import Callable
 
@@ -30,11 +29,10 @@ from storage.records.lookup import environment_values
 from storage.records.scene import Scene
 from storage.records.sky_texels import row_solid_angles, texel_means
 from tests.for_each import for_each
-from tests.laws.test_rigid_motion import moved
 from tests.model.hits.kit import FLOOR, corner, direct, lit_scene, traced
 from tests.model.kit import awake, hits_config, render, tiny_config
 from tests.pipeline.renders.scene_kit import join, material, quad, sphere
-from tests.sky_maps import as_sky, centres, constant, night, one_sun, six_poles, smooth
+from tests.sky_maps import as_sky, constant, night, one_sun, six_poles, smooth
 from train.data.augment import mirror_sky, permute_sky_channels, rotate_sky, scale_sky
 
 
@@ -94,46 +92,6 @@ def _seen(lit: LitScene, targets: list[list[float]]) -> Points:
     return points
 
 
-def _irradiance_twin(scene: Scene, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return irradiance over pi: texel by texel, with one shadow ray each."""
-    lit, sky = lit_scene(scene), scene.environment
-    assert sky is not None
-    fine = 64
-    angles, total = row_solid_angles(fine), np.zeros(3)
-    local = centres(fine)
-    for row in range(fine):
-        for direction in local[row] @ sky.rotation.astype(np.float64).T:
-            cosine = float(normal @ direction)
-            if cosine <= 0:
-                continue
-            start = np.array([place + 1e-4 * normal], np.float32)
-            free = lit.everything.is_free(
-                start, direction[None].astype(np.float32), np.array([1e6], np.float32)
-            )
-            total += environment_values(sky, direction) * (free[0] * cosine * angles[row] / np.pi)
-    return total
-
-
-@pytest.mark.slow("training")
-@for_each("sky", [smooth(), one_sun(1e6)])
-def test_light_of_a_sky_is_that_of_all_its_texels_with_shadows(sky: Environment) -> None:
-    scene = corner(sky=sky)
-    lit = lit_scene(scene)
-    points = _seen(lit, [[0.9, -0.6, 0.0], [-0.9, 0.6, 0.0], [0.6, 1.5, 1.2]])
-    found, count = np.zeros((3, 3)), 64
-    rng = np.random.default_rng(0)
-    for _ in range(count):
-        light = no_light(points)
-        shift = rng.random((2, 3), np.float32)
-        add_sky_light(light, lit, points, None, shift, 0, rays=8, lobe_rays=0)
-        found += light.diffuse / count
-    for point in range(3):
-        expected = _irradiance_twin(scene, points.position[:, point], points.normal[:, point])
-        assert expected.max() > 0.02
-        # 512 rays: 3 % where half of a smooth sky is hidden; a sun's texel is read once by the twin
-        assert found[:, point] == pytest.approx(expected, rel=0.08, abs=0.01 * expected.max())
-
-
 def test_scenes_without_a_sky_stay_as_they_are_to_the_bit() -> None:
     plain, asked = traced(corner(), sky_rays=0), traced(corner(), sky_rays=8)
     for name, value in vars(plain).items():
@@ -151,18 +109,6 @@ def test_a_sky_joins_the_unit_and_what_triangles_receive() -> None:
     dark = scene_light(lit_scene(corner(radiance=0.0, sky=constant((1.0, 0.0, 0.0)))))
     assert dark.mean_3[0] > 0.1
     assert dark.mean_3[1] == pytest.approx(0.03 * dark.mean_3[0], rel=1e-5)
-
-
-def test_scene_and_sky_turned_together_look_the_same() -> None:
-    """The noise too turns with them, but where a ray meets a rim."""
-    rotation = uniform_rotation(np.random.default_rng(2))
-    scene = corner(sky=smooth())
-    sky = scene.environment
-    assert sky is not None
-    turned = dataclasses.replace(sky, rotation=(rotation @ sky.rotation).astype(np.float32))
-    there = dataclasses.replace(moved(scene, rotation, [0.3, -0.2, 0.1]), environment=turned)
-    before, after = direct(traced(scene)), direct(traced(there))
-    assert np.mean(np.abs(before - after).max(axis=-1) > 1e-3) < 0.02
 
 
 @for_each("sky", [one_sun(1e6), constant(1e9), constant(1e-9, height=1)])

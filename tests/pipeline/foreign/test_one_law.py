@@ -98,6 +98,7 @@ SCALED = {"scale": Gf.Vec4f(1, 0.5, 0.75, 1), "bias": Gf.Vec4f(0, 0.25, -0.125, 
         (stated(usd_kit.TEXTURE, {"sourceColorSpace": "raw"}), {"diffuseColor": "rgb"}),
         (stated(usd_kit.TEXTURE, SCALED), {"diffuseColor": "rgb"}),
         (stated(usd_kit.TEXTURE, {"sourceColorSpace": "raw"}), {"roughness": "g"}),
+        (stated(usd_kit.SHADER, {"roughness": 0.3}), {"diffuseColor": "rgb", "metallic": "g"}),
         (stated(usd_kit.SHADER, {"ior": 2.0}), {"diffuseColor": "b"}),
         (stated(usd_kit.SHADER, {"useSpecularWorkflow": 1}), {"specularColor": "rgb"}),
         (stated(usd_kit.TEXTURE, {"wrapS": "mirror"}), {"diffuseColor": "rgb"}),
@@ -124,6 +125,7 @@ def test_usd(
     [
         {},
         {"pbrMetallicRoughness": {"metallicFactor": 1, "baseColorFactor": [0.9, 0.4, 0.2, 1]}},
+        {"pbrMetallicRoughness": {"metallicRoughnessTexture": {"index": 0}}},
         {"extensions": {"KHR_materials_unlit": {}}},
         {"extensions": {"KHR_materials_ior": {"ior": 2.0}}},
         {

@@ -72,25 +72,6 @@ def test_an_array_is_of_what_a_bucket_lacks(bucket: Any, machines: Machines) -> 
         assert array_job(order, per_task=None, at_once=None).tasks == [0, 1]
 
 
-def test_the_first_writer_of_a_shard_wins(bucket: Any, machines: Machines) -> None:
-    """Also where the second has made other bytes, as another processor may."""
-    with machines.maker("a") as first:
-        make(first)
-        with machines.maker("b") as second:
-            make(second)
-            other = other_shard(second)
-            machines.use("a")
-            make(first, 0)
-            machines.use("b")
-            second.add_shard(other)
-            make(second, 1)
-        machines.use("a")
-        (listed,) = (entry for entry in open_dataset(OUT).manifest.shards if entry.name == FIRST)
-        assert listed != other
-        assert listed in second.manifest.shards
-    assert verify_dataset(OUT).problems == []
-
-
 def test_an_old_list_that_arrives_late_is_mended(
     bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -254,9 +235,10 @@ def test_who_freezes_late_takes_nothing_back(bucket: Any, machines: Machines) ->
         assert set(rejected) < set(open_dataset(OUT).failures())
 
 
-def test_the_rejections_are_those_of_the_shard_that_is_there(
+def test_the_first_writer_of_a_shard_wins_with_its_rejections(
     bucket: Any, machines: Machines
 ) -> None:
+    """Also where the second has made other bytes, as another processor may."""
     with machines.maker("a") as first, machines.maker("b") as second:
         machines.use("a")
         first.lock_objects([_locked()])
@@ -267,9 +249,12 @@ def test_the_rejections_are_those_of_the_shard_that_is_there(
         make_tiny_shard(first, 0)
         machines.use("b")
         second.add_shard(other)
+        (listed,) = open_dataset(OUT).manifest.shards
+        assert listed.name == FIRST and listed != other
         assert {row.reason for row in open_dataset(OUT).failures()} == {"no_camera"}
         make_tiny_shard(second, 1)
         second.finish()
+        assert listed in second.manifest.shards
     assert {row.reason for row in _failures(bucket, "failures.jsonl")} == {"no_camera"}
     assert verify_dataset(OUT).problems == []
 

@@ -180,14 +180,6 @@ def test_a_shard_that_missed_the_manifest_is_found(tmp_path: Path) -> None:
     assert later.finish() == whole == open_dataset(str(tmp_path / "b")).manifest
 
 
-def test_a_deleted_shard_is_made_again(tmp_path: Path) -> None:
-    whole = _dataset(tmp_path).manifest
-    (tmp_path / whole.shards[1].name).unlink()
-    assert any("missing" in problem for problem in verify_dataset(tmp_path).problems)
-    assert _dataset(tmp_path).manifest == whole
-    assert verify_dataset(tmp_path).problems == []
-
-
 @for_each("fast", [False, True])
 def test_damage_is_named(tmp_path: Path, fast: bool) -> None:
     shard = _dataset(tmp_path).manifest.shards[0]
@@ -341,12 +333,3 @@ def test_staged_scenes_and_built_in_objects_stand_in_parts(tmp_path: Path) -> No
     assert len({entry.uid for entry in objects}) == 30
     assert all("part" not in entry.uid for entry in objects)
     assert _most_entries(tmp_path) == 2
-
-
-def test_two_workers_are_kept_apart(tmp_path: Path) -> None:
-    folder = DatasetFolder(tmp_path)
-    with folder.hold_exclusively():
-        with pytest.raises(TrilightError, match="another process"), folder.hold_exclusively():
-            pass
-    with folder.hold_exclusively():
-        pass

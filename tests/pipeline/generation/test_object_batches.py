@@ -17,14 +17,13 @@ from pipeline.executors.array_job import array_job
 from pipeline.executors.kubernetes import PLACE
 from pipeline.executors.kubernetes_array import KubernetesOptions, job_manifest
 from pipeline.executors.registry import find_executor
-from pipeline.generation.dataset_order import generate_words
 from pipeline.generation.object_batches import (
     ObjectWork,
     PrepareResult,
     cut_objects,
     prepare_in_batches,
 )
-from pipeline.generation.pipeline import make_dataset, prepare_dataset
+from pipeline.generation.pipeline import prepare_dataset
 from pipeline.objects.listing import Fetched, failure
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
@@ -352,21 +351,3 @@ def test_arrays_that_are_killed_end_in_the_digest_of_one_that_was_not(
     assert array_job(order, per_task=2, at_once=None).tasks == []
     assert verify_dataset(OUT).problems == []
     assert open_dataset(OUT).digest == open_dataset(str(tmp_path / "whole")).digest
-
-
-@pytest.mark.slow("kills")
-def test_two_processes_with_a_bucket_alone_between_them_make_the_digest_of_a_folder(
-    bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """They begin together; each has a cache of its own."""
-    order = tiny_order(out=OUT, scenes=12)
-    without_rendering(monkeypatch)
-    alone = dataclasses.replace(order, out=str(tmp_path / "whole"))
-    digest = make_dataset(alone, Undocumented()).digest
-    words = [*generate_words(order), "--out", OUT]
-    runs = [_start(words, TRILIGHT_CACHE=str(tmp_path / name)) for name in "ab"]
-    for run in runs:
-        said, _ = run.communicate(timeout=300)
-        assert run.returncode == 0, said
-    assert verify_dataset(OUT).problems == []
-    assert open_dataset(OUT).digest == digest

@@ -1,4 +1,4 @@
-"""What kills a child, or takes the disk or the bucket away, is a counted failure or a clear line.
+"""What kills a child, or takes the disk away, is a counted failure or a clear line.
 
 All through the real `make_dataset`: meshes, children, renders, shards, documents.
 """
@@ -22,8 +22,6 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.pipeline.assets.meshes_by_hand import knot, write_obj
 from tests.pipeline.generation import poison
-from tests.pipeline.generation.bucket_kit import OUT, empty_bucket
-from tests.s3_server import control, s3_server
 
 pytestmark = pytest.mark.slow("kills")
 """Children that die and are started again take a minute together."""
@@ -175,34 +173,6 @@ def test_scenes_that_abort_their_child_are_counted(
     skips = [row for row in dataset.failures() if row.reason == "environmental_skip"]
     assert [(int(row.item), row.attempt) for row in skips] == [(1, 0), (2, 0), (2, 1)]
     assert all("SIGABRT" in row.message for row in skips)
-
-
-def test_a_bucket_that_is_lost_in_the_middle(
-    workshop: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
-    pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
-    with s3_server() as port, empty_bucket(port, monkeypatch) as driver:
-        with pytest.raises(TrilightError) as caught:
-            make_dataset(
-                order(workshop, OUT),
-                ThreadRunner(),
-                lambda run, outcome: control(port, "reset-auth", b"0"),
-            )
-        control(port, "reset-auth", b"inf")
-        text = str(caught.value)
-        assert text.startswith(f"out '{OUT}': cannot be") and "run the same command again" in text
-        assert "s3cret" not in text and "\n" not in text
-        assert "shards/set/train-000000.tar" in driver.find("shards/set")
-        made = _log_rows(workshop)
-        assert make(workshop, OUT).digest == expected(workshop)
-        assert _log_rows(workshop) == 8 >= made >= 4  # nothing was made twice
-        assert verify_dataset(OUT).problems == []
-
-
-def _log_rows(workshop: Path) -> int:
-    logs = (workshop / "cache" / "outputs").glob("*/logs/*.jsonl")
-    return sum(len(path.read_text().splitlines()) for path in logs)
 
 
 @pytest.fixture

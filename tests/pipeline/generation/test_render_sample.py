@@ -1,6 +1,5 @@
 """A sample as it is rendered: cameras that are replaced, stored passes, and how far it is."""
 
-import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,29 +12,21 @@ from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.generation import render_sample as module
 from pipeline.generation import render_sample as rendering
-from pipeline.generation.begin_dataset import begin_dataset
-from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
 from pipeline.renders.results import RenderedView
 from pipeline.renders.variant import activate, choose_variant
 from pipeline.scenes.compose import compose_scene
-from pipeline.shards.pack import pack_shard
-from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.splits import scenes_of_shard, shard_name
-from storage.dataset.staging import stage_scene
-from storage.dataset.verify import verify_dataset
 from storage.errors import Rejected, TrilightError
 from storage.records.objects import Failure
 from storage.records.passes.stored import passes_exr
-from storage.records.sample import decode_sample, encode_sample, sample_key
+from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene
 from storage.renderer import Sampling
 from storage.seeds import SceneKey, seed_for
 from storage.settings.changes import json_or_word
-from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _locked
 from tests.pipeline.scenes.small_pool import small_pool
-from tests.scenes_by_hand import tiny_sample, tiny_scene
+from tests.scenes_by_hand import tiny_scene
 
 BUILD = named_build("smoke", resolution=16)
 KEY = "000000000"
@@ -135,30 +126,6 @@ def build(**changes: object) -> BuildSettings:
     return named_build("smoke", resolution=16, changes={**small, **changes})
 
 
-def begun(root: Path, settings: BuildSettings) -> DatasetWriter:
-    return begin_dataset(DatasetFolder(root), settings, ENVIRONMENT, 4, accept_environment=False)
-
-
-def finished(root: Path, settings: BuildSettings) -> DatasetWriter:
-    """Make a dataset of one shard with four tiny scenes, as a run does but for rendering."""
-    writer = begun(root, settings)
-    writer.lock_objects([_locked()])
-    name = shard_name(0, settings.splits)
-    indices = scenes_of_shard(0, settings.splits)
-    for index in indices:
-        made = dataclasses.replace(tiny_sample(seed=index), key=sample_key(index))
-        if settings.storage.passes:
-            packed = (
-                passes_exr(made.scene, settings.storage.passes, view=view, resolution=16)
-                for view in range(2)
-            )
-            made = dataclasses.replace(made, passes_exr=tuple(packed))
-        folder = writer.folder.staged_shard(name)
-        stage_scene(folder, index, made, [], settings.storage.profile)
-    writer.add_shard(pack_shard(writer.folder, name, indices))
-    return writer
-
-
 def test_what_stores_some_says_so_in_the_order_of_the_table() -> None:
     assert build(**ASKED).as_json()["storage"]["passes"] == list(NAMES)
     assert build(**ASKED).digest == build(**{"storage.passes": list(NAMES)}).digest
@@ -180,27 +147,6 @@ def test_a_rendered_sample_holds_what_is_asked() -> None:
     plain = render_sample("000000007", RenderInput(scene=scene), build(), [], ViewProgress(None, 7))
     assert plain.passes_exr is None
     np.testing.assert_array_equal(plain.radiance_rgb, sample.radiance_rgb)
-
-
-def test_a_dataset_with_passes_verifies_and_goes_on(tmp_path: Path) -> None:
-    stored = finished(tmp_path / "stored", build(**ASKED))
-    again = finished(tmp_path / "again", build(**ASKED))
-    plain = finished(tmp_path / "plain", build())
-    for root in ("stored", "again", "plain"):
-        assert verify_dataset(tmp_path / root).problems == []
-    digest = stored.manifest.dataset_digest
-    assert digest == again.manifest.dataset_digest != plain.manifest.dataset_digest
-    assert begun(tmp_path / "stored", build(**ASKED)).manifest.dataset_digest == digest
-    with pytest.raises(TrilightError, match="storage.passes"):
-        begun(tmp_path / "stored", build())
-    with pytest.raises(TrilightError, match="storage.passes"):
-        begun(tmp_path / "plain", build(**ASKED))
-    both = [open_dataset(str(tmp_path / root)).samples() for root in ("stored", "plain")]
-    for with_passes, without in zip(*both, strict=True):
-        assert with_passes.passes_exr is not None and without.passes_exr is None
-        there, computed = with_passes.view_passes(NAMES, view=1), without.view_passes(NAMES, view=1)
-        for name in NAMES:
-            np.testing.assert_array_equal(there[name], computed[name])
 
 
 DONE: Any = object()

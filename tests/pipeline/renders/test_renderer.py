@@ -32,11 +32,8 @@ from storage.settings.changes import changed
 from tests.for_each import for_each
 from tests.pipeline.renders.guided_scenes import mirrors
 from tests.pipeline.renders.sampling import (
-    assert_agree,
-    blocks_of,
     camera_of,
     printed_by,
-    render_passes,
     render_view,
 )
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene, sphere
@@ -49,11 +46,11 @@ GROWING = dataclasses.replace(CHEAP, min_spp=16, max_spp=256)
 """Its first look is at 64 samples: the picture is narrow."""
 
 
-def simple_scene(radiance: float = 20.0) -> Scene:
+def simple_scene() -> Scene:
     parts = [
         quad([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], material(diffuse=[0.7, 0.5, 0.3])),
         sphere([0, 0, 0.5], 0.5, material(diffuse=0.4, specular=0.4, roughness=0.5), rings=8),
-        light([[-0.5, -1.5, 2], [0.5, -1.5, 2], [0, -1, 2.4]], radiance),
+        light([[-0.5, -1.5, 2], [0.5, -1.5, 2], [0, -1, 2.4]], 20.0),
     ]
     return join(parts, eye=(0, -3, 2), target=(0, 0, 0.4), fov_deg=45)
 
@@ -183,24 +180,15 @@ def test_the_measured_floor_is_below_the_true_agreement_here() -> None:
         assert true_db - 10 < view.noise_floor_db < true_db
 
 
-def test_pictures_without_right_light_are_rejected() -> None:
-    scene = simple_scene()
-    renderer = SceneRenderer(scene, CHEAP)
+def test_a_camera_that_looks_away_and_a_lamp_of_no_triangles_are_rejected() -> None:
+    """What else cannot be lit or held is in tests/extremes/test_renders.py."""
     away = look_at_c2w(eye=[0, -3, 2], target=[0, -9, 4], up=[0, 0, 1])
     with pytest.raises(Rejected, match="black_view"):
-        renderer.render_view(away, 40.0, seed=0)
-    for radiance, reason in ((1e-3, "black_view"), (3e38, "nonfinite"), (1e8, "radiance_overflow")):
-        with pytest.raises(Rejected, match=reason):  # before the denoiser hides it
-            render_view(simple_scene(radiance=radiance), CHEAP)
-    with pytest.raises(Rejected, match="no_surfaces"):
-        SceneRenderer(join([light([[0, 0, 1], [1, 0, 1], [0, 1, 1]], 1.0)]), CHEAP)
+        SceneRenderer(simple_scene(), CHEAP).render_view(away, 40.0, seed=0)
     empty = SceneObject(name="nothing", kind="emitter")
     no_triangles = dataclasses.replace(lit_scene(), objects=(*lit_scene().objects, empty))
     with pytest.raises(Rejected, match="unlit_scene"):
         SceneRenderer(no_triangles, SETTINGS)
-    scene.vertex_positions[-3:] = [[0, 0, 1], [1, 0, 1], [2, 0, 1]]
-    with pytest.raises(Rejected, match="unlit_scene"):  # its lamp has no area
-        SceneRenderer(scene, CHEAP)
 
 
 SETTINGS = dataclasses.replace(CHEAP, per_light=True)
@@ -278,20 +266,6 @@ def test_lights_apart_add_up_to_one_denoised_picture() -> None:
     np.testing.assert_allclose(
         render_view(scene, SETTINGS).radiance_rgb, expected, rtol=2 * 2**-11, atol=1e-6
     )
-
-
-def test_the_sum_is_the_picture_of_all_lights_at_once(llvm: None) -> None:
-    """The same integral, by other samples: raw means of 8 x 8 blocks agree within their errors."""
-    scene = lit_scene()
-    tracer = load_tracer(scene, max_depth=6, rr_depth=5)
-    lights = [tracer.only_light(row) for row in light_rows(scene)]
-    separate = blocks_of(
-        np.sum([render_passes(one, scene, passes=12) for one in lights], axis=0), 8
-    )
-    together = blocks_of(render_passes(tracer, scene, passes=12), 8)
-    assert_agree(separate, together)
-    # and the errors are small enough to tell: the lights' own share is far larger
-    assert np.median(np.hypot(separate.error, together.error)) < 0.02 * together.mean.mean()
 
 
 def test_a_light_that_is_off_still_casts_a_shadow_and_is_still_hidden() -> None:

@@ -73,14 +73,6 @@ def test_a_quad_keeps_its_corner_colours(tmp_path: Path, kind: str) -> None:
     assert_corners(prepare(FILES[kind](tmp_path), KEEP))
 
 
-def test_the_mean_of_colours_is_one_of_light_and_not_of_codes(tmp_path: Path) -> None:
-    grey = np.array([[[188, 188, 188]] * 2] * 2, np.uint8)
-    grey[0, 0] = 187  # else it is a constant
-    asset = prepare(textured_glb(tmp_path / "a.glb", picture_bytes(grey)), KEEP)
-    wanted = linear_from_srgb8()[188] * (1 - F)
-    assert np.abs(seen_at(asset, 0.25, -0.25) - wanted).max() < STORED
-
-
 def test_a_texture_transform_moves_the_picture(tmp_path: Path) -> None:
     """A quarter turn about the lower left and a shift back: by the formula of the extension."""
     tree, buffer = textured_tree(PICTURE)

@@ -98,17 +98,6 @@ def test_every_texel_lies_where_gltf_puts_it(tmp_path: Path) -> None:
     assert any("no light" in note for note in loaded.notes)
 
 
-def test_metal_is_blue_and_roughness_green(tmp_path: Path) -> None:
-    mixed = np.array([[[9, 255, 0], [9, 51, 255]]], np.uint8)
-    surface = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}}
-    pictures = (picture_bytes(PICTURE[:1]), picture_bytes(mixed))
-    scene = read(tmp_path, *pictures, material={"pbrMetallicRoughness": surface}).scene
-    plain, metal = row_at(scene, -0.5, 0), row_at(scene, 0.5, 0)
-    assert plain[:3] == pytest.approx(diffuse_of(RED), abs=CODED) and plain[6] == 1
-    assert metal[:3] == pytest.approx([0, 0, 0], abs=CODED) and metal[6] == pytest.approx(0.2)
-    assert metal[3:6] == pytest.approx(np.array(GREEN) / 255 * 20 / 21 + 1 / 21, abs=CODED)
-
-
 def test_cameras_lights_and_emission(tmp_path: Path) -> None:
     lens = {"type": "perspective", "perspective": {"yfov": 0.5, "aspectRatio": 1.0}}
     tree, buffer = quad(
