@@ -44,6 +44,7 @@ class PlacedPrimitive:
         self.positions = self._read_attribute("POSITION", (3,))
         """[V, 3] in the space of the node, or of the world."""
         self._normal_matrix = np.eye(3)
+        self._linear = np.eye(3)
 
     def place(self, to_world: NDArray[np.float64]) -> "PlacedPrimitive":
         """Return an instance in the world by a matrix [4, 4]; mirrored corners change order."""
@@ -52,6 +53,7 @@ class PlacedPrimitive:
         with np.errstate(invalid="ignore", over="ignore"):
             winding = -1 if np.linalg.det(linear) < 0 else 1
             instance.positions = np.einsum("ij,vj->vi", linear, self.positions) + to_world[:3, 3]
+            instance._linear = linear
             instance._normal_matrix = np.cross(linear[[1, 2, 0]], linear[[2, 0, 1]]) * winding
         instance.faces = self.faces[:, ::winding]
         return instance
@@ -88,6 +90,18 @@ class PlacedPrimitive:
         normals = self._read_attribute("NORMAL", (3,))[self.faces]
         return np.einsum("ij,tcj->tci", self._normal_matrix, normals)
 
+    @property
+    def tangents(self) -> NDArray[np.float64] | None:
+        """Tangents [T, 3, 3] of the corners, of any length, and 1, or -1 where the bitangent is
+        the other one, as [T, 3, 4]; None where there are none."""
+        if "TANGENT" not in self._primitive["attributes"]:
+            return None
+        tangents = self._read_attribute("TANGENT", (4,))[self.faces]
+        with np.errstate(invalid="ignore", over="ignore"):
+            hand = np.sign(np.linalg.det(self._linear)) * tangents[..., 3:]
+            along = np.einsum("ij,tcj->tci", self._linear, tangents[..., :3])
+        return np.concatenate([along, hand], axis=-1)
+
     def _read_attribute(
         self, name: str, widths: tuple[int, ...], *, is_unit: bool | None = None
     ) -> NDArray[np.float64]:
@@ -97,7 +111,9 @@ class PlacedPrimitive:
         targets = self._primitive.get("targets", ())
         for weight, target in zip(self._weights, targets, strict=False):
             if weight and name in target:
-                morph = self._document.values(target[name], widths, self._rows, is_unit=is_unit)
+                of_target = widths if name != "TANGENT" else (3,)  # of the tangents alone
+                morph = self._document.values(target[name], of_target, self._rows, is_unit=is_unit)
+                morph = np.pad(morph, ((0, 0), (0, values.shape[1] - morph.shape[1])))
                 with np.errstate(invalid="ignore", over="ignore"):
                     values = values + read_number(weight, "weights") * morph
         return values
