@@ -106,6 +106,14 @@ def chosen_maps(
     return _used_maps(corners[triangles].reshape(-1, 2), scene.textures, index, normals)
 
 
+def without_normal_maps(scene: AnyScene) -> AnyScene:
+    """Return the same scene without normal maps, and without textures that were nothing else."""
+    if scene.normal_textures is None or scene.material_textures is None:
+        return scene
+    kept = _used_maps(scene.uv, scene.textures, scene.material_textures, None)
+    return dataclasses.replace(scene, **kept)
+
+
 def _used_maps(
     uv: NDArray[np.float32] | None,
     textures: tuple[Texture, ...],
