@@ -38,9 +38,7 @@ def read_textured_mesh(
     files = source.materials
     names = contents.material_names
     if source.kind == "obj" and (names or contents.color is None):
-        materials, unread = _obj_materials(
-            names, files, decode, emission=emission, normals=normals
-        )
+        materials, unread = _obj_materials(names, files, decode, emission=emission, normals=normals)
         source.notes.extend(unread)
     elif (
         names

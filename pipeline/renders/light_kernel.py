@@ -214,9 +214,7 @@ def _evaluate_brdf(
     `guide` is the guide table of the viewer's path.
     """
     seen, wo = _flip_to_viewer(scene, vertex, view, active)
-    reflected, pdf = ggx.evaluate_bsdf(
-        seen.lobes, seen.incoming, wo, seen.geometric, seen.unmapped
-    )
+    reflected, pdf = ggx.evaluate_bsdf(seen.lobes, seen.incoming, wo, seen.geometric, seen.unmapped)
     if guide is not None:
         guidance = guide.at(vertex.triangle, vertex.barycentric, seen.front, seen.lobes, active)
         to_light = vertex.frame.to_world(vertex.incoming)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from pipeline.renders.device_memory import own_floats, own_integers
 from pipeline.renders.ggx import KernelLobes
 from storage.optics.bsdf import MIN_ALPHA, bsdf_lobes
-from storage.optics.normal_map import LEAST_TANGENT_SQ, LEAST_Z, u_directions
 from storage.optics.multiscatter import ROUGHNESS_STEPS, mean_albedo, scattered_again
+from storage.optics.normal_map import LEAST_TANGENT_SQ, LEAST_Z, u_directions
 from storage.records.scene import Scene
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 

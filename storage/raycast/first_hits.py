@@ -153,7 +153,7 @@ class FirstHits:
 
     @cached_property
     def shading_normal(self) -> NDArray[np.float64]:
-        """[..., 3] unit, in world space, interpolated between the corners, by the normal map if any.
+        """[..., 3] unit, in world space, interpolated between the corners, bent by a normal map.
 
         It is not turned to the camera. NaN where nothing is met, or where the corners' normals
         cancel out.

@@ -106,10 +106,11 @@ def skin_arrays(skin: LevelSkin, name: str) -> dict[str, NDArray]:
 def read_skin(arrays: Mapping[str, NDArray], quality: SkinQuality, name: str) -> LevelSkin:
     """Return the skin of `skin_arrays`; raises KeyError where there is none."""
     first, second, third = (arrays[f"{column}_{name}"].tobytes() for column in TEXTURED)
+    normal = arrays.get(f"{NORMAL}_{name}")
     return LevelSkin(
         uv=arrays[f"uv_{name}"],
         packed=(first, second, third),
-        packed_normal=arrays[f"{NORMAL}_{name}"].tobytes() if f"{NORMAL}_{name}" in arrays else None,
+        packed_normal=None if normal is None else normal.tobytes(),
         quality=quality,
         emission=arrays.get(f"emission_{name}"),
     )

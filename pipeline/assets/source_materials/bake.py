@@ -201,9 +201,7 @@ def _tiles(
     return tile.ravel(), first
 
 
-def _atlas_values(
-    plan: Atlas, first_of: NDArray[np.int64], texels: _Texels
-) -> NDArray[np.float64]:
+def _atlas_values(plan: Atlas, first_of: NDArray[np.int64], texels: _Texels) -> NDArray[np.float64]:
     """Return the columns of the atlas, [H, W, 7 or 10]."""
     values = np.zeros((plan.height, plan.width, texels.columns.shape[1]))
     # Texels without a tile get a color of the object, for means over the map.
@@ -232,9 +230,7 @@ def _normal_map(values: NDArray[np.float64], texels: _Texels) -> Texture | None:
     return Texture(texels=np.round(values[..., NORMAL] * 255).astype(np.uint8))
 
 
-def _textures(
-    values: NDArray[np.float64], texels: _Texels
-) -> tuple[Texture, Texture, Texture]:
+def _textures(values: NDArray[np.float64], texels: _Texels) -> tuple[Texture, Texture, Texture]:
     """Return the maps in 8 bits; a constant map is one texel in float32."""
     constants = [_constant(texels, part) for part in _PARTS]
     stored = [srgb8(values[..., DIFFUSE])]

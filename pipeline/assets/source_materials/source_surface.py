@@ -122,7 +122,9 @@ class SourceSurface:
         either they are 0, and leave the normal as it is.
         """
         corners = self.parts.mesh.corners[source_face]
-        normal = unit_or_zero(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+        normal = unit_or_zero(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        )
         uv = self.parts.uv[source_face, slot.uv_set] @ slot.uv_matrix.T + slot.uv_offset
         steps = uv[:, 1:] - uv[:, :1]
         area = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0]

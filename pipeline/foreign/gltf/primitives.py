@@ -92,9 +92,13 @@ class PlacedPrimitive:
 
     @property
     def tangents(self) -> NDArray[np.float64] | None:
-        """Tangents [T, 3, 3] of the corners, of any length, and 1, or -1 where the bitangent is
-        the other one, as [T, 3, 4]; None where there are none."""
-        if "TANGENT" not in self._primitive["attributes"]:
+        """Tangents of the corners and the signs of their bitangents [T, 3, 4].
+
+        None where there are none, or where they are morphed.
+        """
+        targets = self._primitive.get("targets", ())
+        is_morphed = any("TANGENT" in target for target in targets)
+        if "TANGENT" not in self._primitive["attributes"] or is_morphed:
             return None
         tangents = self._read_attribute("TANGENT", (4,))[self.faces]
         with np.errstate(invalid="ignore", over="ignore"):
@@ -111,9 +115,7 @@ class PlacedPrimitive:
         targets = self._primitive.get("targets", ())
         for weight, target in zip(self._weights, targets, strict=False):
             if weight and name in target:
-                of_target = widths if name != "TANGENT" else (3,)  # of the tangents alone
-                morph = self._document.values(target[name], of_target, self._rows, is_unit=is_unit)
-                morph = np.pad(morph, ((0, 0), (0, values.shape[1] - morph.shape[1])))
+                morph = self._document.values(target[name], widths, self._rows, is_unit=is_unit)
                 with np.errstate(invalid="ignore", over="ignore"):
                     values = values + read_number(weight, "weights") * morph
         return values

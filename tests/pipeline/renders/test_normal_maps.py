@@ -124,7 +124,9 @@ def test_a_slope_reflects_what_a_tilted_plane_does(turned: bool) -> None:
     lamp = np.array([[1.0, -1.5, 3.0], [1.6, -1.5, 3.0], [1.2, -1.0, 3.2]])
     turn = np.array([[0.0, 1.0], [-1.0, 0.0]]) if turned else None  # u grows with y, v against x
     scene = mapped(
-        [textured_floor(material(diffuse=[0.6, 0.5, 0.4])), light(lamp, 30.0)], one_slope(slope), turn
+        [textured_floor(material(diffuse=[0.6, 0.5, 0.4])), light(lamp, 30.0)],
+        one_slope(slope),
+        turn,
     )
     normal = np.array([-slope[1], slope[0], slope[2]]) if turned else slope
     hits = first_hits(scene, resolution=16)
@@ -201,7 +203,12 @@ def test_frames_without_a_direction_and_odd_texels_leave_unit_normals() -> None:
     assert np.allclose(found[0], [1, 0, LEAST_Z], atol=1e-4)
     corners = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]] * 4, np.float64)
     uv = np.array(
-        [[[0, 0], [1, 0], [0, 1]], [[0, 0], [-1, 0], [0, 1]], [[0, 0]] * 3, [[0, 0], [1, 1], [2, 2]]],
+        [
+            [[0, 0], [1, 0], [0, 1]],
+            [[0, 0], [-1, 0], [0, 1]],
+            [[0, 0]] * 3,
+            [[0, 0], [1, 1], [2, 2]],
+        ],
         np.float64,
     )
     wanted = [[1, 0, 0], [-1, 0, 0], [0, 0, 0], [0, 0, 0]]

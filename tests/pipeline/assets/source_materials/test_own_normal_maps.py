@@ -41,7 +41,7 @@ def _normals(slopes: NDArray) -> NDArray[np.float64]:
 
 
 def _picture(values: ArrayLike | None = None) -> bytes:
-    """Return quarters of 8 x 8 texels with the normals of SLOPES, or others [4, 3] from 0 to 255."""
+    """Return quarters of 8 x 8 texels with the normals of SLOPES, or other codes [4, 3]."""
     codes = np.round((_normals(SLOPES) + 1) / 2 * 255) if values is None else np.asarray(values)
     quarters = codes.reshape(2, 2, 3).astype(np.uint8)
     return picture_bytes(np.repeat(np.repeat(quarters, 8, axis=0), 8, axis=1))
@@ -54,7 +54,9 @@ def _glb(path: Path, uv: ArrayLike = UV_UP, tangent: ArrayLike | None = None, **
     material["pbrMetallicRoughness"] = {"baseColorFactor": [0.5, 0.5, 0.5, 1]}
     if tangent is not None:
         data = np.tile(np.asarray(tangent, "<f4"), (4, 1)).tobytes()
-        tree["bufferViews"].append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data)})
+        tree["bufferViews"].append(
+            {"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data)}
+        )
         tree["buffers"][0]["byteLength"] = len(buffer) + len(data)
         accessor = {"componentType": 5126, "count": 4, "type": "VEC4"}
         tree["accessors"].append({"bufferView": len(tree["bufferViews"]) - 1, **accessor})
