@@ -212,8 +212,7 @@ def _encode_mesh(level: Level) -> bytes:
     """Return a mesh as a PLY file, or as GLB if it has its own materials."""
     if level.skin is None:
         return encode_ply(level.positions, level.faces)
-    skin = level.skin
-    return encode_mesh_glb(level.positions, level.faces, skin.uv, skin.textures, skin.normal)
+    return encode_mesh_glb(level.positions, level.faces, level.skin.uv, level.skin.textures)
 
 
 def _write(

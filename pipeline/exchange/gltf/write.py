@@ -110,7 +110,6 @@ def encode_mesh_glb(
     faces: NDArray[np.integer],
     uv: NDArray[np.floating],
     textures: tuple[Texture, Texture, Texture],
-    normal: Texture | None = None,
 ) -> bytes:
     """Return a textured mesh as the bytes of a GLB file.
 
@@ -119,12 +118,9 @@ def encode_mesh_glb(
         faces: [F, 3] rows of `positions`.
         uv: [F, 3, 2] texture coordinates of the corners, v up.
         textures: diffuse, specular and roughness.
-        normal: normal map, if any.
     """
     file = GlbFile()
     maps = {name: linear_map(texture) for name, texture in zip(TEXTURED, textures, strict=True)}
-    if normal is not None:
-        maps[NORMAL] = linear_map(normal)
     attributes = _attributes(file, positions[faces].reshape(-1, 3), None, uv.reshape(-1, 2))
     indices = file.accessor(np.arange(faces.size, dtype="<u4"), "SCALAR", UNSIGNED)
     primitive = {"attributes": attributes, "indices": indices, "material": 0}
