@@ -17,7 +17,7 @@ from pipeline.renders.device_memory import own_floats, own_integers
 from pipeline.renders.ggx import KernelLobes
 from storage.optics.bsdf import MIN_ALPHA, bsdf_lobes
 from storage.optics.multiscatter import ROUGHNESS_STEPS, mean_albedo, scattered_again
-from storage.optics.normal_map import LEAST_TANGENT_SQ, LEAST_Z, u_directions
+from storage.records.normal_map import LEAST_TANGENT_SQ, LEAST_Z, u_directions
 from storage.records.scene import Scene
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
@@ -147,7 +147,7 @@ class KernelTextures:
         self._u_directions = own_floats(np.pad(u_directions(positions, corners), ((0, 0), (0, 1))))
 
     def mapped_normal(self, normal: Any, triangle: Any, barycentric: Any, active: Any) -> Any:
-        """Return the unit normal (Vector3f) of storage.optics.normal_map; None without any map.
+        """Return the unit normal (Vector3f) of storage.records.normal_map; None without any map.
 
         Args:
             normal: Vector3f, unit, unmapped.
@@ -159,7 +159,8 @@ class KernelTextures:
             return None
         u, v, material = self._place(triangle, barycentric, active)
         texture = dr.gather(mi.Vector4u, self._maps, material, active)
-        along = mi.Vector3f(dr.gather(mi.Vector4f, self._u_directions, triangle, active).xyz)
+        row: Any = dr.gather(mi.Vector4f, self._u_directions, triangle, active)
+        along = mi.Vector3f(row.xyz)
         tangent = along - normal * dr.dot(along, normal)
         length_sq = dr.squared_norm(tangent)
         is_mapped = active & (texture.w > 0) & (length_sq > LEAST_TANGENT_SQ)

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
-from storage.optics.normal_map import mapped_normals, u_directions
 from storage.raycast.caster import MISS
 from storage.raycast.embree import Surfaces
 from storage.records.lookup import normal_texels, textured_rows
+from storage.records.normal_map import mapped_normals, u_directions
 from storage.records.scene import Scene
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from storage.conventions import latlong_uv
-from storage.optics.normal_map import FLAT
 from storage.records.environment import Environment
 from storage.records.material import laid_out
+from storage.records.normal_map import FLAT
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from pipeline.foreign.material import MaterialSamples, Slot, SourceMaterial, sou
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.textured_mesh import TexturedMesh
 from storage.errors import Rejected
-from storage.optics.normal_map import LEAST_Z, u_directions, unit_or_zero
+from storage.records.normal_map import LEAST_Z, u_directions, unit_or_zero
 
 _LEAST_FOUND = 0.999
 """Fraction of the cleaned faces that must match one of the file: all but those that rounding split.
@@ -100,17 +100,15 @@ class SourceSurface:
             stated[:, 2] = np.maximum(stated[:, 2], LEAST_Z)
             x, y, z = unit_or_zero(stated).T
             tangent, bitangent, normal = self._frames(material.normal, *in_file)
-            outward = unit_or_zero(self.mesh.double_area_vectors[faces[chosen]])
+            outward = _unit_normals(self.mesh.positions[self.mesh.faces[faces[chosen]]])
             # A face that was turned over shows the other side of the same bumps.
             side = np.where((outward * normal).sum(axis=1) < 0, -1.0, 1.0)
             slope = side[:, None] * (x[:, None] * tangent + y[:, None] * bitangent)
             level_normal, level_x = (each[chosen] for each in frame)
             slope = _rotated(slope, outward, level_normal)
-            along = np.stack(
-                [(slope * level_x).sum(axis=1),
-                 (slope * np.cross(level_normal, level_x)).sum(axis=1)], axis=1
-            )  # fmt: skip
-            result[chosen] = unit_or_zero(np.concatenate([along, z[:, None]], axis=1))
+            level_y = np.cross(level_normal, level_x)
+            across = [(slope * axis).sum(axis=1) for axis in (level_x, level_y)]
+            result[chosen] = unit_or_zero(np.stack([*across, z], axis=1))
         return result
 
     def _frames(
@@ -121,10 +119,8 @@ class SourceSurface:
         Tangents are those that the file states, or else those of its texture coordinates. Without
         either they are 0, and leave the normal as it is.
         """
-        corners = self.parts.mesh.corners[source_face]
-        normal = unit_or_zero(
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        )
+        corners = self.parts.mesh.positions[self.parts.mesh.faces[source_face]]
+        normal = _unit_normals(corners)
         uv = self.parts.uv[source_face, slot.uv_set] @ slot.uv_matrix.T + slot.uv_offset
         steps = uv[:, 1:] - uv[:, :1]
         area = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0]
@@ -133,7 +129,7 @@ class SourceSurface:
             stated = np.einsum("nc,ncd->nd", source_weights, self.parts.tangent[source_face])
             flat = stated[:, :3] - (stated[:, :3] * normal).sum(axis=1, keepdims=True) * normal
             flat = unit_or_zero(flat)
-            is_stated = flat.any(axis=1)
+            is_stated = np.square(flat).sum(axis=1) > 0
             tangent = np.where(is_stated[:, None], flat, tangent)
             hand = np.where(is_stated, np.sign(stated[:, 3]), hand)
         return tangent, hand[:, None] * np.cross(normal, tangent), normal
@@ -203,18 +199,18 @@ class SourceSurface:
         return 0.5 * np.linalg.norm(vectors, axis=1)
 
 
+def _unit_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the normals [N, 3] of triangles [N, 3, 3]; 0 of those without an area."""
+    return unit_or_zero(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+
+
 def _rotated(
     vectors: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return vectors [N, 3] at right angles to `start`, by the smallest rotation from it to `end`.
-
-    Between opposite directions there is none: such vectors lose their length.
-    """
+    """Return vectors [N, 3] across `start`, by the smallest rotation from it to `end`."""
     ahead = (vectors * end).sum(axis=1, keepdims=True)
-    cosine = (start * end).sum(axis=1, keepdims=True)
-    return vectors - np.where(cosine > -1 + 1e-6, ahead / np.maximum(1 + cosine, 1e-6), 0) * (
-        start + end
-    )
+    halves = np.maximum(1 + (start * end).sum(axis=1, keepdims=True), 1e-6)
+    return vectors - ahead / halves * (start + end)
 
 
 def _halvings(

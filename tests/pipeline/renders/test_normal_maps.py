@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from pipeline.renders.load_tracer import load_tracer
 from scene_templates.rotations import uniform_rotation
-from storage.optics.normal_map import FLAT, LEAST_Z, mapped_normals, u_directions
 from storage.raycast.first_hits import first_hits
+from storage.records.normal_map import FLAT, LEAST_Z, mapped_normals, u_directions
 from storage.records.passes.pictures import view_passes
 from storage.records.retextured import with_textures
 from storage.records.scene import Scene
@@ -92,7 +92,7 @@ def test_the_kernel_agrees_with_mitsubas_normalmap(
 def test_a_flat_map_is_none_in_every_bit_and_flat_texels_change_nothing() -> None:
     row = material(diffuse=[0.2, 0.4, 0.3], specular=0.4, roughness=0.3)
     parts = [textured_floor(row), sphere([0.1, 0, 0.4], 0.3, row, 6), SKY_LAMP]
-    flat = np.tile(np.float32(FLAT), (8, 8, 1))
+    flat = np.tile(np.array(FLAT, np.float32), (8, 8, 1))
     edge = flat.copy()
     edge[:, 0] = 0.9, 0.5, 0.8  # where nothing lies
     plain = join(parts, eye=(0, -0.02, 4), fov_deg=30)
@@ -101,12 +101,12 @@ def test_a_flat_map_is_none_in_every_bit_and_flat_texels_change_nothing() -> Non
     assert away.uv is not None and away.material_textures is not None
     colours = away.material_textures.copy()
     colours[0, 0] = 1
-    shared = {
-        "uv": away.uv + np.float32(0.5),
-        "textures": (*away.textures, noise_map(1, 3, 0.1, 0.5)),
-        "material_textures": colours,
-    }
-    bumpy = dataclasses.replace(away, **shared)
+    bumpy = dataclasses.replace(
+        away,
+        uv=away.uv + np.float32(0.5),
+        textures=(*away.textures, noise_map(1, 3, 0.1, 0.5)),
+        material_textures=colours,
+    )
     smooth = dataclasses.replace(bumpy, normal_textures=None)
     assert np.abs(_traced(bumpy) - _traced(smooth)).max() < 1e-6
 

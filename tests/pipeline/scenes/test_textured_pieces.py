@@ -433,13 +433,11 @@ def test_a_normal_map_comes_with_the_rights_of_its_object_and_changes_nothing_el
     assert texture_families(scene) == texture_families(plain)
     assert scene_digest(without_normal_maps(scene)) == scene_digest(plain)
     triangle, weights = np.arange(scene.num_triangles), np.full((3, scene.num_triangles), 1 / 3)
-    seen = [surface_textures(each) for each in (plain, scene)]
-    rows = [
-        each.materials(triangle, weights, plain.materials[plain.material_index])
-        for each in seen
-        if each is not None
-    ]
-    assert len(rows) == 2 and np.array_equal(*rows)
+    columns = plain.materials[plain.material_index]
+    ours, theirs = map(surface_textures, (scene, plain))
+    assert ours is not None and theirs is not None
+    wanted = theirs.materials(triangle, weights, columns)
+    assert np.array_equal(ours.materials(triangle, weights, columns), wanted)
 
 
 def test_subdivision_moves_no_colour() -> None:

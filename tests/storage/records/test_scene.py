@@ -19,9 +19,9 @@ from safetensors.numpy import save
 from pipeline.objects.ply import encode_ply
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.optics.normal_map import FLAT
 from storage.records.asset import Asset, Level, LevelRecord, decode_asset, encode_asset
 from storage.records.map_facts import textured_objects
+from storage.records.normal_map import FLAT
 from storage.records.retextured import (
     NEW,
     chosen_maps,

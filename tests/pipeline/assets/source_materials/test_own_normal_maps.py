@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Gf, Usd
 
-from storage.optics.normal_map import mapped_normals, u_directions
 from storage.records.asset import Asset, decode_asset, encode_asset
 from storage.records.lookup import texture_values
+from storage.records.normal_map import mapped_normals, u_directions
 from storage.settings.described import settings_record
 from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import prepare, write_glb
@@ -126,7 +126,9 @@ def test_a_level_gives_the_map_of_its_source_back(tmp_path: Path, form: str) -> 
     assert np.abs(_shown(asset) - _wanted()).max() < STEP
     assert asset.materials is not None and "normal map" not in asset.materials.lost
     (again,) = decode_asset(encode_asset(asset)).levels[:1]
-    assert again.skin is not None and again.skin.packed_normal == asset.levels[0].skin.packed_normal
+    skin = asset.levels[0].skin
+    assert skin is not None and again.skin is not None
+    assert again.skin.packed_normal == skin.packed_normal
     plain = prepare(path, KEEP)
     assert plain.materials is not None and plain.levels[0].skin is not None
     assert plain.levels[0].skin.normal is None
