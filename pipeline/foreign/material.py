@@ -98,13 +98,13 @@ def with_normal_map(
     material: SourceMaterial, slot: Slot, strength: float = 1.0, *, lost: tuple[str, ...] = ()
 ) -> SourceMaterial:
     """Return a material with a normal map that is read; `lost` names what still is not."""
-    kept = tuple(word for word in material.lost if word != "normal map")
+    unread = tuple(word for word in material.lost if word != "normal map")
     return replace(
         material,
         normal=slot,
         normal_scale=(2 * strength, 2 * strength, 2.0),
         normal_bias=(-strength, -strength, -1.0),
-        lost=tuple(sorted({*kept, *lost})) if lost else kept,
+        lost=tuple(sorted({*unread, *lost})) if lost else unread,
     )
 
 

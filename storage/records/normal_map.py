@@ -31,7 +31,7 @@ def u_directions(corners: NDArray[np.floating], uv: NDArray[np.floating]) -> NDA
     """
     edges = (corners[:, 1:] - corners[:, :1]).astype(np.float64)
     steps = (uv[:, 1:].astype(np.float64) - uv[:, :1]).astype(np.float64)
-    du, dv = steps[..., 0], steps[..., 1]
+    du, dv = np.moveaxis(steps, -1, 0)
     area = du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]
     along = (dv[:, 1:] * edges[:, 0] - dv[:, :1] * edges[:, 1]) * np.sign(area)[:, None]
     is_chart = np.abs(area) > _LEAST_AREA * np.square(steps).sum(axis=(1, 2))

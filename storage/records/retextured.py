@@ -110,8 +110,9 @@ def without_normal_maps(scene: AnyScene) -> AnyScene:
     """Return the same scene without normal maps, and without textures that were nothing else."""
     if scene.normal_textures is None or scene.material_textures is None:
         return scene
-    kept = _used_maps(scene.uv, scene.textures, scene.material_textures, None)
-    return dataclasses.replace(scene, **kept)
+    return dataclasses.replace(
+        scene, **_used_maps(scene.uv, scene.textures, scene.material_textures, None)
+    )
 
 
 def _used_maps(

@@ -124,7 +124,8 @@ class SourceSurface:
         uv = self.parts.uv[source_face, slot.uv_set] @ slot.uv_matrix.T + slot.uv_offset
         steps = uv[:, 1:] - uv[:, :1]
         area = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0]
-        tangent, hand = u_directions(corners, uv), np.sign(area)
+        tangent = u_directions(corners, uv)
+        hand = np.sign(area)
         if self.parts.tangent is not None:
             stated = np.einsum("nc,ncd->nd", source_weights, self.parts.tangent[source_face])
             flat = stated[:, :3] - (stated[:, :3] * normal).sum(axis=1, keepdims=True) * normal
