@@ -138,7 +138,7 @@ class Vertex:
     """Normal before its map, on the side of the incoming ray, in the frame, Vector3f; None where
     the scene has no normal map."""
     turned: Any = None
-    """True where `facing` has turned the frame, Bool; None where it has not been asked to."""
+    """True where `face_viewer` has turned the frame, Bool; None where it has not been asked to."""
 
 
 def vertex_at(
@@ -172,7 +172,7 @@ def vertex_at(
     )
 
 
-def facing(vertex: Vertex, *directions: Any) -> tuple[Vertex, tuple[Any, ...]]:
+def face_viewer(vertex: Vertex, *directions: Any) -> tuple[Vertex, tuple[Any, ...]]:
     """Return a vertex whose mapped normal faces `incoming`, and other directions in its frame.
 
     A mapped normal that turns away from a viewer is mirrored at the unmapped one, as by Mitsuba's

@@ -54,7 +54,7 @@ from pipeline.renders.kernel_scene import (
     KernelParts,
     KernelScene,
     Vertex,
-    facing,
+    face_viewer,
     next_hit,
     off_surface,
     roulette,
@@ -242,7 +242,7 @@ def _flip_to_viewer(
         unmapped=None if vertex.unmapped is None else vertex.unmapped * flip * side,
         front=vertex.front ^ (side < 0),
     )
-    seen, (wo,) = facing(turned_over, vertex.incoming * flip)
+    seen, (wo,) = face_viewer(turned_over, vertex.incoming * flip)
     albedo = scene.albedo(seen.incoming.z, vertex.lobes.alpha, active)
     return replace(seen, lobes=ggx.seen_from(vertex.lobes, seen.incoming, albedo)), wo
 

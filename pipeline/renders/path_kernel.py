@@ -28,7 +28,7 @@ from pipeline.renders.kernel_scene import (
     KernelParts,
     KernelScene,
     Vertex,
-    facing,
+    face_viewer,
     next_hit,
     off_surface,
     roulette,
@@ -114,7 +114,7 @@ def _vertex_from_viewer(
     direction: Any,
     active: Any,
 ) -> Vertex:
-    vertex, _ = facing(vertex_at(scene, point, triangle, barycentric, direction, active))
+    vertex, _ = face_viewer(vertex_at(scene, point, triangle, barycentric, direction, active))
     albedo = scene.albedo(vertex.incoming.z, vertex.lobes.alpha, active)
     return replace(vertex, lobes=ggx.seen_from(vertex.lobes, vertex.incoming, albedo))
 

@@ -105,7 +105,7 @@ class SourceSurface:
             side = np.where((outward * normal).sum(axis=1) < 0, -1.0, 1.0)
             slope = side[:, None] * (x[:, None] * tangent + y[:, None] * bitangent)
             level_normal, level_x = (each[chosen] for each in frame)
-            slope = _rotated(slope, outward, level_normal)
+            slope = _rotate(slope, outward, level_normal)
             level_y = np.cross(level_normal, level_x)
             across = [(slope * axis).sum(axis=1) for axis in (level_x, level_y)]
             result[chosen] = unit_or_zero(np.stack([*across, z], axis=1))
@@ -205,7 +205,7 @@ def _unit_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     return unit_or_zero(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
 
-def _rotated(
+def _rotate(
     vectors: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return vectors [N, 3] across `start`, by the smallest rotation from it to `end`."""

@@ -72,9 +72,7 @@ def _caustics() -> Scene:
     return mapped([mirror, textured_floor(material(diffuse=0.8)), lamp], bumps(2, 0.8))
 
 
-@pytest.mark.parametrize(
-    "made", [_room, pytest.param(_caustics, marks=pytest.mark.slow("statistics"))]
-)
+@pytest.mark.parametrize("made", [_room, _caustics])
 def test_the_kernel_agrees_with_mitsubas_normalmap(
     made: Callable[[], Scene], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -185,7 +183,6 @@ def test_guides_and_passes_are_the_definition_and_turn_with_the_scene() -> None:
         assert np.mean(np.linalg.norm(back - guide, axis=-1) > 1e-3) < 0.03
 
 
-@pytest.mark.slow("statistics")
 def test_a_moved_scene_shows_the_same_picture() -> None:
     scene = _room()
     motion = uniform_rotation(np.random.default_rng(4)), [0.4, -0.1, 0.2]
