@@ -47,6 +47,23 @@ def textured_scene(seed: int = 0, *textures: Texture, **changes: Any) -> Scene:
     return dataclasses.replace(scene, **{**fields, **changes})
 
 
+def bumps(seed: int = 0, tilt: float = 0.5, size: tuple[int, int] = (5, 7)) -> Texture:
+    """Return a normal map of independent texels, whose slopes are at most `tilt` each way."""
+    slope = np.random.default_rng(seed).uniform(-tilt, tilt, (*size, 2))
+    normal = np.concatenate([slope, np.ones((*size, 1))], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    return Texture(texels=np.round((normal + 1) / 2 * 255).astype(np.uint8))
+
+
+def bumpy_scene(seed: int = 0, **changes: Any) -> Scene:
+    """Return the textured scene, whose floor has a normal map of 8 bits too."""
+    scene = textured_scene(seed)
+    normals = np.full(len(scene.materials), -1, np.int32)
+    normals[FLOOR] = len(scene.textures)
+    maps = {"textures": (*scene.textures, bumps(seed)), "normal_textures": normals}
+    return dataclasses.replace(scene, **{**maps, **changes})
+
+
 def sky(seed: int = 0, **changes: Any) -> Environment:
     """Return a random map of 3 x 6 texels, with a sun of 1e6, that stands on its side."""
     radiance = np.random.default_rng(seed).random((3, 6, 3)).astype(np.float16).astype(np.float32)

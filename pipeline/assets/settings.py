@@ -63,6 +63,9 @@ class OwnMaterialSettings:
     emission: bool = False
     """Keep the emission of surfaces, as one radiance for each triangle of a level. Implied by
     `scenes.materials.own_emission`."""
+    normal_maps: bool = False
+    """Keep the normal maps of materials, as one more texture of each level. RenderFormer's form and
+    its networks have no place for them."""
     transmission: Literal["opaque", "reject"] = "opaque"
     """Fate of an object with transmissive or transparent materials. `opaque`: its surfaces are
     opaque, and its record and the log name what was lost. `reject`: it is refused."""
@@ -74,7 +77,7 @@ class OwnMaterialSettings:
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out later settings at their defaults: digests of earlier builds stay equal."""
         record: dict[str, Any] = as_usual(self)
-        defaults = {"emission": False, "transmission": "opaque"}
+        defaults = {"emission": False, "normal_maps": False, "transmission": "opaque"}
         return {
             name: value
             for name, value in record.items()
@@ -129,6 +132,7 @@ class AssetSettings:
             max_faces=self.max_source_faces,
             max_instances=self.max_instances,
             with_materials=self.own_materials.keep,
+            with_normal_maps=self.own_materials.keep and self.own_materials.normal_maps,
         )
 
     @pydantic.model_serializer(mode="wrap")

@@ -24,7 +24,7 @@ from storage.records.objects import Failure
 from storage.records.sample import PartFloor, Sample, error_text
 from storage.records.scene import Scene
 from storage.records.scene_facts import cameras, lights, surfaces
-from storage.records.texture import TEXTURED, MapSource, Texture
+from storage.records.texture import NORMAL, TEXTURED, MapSource, Texture
 
 _PICTURE_PX = 384
 _MOST_SWATCHES = 128
@@ -139,8 +139,10 @@ def shown_maps(scene: Scene) -> list[ShownMap]:
     maps = []
     for row, texture in enumerate(scene.textures):
         assert scene.material_textures is not None
-        used = (scene.material_textures == row).any(axis=0)
-        role = " and ".join(name for name, uses in zip(TEXTURED, used, strict=True) if uses)
+        used = (scene.material_textures == row).any(axis=0).tolist()
+        used.append(scene.normal_textures is not None and row in scene.normal_textures)
+        names = (*TEXTURED, NORMAL)
+        role = " and ".join(name for name, uses in zip(names, used, strict=True) if uses)
         name = texture.source.name
         caption = name if name.endswith(role) else f"{name} ({role})"
         picture = png_uri(_texture_pixels(texture)) if row < _MOST_MAPS else None

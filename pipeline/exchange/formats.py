@@ -42,7 +42,7 @@ from storage.errors import TrilightError
 from storage.records import scene_file
 from storage.records.material import columns_in_use
 from storage.records.profiles import PACKED, PLAIN
-from storage.records.retextured import without_maps
+from storage.records.retextured import without_maps, without_normal_maps
 from storage.records.sample import decode_sample, decode_scene
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene, read_scene_file
@@ -289,8 +289,10 @@ def _members_in_use(scene: Scene) -> Iterator[str]:
                     yield f"objects.{part_field.name}"
         elif field.name == "environment":
             yield from ("environment",) if scene.environment is not None else ()
+        elif field.name == "normal_textures":
+            yield from ("normal_textures",) if scene.normal_textures is not None else ()
         elif field.name not in MAP_ARRAYS and len(getattr(scene, field.name)):
-            yield field.name  # MAP_ARRAYS belong to `textures`
+            yield field.name  # other MAP_ARRAYS belong to `textures`
 
 
 def drop_uncarried_maps(scene: Scene, carried: Collection[str]) -> Scene:
@@ -299,6 +301,8 @@ def drop_uncarried_maps(scene: Scene, carried: Collection[str]) -> Scene:
     Raises:
         TrilightError: the environment is the only light, and the format cannot hold it.
     """
+    if "normal_textures" not in carried:
+        scene = without_normal_maps(scene)
     loses_sky = scene.environment is not None and "environment" not in carried
     if not loses_sky and (not scene.textures or "textures" in carried):
         return scene

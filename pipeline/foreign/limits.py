@@ -15,3 +15,5 @@ class ReadLimits:
     """Maximum number of nodes that place a mesh."""
     with_materials: bool = False
     """True to read the files that materials name, too."""
+    with_normal_maps: bool = False
+    """True to read normal maps of materials, too."""

@@ -3,7 +3,7 @@
 The Fresnel term becomes albedos that are the same at every angle (storage.optics.fresnel).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,12 @@ class SourceMaterial:
     emission_rgb: RGB = (0.0, 0.0, 0.0)
     emission: Slot | None = None
     """Emission picture, sRGB-encoded, multiplied with `emission_rgb`; it has no column."""
+    normal: Slot | None = None
+    """Normal map, linear: right, up and out where texture coordinates grow; None where there is
+    none, or none is read."""
+    normal_scale: RGB = (2.0, 2.0, 2.0)
+    normal_bias: RGB = (-1.0, -1.0, -1.0)
+    """Factor and offset that make vectors of the picture's values."""
     lost: tuple[str, ...] = ()
     """Names of stated features that have no place here, such as transparency."""
 
@@ -83,8 +89,23 @@ class SourceMaterial:
             self.specular_strength_map,
             self.glossiness,
             self.emission,
+            self.normal,
         )
         return tuple(slot for slot in slots if slot is not None)
+
+
+def with_normal_map(
+    material: SourceMaterial, slot: Slot, strength: float = 1.0, *, lost: tuple[str, ...] = ()
+) -> SourceMaterial:
+    """Return a material with a normal map that is read; `lost` names what still is not."""
+    unread = tuple(word for word in material.lost if word != "normal map")
+    return replace(
+        material,
+        normal=slot,
+        normal_scale=(2 * strength, 2 * strength, 2.0),
+        normal_bias=(-strength, -strength, -1.0),
+        lost=tuple(sorted({*unread, *lost})) if lost else unread,
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -22,6 +22,8 @@ from storage.errors import Rejected
 
 READ_MAPS = {"map_kd", "map_ks", "map_pr", "map_pm", "map_ke"}
 """Maps of an MTL whose pictures are read."""
+NORMAL_MAPS = {"norm", "map_kn"}
+"""Normal maps of an MTL, whose pictures are read on request."""
 _ENCODINGS = ("cp1252", "cp932", "gbk", "cp1251", "cp437")
 """Encodings of old programs, tried for names that are not UTF-8."""
 _LAYOUTS = ("textures", "images", "../textures", "../images", "../materials/textures")
@@ -165,8 +167,10 @@ def gltf_files(tree: Mapping[str, Any], folder: SourceFolder, bytes_left: int) -
     return folder.read_all(named, bytes_left, is_uri=True)
 
 
-def obj_files(data: bytes, folder: SourceFolder, bytes_left: int) -> MaterialFiles:
-    """Return the MTL files of an OBJ and the pictures that those name."""
+def obj_files(
+    data: bytes, folder: SourceFolder, bytes_left: int, *, normal_maps: bool = False
+) -> MaterialFiles:
+    """Return the MTL files of an OBJ and the pictures that those name, normal maps on request."""
     libraries = MaterialFiles()
     for name, *several in list_libraries(data):
         files = folder.read_all([name], bytes_left)
@@ -175,7 +179,8 @@ def obj_files(data: bytes, folder: SourceFolder, bytes_left: int) -> MaterialFil
         bytes_left -= sum(map(len, files.data.values()))
         libraries = libraries.join(files)
     libraries = dataclasses.replace(libraries, libraries=(*libraries.data, *libraries.refused))
-    named = [name for text in libraries.data.values() for name in list_pictures(text, READ_MAPS)]
+    keys = READ_MAPS | NORMAL_MAPS if normal_maps else READ_MAPS
+    named = [name for text in libraries.data.values() for name in list_pictures(text, keys)]
     extra_folders = {name.replace("\\", "/").rpartition("/")[0] for name in libraries.data} - {""}
     return libraries.join(folder.read_all(named, bytes_left, extra_folders=sorted(extra_folders)))
 

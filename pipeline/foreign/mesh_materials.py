@@ -8,13 +8,13 @@ that there is no highlight.
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.material import RGB, WHITE, Slot, SourceMaterial
-from pipeline.foreign.material_files import READ_MAPS, MaterialFiles
+from pipeline.foreign.material import RGB, WHITE, Slot, SourceMaterial, with_normal_map
+from pipeline.foreign.material_files import NORMAL_MAPS, READ_MAPS, MaterialFiles
 from pipeline.foreign.mesh import FileMesh
 from pipeline.foreign.mtl import Fields, read_mtl, split_map
 from pipeline.foreign.numbers import Malformed, parse_number
@@ -24,7 +24,9 @@ from pipeline.foreign.textured_mesh import TexturedMesh
 from storage.errors import Rejected
 
 
-def read_textured_mesh(source: SourceFile, decode: Decode, *, emission: bool) -> TexturedMesh:
+def read_textured_mesh(
+    source: SourceFile, decode: Decode, *, emission: bool, normals: bool = False
+) -> TexturedMesh:
     """Return the triangles of an OBJ, OFF, PLY or STL with their materials; colors are sRGB.
 
     Materials and pictures take precedence over colors, which the notes then name.
@@ -36,7 +38,7 @@ def read_textured_mesh(source: SourceFile, decode: Decode, *, emission: bool) ->
     files = source.materials
     names = contents.material_names
     if source.kind == "obj" and (names or contents.color is None):
-        materials, unread = _obj_materials(names, files, decode, emission=emission)
+        materials, unread = _obj_materials(names, files, decode, emission=emission, normals=normals)
         source.notes.extend(unread)
     elif (
         names
@@ -77,7 +79,8 @@ _MOST_NS = 1000.0
 _PHYSICAL = {"pm", "pr", "map_pm", "map_pr"}
 """Statements of which one makes a material a metallic-roughness one."""
 _READ = {*_PHYSICAL, "kd", "ks", "ns", "ke", "illum", "map_kd", "map_ks", "map_ke"}
-_LOST = {"norm", "bump", "map_bump", "disp", "d", "tr", "map_d"}
+_HEIGHTS = {"bump", "map_bump", "disp"}
+_LOST = {"norm", *_HEIGHTS, "d", "tr", "map_d"}
 """Statements that `SourceMaterial.lost` names in words."""
 _MEANINGLESS = {"ka", "map_ka", "ni", "sharpness", "map_aat"}
 """Statements about ambient light, the inside of what is opaque, and antialiasing."""
@@ -91,7 +94,7 @@ _RGB_OF_XYZ = np.array(
 
 
 def _obj_materials(
-    names: Sequence[str], files: MaterialFiles, decode: Decode, *, emission: bool
+    names: Sequence[str], files: MaterialFiles, decode: Decode, *, emission: bool, normals: bool
 ) -> tuple[list[SourceMaterial], list[str]]:
     """Return the materials of these names, and sentences on statements that are not read."""
     if not names or not files.libraries:
@@ -113,6 +116,8 @@ def _obj_materials(
         materials = [reader.material(fields) for fields in chosen]
         if emission:
             materials = list(map(reader.add_emission, materials, chosen))
+        if normals:
+            materials = list(map(reader.add_normal_map, materials, chosen))
     except Malformed as error:
         raise Rejected("materials_unreadable", f"the MTL is malformed ({error!s:.200})") from error
     unread = [f"library {name[:60]!r}: it is not there" for name in absent]
@@ -121,7 +126,8 @@ def _obj_materials(
         for name in names
         if name not in known
     ]
-    unread += [text for fields in chosen for text in _list_unread(fields)]
+    read = _READ | NORMAL_MAPS if normals else _READ
+    unread += [text for fields in chosen for text in _list_unread(fields, read)]
     return materials, list(dict.fromkeys(unread))
 
 
@@ -170,6 +176,17 @@ class _Reader:
             red, green, blue = WHITE
         return dataclasses.replace(material, emission_rgb=(red, green, blue), emission=picture)
 
+    def add_normal_map(self, material: SourceMaterial, fields: Fields) -> SourceMaterial:
+        """Return a material with its normal map, if any; maps of heights are lost by that name."""
+        heights = ("height map",) if _HEIGHTS & set(fields) else ()
+        text = fields.get("norm", fields.get("map_kn"))
+        if text is None:
+            return material
+        stated = split_map(text)[0].get("-bm", ["1"])
+        slot = self._slot(text)
+        assert slot is not None
+        return with_normal_map(material, slot, parse_number(stated[0], "option -bm"), lost=heights)
+
     def _slot(self, text: str | None, *, is_srgb: bool = False) -> Slot | None:
         if text is None:
             return None
@@ -193,7 +210,7 @@ class _Reader:
 def _list_unsupported(fields: Fields) -> tuple[str, ...]:
     unsupported = {
         "emission": _is_over(fields.get("ke", "0"), 0) or "map_ke" in fields,
-        "normal map": bool({"norm", "bump", "map_bump", "disp"} & set(fields)),
+        "normal map": bool({"norm", *_HEIGHTS} & set(fields)),
         "transparency": not _is_over(fields.get("d", "1"), 1 - 1e-9)
         or _is_over(fields.get("tr", "0"), 0)
         or "map_d" in fields,
@@ -209,10 +226,10 @@ def _is_over(text: str, bound: float) -> bool:
         return bound > 0
 
 
-def _list_unread(fields: Fields) -> Iterator[str]:
+def _list_unread(fields: Fields, read: Set[str]) -> Iterator[str]:
     """Yield names of statements of a material that no code reads."""
     for key, value in fields.items():
-        if key not in _READ | _LOST | _MEANINGLESS:
+        if key not in read | _LOST | _MEANINGLESS:
             yield f"statement {key[:24]!r}"
         elif key in READ_MAPS:
             options = split_map(value)[0]

@@ -141,8 +141,12 @@ def read_source(path: Path, limits: ReadLimits, root: Path | None = None) -> Sou
         gltf = open_gltf(data, suffix, folder, limits)
         materials = gltf.pictures
     elif suffix in (".obj", ".ply") and keep:
-        list_files = obj_files if suffix == ".obj" else ply_files
-        materials = list_files(data, folder, limits.max_bytes - len(data))
+        bytes_left = limits.max_bytes - len(data)
+        if suffix == ".obj":
+            normal_maps = limits.with_normal_maps
+            materials = obj_files(data, folder, bytes_left, normal_maps=normal_maps)
+        else:
+            materials = ply_files(data, folder, bytes_left)
     digest = hashlib.sha256(data)
     buffers = {} if gltf is None else gltf.buffers
     for files in (buffers, materials.data):

@@ -20,5 +20,8 @@ class TexturedMesh:
     materials: Sequence[SourceMaterial]
     uv: NDArray[np.float64]
     """[F, S, 3, 2] texture coordinates of corners by set S, v up; NaN where there are none."""
+    tangent: NDArray[np.float64] | None = None
+    """[F, 3, 4] tangent of each corner, and the sign of its bitangent, where the file states them;
+    NaN where it does not."""
     color: NDArray[np.float64] | None = None
     """[F, 3, 3] linear tint of each corner, multiplied with the base color; None for white."""

@@ -74,7 +74,9 @@ def seen_from(lobes: KernelLobes, wi: Any, albedo: Any) -> KernelLobes:
     return replace(lobes, specular=scaled, weight=dr.select(wi.z > 0, lobes.weight, 0))
 
 
-def evaluate_bsdf(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> tuple[Any, Any]:
+def evaluate_bsdf(
+    lobes: KernelLobes, wi: Any, wo: Any, geometric: Any, unmapped: Any = None
+) -> tuple[Any, Any]:
     """Return f * cos_o (Color3f) and the density with which `sample` draws wo (Float).
 
     Args:
@@ -84,6 +86,8 @@ def evaluate_bsdf(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> tuple
         geometric: Vector3f, the triangle's own normal on the viewer's side. The specular lobe
             reflects nothing to below it, as in Cycles, whatever the shading normal says; `sample`
             still goes there, and the density counts it.
+        unmapped: Vector3f, the normal before its map, below which neither lobe reflects, as with
+            Mitsuba's `normalmap`; the density counts those directions too. None without a map.
     """
     facets = _distribution(dr.normalize(wi + wo), lobes.alpha) / (2 * wi.z)
     # 1 + 2 Lambda of Smith's term, so that G1 = 2 / (1 + m) and G2 = 2 / (m_i + m_o).
@@ -98,12 +102,16 @@ def evaluate_bsdf(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> tuple
     above = wo.z > 0
     reflected = dr.select(faces, reflected, lobes.diffuse * cosine)
     pdf = dr.select(faces, pdf, cosine)
+    if unmapped is not None:
+        reflected = dr.select(dr.dot(wo, unmapped) > 0, reflected, 0)
     return dr.select(above, reflected, 0), dr.select(above, pdf, 0)
 
 
-def diffuse_share(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any:
+def diffuse_share(
+    lobes: KernelLobes, wi: Any, wo: Any, geometric: Any, unmapped: Any = None
+) -> Any:
     """Return the share (Color3f) of the diffuse lobe in what `evaluate_bsdf` returns; 1 of 0."""
-    reflected, _ = evaluate_bsdf(lobes, wi, wo, geometric)
+    reflected, _ = evaluate_bsdf(lobes, wi, wo, geometric, unmapped)
     diffuse = lobes.diffuse * (_INV_PI * dr.maximum(wo.z, 0))
     return dr.select(reflected > diffuse, diffuse / reflected, 1)
 

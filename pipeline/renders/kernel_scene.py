@@ -1,6 +1,6 @@
 """One scene as kernels see it, and the surface code that both kinds of paths share."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -134,6 +134,11 @@ class Vertex:
     incoming: Any
     """Direction to the previous vertex, in the frame, Vector3f."""
     lobes: KernelLobes
+    unmapped: Any = None
+    """Normal before its map, on the side of the incoming ray, in the frame, Vector3f; None where
+    the scene has no normal map."""
+    turned: Any = None
+    """True where `face_viewer` has turned the frame, Bool; None where it has not been asked to."""
 
 
 def vertex_at(
@@ -148,7 +153,12 @@ def vertex_at(
     normal, lobes = scene.table.shading(triangle, barycentric, active)
     geometric = dr.mulsign(point.geometric_normal, dr.dot(point.geometric_normal, normal))
     behind = dr.dot(geometric, direction) > 0
-    frame = mi.Frame3f(dr.select(behind, -normal, normal))
+    mapped = scene.table.mapped_normal(normal, triangle, barycentric, active)
+    shading = normal if mapped is None else mapped
+    frame = mi.Frame3f(dr.select(behind, -shading, shading))
+    unmapped = None
+    if mapped is not None:
+        unmapped = frame.to_local(dr.select(behind, -normal, normal))
     return Vertex(
         point=point,
         triangle=triangle,
@@ -158,7 +168,35 @@ def vertex_at(
         geometric=frame.to_local(dr.select(behind, -geometric, geometric)),
         incoming=frame.to_local(-direction),
         lobes=lobes,
+        unmapped=unmapped,
     )
+
+
+def face_viewer(vertex: Vertex, *directions: Any) -> tuple[Vertex, tuple[Any, ...]]:
+    """Return a vertex whose mapped normal faces `incoming`, and other directions in its frame.
+
+    A mapped normal that turns away from a viewer is mirrored at the unmapped one, as by Mitsuba's
+    `normalmap`: a half turn about that normal maps one frame to the other. Where the scene has no
+    normal map, all stays.
+    """
+    axis = vertex.unmapped
+    if axis is None:
+        return vertex, directions
+    turned = (vertex.incoming.z <= 0) & (dr.dot(vertex.incoming, axis) > 0)
+
+    def turn(direction: Any) -> Any:
+        return dr.select(turned, axis * (2 * dr.dot(axis, direction)) - direction, direction)
+
+    axes = (mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
+    frame = mi.Frame3f(*(mi.Vector3f(vertex.frame.to_world(turn(each))) for each in axes))
+    faced = replace(
+        vertex,
+        frame=frame,
+        geometric=turn(vertex.geometric),
+        incoming=turn(vertex.incoming),
+        turned=turned,
+    )
+    return faced, tuple(map(turn, directions))
 
 
 class Hit:
@@ -246,7 +284,9 @@ class KernelParts:
         """
         if not self._lobes:
             return None
-        return ggx.diffuse_share(vertex.lobes, vertex.incoming, local, vertex.geometric)
+        return ggx.diffuse_share(
+            vertex.lobes, vertex.incoming, local, vertex.geometric, vertex.unmapped
+        )
 
     def carry_share(self, vertex: Vertex, local: Any, depth: Any, before: Any) -> Any:
         """Return the `share` of the first vertex of a path, which has `depth` (UInt32) by now."""

@@ -54,6 +54,7 @@ from pipeline.renders.kernel_scene import (
     KernelParts,
     KernelScene,
     Vertex,
+    face_viewer,
     next_hit,
     off_surface,
     roulette,
@@ -213,12 +214,14 @@ def _evaluate_brdf(
     `guide` is the guide table of the viewer's path.
     """
     seen, wo = _flip_to_viewer(scene, vertex, view, active)
-    reflected, pdf = ggx.evaluate_bsdf(seen.lobes, seen.incoming, wo, seen.geometric)
+    reflected, pdf = ggx.evaluate_bsdf(seen.lobes, seen.incoming, wo, seen.geometric, seen.unmapped)
     if guide is not None:
         guidance = guide.at(vertex.triangle, vertex.barycentric, seen.front, seen.lobes, active)
         to_light = vertex.frame.to_world(vertex.incoming)
         pdf = guide.mixture(guidance, pdf, to_light, active)
     back = ggx.reverse_pdf(seen.lobes, seen.incoming, wo, seen.geometric)
+    if seen.turned is not None:
+        back = dr.select(seen.turned, 0, back)
     return reflected, pdf, back
 
 
@@ -228,17 +231,20 @@ def _flip_to_viewer(
     """Return the vertex as a viewer in direction `view` has it, and where light comes from.
 
     The surface is turned to the side of the viewer, as the path tracer has it. The BRDF is the same
-    around the normal, so that mirroring z is enough.
+    around the normal, so that mirroring z is enough. Mapped normals then face the viewer.
     """
     side = dr.mulsign(mi.Float(1), dr.dot(vertex.geometric, view))
     flip = mi.Vector3f(1, 1, side)
-    wi = view * flip
-    wo = vertex.incoming * flip
-    geometric = vertex.geometric * flip * side
-    albedo = scene.albedo(wi.z, vertex.lobes.alpha, active)
-    lobes = ggx.seen_from(vertex.lobes, wi, albedo)
-    front = vertex.front ^ (side < 0)
-    return replace(vertex, lobes=lobes, incoming=wi, geometric=geometric, front=front), wo
+    turned_over = replace(
+        vertex,
+        incoming=view * flip,
+        geometric=vertex.geometric * flip * side,
+        unmapped=None if vertex.unmapped is None else vertex.unmapped * flip * side,
+        front=vertex.front ^ (side < 0),
+    )
+    seen, (wo,) = face_viewer(turned_over, vertex.incoming * flip)
+    albedo = scene.albedo(seen.incoming.z, vertex.lobes.alpha, active)
+    return replace(seen, lobes=ggx.seen_from(vertex.lobes, seen.incoming, albedo)), wo
 
 
 _SLOTS = 6

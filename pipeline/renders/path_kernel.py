@@ -28,6 +28,7 @@ from pipeline.renders.kernel_scene import (
     KernelParts,
     KernelScene,
     Vertex,
+    face_viewer,
     next_hit,
     off_surface,
     roulette,
@@ -113,7 +114,7 @@ def _vertex_from_viewer(
     direction: Any,
     active: Any,
 ) -> Vertex:
-    vertex = vertex_at(scene, point, triangle, barycentric, direction, active)
+    vertex, _ = face_viewer(vertex_at(scene, point, triangle, barycentric, direction, active))
     albedo = scene.albedo(vertex.incoming.z, vertex.lobes.alpha, active)
     return replace(vertex, lobes=ggx.seen_from(vertex.lobes, vertex.incoming, albedo))
 
@@ -203,12 +204,16 @@ def _ratio(guidance: Guidance | None, pdf: Any, unguided: Any) -> Any:
 
 
 def _evaluate_brdf(vertex: Vertex, local: Any) -> tuple[Any, Any]:
-    return ggx.evaluate_bsdf(vertex.lobes, vertex.incoming, local, vertex.geometric)
+    return ggx.evaluate_bsdf(
+        vertex.lobes, vertex.incoming, local, vertex.geometric, vertex.unmapped
+    )
 
 
 def _reverse_pdf_term(vertex: Vertex, local: Any, depth: Any) -> Any:
     """Return C+ r of a light path that comes from `local`; r is 1 at x1, where it ends."""
     drawn = ggx.reverse_pdf(vertex.lobes, vertex.incoming, local, vertex.geometric)
+    if vertex.turned is not None:  # a light path is not turned to its next viewer
+        drawn = dr.select(vertex.turned, 0, drawn)
     return dr.abs(dr.dot(vertex.geometric, local)) * dr.select(depth > 1, drawn, 1)
 
 

@@ -4,6 +4,7 @@ A row is 29 floats padded to 32, so that a lane loads it as aligned groups of fo
 component by component). Nothing about a scene is a literal in the kernel: one kernel serves all.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ from pipeline.renders.device_memory import own_floats, own_integers
 from pipeline.renders.ggx import KernelLobes
 from storage.optics.bsdf import MIN_ALPHA, bsdf_lobes
 from storage.optics.multiscatter import ROUGHNESS_STEPS, mean_albedo, scattered_again
+from storage.records.normal_map import LEAST_TANGENT_SQ, LEAST_Z, u_directions
 from storage.records.scene import Scene
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
@@ -91,6 +93,11 @@ class SurfaceTable:
         length_sq = dr.maximum(dr.squared_norm(normal), _TINY)
         return normal * dr.rsqrt(length_sq), lobes
 
+    def mapped_normal(self, normal: Any, triangle: Any, barycentric: Any, active: Any) -> Any:
+        """Return the normal (Vector3f) of `shading` by its map; None where the scene has no map."""
+        del normal, triangle, barycentric, active
+        return None
+
     def _group(self, triangle: Any, group: int, active: Any) -> Any:
         return dr.gather(mi.Vector4f, self._rows, triangle * _GROUPS + group, active)
 
@@ -131,12 +138,48 @@ class KernelTextures:
         self._colours = _texels(colours, _COLOUR)
         self._numbers = _texels(numbers, _NUMBER)
         places = _places(colours) | _places(numbers)
-        rows = np.zeros((len(scene.materials), len(TEXTURED), 4), np.int64)
-        textured = scene.material_textures != CONSTANT
-        rows[textured] = [
-            places[scene.textures[row].sha256] for row in scene.material_textures[textured]
-        ]
-        self._rows = own_integers(rows)
+        self._rows = _lookups(scene, scene.material_textures, places)
+        self._u_directions: Any = None
+        if scene.normal_textures is None:
+            return
+        self._maps = _lookups(scene, scene.normal_textures, places)
+        positions = scene.vertex_positions[scene.faces[order]]
+        self._u_directions = own_floats(np.pad(u_directions(positions, corners), ((0, 0), (0, 1))))
+
+    def mapped_normal(self, normal: Any, triangle: Any, barycentric: Any, active: Any) -> Any:
+        """Return the unit normal (Vector3f) of storage.records.normal_map; None without any map.
+
+        Args:
+            normal: Vector3f, unit, unmapped.
+            triangle: UInt32.
+            barycentric: Point2f, the weights of the 2nd and 3rd corner.
+            active: Bool.
+        """
+        if self._u_directions is None:
+            return None
+        u, v, material = self._place(triangle, barycentric, active)
+        texture = dr.gather(mi.Vector4u, self._maps, material, active)
+        row: Any = dr.gather(mi.Vector4f, self._u_directions, triangle, active)
+        along = mi.Vector3f(row.xyz)
+        tangent = along - normal * dr.dot(along, normal)
+        length_sq = dr.squared_norm(tangent)
+        is_mapped = active & (texture.w > 0) & (length_sq > LEAST_TANGENT_SQ)
+        tangent *= dr.rsqrt(dr.maximum(length_sq, LEAST_TANGENT_SQ))
+        texel = 2 * self._bilinear(mi.Color3f, texture, u, v, is_mapped) - 1
+        bitangent = dr.cross(normal, tangent)
+        z = dr.maximum(texel.z, LEAST_Z)
+        mapped = dr.normalize(tangent * texel.x + bitangent * texel.y + normal * z)
+        return dr.select(is_mapped, mapped, normal)
+
+    def _place(self, triangle: Any, barycentric: Any, active: Any) -> tuple[Any, Any, Any]:
+        """Return u and v in [0, 1] (Float), and the material (UInt32), of a place."""
+        near = dr.gather(mi.Vector4f, self._corners, triangle * 2, active)
+        far = dr.gather(mi.Vector4f, self._corners, triangle * 2 + 1, active)
+        weight = 1 - barycentric.x - barycentric.y
+        u = weight * near.x + barycentric.x * near.z + barycentric.y * far.x
+        v = weight * near.y + barycentric.x * near.w + barycentric.y * far.y
+        material = dr.gather(mi.UInt32, self._material, triangle, active)
+        return u - dr.floor(u), v - dr.floor(v), material
 
     def values(
         self, triangle: Any, barycentric: Any, columns: tuple[Any, Any, Any], active: Any
@@ -149,19 +192,14 @@ class KernelTextures:
             columns: what they are where no texture stands for them.
             active: Bool.
         """
-        near = dr.gather(mi.Vector4f, self._corners, triangle * 2, active)
-        far = dr.gather(mi.Vector4f, self._corners, triangle * 2 + 1, active)
-        weight = 1 - barycentric.x - barycentric.y
-        u = weight * near.x + barycentric.x * near.z + barycentric.y * far.x
-        v = weight * near.y + barycentric.x * near.w + barycentric.y * far.y
-        material = dr.gather(mi.UInt32, self._material, triangle, active)
+        u, v, material = self._place(triangle, barycentric, active)
         kinds = (mi.Color3f, mi.Color3f, mi.Float)
         values = []
         for place, (kind, constant) in enumerate(zip(kinds, columns, strict=True)):
             row = material * len(TEXTURED) + place
             texture = dr.gather(mi.Vector4u, self._rows, row, active)
             textured = active & (texture.w > 0)
-            value = self._bilinear(kind, texture, u - dr.floor(u), v - dr.floor(v), textured)
+            value = self._bilinear(kind, texture, u, v, textured)
             values.append(dr.select(textured, value, constant))
         return values[0], values[1], values[2]
 
@@ -196,7 +234,10 @@ def _neighbours(place: Any, count: Any) -> tuple[Any, Any, Any]:
     return first, second, scaled - below
 
 
-def _places(textures: list[Texture]) -> dict[str, tuple[int, int, int, int]]:
+Place = tuple[int, int, int, int]
+
+
+def _places(textures: list[Texture]) -> dict[str, Place]:
     """Return where each texture begins, in texels, its width and height, and 1: it is there."""
     places = {}
     first = 0
@@ -205,6 +246,12 @@ def _places(textures: list[Texture]) -> dict[str, tuple[int, int, int, int]]:
         places[texture.sha256] = (first, width, height, 1)
         first += height * width
     return places
+
+
+def _lookups(scene: Scene, index: NDArray[np.int32], places: Mapping[str, Place]) -> Any:
+    """Return the places of textures by their rows; zeros for CONSTANT."""
+    shas = [None if row == CONSTANT else scene.textures[row].sha256 for row in index.ravel()]
+    return own_integers(np.array([(0,) * 4 if sha is None else places[sha] for sha in shas]))
 
 
 def _texels(textures: list[Texture], floats: int) -> Any:
@@ -251,6 +298,9 @@ class TexturedTable(SurfaceTable):
             weight=dr.select(reflects, mirrored / (most + mirrored), 0),
             multiscatter=self._scattered_again(specular, alpha, active),
         )
+
+    def mapped_normal(self, normal: Any, triangle: Any, barycentric: Any, active: Any) -> Any:
+        return self._textures.mapped_normal(normal, triangle, barycentric, active)
 
     def _scattered_again(self, specular: Any, alpha: Any, active: Any) -> Any:
         """Return Fms (Color3f) of storage.optics.multiscatter."""

@@ -292,6 +292,8 @@ def _features(objects: Any, resolution: int, spp: int) -> dict[str, Any]:
     hit = _first_hit(scene, film, resolution, spp)
     active = hit.is_valid()
     normal, lobes = scene.table.shading(hit.prim_index, hit.prim_uv, active)
+    mapped = scene.table.mapped_normal(normal, hit.prim_index, hit.prim_uv, active)
+    normal = normal if mapped is None else mapped
     named = {"albedo": lobes.diffuse + lobes.specular, "normal": normal}
     if parts.num_lobes == 2:
         named |= {"diffuse": lobes.diffuse, "specular": lobes.specular}

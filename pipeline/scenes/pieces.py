@@ -26,6 +26,8 @@ class Skin:
     """[3T, 2] texture coordinates of each corner of each triangle."""
     textures: tuple[Texture, Texture, Texture]
     """Textures of the diffuse, specular and roughness columns."""
+    normal: Texture | None = None
+    """Normal map; by default none."""
     uid: str = ""
     """uid of a user's texture, as objects.lock.jsonl names it; empty for others."""
     emission: NDArray[np.float32] | None = None
@@ -169,6 +171,7 @@ def _skins(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
         return {}
     textures = dict[str, Texture]()
     rows = []
+    normals = []
     corners = []
     for piece in pieces:
         index = np.full((len(piece.materials), len(TEXTURED)), CONSTANT, np.int32)
@@ -178,12 +181,19 @@ def _skins(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
                 textures.setdefault(texture.sha256, texture)
             index[:] = [list(textures).index(each.sha256) for each in piece.skin.textures]
             uv = piece.skin.uv
+        normal = np.full(len(index), CONSTANT, np.int32)
+        if piece.skin is not None and piece.skin.normal is not None:
+            textures.setdefault(piece.skin.normal.sha256, piece.skin.normal)
+            normal[:] = list(textures).index(piece.skin.normal.sha256)
         rows.append(index)
+        normals.append(normal)
         corners.append(uv)
+    of_normals = np.concatenate(normals)
     return {
         "uv": np.concatenate(corners),
         "textures": tuple(textures.values()),
         "material_textures": np.concatenate(rows),
+        "normal_textures": of_normals if (of_normals != CONSTANT).any() else None,
     }
 
 

@@ -21,7 +21,7 @@ from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, default_rows
 from storage.records.objects import LockedObject
 from storage.records.scene import SceneObject
 from storage.records.skin import LevelSkin
-from storage.records.texture import TEXTURED, MapSource
+from storage.records.texture import NORMAL, TEXTURED, MapSource
 from storage.seeds import SceneKey
 
 
@@ -62,10 +62,10 @@ def _skin(skin: LevelSkin, locked: LockedObject) -> Skin:
         Rejected: law_broken if the textures are invalid: an old version may have prepared them.
     """
     try:
-        textures = skin.textures
+        textures = [*skin.textures, *(() if skin.normal is None else (skin.normal,))]
     except TrilightError as error:
         raise Rejected("law_broken", f"object {locked.uid}: {error}") from error
-    first, second, third = (
+    first, second, third, *normal = (
         dataclasses.replace(
             texture,
             source=MapSource(
@@ -75,9 +75,14 @@ def _skin(skin: LevelSkin, locked: LockedObject) -> Skin:
                 source_url=locked.source_url,
             ),
         )
-        for texture, column in zip(textures, TEXTURED, strict=True)
+        for texture, column in zip(textures, (*TEXTURED, NORMAL), strict=False)
     )
-    return Skin(uv=skin.uv.reshape(-1, 2), textures=(first, second, third), emission=skin.emission)
+    return Skin(
+        uv=skin.uv.reshape(-1, 2),
+        textures=(first, second, third),
+        normal=normal[0] if normal else None,
+        emission=skin.emission,
+    )
 
 
 def with_source_emission(

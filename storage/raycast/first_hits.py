@@ -15,7 +15,8 @@ from storage.conventions import camera_rays
 from storage.errors import TrilightError
 from storage.raycast.caster import MISS
 from storage.raycast.embree import Surfaces
-from storage.records.lookup import textured_rows
+from storage.records.lookup import normal_texels, textured_rows
+from storage.records.normal_map import mapped_normals, u_directions
 from storage.records.scene import Scene
 
 
@@ -68,6 +69,11 @@ class SeenFrom:
         a, b, c = np.moveaxis(self.corners, 1, 0)
         with np.errstate(invalid="ignore"):
             return _unit(np.cross(b - a, c - a))
+
+    @cached_property
+    def u_directions(self) -> NDArray[np.float64]:
+        """[T + 1, 3] unit directions in which u grows; 0 for triangles without any."""
+        return u_directions(self.corners, self.corner_uv)
 
     @cached_property
     def objects(self) -> NDArray[np.int64]:
@@ -147,13 +153,21 @@ class FirstHits:
 
     @cached_property
     def shading_normal(self) -> NDArray[np.float64]:
-        """[..., 3] unit, in world space, interpolated between the corners.
+        """[..., 3] unit, in world space, interpolated between the corners, bent by a normal map.
 
         It is not turned to the camera. NaN where nothing is met, or where the corners' normals
         cancel out.
         """
         with np.errstate(invalid="ignore"):
-            return _unit(self.interpolate(self.seen.corner_normals))
+            normals = _unit(self.interpolate(self.seen.corner_normals))
+        scene = self.seen.scene
+        if scene.normal_textures is not None:
+            is_met = self.met
+            triangle = self.triangle[is_met]
+            texels = normal_texels(scene, scene.material_index[triangle], self.uv[is_met])
+            u_direction = self.seen.u_directions[triangle]
+            normals[is_met] = mapped_normals(normals[is_met], u_direction, texels)
+        return normals
 
     @cached_property
     def uv(self) -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from storage.conventions import latlong_uv
 from storage.records.environment import Environment
 from storage.records.material import laid_out
+from storage.records.normal_map import FLAT
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
 if TYPE_CHECKING:
@@ -66,6 +67,22 @@ def textured_rows(
             chosen = textures_N == texture
             rows[chosen, places[name]] = texture_values(scene.textures[texture], uv[chosen])
     return rows
+
+
+def normal_texels(
+    scene: "Scene", material_index: NDArray[np.integer], uv: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the values [N, 3] of normal maps at places on surfaces; arguments as `textured_rows`.
+
+    Where a material has none, it is a flat one.
+    """
+    texels = np.tile(FLAT, (len(uv), 1))
+    if scene.normal_textures is not None:
+        rows = scene.normal_textures[material_index]
+        for row in np.unique(rows[rows != CONSTANT]):
+            chosen = rows == row
+            texels[chosen] = texture_values(scene.textures[row], uv[chosen])
+    return texels
 
 
 def _bilinear(

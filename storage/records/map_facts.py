@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from storage.records.environment import Environment
 from storage.records.scene import Scene
 from storage.records.sky_texels import row_solid_angles
-from storage.records.texture import CONSTANT, TEXTURED
+from storage.records.texture import CONSTANT, NORMAL, TEXTURED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +48,8 @@ def texture_families(scene: Scene) -> set[str]:
     names = set()
     for texture in scene.textures:
         name, _, column = texture.source.name.rpartition(" ")
-        names.add(name if name and column in TEXTURED else texture.source.name)
+        is_column = name and column in (*TEXTURED, NORMAL)
+        names.add(name if is_column else texture.source.name)
     return names
 
 
@@ -57,4 +58,6 @@ def textured_objects(scene: Scene) -> set[int]:
     if scene.material_textures is None:
         return set()
     textured: NDArray[np.bool_] = np.any(scene.material_textures != CONSTANT, axis=1)
+    if scene.normal_textures is not None:
+        textured |= scene.normal_textures != CONSTANT
     return set(np.unique(scene.object_index[textured[scene.material_index]]).tolist())

@@ -1,16 +1,26 @@
 """Scenes with other textures: without constant ones, without any, or of other triangles."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from storage.records.material import laid_out
+from storage.records.normal_map import FLAT
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
 if TYPE_CHECKING:
     from storage.records.scene import Scene
+
+NO_TEXTURES: Mapping[str, Any] = {
+    "uv": None,
+    "textures": (),
+    "material_textures": None,
+    "normal_textures": None,
+}
+"""Fields of a scene without textures."""
 
 NEW = -1
 """In `chosen_maps`: a triangle or a material that the scene does not have."""
@@ -34,15 +44,18 @@ def without_constant_textures(scene: AnyScene) -> AnyScene:
     materials = scene.materials.copy()
     index = scene.material_textures.copy()
     places = {column.name: part for column, part in laid_out()}
+    normals = scene.normal_textures
+    if normals is not None:
+        flat = [row for row, value in constants.items() if np.array_equal(value, FLAT)]
+        normals = np.where(np.isin(normals, flat), np.int32(CONSTANT), normals)
     for place, name in enumerate(TEXTURED):
         for row, value in constants.items():
             chosen = np.flatnonzero(index[:, place] == row)
             if len(chosen):  # else it is one of another width
                 materials[chosen, places[name]] = value
                 index[chosen, place] = CONSTANT
-    uv, textures, rows = _drop_unused(scene.uv, scene.textures, index)
     return dataclasses.replace(
-        scene, materials=materials, uv=uv, textures=textures, material_textures=rows
+        scene, materials=materials, **_used_maps(scene.uv, scene.textures, index, normals)
     )
 
 
@@ -51,6 +64,7 @@ def with_textures(
     uv: NDArray[np.float32],
     textures: tuple[Texture, ...],
     material_textures: NDArray[np.int32],
+    normal_textures: NDArray[np.int32] | None = None,
 ) -> AnyScene:
     """Return the same scene with textures, whose columns hold their means.
 
@@ -59,6 +73,7 @@ def with_textures(
         uv: [3T, 2] of each corner of each triangle.
         textures: each used, and each content once.
         material_textures: [M, 3] rows of `textures`, or CONSTANT, in the order of TEXTURED.
+        normal_textures: [M] rows of `textures` that are normal maps, or CONSTANT; none by default.
     """
     return dataclasses.replace(
         scene,
@@ -66,6 +81,7 @@ def with_textures(
         uv=uv,
         textures=textures,
         material_textures=material_textures,
+        normal_textures=normal_textures,
     )
 
 
@@ -83,26 +99,42 @@ def chosen_maps(
         return {}
     corners = np.append(scene.uv.reshape(-1, 3, 2), np.zeros((1, 3, 2), np.float32), axis=0)
     plain = np.full((1, len(TEXTURED)), CONSTANT, np.int32)
-    index = np.append(scene.material_textures, plain, axis=0)
-    uv, textures, index_of = _drop_unused(
-        corners[triangles].reshape(-1, 2), scene.textures, index[materials]
+    index = np.append(scene.material_textures, plain, axis=0)[materials]
+    normals = scene.normal_textures
+    if normals is not None:
+        normals = np.append(normals, np.int32(CONSTANT))[materials]
+    return _used_maps(corners[triangles].reshape(-1, 2), scene.textures, index, normals)
+
+
+def without_normal_maps(scene: AnyScene) -> AnyScene:
+    """Return the same scene without normal maps, and without textures that were nothing else."""
+    if scene.normal_textures is None or scene.material_textures is None:
+        return scene
+    return dataclasses.replace(
+        scene, **_used_maps(scene.uv, scene.textures, scene.material_textures, None)
     )
-    return {"uv": uv, "textures": textures, "material_textures": index_of}
 
 
-Textured = tuple[NDArray[np.float32] | None, tuple[Texture, ...], NDArray[np.int32] | None]
-
-
-def _drop_unused(
-    uv: NDArray[np.float32] | None, textures: tuple[Texture, ...], index: NDArray[np.int32]
-) -> Textured:
-    """Return coordinates, textures and their rows without textures that no material uses."""
-    used_rows = np.setdiff1d(index, CONSTANT)
+def _used_maps(
+    uv: NDArray[np.float32] | None,
+    textures: tuple[Texture, ...],
+    index: NDArray[np.int32],
+    normals: NDArray[np.int32] | None,
+) -> dict[str, Any]:
+    """Return the fields of coordinates, textures and their rows without textures that none uses."""
+    if normals is not None and (normals == CONSTANT).all():
+        normals = None
+    used_rows = np.setdiff1d(index if normals is None else np.append(index, normals), CONSTANT)
     if not len(used_rows):
-        return None, (), None
+        return dict(NO_TEXTURES)
     renumbered = np.full(len(textures) + 1, CONSTANT, np.int32)  # the last one is that of CONSTANT
     renumbered[used_rows] = np.arange(len(used_rows))
-    return uv, tuple(textures[row] for row in used_rows), renumbered[index]
+    return {
+        "uv": uv,
+        "textures": tuple(textures[row] for row in used_rows),
+        "material_textures": renumbered[index],
+        "normal_textures": None if normals is None else renumbered[normals],
+    }
 
 
 def _with_means(
@@ -128,6 +160,4 @@ def without_maps(scene: AnyScene, *, textures: bool = True, environment: bool = 
     if not textures or scene.material_textures is None:
         return scene
     materials = _with_means(scene.materials, scene.textures, scene.material_textures)
-    return dataclasses.replace(
-        scene, materials=materials, uv=None, material_textures=None, textures=()
-    )
+    return dataclasses.replace(scene, materials=materials, **NO_TEXTURES)

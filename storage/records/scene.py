@@ -113,6 +113,9 @@ class Scene:
     )
     """[M, 3] rows of `textures` that stand for diffuse, specular and roughness of each material, or
     -1 where its own column does; None where nothing is textured."""
+    normal_textures: Annotated[NDArray[np.int32], Within(CONSTANT, MAX_TEXTURES - 1)] | None = None
+    """[M] rows of `textures` that are the normal map of each material (storage.records.normal_map),
+    or -1 for none; None where no material has one."""
     environment: Environment | None = None
     """Light from far away; None where there is none."""
 
@@ -153,7 +156,7 @@ class Scene:
         meshes and whether light reaches what they see (pipeline.scenes does that).
         """
         _check_arrays(self)
-        if has_maps(self) or self.uv is not None or self.material_textures is not None:
+        if has_maps(self):
             check_maps(self)
         _check_geometry(self)
         _check_materials(self)

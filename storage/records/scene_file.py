@@ -48,7 +48,9 @@ MAX_FILE_BYTES = (256 << 20) + MAX_MAPS_BYTES
 MAX_HEADER_BYTES = 8 << 20
 """An object takes 150 bytes and its attribution; there are at most 65,536."""
 
-CARRIED = frozenset({*ARRAY_FIELDS, "objects", "provenance", "textures", "environment"})
+CARRIED = frozenset(
+    {*ARRAY_FIELDS, "objects", "provenance", "textures", "normal_textures", "environment"}
+)
 """What the form holds of a scene (pipeline.exchange.formats): all of it, added columns too."""
 
 _METADATA = "trilight_scene"

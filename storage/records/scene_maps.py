@@ -3,7 +3,7 @@
 A scene that has no textures has no texture coordinates and no `material_textures` either: the three
 come together. A texture stands in the place of one of the columns TEXTURED; what the material row
 itself says there counts for nothing, and is by convention the texture's mean, for readers that know
-no textures.
+no textures. Or it is a normal map, which stands in the place of no column.
 """
 
 from collections.abc import Iterator, Mapping
@@ -33,6 +33,7 @@ SUM_TOLERANCE = 1e-5
 MAP_ARRAYS: Mapping[str, tuple[type, tuple[int | None, ...]]] = {
     "uv": (np.float32, (None, 2)),
     "material_textures": (np.int32, (None, len(TEXTURED))),
+    "normal_textures": (np.int32, (None,)),
 }
 """dtype and shape of the array fields that only textured scenes have."""
 
@@ -42,7 +43,8 @@ _BLOCK = 256  # rows of a texture that are compared at a time
 
 def has_maps(scene: "Scene") -> bool:
     """Return whether a scene has anything of schema 4."""
-    return bool(scene.textures) or scene.environment is not None
+    has_arrays = any(getattr(scene, name) is not None for name in MAP_ARRAYS)
+    return bool(scene.textures) or scene.environment is not None or has_arrays
 
 
 def check_maps(scene: "Scene") -> None:
@@ -58,9 +60,13 @@ def check_maps(scene: "Scene") -> None:
     if any(together) and not all(together):
         missing = ("uv", "material_textures", "textures")[together.index(False)]
         broken_law(f"{missing} is missing", "uv, material_textures and textures, or none of them")
+    if scene.normal_textures is not None and not scene.textures:
+        broken_law("normal_textures is there without textures", "both, or no normal_textures")
     if scene.textures:
         _require_shape(scene, "uv", 3 * scene.num_triangles)
         _require_shape(scene, "material_textures", len(scene.materials))
+        if scene.normal_textures is not None:
+            _require_shape(scene, "normal_textures", len(scene.materials))
         _check_textures(scene)
         for row, diffuse, specular in _albedos(scene):
             _check_sum(row, diffuse, specular)
@@ -76,24 +82,30 @@ def _check_textures(scene: "Scene") -> None:
         seen.add(texture.sha256)
     index = scene.material_textures
     assert index is not None
-    lawful = (index >= CONSTANT) & (index < count)
-    require_law(lawful, "material_textures", index, f"rows below {count}, or {CONSTANT} for none")
-    unused = np.setdiff1d(np.arange(count), index)
+    normals = np.zeros(0, np.int32) if scene.normal_textures is None else scene.normal_textures
+    for name, rows in (("material_textures", index), ("normal_textures", normals)):
+        lawful = (rows >= CONSTANT) & (rows < count)
+        require_law(lawful, name, rows, f"rows below {count}, or {CONSTANT} for none")
+    unused = np.setdiff1d(np.arange(count), np.append(index, normals))
     if len(unused):
         broken_law(f"textures[{unused[0]}] is used by no material", "textures that are used")
     for place, (name, width) in enumerate(_widths().items()):
         for row in np.unique(index[:, place][index[:, place] != CONSTANT]):
             if (got := scene.textures[row].channels) != width:
                 broken_law(f"textures[{row}] has {got} channels", f"{width}, as {name} has")
+    for row in np.unique(normals[normals != CONSTANT]):
+        texture = scene.textures[row]
+        if texture.channels != 3 or texture.is_srgb:
+            got = f"{texture.channels} channels{', sRGB-encoded' if texture.is_srgb else ''}"
+            broken_law(f"textures[{row}] has {got}", "3 linear channels, as a normal map has")
 
 
 def _require_shape(scene: "Scene", name: str, length: int) -> None:
     array: NDArray = getattr(scene, name)
-    dtype, (_, width) = MAP_ARRAYS[name]
-    if array.dtype != dtype or array.shape != (length, width):
-        broken_law(
-            f"{name} is {array.dtype} of shape {array.shape}", f"{np.dtype(dtype)} {length, width}"
-        )
+    dtype, (_, *widths) = MAP_ARRAYS[name]
+    shape = (length, *widths)
+    if array.dtype != dtype or array.shape != shape:
+        broken_law(f"{name} is {array.dtype} of shape {array.shape}", f"{np.dtype(dtype)} {shape}")
 
 
 Reflecting = Texture | NDArray[np.float32]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.records.packed_maps import unpack_texture
-from storage.records.texture import TEXTURED, Texture
+from storage.records.texture import NORMAL, TEXTURED, Texture
 
 SkinTextures = tuple[Texture, Texture, Texture]
 """Diffuse, specular and roughness; one texel in float32 where one is the same everywhere."""
@@ -64,6 +64,8 @@ class LevelSkin:
     """[F, 3, 2] texture coordinates of each corner of each face, within [0, 1], v up."""
     packed: tuple[bytes, bytes, bytes]
     """Encoded bytes of the three textures."""
+    packed_normal: bytes | None = None
+    """Encoded bytes of the normal map; None where the source has none, or it was not requested."""
     quality: SkinQuality
     """Errors measured against the source."""
     emission: NDArray[np.float32] | None = None
@@ -76,11 +78,16 @@ class LevelSkin:
         first, second, third = map(unpack_texture, self.packed, TEXTURED)
         return first, second, third
 
+    @cached_property
+    def normal(self) -> Texture | None:
+        """The normal map, unpacked."""
+        return None if self.packed_normal is None else unpack_texture(self.packed_normal, NORMAL)
+
     @property
     def num_bytes(self) -> int:
         """Bytes as they are stored."""
         glow = 0 if self.emission is None else self.emission.nbytes
-        return self.uv.nbytes + sum(map(len, self.packed)) + glow
+        return self.uv.nbytes + sum(map(len, (*self.packed, self.packed_normal or b""))) + glow
 
 
 def skin_arrays(skin: LevelSkin, name: str) -> dict[str, NDArray]:
@@ -89,6 +96,8 @@ def skin_arrays(skin: LevelSkin, name: str) -> dict[str, NDArray]:
         f"{column}_{name}": np.frombuffer(data, np.uint8)
         for column, data in zip(TEXTURED, skin.packed, strict=True)
     }
+    if skin.packed_normal is not None:
+        maps[f"{NORMAL}_{name}"] = np.frombuffer(skin.packed_normal, np.uint8)
     if skin.emission is not None:
         maps[f"emission_{name}"] = np.ascontiguousarray(skin.emission)
     return {f"uv_{name}": np.ascontiguousarray(skin.uv), **maps}
@@ -97,9 +106,11 @@ def skin_arrays(skin: LevelSkin, name: str) -> dict[str, NDArray]:
 def read_skin(arrays: Mapping[str, NDArray], quality: SkinQuality, name: str) -> LevelSkin:
     """Return the skin of `skin_arrays`; raises KeyError where there is none."""
     first, second, third = (arrays[f"{column}_{name}"].tobytes() for column in TEXTURED)
+    normal = arrays.get(f"{NORMAL}_{name}")
     return LevelSkin(
         uv=arrays[f"uv_{name}"],
         packed=(first, second, third),
+        packed_normal=None if normal is None else normal.tobytes(),
         quality=quality,
         emission=arrays.get(f"emission_{name}"),
     )

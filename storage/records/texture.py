@@ -18,6 +18,9 @@ from storage.records.scene_laws import broken_law, require_law
 TEXTURED = ("diffuse", "specular", "roughness")
 """Names of the columns that a texture can stand for, in the order of `Scene.material_textures`."""
 
+NORMAL = "normal"
+"""Name of a normal map among the textures of a material; no column has it."""
+
 CONSTANT = -1
 """In `Scene.material_textures`: the column is what the material row says."""
 

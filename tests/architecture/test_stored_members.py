@@ -25,7 +25,7 @@ from storage.records.sample import PartFloor, Sample, decode_sample, decode_scen
 from storage.records.scene_facts import scene_values
 from storage.records.texture import MapSource
 from tests.scenes_by_hand import tiny_sample
-from tests.textured_by_hand import sky, textured_scene
+from tests.textured_by_hand import bumpy_scene, sky
 from train.data.scenes import TrainingScene, training_scene
 
 Members = dict[str, bytes]
@@ -55,7 +55,7 @@ def _sample() -> Sample:
 
 def _textured() -> Sample:
     """Return a textured sample below a sky, of which every name and right is filled in."""
-    scene = textured_scene()
+    scene = bumpy_scene()
     rights = MapSource(name="n", licence="CC-BY-4.0", attribution="a", source_url="https://x.org")
     textures = tuple(dataclasses.replace(texture, source=rights) for texture in scene.textures)
     scene = dataclasses.replace(scene, textures=textures, environment=sky(source=rights))
@@ -148,8 +148,8 @@ def _change_array(name: str) -> Change:
         # the middle, since the last row of a camera's pose is constant; by little, so that an
         # index still points somewhere
         place = tuple(size // 2 for size in changed.shape)
-        if name == "material_textures":  # of the floor: lamps are hidden, and their look with them
-            place = (0, 0)
+        if name.endswith("_textures"):  # of the floor: lamps are hidden, and their look with them
+            place = (0,) * changed.ndim
         changed[place] = changed[place] - 1 if changed[place] else 1
         members[ARRAYS] = save({**arrays, name: changed})
 
@@ -229,11 +229,11 @@ def test_a_consumer_reads_every_member_of_a_textured_sample() -> None:
 
 
 def test_every_member_of_a_textured_sample_is_changed_above() -> None:
-    parts = {"maps_sha256", "uv", "material_textures"}
+    parts = {"maps_sha256", "uv", "material_textures", "normal_textures"}
     assert {stored.partition(" ")[2] for stored in CHANGES_OF_MAPS if ARRAYS in stored} == parts
     maps = {name for name in CHANGES_OF_MAPS if MAP_NAME.fullmatch(name)}
     assert maps == {name for name in encode_sample(_textured()) if MAP_NAME.fullmatch(name)}
-    assert len(maps) == 3
+    assert len(maps) == 4
 
 
 def test_every_member_is_changed_above() -> None:

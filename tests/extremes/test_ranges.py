@@ -55,7 +55,7 @@ from storage.settings.ranges import Within
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
-from tests.textured_by_hand import textured_scene
+from tests.textured_by_hand import bumpy_scene
 from train.evaluation.options import EvaluationOptions, LeaderboardOptions
 from train.monitoring.settings import WatchSettings
 from train.runs import named_run
@@ -323,7 +323,7 @@ ARRAYS = [(name, field) for name, field in DESCRIBED.items() if field.within is 
 PLACES: dict[str, Any] = {
     "vertex_positions": (1, 2), "vertex_normals": (0, 0), "faces": (1, 2), "material_index": 1,
     "object_index": 1, "c2w": (1, 0, 3), "fov_deg": 1,
-    "uv": (1, 0), "material_textures": (FLOOR, 1),
+    "uv": (1, 0), "material_textures": (FLOOR, 1), "normal_textures": FLOOR,
     "diffuse": (FLOOR, 1), "specular": (FLOOR, 4), "roughness": (FLOOR, 6), "emission": (LIGHT, 8),
 }  # fmt: skip
 """One number of each array, and of each part of the materials."""
@@ -335,7 +335,7 @@ def _is_float(field: FieldDescription) -> bool:
 
 def _with(place: str, field: FieldDescription, number: Any) -> Scene:
     """Return a dark floor under a light, with one number of an array replaced."""
-    scene = textured_scene() if field.name in MAP_ARRAYS else tiny_scene()
+    scene = bumpy_scene() if field.name in MAP_ARRAYS else tiny_scene()
     scene.materials[FLOOR] = 0
     if field.name == "vertex_normals":
         scene.vertex_normals[0] = 0
@@ -365,7 +365,7 @@ def test_an_array_of_a_scene_may_reach_the_end(
     # What rows there are is a law between arrays; the range is that of the type.
     array = getattr(scene, field.name)
     ends = (0, np.iinfo(array.dtype).max)
-    if field.name == "material_textures":  # -1 stands for no texture
+    if field.name in ("material_textures", "normal_textures"):  # -1 stands for no texture
         ends = (CONSTANT, MAX_TEXTURES - 1)
     assert number == dict(zip(("low", "high"), ends, strict=True))[end]
     assert field.within is not None and field.within.holds(array).all()

@@ -23,6 +23,7 @@ from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from tests.oracle.plugin_textures import (
     PLUGIN,
+    normal_mapped,
     plugin_sky,
     register_plugin,
     textured_albedo,
@@ -70,7 +71,7 @@ def scaled_albedos(lobes: Lobes) -> tuple[NDArray[np.float64], NDArray[np.float6
 def _material(scene: Scene, row: int) -> Any:
     """Return the BSDF of a mesh: of one material row in textured scenes, read from faces else."""
     if scene.textures:
-        return _two_sided(_blend(textured_slots(scene, row, _SMITH)))
+        return _two_sided(normal_mapped(scene, row, _blend(textured_slots(scene, row, _SMITH))))
     return _two_sided(_blend({name: _face(name) for name in _SLOTS}))
 
 

@@ -63,6 +63,19 @@ def textured_albedo(scene: Scene, row: int) -> dict[str, Any]:
     return {"type": "blendbsdf", "weight": 0.5, "first": first, "second": second}
 
 
+def normal_mapped(scene: Scene, row: int, material: dict[str, Any]) -> dict[str, Any]:
+    """Return a material below Mitsuba's `normalmap`, where its row has a normal map.
+
+    Without its shadowing function, which darkens what no surface shadows; Trilight has none.
+    """
+    if scene.normal_textures is None or scene.normal_textures[row] == CONSTANT:
+        return material
+    texture = scene.textures[scene.normal_textures[row]]
+    bitmap = _bitmap(texture.linear(texture.texels).astype(np.float64))
+    below = {"normalmap": bitmap, "bsdf": material, "use_shadowing_function": False}
+    return {"type": "normalmap", **below}
+
+
 def _texels(scene: Scene, row: int, name: str) -> NDArray[np.float64]:
     """Return the linear values [H, W, C] of a column, of one texel where it is a constant."""
     assert scene.material_textures is not None

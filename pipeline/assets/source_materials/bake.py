@@ -23,6 +23,8 @@ from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.picture import spread_points
 from storage.conventions import linear_from_srgb8, srgb8
 from storage.errors import Rejected
+from storage.records.normal_map import FLAT as FLAT_NORMAL
+from storage.records.normal_map import unit_or_zero
 from storage.records.texture import Texture
 
 _INSET = 0.02
@@ -42,7 +44,12 @@ _MOST = 1e30
 DIFFUSE = slice(0, 3)
 SPECULAR = slice(3, 6)
 ROUGHNESS = slice(6, 7)
-"""Slices of a texel's seven columns, in the order of `material.source_columns`."""
+"""Slices of a texel's first columns, in the order of `material.source_columns`."""
+NORMAL = slice(7, 10)
+"""Slice of the columns of the normal map, where there is one."""
+_LEAST_SLOPE = 1.5 / 255
+"""Components of a normal that 8 bits take for a flat one, whichever of two codes stands for 0."""
+_FLAT_CODE = np.round(255 * np.array(FLAT_NORMAL)).astype(np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,6 +60,8 @@ class BakedTextures:
     """[F, 3, 2] texture coordinates of the corners, v up."""
     textures: tuple[Texture, Texture, Texture]
     """Textures for diffuse albedo, specular albedo and roughness."""
+    normal: Texture | None
+    """Normal map; None where the source has none."""
     missed: float
     """Fraction of the texels without a source surface nearby."""
     density: float
@@ -64,8 +73,8 @@ class _Texels:
     """The texels of all tiles, one tile after another."""
 
     start: NDArray[np.int64]  # [F + 1] first texel of each
-    columns: NDArray[np.float64]  # [P, 7]
-    codes: NDArray[np.uint8]  # [P, 7] as they would be stored in 8 bits
+    columns: NDArray[np.float64]  # [P, 7], or 10 with a normal map
+    codes: NDArray[np.uint8]  # as they would be stored in 8 bits
     missed: float
 
 
@@ -93,9 +102,11 @@ def bake(
     uv = np.zeros((len(corners), 3, 2))
     for face, tile in enumerate(tile_of):
         uv[face, order[face]] = plan.uv(int(tile))
+    values = _atlas_values(plan, first_of, texels)
     return BakedTextures(
         uv=uv.astype(np.float32),
-        textures=_textures(plan, first_of, texels),
+        textures=_textures(values, texels),
+        normal=_normal_map(values, texels),
         missed=texels.missed,
         density=density,
     )
@@ -131,12 +142,19 @@ def _bake_texels(
         [weights_of[int(side)] @ corner for side, corner in zip(cells, corners, strict=True)]
     )
     normals = np.repeat(normal, counts, axis=0)
-    columns = np.zeros((len(points), 7))
+    edge = unit_or_zero(corners[:, 1] - corners[:, 0])  # u grows along it in tiles
+    along = np.repeat(edge, counts, axis=0)
+    columns = np.zeros((len(points), NORMAL.stop if source.has_normal_maps else NORMAL.start))
     missed = 0
     for first in range(0, len(points), _BLOCK):
         part = slice(first, first + _BLOCK)
         locations = nearest.find(points[part], normals[part], reach)
-        columns[part] = source.columns(locations.faces, locations.weights, 1 / density)
+        place = locations.faces, locations.weights, 1 / density
+        columns[part, : NORMAL.start] = source.columns(*place)
+        if source.has_normal_maps:
+            mapped = source.normals(*place, (normals[part], along[part]))
+            mapped[np.abs(mapped[:, :2]).max(axis=1) < _LEAST_SLOPE] = 0, 0, 1
+            columns[part, NORMAL] = (mapped + 1) / 2
         missed += int(locations.is_missed.sum())
     codes = np.concatenate(
         [
@@ -154,11 +172,17 @@ def _inset(weights: NDArray[np.float64], cells: np.integer) -> NDArray[np.float6
 
 
 def _is_flat(texels: _Texels) -> NDArray[np.bool_]:
-    """Return [F] True where all texels of a tile have the same 8-bit codes."""
+    """Return [F] True where all texels of a tile have the same 8-bit codes, and flat normals."""
     starts = texels.start[:-1]
     low = np.minimum.reduceat(texels.codes, starts, axis=0)
     high = np.maximum.reduceat(texels.codes, starts, axis=0)
-    return (low == high).all(axis=1)
+    return (low == high).all(axis=1) & _has_flat_normals(low)
+
+
+def _has_flat_normals(codes: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return [N] True for rows of codes whose normal is flat, or that have none."""
+    normals = codes[:, NORMAL]
+    return (normals == _FLAT_CODE[: normals.shape[1]]).all(axis=1)
 
 
 def _tiles(
@@ -177,12 +201,9 @@ def _tiles(
     return tile.ravel(), first
 
 
-def _textures(
-    plan: Atlas, first_of: NDArray[np.int64], texels: _Texels
-) -> tuple[Texture, Texture, Texture]:
-    """Return the maps in 8 bits; a constant map is one texel in float32."""
-    constants = [_constant(texels, part) for part in _PARTS]
-    values = np.zeros((plan.height, plan.width, 7))
+def _atlas_values(plan: Atlas, first_of: NDArray[np.int64], texels: _Texels) -> NDArray[np.float64]:
+    """Return the columns of the atlas, [H, W, 7 or 10]."""
+    values = np.zeros((plan.height, plan.width, texels.columns.shape[1]))
     # Texels without a tile get a color of the object, for means over the map.
     values[:] = texels.columns[0]
     for tile, face in enumerate(first_of):
@@ -194,7 +215,24 @@ def _textures(
             values[square] = texels.columns[mine].mean(axis=0)
         else:
             at = plan.texels(tile, tile_weights(cells)[0])
-            values[at[:, 1], at[:, 0]] = texels.columns[mine]
+            columns = texels.columns[mine].copy()
+            if plan.is_turned[tile]:  # and its frame with it
+                slopes = columns[:, NORMAL.start : NORMAL.start + 2]
+                slopes[:] = 1 - slopes
+            values[at[:, 1], at[:, 0]] = columns
+    return values
+
+
+def _normal_map(values: NDArray[np.float64], texels: _Texels) -> Texture | None:
+    """Return the normal map in 8 bits; None where it would be flat."""
+    if _has_flat_normals(texels.codes).all():
+        return None
+    return Texture(texels=np.round(values[..., NORMAL] * 255).astype(np.uint8))
+
+
+def _textures(values: NDArray[np.float64], texels: _Texels) -> tuple[Texture, Texture, Texture]:
+    """Return the maps in 8 bits; a constant map is one texel in float32."""
+    constants = [_constant(texels, part) for part in _PARTS]
     stored = [srgb8(values[..., DIFFUSE])]
     stored += [np.round(values[..., part] * 255).astype(np.uint8) for part in _PARTS[1:]]
     if constants[0] is None:

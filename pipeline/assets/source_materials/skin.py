@@ -106,7 +106,13 @@ class SkinBaker:
         glow = level_emission(mesh, self._surface, self._nearest, reach)
         _require_lawful(baked.textures, glow)
         first, second, third = map(pack_texture, baked.textures)
-        skin = LevelSkin(uv=baked.uv, packed=(first, second, third), quality=quality, emission=glow)
+        skin = LevelSkin(
+            uv=baked.uv,
+            packed=(first, second, third),
+            packed_normal=None if baked.normal is None else pack_texture(baked.normal),
+            quality=quality,
+            emission=glow,
+        )
         return dataclasses.replace(level, skin=skin)
 
     def _require_near(self, quality: SkinQuality, budget: int) -> None:
@@ -145,7 +151,7 @@ def open_skin_baker(
             texture_coordinates_not_finite.
     """
     decode = Decoder(settings.max_pixels)
-    parts = _parts(source, decode, emission=settings.emission)
+    parts = _parts(source, decode, emission=settings.emission, normals=settings.normal_maps)
     source.notes.extend(decode.notes)
     lost = {word for material in parts.materials for word in material.lost}
     lost -= {"emission"} if settings.emission else set()
@@ -153,11 +159,12 @@ def open_skin_baker(
     return SkinBaker(surface, settings), OwnMaterials(lost=tuple(sorted(lost)))
 
 
-def _parts(source: SourceFile, decode: Decode, *, emission: bool) -> TexturedMesh:
-    if source.usd is not None:
+def _parts(
+    source: SourceFile, decode: Decode, *, emission: bool, normals: bool = False
+) -> TexturedMesh:
+    if source.usd is not None:  # whose normal maps its limits have chosen
         return usd_textured_mesh(source.usd, decode, emission=emission)
     if source.gltf is not None:
-        return gltf_textured_mesh(
-            source.gltf, GltfMaterials(source.gltf, decode, emission=emission)
-        )
-    return read_textured_mesh(source, decode, emission=emission)
+        materials = GltfMaterials(source.gltf, decode, emission=emission, normals=normals)
+        return gltf_textured_mesh(source.gltf, materials)
+    return read_textured_mesh(source, decode, emission=emission, normals=normals)

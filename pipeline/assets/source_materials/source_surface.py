@@ -12,10 +12,14 @@ from pipeline.foreign.material import MaterialSamples, Slot, SourceMaterial, sou
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.textured_mesh import TexturedMesh
 from storage.errors import Rejected
+from storage.records.normal_map import LEAST_Z, u_directions, unit_or_zero
 
 _LEAST_FOUND = 0.999
 """Fraction of the cleaned faces that must match one of the file: all but those that rounding split.
 """
+
+_LEAST_LENGTH = 0.1
+"""Least length of a normal of a picture: a shorter one has no direction, and counts as flat."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,6 +66,74 @@ class SourceSurface:
             if material.emits and material.emission is not None:
                 result[chosen] *= self._sample_picture(material.emission, *in_file, cell)[:, :3]
         return result
+
+    @property
+    def has_normal_maps(self) -> bool:
+        """True where any material has a normal map."""
+        return any(material.normal is not None for material in self.parts.materials)
+
+    def normals(
+        self,
+        faces: NDArray[np.int64],
+        weights: NDArray[np.float64],
+        cell: float,
+        frame: tuple[NDArray[np.float64], NDArray[np.float64]],
+    ) -> NDArray[np.float64]:
+        """Return the normals [N, 3] of the maps at points on faces, in the frames of a level.
+
+        They are relative to the shading normal of the source, so that they hold whatever shading
+        normals a level gets.
+
+        Args:
+            faces: [N] clean faces.
+            weights: [N, 3] barycentric coordinates in them.
+            cell: width in the unit box over which pictures are averaged.
+            frame: unit normal and x axis of the level at each point, [N, 3] each.
+        """
+        result = np.tile([0.0, 0.0, 1.0], (len(faces), 1))
+        for material, chosen, in_file in self._by_material(faces, weights):
+            if material.normal is None:
+                continue
+            texels = self._sample_picture(material.normal, *in_file, cell)[:, :3]
+            stated = texels * np.array(material.normal_scale) + np.array(material.normal_bias)
+            stated[np.square(stated).sum(axis=1) < _LEAST_LENGTH**2] = 0, 0, 1
+            stated[:, 2] = np.maximum(stated[:, 2], LEAST_Z)
+            x, y, z = unit_or_zero(stated).T
+            tangent, bitangent, normal = self._frames(material.normal, *in_file)
+            outward = _unit_normals(self.mesh.positions[self.mesh.faces[faces[chosen]]])
+            # A face that was turned over shows the other side of the same bumps.
+            side = np.where((outward * normal).sum(axis=1) < 0, -1.0, 1.0)
+            slope = side[:, None] * (x[:, None] * tangent + y[:, None] * bitangent)
+            level_normal, level_x = (each[chosen] for each in frame)
+            slope = _rotate(slope, outward, level_normal)
+            level_y = np.cross(level_normal, level_x)
+            across = [(slope * axis).sum(axis=1) for axis in (level_x, level_y)]
+            result[chosen] = unit_or_zero(np.stack([*across, z], axis=1))
+        return result
+
+    def _frames(
+        self, slot: Slot, source_face: NDArray[np.int64], source_weights: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return unit tangent, bitangent and normal [N, 3] at points of the file.
+
+        Tangents are those that the file states, or else those of its texture coordinates. Without
+        either they are 0, and leave the normal as it is.
+        """
+        corners = self.parts.mesh.positions[self.parts.mesh.faces[source_face]]
+        normal = _unit_normals(corners)
+        uv = self.parts.uv[source_face, slot.uv_set] @ slot.uv_matrix.T + slot.uv_offset
+        steps = uv[:, 1:] - uv[:, :1]
+        area = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0]
+        tangent = u_directions(corners, uv)
+        hand = np.sign(area)
+        if self.parts.tangent is not None:
+            stated = np.einsum("nc,ncd->nd", source_weights, self.parts.tangent[source_face])
+            flat = stated[:, :3] - (stated[:, :3] * normal).sum(axis=1, keepdims=True) * normal
+            flat = unit_or_zero(flat)
+            is_stated = np.square(flat).sum(axis=1) > 0
+            tangent = np.where(is_stated[:, None], flat, tangent)
+            hand = np.where(is_stated, np.sign(stated[:, 3]), hand)
+        return tangent, hand[:, None] * np.cross(normal, tangent), normal
 
     def _by_material(
         self, faces: NDArray[np.int64], weights: NDArray[np.float64]
@@ -126,6 +198,20 @@ class SourceSurface:
         """Area [R] of each face of the file, in the unit box."""
         vectors = normalize(self.parts.mesh).double_area_vectors
         return 0.5 * np.linalg.norm(vectors, axis=1)
+
+
+def _unit_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the normals [N, 3] of triangles [N, 3, 3]; 0 of those without an area."""
+    return unit_or_zero(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+
+
+def _rotate(
+    vectors: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return vectors [N, 3] across `start`, by the smallest rotation from it to `end`."""
+    ahead = (vectors * end).sum(axis=1, keepdims=True)
+    halves = np.maximum(1 + (start * end).sum(axis=1, keepdims=True), 1e-6)
+    return vectors - ahead / halves * (start + end)
 
 
 def _halvings(

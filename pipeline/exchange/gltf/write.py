@@ -30,10 +30,10 @@ from storage.atomic import write_atomically
 from storage.conventions import srgb8
 from storage.records.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, ROUGHNESS, SPECULAR
 from storage.records.scene import ARRAY_FIELDS, Scene
-from storage.records.texture import TEXTURED, Texture
+from storage.records.texture import CONSTANT, NORMAL, TEXTURED, Texture
 
 CARRIED = frozenset(
-    {*ARRAY_FIELDS, "objects.name", "objects.kind", "textures"} - {"materials"}
+    {*ARRAY_FIELDS, "objects.name", "objects.kind", "textures", "normal_textures"} - {"materials"}
     | {f"materials.{name}" for name in PUBLISHED_COLUMNS}
 )
 """Members of a scene that the file holds (pipeline.exchange.formats)."""
@@ -174,7 +174,7 @@ def _attributes(
 def _material(
     file: "GlbFile", maps: Mapping[str, Map], emission: NDArray[np.floating]
 ) -> dict[str, Any]:
-    """Return the JSON of a material of the maps of its columns and its radiance [3]."""
+    """Return the JSON of a material of its maps, a normal map among them, and its radiance [3]."""
     diffuse, specular = resample_to_largest(maps["diffuse"], maps["specular"])
     strength = float(specular.max())
     base: Map = np.clip(diffuse / np.maximum(1 - specular, 1e-6), 0, 1).astype(np.float32)
@@ -198,6 +198,9 @@ def _material(
         packed = np.concatenate([blank, rough, blank], axis=2)
         surface["metallicRoughnessTexture"] = {"index": file.picture(packed)}
     made: dict[str, Any] = {"pbrMetallicRoughness": surface, "doubleSided": True}
+    if NORMAL in maps:
+        codes = np.round(255 * maps[NORMAL]).astype(np.uint8)
+        made["normalTexture"] = {"index": file.picture(codes)}
     extensions: dict[str, Any] = {"KHR_materials_specular": lobe}
     brightest = float(emission.max())
     if brightest > 0:
@@ -207,13 +210,15 @@ def _material(
 
 
 def _maps(scene: Scene, row: int) -> Mapping[str, Map]:
-    """Return the map of each column of a material that may be textured."""
+    """Return the map of each column of a material that may be textured, and its normal map."""
     column_slices = {"diffuse": DIFFUSE, "specular": SPECULAR, "roughness": ROUGHNESS}
     maps = {name: constant_map(scene.materials[row, part]) for name, part in column_slices.items()}
     if scene.material_textures is not None:
         for name, texture in zip(TEXTURED, scene.material_textures[row], strict=True):
             if texture >= 0:
                 maps[name] = linear_map(scene.textures[texture])
+    if scene.normal_textures is not None and scene.normal_textures[row] != CONSTANT:
+        maps[NORMAL] = linear_map(scene.textures[scene.normal_textures[row]])
     return maps
 
 

@@ -35,7 +35,7 @@ from storage.records.material import (
 )
 from storage.records.scene import OBJECT_KINDS, Scene, SceneObject
 from storage.records.scene_file import scene_digest, scene_provenance
-from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
+from storage.records.texture import CONSTANT, NORMAL, TEXTURED, MapSource, Texture
 
 
 def scene_keys(layer: Any) -> list[str] | None:
@@ -128,6 +128,7 @@ def _read_scene(root: Any, opened: OpenedStage) -> Scene:
         uv=_read_coordinates(meshes, len(faces)) if materials.textures else None,
         textures=materials.textures,
         material_textures=materials.material_textures,
+        normal_textures=materials.normal_textures,
         environment=sky,
     )
 
@@ -216,6 +217,8 @@ class _Materials:
     """Distinct textures, the value of `Scene.textures`."""
     material_textures: NDArray[np.int32] | None
     """[M, 3] the value of `Scene.material_textures`; None without textures."""
+    normal_textures: NDArray[np.int32] | None
+    """[M] the value of `Scene.normal_textures`; None without normal maps."""
 
 
 def _read_materials(folder: Any, opened: OpenedStage) -> _Materials:
@@ -223,7 +226,8 @@ def _read_materials(folder: Any, opened: OpenedStage) -> _Materials:
     prims = _list_by_row(folder, names.material_name)
     rows = default_rows(len(prims))
     columns = _list_columns(prims[0])
-    index = np.full((len(prims), len(TEXTURED)), CONSTANT, np.int32)
+    places = (*TEXTURED, NORMAL)
+    index = np.full((len(prims), len(places)), CONSTANT, np.int32)
     textures: dict[int, Texture] = {}
     for row, prim in enumerate(prims):
         for column, part in laid_out():
@@ -231,11 +235,13 @@ def _read_materials(folder: Any, opened: OpenedStage) -> _Materials:
                 rows[row, part] = prim.attributes[names.column_attribute(column.name)].default
         used = _read_textures(prim, textures, opened)
         for name, texture in used.items():
-            index[row, TEXTURED.index(name)] = texture
+            index[row, places.index(name)] = texture
+    normals = index[:, len(TEXTURED)].copy()
     return _Materials(
         rows=rows,
         textures=tuple(textures[row] for row in range(len(textures))),
-        material_textures=index if textures else None,
+        material_textures=index[:, : len(TEXTURED)].copy() if textures else None,
+        normal_textures=normals if (normals != CONSTANT).any() else None,
     )
 
 

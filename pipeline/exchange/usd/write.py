@@ -51,7 +51,7 @@ ENVIRONMENT = "Environment"
 """Name of the prim of an environment."""
 
 CARRIED = frozenset(
-    {*ARRAY_FIELDS, "provenance", "textures", "environment"}
+    {*ARRAY_FIELDS, "provenance", "textures", "normal_textures", "environment"}
     | {f"objects.{field}" for field in OBJECT_TEXTS}
 )
 """Members of a scene that the file holds (pipeline.exchange.formats)."""

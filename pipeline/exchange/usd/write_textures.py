@@ -23,7 +23,7 @@ from pipeline.exchange.usd.names import MAP_TEXTS, TEXTURE_ROW, format_map, text
 from storage.errors import TrilightError
 from storage.records.exr import MAX_RESOLUTION, decode_channels, encode_channels
 from storage.records.scene import Scene
-from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
+from storage.records.texture import CONSTANT, NORMAL, TEXTURED, MapSource, Texture
 
 PREVIEW = "Preview"
 OPENPBR = "OpenPBR"
@@ -33,8 +33,9 @@ SHADERS = {
     "diffuse": "DiffuseTexture",
     "specular": "SpecularTexture",
     "roughness": "RoughnessTexture",
+    NORMAL: "NormalTexture",
 }
-"""Name of the texture shader of each column."""
+"""Name of the texture shader of each column, and of the normal map."""
 
 COORDINATES = "Coordinates"
 """Name of the shader that reads texture coordinates."""
@@ -46,14 +47,22 @@ _INPUTS = {
     "diffuse": ("color3f", "inputs:diffuseColor", "outputs:rgb", "float3"),
     "specular": ("color3f", "inputs:specularColor", "outputs:rgb", "float3"),
     "roughness": ("float", "inputs:roughness", "outputs:r", "float"),
+    NORMAL: ("normal3f", "inputs:normal", "outputs:rgb", "float3"),
 }
 """Type and name of the input, and name and type of its output, by column."""
+
+_TO_VECTORS: Attributes = {
+    "inputs:scale": ("float4", (2.0, 2.0, 2.0, 1.0)),
+    "inputs:bias": ("float4", (-1.0, -1.0, -1.0, 0.0)),
+    "inputs:fallback": ("float4", (0.0, 0.0, 1.0, 1.0)),
+}
+"""Inputs that make vectors of the texels of a normal map."""
 
 COAT_ROUGHNESS = "inputs:clearcoatRoughness"
 """Input of a preview without a coat; it preserves the specular texture in Blender."""
 
 Used = Mapping[str, tuple[int, Texture]]
-"""Row and texture of each textured column of a material."""
+"""Row and texture of each textured column of a material, and of its normal map."""
 
 Links = Mapping[str, tuple[str, str | None]]
 """Type and connected output, if any, of each input and output by name."""
@@ -63,10 +72,11 @@ def used_textures(scene: Scene, row: int) -> Used:
     """Return the textures of a material row."""
     if scene.material_textures is None:
         return {}
-    index = scene.material_textures[row].tolist()
+    normal = CONSTANT if scene.normal_textures is None else int(scene.normal_textures[row])
+    index = [*scene.material_textures[row].tolist(), normal]
     return {
         name: (texture, scene.textures[texture])
-        for name, texture in zip(TEXTURED, index, strict=True)
+        for name, texture in zip((*TEXTURED, NORMAL), index, strict=True)
         if texture != CONSTANT
     }
 
@@ -86,9 +96,12 @@ def build_source_table(used: Used) -> Attributes:
 
 def texture_tables(used: Used) -> dict[str, Attributes]:
     """Return the attributes of a material's texture shaders, by path below the material."""
-    tables = {
+    tables: dict[str, Attributes] = {
         f"/{SHADERS[name]}": _texture_table(row, texture) for name, (row, texture) in used.items()
     }
+    if NORMAL in used:
+        path = f"/{SHADERS[NORMAL]}"
+        tables[path] = {**tables[path], **_TO_VECTORS}
     if used:
         tables[f"/{COORDINATES}"] = {
             "info:id": ("uniform token", "UsdPrimvarReader_float2"),

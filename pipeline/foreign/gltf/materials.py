@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.gltf.document import GltfDocument
 from pipeline.foreign.gltf.nodes import entry, extension
-from pipeline.foreign.material import MOST_UV_SETS, RGB, Slot, SourceMaterial
+from pipeline.foreign.material import MOST_UV_SETS, RGB, Slot, SourceMaterial, with_normal_map
 from pipeline.foreign.numbers import Malformed, read_count, read_number, read_numbers
 from pipeline.foreign.picture import Decode, Picture, Wrap
 from storage.errors import Rejected
@@ -35,6 +35,7 @@ class GltfMaterials:
         decode: Decode,
         *,
         emission: bool = False,
+        normals: bool = False,
         notes: list[str] | None = None,
     ) -> None:
         """Store the arguments; materials are read on demand.
@@ -43,12 +44,14 @@ class GltfMaterials:
             document: the file.
             decode: returns the values of a picture's bytes.
             emission: whether emission is read, too.
+            normals: whether normal maps are read, too.
             notes: receives sentences on parts that are left out; None refuses the file for these.
         """
         self._document = document
         self._tree = document.tree
         self._decode = decode
         self._emission = emission
+        self._normals = normals
         self._notes = notes
         self._values: dict[int, NDArray] = {}
         self._known: dict[int, SourceMaterial] = {}
@@ -75,7 +78,8 @@ class GltfMaterials:
         if "KHR_materials_unlit" in row.get("extensions", {}):
             return self._unlit(row)
         material = self._metallic(row) if glossy is None else self._glossy(glossy)
-        return self._with_emission(dataclasses.replace(material, lost=_list_unsupported(row)), row)
+        material = dataclasses.replace(material, lost=_list_unsupported(row))
+        return self._with_emission(self._with_normals(material, row), row)
 
     def _unlit(self, row: Mapping[str, Any]) -> SourceMaterial:
         """Return a diffuse surface of the base color, which looks unlit under uniform light."""
@@ -116,6 +120,14 @@ class GltfMaterials:
             specular_colour=self._slot(row, "specularGlossinessTexture", is_srgb=True),
             glossiness=self._slot(row, "specularGlossinessTexture"),
         )
+
+    def _with_normals(self, material: SourceMaterial, row: Mapping[str, Any]) -> SourceMaterial:
+        """Return a material with its normal map, where normal maps are read."""
+        slot = self._slot(row, "normalTexture") if self._normals else None
+        if slot is None:
+            return material
+        strength = read_number(row["normalTexture"].get("scale", 1), "normalTexture.scale")
+        return with_normal_map(material, slot, strength)
 
     def _with_emission(self, material: SourceMaterial, row: Mapping[str, Any]) -> SourceMaterial:
         """Return a material with its emission, where emission is read."""

@@ -41,10 +41,14 @@ def gltf_textured_mesh(document: GltfDocument, materials: GltfMaterials) -> Text
         counts = [len(instance.faces) for instance in primitives]
         color = np.ones((sum(counts), 3, 3))
         uv = np.full((sum(counts), MOST_UV_SETS, 3, 2), np.nan)
+        has_normal_maps = any(material.normal is not None for material in known.values())
+        tangent = np.full((sum(counts), 3, 4), np.nan) if has_normal_maps else None
         for instance, last in zip(primitives, np.cumsum(counts), strict=True):
             span = slice(last - len(instance.faces), last)
             if (colors := instance.colors) is not None:
                 color[span] = colors
+            if tangent is not None and (tangents := instance.tangents) is not None:
+                tangent[span] = tangents
             for number in range(MOST_UV_SETS):
                 if (coordinates := instance.coordinates(number)) is not None:
                     uv[span, number] = coordinates
@@ -53,6 +57,7 @@ def gltf_textured_mesh(document: GltfDocument, materials: GltfMaterials) -> Text
             material=np.repeat(numbers, counts),
             materials=(*known.values(), DEFAULT),
             uv=uv,
+            tangent=tangent,
             color=None if (color == 1).all() else color,
         )
 

@@ -44,6 +44,7 @@ class PlacedPrimitive:
         self.positions = self._read_attribute("POSITION", (3,))
         """[V, 3] in the space of the node, or of the world."""
         self._normal_matrix = np.eye(3)
+        self._linear = np.eye(3)
 
     def place(self, to_world: NDArray[np.float64]) -> "PlacedPrimitive":
         """Return an instance in the world by a matrix [4, 4]; mirrored corners change order."""
@@ -52,6 +53,7 @@ class PlacedPrimitive:
         with np.errstate(invalid="ignore", over="ignore"):
             winding = -1 if np.linalg.det(linear) < 0 else 1
             instance.positions = np.einsum("ij,vj->vi", linear, self.positions) + to_world[:3, 3]
+            instance._linear = linear
             instance._normal_matrix = np.cross(linear[[1, 2, 0]], linear[[2, 0, 1]]) * winding
         instance.faces = self.faces[:, ::winding]
         return instance
@@ -87,6 +89,22 @@ class PlacedPrimitive:
             return None
         normals = self._read_attribute("NORMAL", (3,))[self.faces]
         return np.einsum("ij,tcj->tci", self._normal_matrix, normals)
+
+    @property
+    def tangents(self) -> NDArray[np.float64] | None:
+        """Tangents of the corners and the signs of their bitangents [T, 3, 4].
+
+        None where there are none, or where they are morphed.
+        """
+        targets = self._primitive.get("targets", ())
+        is_morphed = any("TANGENT" in target for target in targets)
+        if "TANGENT" not in self._primitive["attributes"] or is_morphed:
+            return None
+        tangents = self._read_attribute("TANGENT", (4,))[self.faces]
+        with np.errstate(invalid="ignore", over="ignore"):
+            hand = np.sign(np.linalg.det(self._linear)) * tangents[..., 3:]
+            along = np.einsum("ij,tcj->tci", self._linear, tangents[..., :3])
+        return np.concatenate([along, hand], axis=-1)
 
     def _read_attribute(
         self, name: str, widths: tuple[int, ...], *, is_unit: bool | None = None

@@ -10,7 +10,14 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.material import MOST_UV_SETS, RGB, WHITE, Slot, SourceMaterial
+from pipeline.foreign.material import (
+    MOST_UV_SETS,
+    RGB,
+    WHITE,
+    Slot,
+    SourceMaterial,
+    with_normal_map,
+)
 from pipeline.foreign.picture import Decode, Picture, has_colors
 from pipeline.foreign.textured_mesh import TexturedMesh
 from pipeline.foreign.usd.object_source import UsdSource
@@ -186,6 +193,8 @@ class MeshMaterials:
             picture = self._color_slot(stated, "emissiveColor")
             glow = _glow(stated) if picture is not None else _scale_glow(stated)
             material = dataclasses.replace(material, emission_rgb=glow, emission=picture)
+        if "normal" in stated.textures:
+            material = self._with_normal_map(material, stated.textures["normal"])
         if stated.is_specular:
             return self._specular(stated, material)
         metallic = self._slot(stated, "metallic")
@@ -205,6 +214,25 @@ class MeshMaterials:
             specular_colour=color,
             has_fresnel=stated.constants["ior"][0] != IOR_OF_CONSTANT_ALBEDOS,
         )
+
+    def _with_normal_map(self, material: SourceMaterial, node: TextureNode) -> SourceMaterial:
+        """Return a material with its normal map.
+
+        Files that state neither scale nor bias mean those of a picture from 0 to 1. The picture is
+        linear, unless it is said to be sRGB-encoded.
+        """
+        plain = dataclasses.replace(
+            node,
+            scale=np.ones(4, np.float32),
+            bias=np.zeros(4, np.float32),
+            color_space="sRGB" if node.color_space == "sRGB" else "raw",
+        )
+        slot = self._read_slot(plain, "", is_grey=False)
+        material = with_normal_map(material, slot)
+        if (node.scale == 1).all() and not node.bias.any():
+            return material
+        scale, bias = (values[:3].astype(float).tolist() for values in (node.scale, node.bias))
+        return dataclasses.replace(material, normal_scale=tuple(scale), normal_bias=tuple(bias))
 
     def _color_slot(self, stated: StatedMaterial, name: str) -> Slot | None:
         """Return the slot of a color input; a single channel is copied to all three."""

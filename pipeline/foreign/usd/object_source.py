@@ -96,7 +96,10 @@ class UsdSource:
         if limits.with_materials:
             try:
                 self._materials = read_or_reject(
-                    path, lambda: read_stage_materials(self.stage, bytes_left)
+                    path,
+                    lambda: read_stage_materials(
+                        self.stage, bytes_left, normals=limits.with_normal_maps
+                    ),
                 )
             except Rejected as why:
                 self._materials = Rejected(why.reason, why.message)  # its traceback holds the stage

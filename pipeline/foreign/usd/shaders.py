@@ -209,7 +209,12 @@ def surface_shader(material: Any) -> Any:
 
 
 def read_material(
-    material: Any, time: Any, opened: OpenedStage, known: Collection[str] = ()
+    material: Any,
+    time: Any,
+    opened: OpenedStage,
+    known: Collection[str] = (),
+    *,
+    normals: bool = False,
 ) -> StatedMaterial | None:
     """Return the inputs of a material, or None where it has no supported shader.
 
@@ -218,6 +223,7 @@ def read_material(
         time: time of the values.
         opened: the file, which receives notes.
         known: unsupported inputs that the caller reads itself.
+        normals: whether the normal map of a UsdPreviewSurface is read, as the texture `normal`.
 
     Raises:
         TrilightError: a picture is outside of the folder, or on the network.
@@ -229,6 +235,8 @@ def read_material(
     notes = len(opened.lost)
     for name in TEXTURED:
         reader.read_connection(name)
+    if normals:
+        reader.read_normal_map()
     constants = {name: reader.constant(name) for name in DEFAULTS}
     has_networks = len(opened.lost) > notes
     constants["diffuseColor"] = constants["diffuseColor"] * reader.weight()
@@ -285,6 +293,16 @@ class _Reader:
         else:
             self._lose(name, f"{node.GetShaderId() or 'a network'} that is not read")
 
+    def read_normal_map(self) -> None:
+        """Store the texture of the normal; other connections stay unsupported."""
+        from pxr import UsdShade
+
+        sources = find_sources(self._shader, "normal")
+        if self._shader.GetShaderId() != PREVIEW or not sources or not is_output(sources[0]):
+            return
+        if UsdShade.Shader(sources[0].GetPrim()).GetShaderId() == "UsdUVTexture":
+            self.read_connection("normal")
+
     def constant(self, name: str) -> NDArray[np.float32]:
         """Return the constant [3] of an input; a number fills all channels."""
         if name in self._fallbacks:
@@ -308,7 +326,7 @@ class _Reader:
 
     def list_unsupported(self) -> list[str]:
         """Return names of unsupported inputs that have an effect, unknown ones included."""
-        read = {*(self._names.get(name, name) for name in DEFAULTS), *_WEIGHTS}
+        read = {*(self._names.get(name, name) for name in DEFAULTS), *_WEIGHTS, *self.textures}
         names = []
         for each in self._shader.GetInputs():
             name = str(each.GetBaseName())

@@ -46,7 +46,11 @@ class StageMaterials:
 
 
 def read_stage_materials(
-    stage: UsdStage, max_bytes: int, read: ReadMaterial | None = None
+    stage: UsdStage,
+    max_bytes: int,
+    read: ReadMaterial | None = None,
+    *,
+    normals: bool = False,
 ) -> StageMaterials:
     """Return the materials of the visible meshes of a stage.
 
@@ -55,6 +59,7 @@ def read_stage_materials(
         max_bytes: maximum bytes of all pictures together.
         read: function that reads a UsdShade.Material, None leaving it out; by default one that
             refuses a material without a shader that is understood.
+        normals: whether that function reads normal maps, too.
 
     Raises:
         Rejected: texture_outside, materials_unreadable.
@@ -67,7 +72,7 @@ def read_stage_materials(
             return -1
         name = str(material.GetPath())
         if name not in rows:
-            stated = _read_strictly(stage, material) if read is None else read(material)
+            stated = read(material) if read else _read_strictly(stage, material, normals=normals)
             rows[name] = -1 if stated is None else len(materials)
             materials.extend([] if stated is None else [_drop_ior_texture(stage, stated)])
         return rows[name]
@@ -90,8 +95,8 @@ def read_stage_materials(
     )
 
 
-def _read_strictly(stage: UsdStage, material: Any) -> StatedMaterial:
-    stated = read_material(material, stage.time, stage.opened)
+def _read_strictly(stage: UsdStage, material: Any, *, normals: bool) -> StatedMaterial:
+    stated = read_material(material, stage.time, stage.opened, normals=normals)
     if stated is None:
         name = str(material.GetPath())
         raise TrilightError(f"{name!r:.100} has no shader that is understood")

@@ -167,7 +167,8 @@ PASSES = (
         name="shading_normal",
         short="normal",
         layer="N",
-        means="Unit normal interpolated between the triangle's corners, not turned to the camera.",
+        means="Unit normal interpolated between the triangle's corners and bent by its normal map, "
+        "not turned to the camera.",
         channels=_XYZ,
         averaging="surfaces",
         frame="world",

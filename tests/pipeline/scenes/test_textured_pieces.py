@@ -9,6 +9,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from model.hits.textures import surface_textures
 from pipeline.scenes.pieces import (
     ScenePiece,
     Skin,
@@ -34,9 +35,11 @@ from scene_templates.textures import TextureSettings
 from storage.errors import Rejected
 from storage.records.asset import Level
 from storage.records.lookup import texture_values
+from storage.records.map_facts import texture_families
 from storage.records.material import EMISSION, default_rows
 from storage.records.objects import locked_uids
 from storage.records.packed_maps import pack_texture
+from storage.records.retextured import without_normal_maps
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import scene_digest
 from storage.records.skin import LevelSkin, SkinQuality
@@ -47,6 +50,7 @@ from tests.for_each import for_each
 from tests.pipeline.scenes.small_pool import LOOK, first_scene, pooled, small_pool
 from tests.scene_templates.balls import STILL
 from tests.scene_templates.statistics import require_plausible, share
+from tests.textured_by_hand import bumps
 
 SMALL = SurfaceMapSettings(size=8)
 PLAIN = SceneSettings(families=DEFAULT_FAMILIES, num_views=1)
@@ -401,6 +405,39 @@ def test_an_object_whose_textures_break_a_law_costs_scenes_by_its_name() -> None
     levels = [dataclasses.replace(level, skin=skin)]
     with pytest.raises(Rejected, match=f"^law_broken: object {entries[0].locked.uid}: .*diffuse"):
         source_skins(entries, levels, OWN.materials, SceneKey(0, 0))
+
+
+def test_a_normal_map_comes_with_the_rights_of_its_object_and_changes_nothing_else() -> None:
+    """Networks read the same surfaces, and parts without a map say so."""
+    pool = _pool()
+    mapped = []
+    for seed, entry in enumerate(pool):
+        levels = [
+            level
+            if level.skin is None
+            else dataclasses.replace(
+                level,
+                skin=dataclasses.replace(level.skin, packed_normal=pack_texture(bumps(seed))),
+            )
+            for level in entry.asset.levels
+        ]
+        asset = dataclasses.replace(entry.asset, levels=tuple(levels))
+        mapped.append(dataclasses.replace(entry, asset=asset))
+    plain, scene = (_scene(OWN, 1, each) for each in (pool, mapped))
+    scene.check()
+    assert scene.normal_textures is not None and scene.material_textures is not None
+    textured = (scene.material_textures >= 0).all(axis=1)
+    assert textured.any() and np.array_equal(scene.normal_textures >= 0, textured)
+    for row in scene.normal_textures[textured]:
+        assert scene.textures[row].source.name.endswith(" normal")
+    assert texture_families(scene) == texture_families(plain)
+    assert scene_digest(without_normal_maps(scene)) == scene_digest(plain)
+    triangle, weights = np.arange(scene.num_triangles), np.full((3, scene.num_triangles), 1 / 3)
+    columns = plain.materials[plain.material_index]
+    ours, theirs = map(surface_textures, (scene, plain))
+    assert ours is not None and theirs is not None
+    wanted = theirs.materials(triangle, weights, columns)
+    assert np.array_equal(ours.materials(triangle, weights, columns), wanted)
 
 
 def test_subdivision_moves_no_colour() -> None:

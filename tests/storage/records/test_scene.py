@@ -20,10 +20,15 @@ from pipeline.objects.ply import encode_ply
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.asset import Asset, Level, LevelRecord, decode_asset, encode_asset
+from storage.records.map_facts import textured_objects
+from storage.records.normal_map import FLAT
 from storage.records.retextured import (
+    NEW,
+    chosen_maps,
     with_textures,
     without_constant_textures,
     without_maps,
+    without_normal_maps,
 )
 from storage.records.sample import encode_sample
 from storage.records.scene import ARRAY_FIELDS, Scene, SceneObject
@@ -41,6 +46,8 @@ from tests.for_each import case, for_each
 from tests.pipeline.scenes.small_pool import QUALITY, SOURCE
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_sample, tiny_scene
 from tests.textured_by_hand import (
+    bumps,
+    bumpy_scene,
     colour_texture,
     corner_uv,
     number_texture,
@@ -118,6 +125,10 @@ def _rough(value: float) -> Scene:
     return textured_scene(0, colour_texture(), _with_texel(number_texture(), value))
 
 
+def _normals(rows: list[int]) -> Scene:
+    return bumpy_scene(normal_textures=np.array(rows, np.int32))
+
+
 def _coloured(texels: np.ndarray, *, is_srgb: bool = False) -> Scene:
     return textured_scene(0, Texture(texels=texels, is_srgb=is_srgb), number_texture())
 
@@ -168,6 +179,12 @@ BROKEN: list[tuple[Scene, str]] = [
     (_coloured(np.zeros((0, 4, 3), np.uint8)), "sides of 1 to 16384"),
     (_coloured(np.zeros((16385, 1, 3), np.uint8)), "sides of 1 to 16384"),
     (_coloured(np.zeros((2, 2, 2), np.uint8)), "1 or 3"),
+    (_normals([3, -1]), r"normal_textures\[0\] is 3; expected rows below 3"),
+    (_normals([-1, -1]), r"textures\[2\] is used by no"),
+    (_normals([2, 1]), r"textures\[1\] has 1 channels; expected 3 linear channels, as a normal"),
+    (_normals([0, 2]), r"textures\[0\] has 3 channels, sRGB-encoded"),
+    (_normals([2, -1, -1]), r"normal_textures is int32 of shape \(3,\)"),
+    (tiny_scene(normal_textures=np.array([-1, -1], np.int32)), "normal_textures is there without"),
     (_coloured(_even(0.9)), r"materials\[0\] with its textures: diffuse \+ specular\[0\] is 1.1"),
     (_below(radiance_rgb=_even(math.nan)), r"radiance_rgb\[0, 0, 0\] is nan"),
     (_below(radiance_rgb=_even(-1)), r"is -1\.; expected finite values from 0 to 1e\+09"),
@@ -182,7 +199,8 @@ BROKEN: list[tuple[Scene, str]] = [
 
 
 def test_valid_scenes_pass() -> None:
-    for scene in (tiny_scene(), textured_scene(environment=sky()), _below(is_seen=True)):
+    lit = textured_scene(environment=sky())
+    for scene in (tiny_scene(), lit, _below(is_seen=True), bumpy_scene()):
         scene.check()
 
 
@@ -259,6 +277,26 @@ def test_one_constant_texture_among_others_goes_alone() -> None:
     assert left.material_textures.tolist() == [[-1, -1, 0], [-1, -1, -1]]
     assert (left.materials[FLOOR, :3] == np.float32(0.2)).all()
     assert without_constant_textures(left) is left
+
+
+def test_a_flat_normal_map_is_none_and_a_scene_keeps_the_others() -> None:
+    flat = Texture(texels=np.full((3, 3, 3), FLAT, np.float32))
+    plain = textured_scene()
+    smooth = bumpy_scene(textures=(*plain.textures, flat))
+    smooth.check()
+    assert encode_arrays(smooth) == encode_arrays(plain)
+    scene = bumpy_scene()
+    assert scene_digest(scene) != scene_digest(plain)
+    assert decode_scene_file(encode_scene(scene), "a").normal_textures.tolist() == [2, -1]  # type: ignore[union-attr]
+    assert encode_scene(decode_scene_file(encode_scene(scene), "a")) == encode_scene(scene)
+    assert encode_arrays(without_normal_maps(scene)) == encode_arrays(plain)
+    assert without_maps(scene).normal_textures is None
+    chosen = chosen_maps(scene, np.array([0, NEW]), np.array([NEW, FLOOR]))
+    assert chosen["normal_textures"].tolist() == [-1, 2] and len(chosen["textures"]) == 3
+    only = bumpy_scene(material_textures=np.full((2, 3), -1, np.int32), textures=(bumps(),))
+    only = dataclasses.replace(only, normal_textures=np.array([0, -1], np.int32))
+    only.check()
+    assert textured_objects(only) == {0}
 
 
 def test_what_lies_beyond_a_reader_is_left_out() -> None:

@@ -39,7 +39,14 @@ from tests.pipeline.assets.source_materials.textured_kit import (
 )
 from tests.pipeline.exchange.exchange_kit import row_at
 from tests.scenes_by_hand import FLOOR, tiny_scene
-from tests.textured_by_hand import colour_texture, corner_uv, number_texture, sky, textured_scene
+from tests.textured_by_hand import (
+    bumpy_scene,
+    colour_texture,
+    corner_uv,
+    number_texture,
+    sky,
+    textured_scene,
+)
 
 RED, GREEN, BLUE, GREY = (255, 0, 0), (0, 255, 0), (0, 0, 255), (128, 128, 128)
 PICTURE = np.array([[RED, GREEN], [BLUE, GREY]], np.uint8)
@@ -283,6 +290,15 @@ def test_what_a_glb_loses_is_said(tmp_path: Path) -> None:
     )
     with pytest.raises(TrilightError, match="only light is its environment"):
         write_scene(tmp_path / "b.glb", dark)
+
+
+def test_a_stranger_reads_a_normal_map(tmp_path: Path) -> None:
+    scene = bumpy_scene()
+    assert "normal" not in " ".join(write_scene(tmp_path / "a.glb", scene))
+    meshes = trimesh.load_scene(tmp_path / "a.glb").geometry.values()
+    maps = [mesh.visual.material.normalTexture for mesh in meshes]
+    (found,) = (np.asarray(each.convert("RGB")) for each in maps if each is not None)
+    assert np.array_equal(found[::-1], scene.textures[2].texels)
 
 
 def test_a_stranger_reads_it(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
+from pipeline.exchange.formats import FORMATS, drop_uncarried_maps, list_lost_members
 from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.usd.read import read_usd
 from pipeline.exchange.usd.write import SUFFIXES, write_usd, write_usd_shard
@@ -27,7 +28,7 @@ from tests.pipeline.exchange.exchange_kit import assert_usd_keeps_all
 from tests.pipeline.foreign.test_light_pictures import radiance_hdr
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.sky_maps import COLOURS, POLES, one_sun, six_poles, smooth
-from tests.textured_by_hand import number_texture, sky, textured_scene
+from tests.textured_by_hand import bumpy_scene, number_texture, sky, textured_scene
 
 
 def _read(path: Path) -> LoadedScene:
@@ -42,12 +43,30 @@ def _sky(scene: Scene) -> Environment:
 def test_scenes_of_a_shard_keep_their_skies_and_textures(tmp_path: Path) -> None:
     scenes = [tiny_scene(environment=sky) for sky in (smooth(), None, smooth(is_seen=True))]
     scenes += [textured_scene(seed) for seed in (0, 1, 0)]
+    scenes += [bumpy_scene()]
     path = tmp_path / "many.usdc"
     write_usd_shard(path, ((f"k{row}", scene) for row, scene in enumerate(scenes)))
     assert len(list(tmp_path.glob("sky-*.exr"))) == 1  # one content, one file
-    assert len(list(tmp_path.glob("texture-*.png"))) == 2
+    assert len(list(tmp_path.glob("texture-*.png"))) == 3
     for row, scene in enumerate(scenes):
         assert encode_scene(read_usd(path, f"k{row}", None, "").scene) == encode_scene(scene)
+
+
+def test_a_normal_map_is_an_input_that_usd_defines(tmp_path: Path) -> None:
+    scene = bumpy_scene()
+    write_usd(tmp_path / "a.usda", scene)
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    shader = UsdShade.Shader(stage.GetPrimAtPath(f"/Scene/Materials/material_{FLOOR}/Preview"))
+    (source,) = UsdShade.Utils.GetValueProducingAttributes(shader.GetInput("normal"))
+    node = UsdShade.Shader(source.GetPrim())
+    stated = {name: node.GetInput(name).Get() for name in ("scale", "bias", "sourceColorSpace")}
+    assert stated == {"scale": (2, 2, 2, 1), "bias": (-1, -1, -1, 0), "sourceColorSpace": "raw"}
+    picture = np.asarray(Image.open(tmp_path / node.GetInput("file").Get().path))
+    assert np.array_equal(picture[::-1], scene.textures[2].texels)
+    assert not list_lost_members(scene, FORMATS[".usda"].carried)
+    assert "normal_textures" in " ".join(list_lost_members(scene, FORMATS[".h5"].carried))
+    dropped = drop_uncarried_maps(scene, FORMATS[".h5"].carried)
+    assert scene_digest(dropped) == scene_digest(textured_scene())
 
 
 def test_other_programs_find_each_pole_where_we_have_it(tmp_path: Path) -> None:
