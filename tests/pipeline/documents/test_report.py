@@ -169,13 +169,13 @@ def test_the_numbers_of_a_dataset_and_of_a_scene_are_on_their_pages(five: dict[s
 def test_the_report_says_which_objects_keep_their_materials(tmp_path: Path) -> None:
     dataset = five_scenes(tmp_path)
     report = report_of(dataset)
-    assert "a A train drawn 3" in text_of(read(report.read_bytes()))
+    assert "a A train drawn 4" in text_of(read(report.read_bytes()))
     scenes = {"materials": {"source": "object"}}
     root = edit_manifest(dataset, settings={**dataset.manifest.settings, "scenes": scenes})
     (root / "logs").mkdir(exist_ok=True)
     (root / "logs" / "drawn_materials.json").write_text('{"b": ["no_materials"]}')
     text = text_of(read(report_of(open_dataset(str(root))).read_bytes()))
-    assert "a A train own 3" in text
+    assert "a A train own 4" in text
     assert "b B train drawn: no_materials 1" in text
 @pytest.mark.usefixtures("bare_reports")
 def test_one_scene_or_none_at_all(tmp_path: Path) -> None:
