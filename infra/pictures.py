@@ -5,6 +5,7 @@ ground of its own, so that it stands on light and on dark pages. Data is made on
 """
 
 import argparse
+import contextlib
 import re
 import shutil
 import subprocess
@@ -17,16 +18,29 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-import trilight
+from infra.cli.console import console
+from infra.render.path_tracer import PathTracer, RenderChild
+from infra.render.quality import ToStatedError
+from infra.render.sources import own_camera
+from model.neural_renderer import NeuralRenderer
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.preview import preview
 from pipeline.assets.settings import AssetSettings
+from pipeline.executors.threads import ThreadRunner
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.pipeline import make_dataset
+from pipeline.renders.results import RenderedView
+from pipeline.renders.settings import NoiseTargets
+from pipeline.renders.variant import choose_variant
 from storage.conventions import preview_gain, preview_srgb8
+from storage.dataset.dataset import open_dataset
 from storage.metrics import psnr_log_db
+from storage.records.sample import Sample
+from storage.records.scene import Scene
 from train.evaluation.error_colors import ERROR_WHITE, heat_colors, mean_error
 
 GROUND = (22, 25, 29)
@@ -34,7 +48,7 @@ INK = (240, 240, 236)
 FAINT = (158, 167, 176)
 GIVEN, TRACED, LEARNED = (158, 167, 176), (86, 156, 214), (240, 146, 60)
 """A user's, the path tracer's and the network's: the colors of the bars above panels."""
-GAP_PX, BAR_PX, TEXT_PX = 12, 6, 28
+GAP_PX, BAR_PX, TEXT_PX = 12, 6, 33
 STATED_DB = (30, 40, 46)
 AMPLIFIED = 5
 """How much brighter an error is drawn than in reports."""
@@ -86,7 +100,12 @@ SKIES = {
     "scenes.cameras.elevation_deg": [4, 12],
 }
 
-ALONE = {"renders.resolution": 256, "scenes.num_views": 1, "scenes.max_triangles": 1100, "scenes.cameras.elevation_deg": [25, 30]}
+ALONE = {
+    "renders.resolution": 256,
+    "scenes.num_views": 1,
+    "scenes.max_triangles": 1100,
+    "scenes.cameras.elevation_deg": [25, 30],
+}
 """Of the preset `object-views`."""
 
 
@@ -107,8 +126,10 @@ class Pictures:
     def hero(self) -> None:
         """One scene in five steps: given mesh, clean mesh, traced, by the network, its error."""
         scene = self._room()
-        traced = trilight.render(scene, view=self._view, resolution=320, noise_floor_db=46)
-        learned = trilight.open_network().render(_seen_by(scene, self._view), resolution=320)[0]
+        traced = _traced(scene, self._view, 320, STATED_DB[-1])
+        learned = NeuralRenderer.load("builtin:").render(
+            _seen_by(scene, self._view), resolution=320
+        )[0]
         given, level = self._meshes(scene)
         target = traced.radiance_rgb
         gain = preview_gain(target)
@@ -131,10 +152,7 @@ class Pictures:
             for row, view in enumerate(sample.views)
         ]
         _, row, scene = min(views, key=lambda each: each[0])
-        images = [
-            trilight.render(scene, view=row, resolution=128, noise_floor_db=target)
-            for target in STATED_DB
-        ]
+        images = [_traced(scene, row, 128, target) for target in STATED_DB]
         few, _, many = (image.radiance_rgb for image in images)
         gain = preview_gain(many)
         errors = mean_error(few, many)[16:-16, 16:-16].reshape(6, 16, 6, 16).mean(axis=(1, 3))
@@ -173,7 +191,9 @@ class Pictures:
     def viewer(self) -> None:
         """Screenshot of `trilight view`, where Chromium is."""
         if shutil.which("chromium") is None:
-            print("viewer: no picture, since Chromium is not installed (apt-get install chromium)")
+            console.print(
+                "viewer: no picture, since Chromium is not installed (apt-get install chromium)"
+            )
             return
         from tests.end_to_end.browser_kit import browser  # a checkout has it, and a wheel has not
 
@@ -189,11 +209,13 @@ class Pictures:
                 address = next(found[0] for found in said if found)
                 path = self._out / "viewer.png"
                 with browser("--hide-scrollbars") as page:
-                    page.show(1100, 1060)
+                    page.show(1100, 1270)
                     page.open(address)
                     page.until(f"{_CARD} && !document.querySelector('.busy')")
                     for kind in ("input", "change"):
-                        page.run(f"view.value = {self._view}; view.dispatchEvent(new Event('{kind}'))")
+                        page.run(
+                            f"view.value = {self._view}; view.dispatchEvent(new Event('{kind}'))"
+                        )
                     page.run(f"{_CARD}.click()")
                     page.until(f"{_CARD}.innerText.includes('stated')")
                     page.until("!document.querySelector('.busy')")
@@ -203,15 +225,15 @@ class Pictures:
         self._write("viewer", np.asarray(Image.open(path).convert("RGB")))
         path.unlink()
 
-    def _room(self) -> trilight.Scene:
+    def _room(self) -> Scene:
         scenes = [sample.scene for sample in self._samples("rooms", ROOMS)]
         return next(s for s in scenes if s.provenance["scene_index"] == self._number)
 
     def _samples(
         self, name: str, changes: Mapping[str, Any], build: str = "tiny"
-    ) -> Iterator[trilight.Sample]:
+    ) -> Iterator[Sample]:
         """Make one of the datasets, unless it is there, and yield its training scenes."""
-        order = trilight.DatasetOrder(
+        order = DatasetOrder(
             build=build,
             objects=str(self._objects),
             out=str(self._data / name),
@@ -220,10 +242,10 @@ class Pictures:
             licence="CC0-1.0",
             changes=changes,
         )
-        trilight.generate(order)
-        yield from trilight.open_dataset(str(self._data / name)).samples("train")
+        make_dataset(order, ThreadRunner())
+        yield from open_dataset(str(self._data / name)).samples("train")
 
-    def _meshes(self, scene: trilight.Scene) -> tuple[TriangleMesh, TriangleMesh]:
+    def _meshes(self, scene: Scene) -> tuple[TriangleMesh, TriangleMesh]:
         """Return the object whose file has most triangles: that file, and what the scene has."""
         objects = [row for row, each in enumerate(scene.objects) if each.kind == "object"]
         given = {row: self._given(scene.objects[row].uid) for row in objects}
@@ -242,13 +264,20 @@ class Pictures:
     def _write(self, name: str, pixels: Pixels) -> None:
         path = self._out / f"{name}.webp"
         Image.fromarray(pixels).save(path, quality=QUALITY, method=6)
-        print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
+        console.print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 
 
 _CARD = "[...document.querySelectorAll('.card')].find(c => c.innerText.startsWith('Path traced'))"
 
 
-def _seen_by(scene: trilight.Scene, view: int) -> trilight.Scene:
+def _traced(scene: Scene, view: int, resolution: int, target_db: float) -> RenderedView:
+    quality = ToStatedError(targets=NoiseTargets(log_db=target_db))
+    tracer = PathTracer(RenderChild(choose_variant("auto")), quality, resolution)
+    with contextlib.closing(tracer):
+        return tracer.load(scene, "scene").render_view(own_camera(scene, view, named="view"))
+
+
+def _seen_by(scene: Scene, view: int) -> Scene:
     return scene.with_cameras(scene.c2w[[view]], scene.fov_deg[[view]])
 
 
@@ -267,7 +296,9 @@ def _drawn(mesh: TriangleMesh, width: int) -> Pixels:
     half = max(right - left, bottom - top) / 1.8
     x, y = (left + right) / 2, (top + bottom) / 2
     box = (x - half, y - half, x + half, y + half)
-    near = grey.transform((width, width), Image.Transform.EXTENT, box, Image.Resampling.BICUBIC, fillcolor=255)
+    near = grey.transform(
+        (width, width), Image.Transform.EXTENT, box, Image.Resampling.BICUBIC, fillcolor=255
+    )
     drawn = np.asarray(near, np.float64)[..., None].repeat(3, axis=2)
     empty = np.clip((drawn - 240) / 15, 0, 1)
     return np.round(empty * GROUND + (1 - empty) * drawn).astype(np.uint8)

@@ -177,6 +177,8 @@ def test_the_report_says_which_objects_keep_their_materials(tmp_path: Path) -> N
     text = text_of(read(report_of(open_dataset(str(root))).read_bytes()))
     assert "a A train own 4" in text
     assert "b B train drawn: no_materials 1" in text
+
+
 @pytest.mark.usefixtures("bare_reports")
 def test_one_scene_or_none_at_all(tmp_path: Path) -> None:
     dataset = write_dataset(tmp_path, {"validation-000002.tar": [sample(9, furnished([]))]})
