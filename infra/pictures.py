@@ -12,7 +12,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,9 +46,13 @@ from train.evaluation.error_colors import ERROR_WHITE, heat_colors, mean_error
 GROUND = (22, 25, 29)
 INK = (240, 240, 236)
 FAINT = (158, 167, 176)
-GIVEN, TRACED, LEARNED = (158, 167, 176), (86, 156, 214), (240, 146, 60)
+GIVEN = FAINT
+TRACED = (86, 156, 214)
+LEARNED = (240, 146, 60)
 """A user's, the path tracer's and the network's: the colors of the bars above panels."""
-GAP_PX, BAR_PX, TEXT_PX = 12, 6, 33
+GAP_PX = 12
+BAR_PX = 6
+TEXT_PX = 33
 STATED_DB = (30, 40, 46)
 AMPLIFIED = 5
 """How much brighter an error is drawn than in reports."""
@@ -126,18 +130,18 @@ class Pictures:
     def hero(self) -> None:
         """One scene in five steps: given mesh, clean mesh, traced, by the network, its error."""
         scene = self._room()
-        traced = _traced(scene, self._view, 320, STATED_DB[-1])
+        traced = _trace(scene, self._view, 320, STATED_DB[-1])
         learned = NeuralRenderer.load("builtin:").render(
             _seen_by(scene, self._view), resolution=320
         )[0]
-        given, level = self._meshes(scene)
+        source, level = self._meshes(scene)
         target = traced.radiance_rgb
         gain = preview_gain(target)
         agreement = f"{psnr_log_db(learned, target):.0f} dB, included"
         stated = f"stated error {traced.noise_floor_db:.0f} dB"
         panels = [
-            _panel(_drawn(given, 320), "Your mesh", _triangles(given), GIVEN),
-            _panel(_drawn(level, 320), "Clean mesh", _triangles(level), TRACED),
+            _panel(_draw_mesh(source, 320), "Your mesh", _triangles(source), GIVEN),
+            _panel(_draw_mesh(level, 320), "Clean mesh", _triangles(level), TRACED),
             _panel(preview_srgb8(gain * target), "Path traced", stated, TRACED),
             _panel(preview_srgb8(gain * learned), "Network", agreement, LEARNED),
             _panel(_error(learned, target), "Its error", f"{AMPLIFIED} times brighter", LEARNED),
@@ -152,40 +156,51 @@ class Pictures:
             for row, view in enumerate(sample.views)
         ]
         _, row, scene = min(views, key=lambda each: each[0])
-        images = [_traced(scene, row, 128, target) for target in STATED_DB]
+        images = [_trace(scene, row, 128, target) for target in STATED_DB]
         few, _, many = (image.radiance_rgb for image in images)
         gain = preview_gain(many)
         errors = mean_error(few, many)[16:-16, 16:-16].reshape(6, 16, 6, 16).mean(axis=(1, 3))
-        top, left = (16 * int(cell) for cell in np.unravel_index(errors.argmax(), errors.shape))
+        top_px, left_px = (
+            16 * int(cell) for cell in np.unravel_index(errors.argmax(), errors.shape)
+        )
         panels = []
         for target, image in zip(STATED_DB, images, strict=True):
-            shown = Image.fromarray(preview_srgb8(gain * image.radiance_rgb))
-            detail = shown.crop((left, top, left + 48, top + 48))
-            both = [part.resize((384, 384), Image.Resampling.NEAREST) for part in (shown, detail)]
+            display = Image.fromarray(preview_srgb8(gain * image.radiance_rgb))
+            detail = display.crop((left_px, top_px, left_px + 48, top_px + 48))
+            both = [part.resize((384, 384), Image.Resampling.NEAREST) for part in (display, detail)]
             said = f"{image.noise_floor_db:.0f} dB, {image.spp:,} samples"
-            panels.append(_panel(np.concatenate(both), f"Asked: {target} dB", said, TRACED))
+            panels.append(
+                _panel(
+                    np.concatenate([np.asarray(part) for part in both]),
+                    f"Asked: {target} dB",
+                    said,
+                    TRACED,
+                )
+            )
         self._write("stated_errors", _beside(panels))
 
     def own_objects(self) -> None:
         """Objects of the folder: as given, clean, and rendered alone with their own materials."""
         columns = {}
         for sample in self._samples("alone", ALONE, build="object-views"):
-            given, level = self._meshes(sample.scene)
+            source, level = self._meshes(sample.scene)
             image = sample.radiance_rgb[0]
-            shown = np.maximum(preview_srgb8(preview_gain(image) * image), np.uint8(GROUND))
+            display = np.maximum(
+                preview_srgb8(preview_gain(image) * image), np.array(GROUND, np.uint8)
+            )
             panels = [
-                _panel(_drawn(given, 256), "Your file", _triangles(given), GIVEN),
-                _panel(_drawn(level, 256), "Clean", _triangles(level), TRACED),
-                _panel(shown, "Rendered", "its own materials", TRACED),
+                _panel(_draw_mesh(source, 256), "Your file", _triangles(source), GIVEN),
+                _panel(_draw_mesh(level, 256), "Clean", _triangles(level), TRACED),
+                _panel(display, "Rendered", "its own materials", TRACED),
             ]
-            columns[-len(given.faces), len(level.faces)] = np.concatenate(panels)
+            columns[-len(source.faces), len(level.faces)] = np.concatenate(panels)
         self._write("own_objects", _beside([columns[key] for key in sorted(columns)[:4]]))
 
     def textures_and_skies(self) -> None:
         """Six scenes with textures below skies."""
         images = [sample.radiance_rgb[0] for sample in self._samples("skies", SKIES)]
-        shown = [preview_srgb8(preview_gain(image) * image) for image in images[:6]]
-        rows = [_beside(shown[:3]), _beside(shown[3:])]
+        display = [preview_srgb8(preview_gain(image) * image) for image in images[:6]]
+        rows = [_beside(display[:3]), _beside(display[3:])]
         self._write("textures_and_skies", np.concatenate(rows))
 
     def viewer(self) -> None:
@@ -206,7 +221,7 @@ class Pictures:
             try:
                 assert viewing.stdout is not None
                 said = (re.search(r"http://\S+", line) for line in viewing.stdout)
-                address = next(found[0] for found in said if found)
+                address = next(match[0] for match in said if match)
                 path = self._out / "viewer.png"
                 with browser("--hide-scrollbars") as page:
                     page.show(1100, 1270)
@@ -248,15 +263,15 @@ class Pictures:
     def _meshes(self, scene: Scene) -> tuple[TriangleMesh, TriangleMesh]:
         """Return the object whose file has most triangles: that file, and what the scene has."""
         objects = [row for row, each in enumerate(scene.objects) if each.kind == "object"]
-        given = {row: self._given(scene.objects[row].uid) for row in objects}
-        row = max(objects, key=lambda each: len(given[each].faces))
+        source = {row: self._source_mesh(scene.objects[row].uid) for row in objects}
+        row = max(objects, key=lambda each: len(source[each].faces))
         faces = scene.faces[scene.object_index == row].astype(np.int64)
         positions = scene.vertex_positions.astype(np.float64)
         used, where = np.unique(faces, return_inverse=True)
         level = TriangleMesh(positions=positions[used], faces=where.reshape(-1, 3))
-        return given[row], orient_outward(clean(normalize(level)))[0]
+        return source[row], orient_outward(clean(normalize(level)))[0]
 
-    def _given(self, uid: str) -> TriangleMesh:
+    def _source_mesh(self, uid: str) -> TriangleMesh:
         path = next(self._objects.rglob(f"{Path(uid).stem}.*"))
         mesh = load_mesh(read_source(path, AssetSettings().read_limits))
         return orient_outward(clean(normalize(mesh)))[0]
@@ -270,11 +285,13 @@ class Pictures:
 _CARD = "[...document.querySelectorAll('.card')].find(c => c.innerText.startsWith('Path traced'))"
 
 
-def _traced(scene: Scene, view: int, resolution: int, target_db: float) -> RenderedView:
+def _trace(scene: Scene, view: int, resolution: int, target_db: float) -> RenderedView:
     quality = ToStatedError(targets=NoiseTargets(log_db=target_db))
     tracer = PathTracer(RenderChild(choose_variant("auto")), quality, resolution)
     with contextlib.closing(tracer):
-        return tracer.load(scene, "scene").render_view(own_camera(scene, view, named="view"))
+        camera = own_camera(scene, view, named="view")
+        # no preview, whose error is not measured
+        return cast(RenderedView, tracer.load(scene, "scene").render_view(camera))
 
 
 def _seen_by(scene: Scene, view: int) -> Scene:
@@ -289,13 +306,14 @@ def _triangles(mesh: TriangleMesh) -> str:
     return f"{len(mesh.faces):,} triangles"
 
 
-def _drawn(mesh: TriangleMesh, width: int) -> Pixels:
+def _draw_mesh(mesh: TriangleMesh, width: int) -> Pixels:
     """Return a mesh with its edges on our ground [W, W, 3], as large as fits."""
     grey = Image.fromarray(preview(mesh, 2 * width))
-    left, top, right, bottom = grey.point(lambda value: 255 * (value < 255)).getbbox() or ()
-    half = max(right - left, bottom - top) / 1.8
-    x, y = (left + right) / 2, (top + bottom) / 2
-    box = (x - half, y - half, x + half, y + half)
+    rows, columns = np.nonzero(np.asarray(grey) < 255)
+    ends = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]])
+    half = np.ptp(ends, axis=0).max() / 1.8
+    corners = ends.mean(axis=0) + np.array([[-half], [half]])
+    box = (*corners[0].tolist(), *corners[1].tolist())
     near = grey.transform(
         (width, width), Image.Transform.EXTENT, box, Image.Resampling.BICUBIC, fillcolor=255
     )
@@ -323,8 +341,8 @@ def _beside(panels: Sequence[Pixels]) -> Pixels:
     step = width + GAP_PX
     row = np.full((height + 2 * GAP_PX, GAP_PX + step * len(panels), 3), GROUND, np.uint8)
     for place, pixels in enumerate(panels):
-        left = GAP_PX + place * step
-        row[GAP_PX : GAP_PX + height, left : left + width] = pixels
+        left_px = GAP_PX + place * step
+        row[GAP_PX : GAP_PX + height, left_px : left_px + width] = pixels
     return row
 
 
@@ -339,9 +357,9 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("data/pictures"))
     parser.add_argument("--room", type=int, nargs=2, default=(15, 1), help="scene and view to show")
     parser.add_argument("--only", nargs="*", choices=NAMES, default=NAMES)
-    asked = parser.parse_args()
-    pictures = Pictures(asked.objects, asked.data, asked.out, tuple(asked.room))
-    for name in asked.only:
+    arguments = parser.parse_args()
+    pictures = Pictures(arguments.objects, arguments.data, arguments.out, tuple(arguments.room))
+    for name in arguments.only:
         getattr(pictures, name)()
 
 

@@ -129,8 +129,8 @@ def _describe(renderer: Renderer, facts: Facts) -> Rows:
             samples = f"{facts['spp']}, {_FILTERS[preview.denoiser]}"
             return [("samples per pixel", samples), ("noise floor", unknown)]
         case PathTracer(settings=RenderSettings() as settings):
-            shown = _shown_floors(settings)
-            floors = [_floor(settings, facts, name, metric) for name, metric in shown.items()]
+            names = _shown_floors(settings)
+            floors = [_floor(settings, facts, name, metric) for name, metric in names.items()]
             rows = [("noise floor", floors[0]), *(("", floor) for floor in floors[1:])]
             if settings.stated_error == "calibrated":
                 rows.append(("", _meaning(settings, facts)))
@@ -147,8 +147,8 @@ def _describe(renderer: Renderer, facts: Facts) -> Rows:
 
 def _shown_floors(settings: RenderSettings) -> dict[str, str]:
     """Return the stated errors that were asked for, as `_FLOORS`; JSON has all three."""
-    asked = {name: metric for name, metric in _FLOORS.items() if metric in settings.targets_db}
-    return asked or {"noise_floor_db": "psnr_log_db"}
+    targets = {name: metric for name, metric in _FLOORS.items() if metric in settings.targets_db}
+    return targets or {"noise_floor_db": "psnr_log_db"}
 
 
 def _floor(settings: RenderSettings, facts: Facts, name: str, metric: str) -> str:

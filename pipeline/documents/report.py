@@ -71,9 +71,9 @@ def _most_used(
     """Return uid, title, split, materials and placements of the objects most often in scenes."""
     locked = {entry.uid: (entry.title, entry.split) for entry in distributions.objects}
     ranked = sorted(distributions.placements.items(), key=lambda entry: (-entry[1], entry[0]))
-    known, others = _drawn_materials(dataset)
+    reasons, usual = _drawn_materials(dataset)
     return [
-        (uid, *locked.get(uid, ("", "")), known.get(uid, others), count)
+        (uid, *locked.get(uid, ("", "")), reasons.get(uid, usual), count)
         for uid, count in ranked[:_MOST_USED]
     ]
 
@@ -86,7 +86,7 @@ def _drawn_materials(dataset: Dataset) -> tuple[dict[str, str], str]:
     if settings.get("scenes", {}).get("materials", {}).get("source") != "object":
         return {}, "drawn"
     lost = json.loads(dataset.files.read("logs/drawn_materials.json") or "{}")
-    return {uid: f"drawn: {', '.join(reasons)}" for uid, reasons in lost.items()}, "own"
+    return {uid: f"drawn: {', '.join(whys)}" for uid, whys in lost.items()}, "own"
 
 
 def _lines(values: Mapping[str, object], prefix: str = "") -> Iterator[str]:
