@@ -34,7 +34,7 @@ _POLL_S = 0.5
 _MAX_NOTES = 20
 """Maximum number of notes that are printed."""
 
-_RUN = "smoke"
+_RUN = "tiny"
 """Training preset that the next step names."""
 
 

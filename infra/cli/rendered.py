@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -119,7 +119,7 @@ def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
     print_rows("Rendered", rows)
     measure = " and ".join(str(picture.path) for picture in done.pictures.values())
     look = f"Look at {done.shot.png}; measure with {measure}"
-    _print_last(look, _floors([done]), _expected_errors([done]))
+    console.print(f"\n{look}", style="bold")
 
 
 def _describe(renderer: Renderer, facts: Facts) -> Rows:
@@ -129,7 +129,8 @@ def _describe(renderer: Renderer, facts: Facts) -> Rows:
             samples = f"{facts['spp']}, {_FILTERS[preview.denoiser]}"
             return [("samples per pixel", samples), ("noise floor", unknown)]
         case PathTracer(settings=RenderSettings() as settings):
-            floors = [_floor(settings, facts, name, metric) for name, metric in _FLOORS.items()]
+            names = _shown_floors(settings)
+            floors = [_floor(settings, facts, name, metric) for name, metric in names.items()]
             rows = [("noise floor", floors[0]), *(("", floor) for floor in floors[1:])]
             if settings.stated_error == "calibrated":
                 rows.append(("", _meaning(settings, facts)))
@@ -142,6 +143,12 @@ def _describe(renderer: Renderer, facts: Facts) -> Rows:
         case NetworkRenderer():
             return [("network", f"{renderer.checkpoint}; passes: {facts['passes']}")]
     raise TypeError(f"{renderer.name} is a renderer without a description")
+
+
+def _shown_floors(settings: RenderSettings) -> dict[str, str]:
+    """Return the stated errors that were asked for, as `_FLOORS`; JSON has all three."""
+    targets = {name: metric for name, metric in _FLOORS.items() if metric in settings.targets_db}
+    return targets or {"noise_floor_db": "psnr_log_db"}
 
 
 def _floor(settings: RenderSettings, facts: Facts, name: str, metric: str) -> str:
@@ -163,31 +170,15 @@ def _meaning(settings: RenderSettings, facts: Facts) -> str:
     return f"a bound: pictures like this one are not calibrated ({OUTSIDE})"
 
 
-def _floors(shots: Sequence[FinishedShot]) -> dict[str, list[float]]:
-    """Return the noise floors of all pictures by metric; empty where none is path traced."""
+def _floors(plan: RenderPlan, shots: Sequence[FinishedShot]) -> dict[str, list[float]]:
+    """Return the stated errors of all pictures that were asked for, by metric."""
     every = [shot.pictures["mitsuba"].facts for shot in shots if "mitsuba" in shot.pictures]
-    traced = [facts for facts in every if "noise_floor_db" in facts]
-    names = _FLOORS.items() if traced else ()
-    return {metric: [float(facts[name]) for facts in traced] for name, metric in names}
-
-
-def _expected_errors(shots: Sequence[FinishedShot]) -> list[float]:
-    """Return the expected errors of all pictures in dB; empty where one is not calibrated."""
-    every = [shot.pictures["mitsuba"].facts for shot in shots if "mitsuba" in shot.pictures]
-    name = _EXPECTED["noise_floor_db"]
-    return [float(facts[name]) for facts in every] if all(name in f for f in every) else []
-
-
-def _print_last(
-    look: str, floors: Mapping[str, Sequence[float]], expected: Sequence[float]
-) -> None:
-    """Print the file to look at, and all three noise floors, since one alone means little."""
-    if floors:
-        probably = f", probably {np.median(expected):.1f}" if expected else ""
-        log, linear, objects = (np.median(values) for values in floors.values())
-        which = "noise floor" if len(floors["psnr_log_db"]) == 1 else "median noise floor"
-        look += f"; {which} {log:.1f} dB{probably} (linear {linear:.1f}, objects {objects:.1f})"
-    console.print(f"\n{look}", style="bold")
+    names: dict[str, str] = {}
+    for renderer in plan.renderers:
+        match renderer:
+            case PathTracer(settings=RenderSettings() as settings):
+                names = _shown_floors(settings)
+    return {metric: [float(facts[name]) for facts in every] for name, metric in names.items()}
 
 
 def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: float) -> None:
@@ -197,10 +188,10 @@ def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: fl
         ("pictures", f"{len(shots)} of {plan.resolution} x {plan.resolution}"),
         ("files", f"{len(pictures)}, of which {num_kept} were there already"),
     ]
-    floors = _floors(shots)
+    floors = _floors(plan, shots)
     agreements = [shot.psnr_log_db for shot in shots if shot.psnr_log_db is not None]
     for metric, values in floors.items():
-        rows += _spread("noise floor" if metric == "psnr_log_db" else "", values, metric)
+        rows += _spread("noise floor", values, metric)
     rows += _spread("agreement", agreements, "psnr_log_db")
     if flickers := [shot.flicker for shot in shots if shot.flicker is not None]:
         db = np.median([flicker.db for flicker in flickers])
@@ -212,7 +203,7 @@ def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: fl
     print_rows("Rendered", rows)
     folder = plan.output.folder
     look = f"Look at {plan.output.video or folder}; measure with the pictures in {folder}"
-    _print_last(look, floors, _expected_errors(shots))
+    console.print(f"\n{look}", style="bold")
 
 
 def _time_rows(plan: RenderPlan, shots: Sequence[FinishedShot]) -> Rows:

@@ -59,7 +59,7 @@ class RenderOptions:
     max_spp: Samples = MOST_TRACED_SPP
     """mitsuba: maximum number of samples per pixel."""
     stated_error: StatedError = RenderSettings.stated_error
-    """mitsuba: what a noise floor is: a bound, or calibrated on other scenes, beside an expected
+    """mitsuba: how the error is stated: as a bound, or calibrated on other scenes, with an expected
     error."""
     spp: Annotated[int | None, Within(1, MOST_SPP, unit="samples")] = None
     """mitsuba: samples per pixel of a preview with one denoise; by default sampling goes on to the

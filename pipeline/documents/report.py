@@ -57,7 +57,7 @@ def write_report(
         filters=gallery_filters(cards),
         passes_command=passes_command(),
         sections=report_sections(distributions),
-        most_used=_most_used(distributions),
+        most_used=_most_used(distributions, dataset),
         settings=list(_lines(settings)),
         environment=list(_lines(manifest.environment)),
     )
@@ -65,11 +65,28 @@ def write_report(
     return folder.report
 
 
-def _most_used(distributions: Distributions) -> list[tuple[str, str, str, int]]:
-    """Return uid, title, split and placements of the objects that scenes have most often."""
+def _most_used(
+    distributions: Distributions, dataset: Dataset
+) -> list[tuple[str, str, str, str, int]]:
+    """Return uid, title, split, materials and placements of the objects most often in scenes."""
     locked = {entry.uid: (entry.title, entry.split) for entry in distributions.objects}
     ranked = sorted(distributions.placements.items(), key=lambda entry: (-entry[1], entry[0]))
-    return [(uid, *locked.get(uid, ("", "")), count) for uid, count in ranked[:_MOST_USED]]
+    reasons, usual = _drawn_materials(dataset)
+    return [
+        (uid, *locked.get(uid, ("", "")), reasons.get(uid, usual), count)
+        for uid, count in ranked[:_MOST_USED]
+    ]
+
+
+def _drawn_materials(dataset: Dataset) -> tuple[dict[str, str], str]:
+    """Return why materials of an object are drawn, by uid, and what the others have."""
+    settings = dataset.manifest.settings
+    if "derived" in settings:  # of several datasets, perhaps
+        return {}, ""
+    if settings.get("scenes", {}).get("materials", {}).get("source") != "object":
+        return {}, "drawn"
+    lost = json.loads(dataset.files.read("logs/drawn_materials.json") or "{}")
+    return {uid: f"drawn: {', '.join(whys)}" for uid, whys in lost.items()}, "own"
 
 
 def _lines(values: Mapping[str, object], prefix: str = "") -> Iterator[str]:

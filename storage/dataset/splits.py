@@ -116,6 +116,6 @@ def require_objects(num_by_split: Mapping[str, int], required_splits: set[str]) 
         total = sum(num_by_split.values())
         raise TrilightError(
             f"split {empty[0]!r}: none of the {total} accepted objects falls into it; expected at "
-            "least 1, for which about 30 different objects are enough. Add objects (for example "
-            "mix in `builtin:`), or make fewer scenes."
+            "least 1, for which about 30 different objects are enough. Add objects, or make fewer "
+            "scenes."
         )

@@ -34,7 +34,7 @@ def list_folder(folder: Path, licence: str | None) -> Listing:
         problem = "is not a folder" if folder.exists() else "does not exist"
         raise TrilightError(
             f"objects {display_path!r} {problem}; expected a folder of {' '.join(SUFFIXES)} "
-            "files, or builtin: for built-in objects."
+            "files, or procedural: for built-in objects."
         )
     catalogue = only_catalogue(lambda name: (folder / name).exists())
     if catalogue is None:

@@ -27,13 +27,14 @@ from pipeline.documents.report import write_report
 from pipeline.documents.report_sections import _rejections
 from pipeline.documents.rights import rights_of
 from pipeline.documents.scene_page import Neighbours, encode_scene_page, shown_maps
-from storage.dataset.dataset import Dataset
+from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError
 from storage.records.objects import Failure
 from storage.records.scene import SceneObject
 from storage.records.texture import MapSource, Texture
 from tests.pipeline.documents.dataset_by_hand import (
+    edit_manifest,
     five_scenes,
     furnished,
     locked,
@@ -163,6 +164,19 @@ def test_the_numbers_of_a_dataset_and_of_a_scene_are_on_their_pages(five: dict[s
     assert "no_room" not in text_of(five["000000000"])
     # linear 0.6 is 0.7977 in sRGB, 203 of 255
     assert "background: #cb0000" in five["000000000"].styles
+
+
+def test_the_report_says_which_objects_keep_their_materials(tmp_path: Path) -> None:
+    dataset = five_scenes(tmp_path)
+    report = report_of(dataset)
+    assert "a A train drawn 4" in text_of(read(report.read_bytes()))
+    scenes = {"materials": {"source": "object"}}
+    root = edit_manifest(dataset, settings={**dataset.manifest.settings, "scenes": scenes})
+    (root / "logs").mkdir(exist_ok=True)
+    (root / "logs" / "drawn_materials.json").write_text('{"b": ["no_materials"]}')
+    text = text_of(read(report_of(open_dataset(str(root))).read_bytes()))
+    assert "a A train own 4" in text
+    assert "b B train drawn: no_materials 1" in text
 
 
 @pytest.mark.usefixtures("bare_reports")

@@ -1,0 +1,367 @@
+"""Pictures of the documents: `python -m infra.pictures FOLDER` makes all, from a folder of objects.
+
+The published ones show KayKit's Dungeon Remastered by Kay Lousberg (CC0). Every picture has a dark
+ground of its own, so that it stands on light and on dark pages. Data is made once, and kept.
+"""
+
+import argparse
+import contextlib
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from infra.cli.console import console
+from infra.render.path_tracer import PathTracer, RenderChild
+from infra.render.quality import ToStatedError
+from infra.render.sources import own_camera
+from model.neural_renderer import NeuralRenderer
+from pipeline.assets.cleaning.clean import clean, normalize
+from pipeline.assets.cleaning.orient import orient_outward
+from pipeline.assets.preview import preview
+from pipeline.assets.settings import AssetSettings
+from pipeline.executors.threads import ThreadRunner
+from pipeline.foreign.load import load_mesh
+from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.source_file import read_source
+from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.pipeline import make_dataset
+from pipeline.renders.results import RenderedView
+from pipeline.renders.settings import NoiseTargets
+from pipeline.renders.variant import choose_variant
+from storage.conventions import preview_gain, preview_srgb8
+from storage.dataset.dataset import open_dataset
+from storage.metrics import psnr_log_db
+from storage.records.sample import Sample
+from storage.records.scene import Scene
+from train.evaluation.error_colors import ERROR_WHITE, heat_colors, mean_error
+
+GROUND = (22, 25, 29)
+INK = (240, 240, 236)
+FAINT = (158, 167, 176)
+GIVEN = FAINT
+TRACED = (86, 156, 214)
+LEARNED = (240, 146, 60)
+"""A user's, the path tracer's and the network's: the colors of the bars above panels."""
+GAP_PX = 12
+BAR_PX = 6
+TEXT_PX = 33
+STATED_DB = (30, 40, 46)
+AMPLIFIED = 5
+"""How much brighter an error is drawn than in reports."""
+QUALITY = 82
+"""Of WebP: at most 150 kB a picture."""
+
+Pixels = NDArray[np.uint8]
+
+_STILL = {
+    "scenes.materials.source": "object",
+    "scenes.placement.orientation": "kept",
+    "scenes.placement.resting_share": 1.0,
+    "scenes.placement.overlap_share": 0.0,
+    "scenes.textures.share": 1.0,
+    "scenes.skies.share": 1.0,
+    "scenes.cameras.up_jitter": 0.0,
+    "scenes.cameras.target_jitter": 0.05,
+    "scenes.cameras.elevation_deg": [14, 34],
+    "scenes.cameras.fov_deg": [36, 42],
+    "scenes.lights.count": [2, 3],
+}
+"""Objects stand upright on a textured floor, as a person would place them."""
+
+
+def _family(template: str) -> dict[str, Any]:
+    shell = {"square_share": 1.0, "scale": [1.5, 1.6], "raise_z": [0.55, 0.7]}
+    return {
+        "name": f"still-{template}",
+        "template": template,
+        "shell": shell,
+        "num_objects": [2, 3],
+        "object_scale": [0.9, 1.5],
+    }
+
+
+ROOMS = {
+    **_STILL,
+    "scenes.families": [_family("corner")],
+    "scenes.skies.over_lamps_log": [0.02, 0.05],
+}
+"""A weak sky beside lamps: the included network knows lamps alone."""
+
+SKIES = {
+    **_STILL,
+    "scenes.families": [_family("plane"), _family("wall")],
+    "scenes.skies.seen_share": 1.0,
+    "scenes.skies.over_lamps_log": [0.8, 2.5],
+    "scenes.skies.maps.families": ["sun_and_sky", "clouds"],
+    "scenes.cameras.elevation_deg": [4, 12],
+}
+
+ALONE = {
+    "renders.resolution": 256,
+    "scenes.num_views": 1,
+    "scenes.max_triangles": 1100,
+    "scenes.cameras.elevation_deg": [25, 30],
+}
+"""Of the preset `object-views`."""
+
+
+GLOSSY = {"renders.noise_floor_db": 20.0, "renders.resolution": 128}
+"""Drawn materials, stopped at the first measurement."""
+
+
+class Pictures:
+    """Makes the pictures of one folder of objects."""
+
+    def __init__(self, objects: Path, data: Path, out: Path, place: tuple[int, int]) -> None:
+        """`place`: number of the room and its view that the first pictures show."""
+        self._objects = objects
+        self._data = data
+        self._out = out
+        self._number, self._view = place
+
+    def hero(self) -> None:
+        """One scene in five steps: given mesh, clean mesh, traced, by the network, its error."""
+        scene = self._room()
+        traced = _trace(scene, self._view, 320, STATED_DB[-1])
+        learned = NeuralRenderer.load("builtin:").render(
+            _seen_by(scene, self._view), resolution=320
+        )[0]
+        source, level = self._meshes(scene)
+        target = traced.radiance_rgb
+        gain = preview_gain(target)
+        agreement = f"{psnr_log_db(learned, target):.0f} dB, included"
+        stated = f"stated error {traced.noise_floor_db:.0f} dB"
+        panels = [
+            _panel(_draw_mesh(source, 320), "Your mesh", _triangles(source), GIVEN),
+            _panel(_draw_mesh(level, 320), "Clean mesh", _triangles(level), TRACED),
+            _panel(preview_srgb8(gain * target), "Path traced", stated, TRACED),
+            _panel(preview_srgb8(gain * learned), "Network", agreement, LEARNED),
+            _panel(_error(learned, target), "Its error", f"{AMPLIFIED} times brighter", LEARNED),
+        ]
+        self._write("hero", _beside(panels))
+
+    def stated_errors(self) -> None:
+        """One view of drawn, glossy materials at 30, 40 and 46 dB, each with a detail."""
+        views = [
+            (abs(view.noise_floor_db - STATED_DB[0]), row, sample.scene)
+            for sample in self._samples("glossy", GLOSSY)
+            for row, view in enumerate(sample.views)
+        ]
+        _, row, scene = min(views, key=lambda each: each[0])
+        images = [_trace(scene, row, 128, target) for target in STATED_DB]
+        few, _, many = (image.radiance_rgb for image in images)
+        gain = preview_gain(many)
+        errors = mean_error(few, many)[16:-16, 16:-16].reshape(6, 16, 6, 16).mean(axis=(1, 3))
+        top_px, left_px = (
+            16 * int(cell) for cell in np.unravel_index(errors.argmax(), errors.shape)
+        )
+        panels = []
+        for target, image in zip(STATED_DB, images, strict=True):
+            display = Image.fromarray(preview_srgb8(gain * image.radiance_rgb))
+            detail = display.crop((left_px, top_px, left_px + 48, top_px + 48))
+            both = [part.resize((384, 384), Image.Resampling.NEAREST) for part in (display, detail)]
+            said = f"{image.noise_floor_db:.0f} dB, {image.spp:,} samples"
+            panels.append(
+                _panel(
+                    np.concatenate([np.asarray(part) for part in both]),
+                    f"Asked: {target} dB",
+                    said,
+                    TRACED,
+                )
+            )
+        self._write("stated_errors", _beside(panels))
+
+    def own_objects(self) -> None:
+        """Objects of the folder: as given, clean, and rendered alone with their own materials."""
+        columns = {}
+        for sample in self._samples("alone", ALONE, build="object-views"):
+            source, level = self._meshes(sample.scene)
+            image = sample.radiance_rgb[0]
+            display = np.maximum(
+                preview_srgb8(preview_gain(image) * image), np.array(GROUND, np.uint8)
+            )
+            panels = [
+                _panel(_draw_mesh(source, 256), "Your file", _triangles(source), GIVEN),
+                _panel(_draw_mesh(level, 256), "Clean", _triangles(level), TRACED),
+                _panel(display, "Rendered", "its own materials", TRACED),
+            ]
+            columns[-len(source.faces), len(level.faces)] = np.concatenate(panels)
+        self._write("own_objects", _beside([columns[key] for key in sorted(columns)[:4]]))
+
+    def textures_and_skies(self) -> None:
+        """Six scenes with textures below skies."""
+        images = [sample.radiance_rgb[0] for sample in self._samples("skies", SKIES)]
+        display = [preview_srgb8(preview_gain(image) * image) for image in images[:6]]
+        rows = [_beside(display[:3]), _beside(display[3:])]
+        self._write("textures_and_skies", np.concatenate(rows))
+
+    def viewer(self) -> None:
+        """Screenshot of `trilight view`, where Chromium is."""
+        if shutil.which("chromium") is None:
+            console.print(
+                "viewer: no picture, since Chromium is not installed (apt-get install chromium)"
+            )
+            return
+        from tests.end_to_end.browser_kit import browser  # a checkout has it, and a wheel has not
+
+        self._room()
+        shard = self._data / "rooms" / f"train-{self._number // 4:06d}.tar"
+        command = [sys.executable, "-m", "trilight", "view", f"{shard}::{self._number:09d}"]
+        with subprocess.Popen(
+            [*command, "--no-browser"], stdout=subprocess.PIPE, text=True
+        ) as viewing:
+            try:
+                assert viewing.stdout is not None
+                said = (re.search(r"http://\S+", line) for line in viewing.stdout)
+                address = next(match[0] for match in said if match)
+                path = self._out / "viewer.png"
+                with browser("--hide-scrollbars") as page:
+                    page.show(1100, 1270)
+                    page.open(address)
+                    page.until(f"{_CARD} && !document.querySelector('.busy')")
+                    for kind in ("input", "change"):
+                        page.run(
+                            f"view.value = {self._view}; view.dispatchEvent(new Event('{kind}'))"
+                        )
+                    page.run(f"{_CARD}.click()")
+                    page.until(f"{_CARD}.innerText.includes('stated')")
+                    page.until("!document.querySelector('.busy')")
+                    page.picture(path)
+            finally:
+                viewing.terminate()
+        self._write("viewer", np.asarray(Image.open(path).convert("RGB")))
+        path.unlink()
+
+    def _room(self) -> Scene:
+        scenes = [sample.scene for sample in self._samples("rooms", ROOMS)]
+        return next(s for s in scenes if s.provenance["scene_index"] == self._number)
+
+    def _samples(
+        self, name: str, changes: Mapping[str, Any], build: str = "tiny"
+    ) -> Iterator[Sample]:
+        """Make one of the datasets, unless it is there, and yield its training scenes."""
+        order = DatasetOrder(
+            build=build,
+            objects=str(self._objects),
+            out=str(self._data / name),
+            scenes=16,
+            seed=1,
+            licence="CC0-1.0",
+            changes=changes,
+        )
+        make_dataset(order, ThreadRunner())
+        yield from open_dataset(str(self._data / name)).samples("train")
+
+    def _meshes(self, scene: Scene) -> tuple[TriangleMesh, TriangleMesh]:
+        """Return the object whose file has most triangles: that file, and what the scene has."""
+        objects = [row for row, each in enumerate(scene.objects) if each.kind == "object"]
+        source = {row: self._source_mesh(scene.objects[row].uid) for row in objects}
+        row = max(objects, key=lambda each: len(source[each].faces))
+        faces = scene.faces[scene.object_index == row].astype(np.int64)
+        positions = scene.vertex_positions.astype(np.float64)
+        used, where = np.unique(faces, return_inverse=True)
+        level = TriangleMesh(positions=positions[used], faces=where.reshape(-1, 3))
+        return source[row], orient_outward(clean(normalize(level)))[0]
+
+    def _source_mesh(self, uid: str) -> TriangleMesh:
+        path = next(self._objects.rglob(f"{Path(uid).stem}.*"))
+        mesh = load_mesh(read_source(path, AssetSettings().read_limits))
+        return orient_outward(clean(normalize(mesh)))[0]
+
+    def _write(self, name: str, pixels: Pixels) -> None:
+        path = self._out / f"{name}.webp"
+        Image.fromarray(pixels).save(path, quality=QUALITY, method=6)
+        console.print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
+
+
+_CARD = "[...document.querySelectorAll('.card')].find(c => c.innerText.startsWith('Path traced'))"
+
+
+def _trace(scene: Scene, view: int, resolution: int, target_db: float) -> RenderedView:
+    quality = ToStatedError(targets=NoiseTargets(log_db=target_db))
+    tracer = PathTracer(RenderChild(choose_variant("auto")), quality, resolution)
+    with contextlib.closing(tracer):
+        camera = own_camera(scene, view, named="view")
+        # no preview, whose error is not measured
+        return cast(RenderedView, tracer.load(scene, "scene").render_view(camera))
+
+
+def _seen_by(scene: Scene, view: int) -> Scene:
+    return scene.with_cameras(scene.c2w[[view]], scene.fov_deg[[view]])
+
+
+def _error(image: NDArray[np.float32], target: NDArray[np.float32]) -> Pixels:
+    return heat_colors(AMPLIFIED * mean_error(image, target) / ERROR_WHITE)
+
+
+def _triangles(mesh: TriangleMesh) -> str:
+    return f"{len(mesh.faces):,} triangles"
+
+
+def _draw_mesh(mesh: TriangleMesh, width: int) -> Pixels:
+    """Return a mesh with its edges on our ground [W, W, 3], as large as fits."""
+    grey = Image.fromarray(preview(mesh, 2 * width))
+    rows, columns = np.nonzero(np.asarray(grey) < 255)
+    ends = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]])
+    half = np.ptp(ends, axis=0).max() / 1.8
+    corners = ends.mean(axis=0) + np.array([[-half], [half]])
+    box = (*corners[0].tolist(), *corners[1].tolist())
+    near = grey.transform(
+        (width, width), Image.Transform.EXTENT, box, Image.Resampling.BICUBIC, fillcolor=255
+    )
+    drawn = np.asarray(near, np.float64)[..., None].repeat(3, axis=2)
+    empty = np.clip((drawn - 240) / 15, 0, 1)
+    return np.round(empty * GROUND + (1 - empty) * drawn).astype(np.uint8)
+
+
+def _panel(pixels: Pixels, title: str, text: str, color: tuple[int, int, int]) -> Pixels:
+    """Return a picture below a bar and above two lines of text."""
+    height, width = pixels.shape[:2]
+    panel = Image.new("RGB", (width, BAR_PX + height + 3 * TEXT_PX), GROUND)
+    panel.paste(color, (0, 0, width, BAR_PX))
+    panel.paste(Image.fromarray(pixels), (0, BAR_PX))
+    pen = ImageDraw.Draw(panel)
+    for line, (words, ink) in enumerate(((title, INK), (text, FAINT))):
+        place = (GAP_PX, BAR_PX + height + round((1.3 * line + 0.3) * TEXT_PX))
+        pen.text(place, words, ink, ImageFont.load_default(TEXT_PX - 3 * line))
+    return np.asarray(panel)
+
+
+def _beside(panels: Sequence[Pixels]) -> Pixels:
+    """Return panels in a row, with gaps between and around."""
+    height, width = panels[0].shape[:2]
+    step = width + GAP_PX
+    row = np.full((height + 2 * GAP_PX, GAP_PX + step * len(panels), 3), GROUND, np.uint8)
+    for place, pixels in enumerate(panels):
+        left_px = GAP_PX + place * step
+        row[GAP_PX : GAP_PX + height, left_px : left_px + width] = pixels
+    return row
+
+
+NAMES = ("hero", "stated_errors", "own_objects", "textures_and_skies", "viewer")
+
+
+def main() -> None:
+    """Make the pictures that the command line names."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("objects", type=Path, help="folder of at least 30 objects")
+    parser.add_argument("--out", type=Path, default=Path("docs/pictures"))
+    parser.add_argument("--data", type=Path, default=Path("data/pictures"))
+    parser.add_argument("--room", type=int, nargs=2, default=(15, 1), help="scene and view to show")
+    parser.add_argument("--only", nargs="*", choices=NAMES, default=NAMES)
+    arguments = parser.parse_args()
+    pictures = Pictures(arguments.objects, arguments.data, arguments.out, tuple(arguments.room))
+    for name in arguments.only:
+        getattr(pictures, name)()
+
+
+if __name__ == "__main__":
+    main()
