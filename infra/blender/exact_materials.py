@@ -118,6 +118,8 @@ def restore_material(material: Any) -> None:
     gloss.distribution = "MULTI_GGX"
     follow(material, "specularAlbedo", base.inputs["Specular Tint"], gloss.inputs["Color"])
     follow(material, "roughness", base.inputs["Roughness"], gloss.inputs["Roughness"])
+    for known in base.inputs["Normal"].links:  # of a normal map
+        link(known.from_socket, gloss.inputs["Normal"])
     base.inputs["Specular IOR Level"].default_value = 0.0
     both = nodes.new("ShaderNodeAddShader")
     both.name = _SUM

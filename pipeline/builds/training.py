@@ -22,7 +22,7 @@ published scenes have defects (reference: renderformer.md, G):
 
 import dataclasses
 
-from pipeline.assets.settings import AssetSettings
+from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.builds.settings import BuildSettings, NamedBuild
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.renders.settings import RenderSettings
@@ -96,12 +96,15 @@ def sky_256() -> BuildSettings:
 
 
 def object_views() -> BuildSettings:
-    """One object with its own materials, alone below a sky: 24 views around it, 38 dB over it."""
+    """One object with its own materials and normal maps, alone below a sky: 24 views, 38 dB."""
     build = smoke()
     return dataclasses.replace(
         build,
         build="object-views",
-        assets=AssetSettings(budgets=(16_384, 8_192, 4_096, 2_048, 1_024, 512)),
+        assets=AssetSettings(
+            budgets=(16_384, 8_192, 4_096, 2_048, 1_024, 512),
+            own_materials=OwnMaterialSettings(normal_maps=True),
+        ),
         scenes=SceneSettings(
             families=(alone(),),
             max_triangles=16_384,
