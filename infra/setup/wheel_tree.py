@@ -20,8 +20,8 @@ PACKAGES = ("storage", "scene_templates", "pipeline", "model", "train", "infra")
 
 _BUILD_FILES = ("pyproject.toml", "README.md", "LICENSE", "requirements")
 """Files that a build reads in addition to the packages."""
-CHECKOUT_ONLY = "infra/bench"
-"""Folder of the experiments, which wheels leave out."""
+CHECKOUT_ONLY = ("infra/bench", "infra/pictures.py")
+"""The experiments and the pictures of the documents, which wheels leave out."""
 _IGNORED = shutil.ignore_patterns("__pycache__", "*.pyc", ".*")
 
 
@@ -38,7 +38,9 @@ def write_wheel_tree(checkout: Path, tree: Path) -> None:
     shutil.copytree(checkout / FACE, tree / FACE, ignore=_IGNORED)
     for package in PACKAGES:
         shutil.copytree(checkout / package, tree / FACE / package, ignore=_IGNORED)
-    shutil.rmtree(tree / FACE / CHECKOUT_ONLY)
+    for name in CHECKOUT_ONLY:
+        path = tree / FACE / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
     shutil.copy2(checkout / "prefect.yaml", tree / FACE)
     for path in (tree / FACE).rglob("*.py"):
         text = path.read_text(encoding="utf-8")

@@ -60,6 +60,7 @@ BUILD_V1 = BuildSettings(
             max_colour_error=0.05,
             max_missed=0.1,
             emission=False,
+            normal_maps=False,
             transmission="opaque",
             if_lost="drawn",
         ),

@@ -83,7 +83,7 @@ def test_every_module_of_the_tree_compiles(tree: Path) -> None:
 def test_lines_keep_their_numbers(tree: Path) -> None:
     for package in (*PACKAGES, FACE):
         for path in (ROOT / package).rglob("*.py"):
-            if path.is_relative_to(ROOT / CHECKOUT_ONLY):
+            if any(path.is_relative_to(ROOT / name) for name in CHECKOUT_ONLY):
                 continue
             beside = tree / ("" if package == FACE else FACE) / path.relative_to(ROOT)
             assert beside.read_text().count("\n") == path.read_text().count("\n"), path
@@ -94,7 +94,7 @@ def test_all_files_of_the_checkout_are_in_the_tree(tree: Path) -> None:
     tracked = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True)
     for name in tracked.stdout.splitlines():
         copied = tree / ("" if name.startswith(f"{FACE}/") else FACE) / name
-        assert copied.is_file() != name.startswith(f"{CHECKOUT_ONLY}/"), name
+        assert copied.is_file() != name.startswith(CHECKOUT_ONLY), name
     assert (tree / FACE / "prefect.yaml").is_file()
 
 
