@@ -207,6 +207,12 @@ def test_the_count_of_wrong_errors_is_that_of_the_rows() -> None:
     assert (len(wrong), sum(wrong)) == (int(said[1]), int(said[2]))
 
 
+def test_there_are_as_many_files_of_tests_as_is_said() -> None:
+    said = re.search(r"\[(\d+)\+ files\]\(tests\)", README.read_text())
+    assert said is not None
+    assert len([*(ROOT / "tests").rglob("test_*.py")]) >= int(said[1])
+
+
 TROUBLE = DOCS / "how-to" / "troubleshooting.md"
 PRODUCT = ("infra", "pipeline", "storage", "train", "model", "scene_templates")
 
