@@ -5,6 +5,7 @@ And views whose rays a card traces: their code on the CPU's tensors, and the ker
 
 import ctypes
 import dataclasses
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -220,6 +221,10 @@ def test_settings_that_go_not_together_are_refused(changes: dict[str, Any], mess
         hits_config(**changes)
 
 
+@pytest.mark.skipif(
+    os.environ.get("ATEN_CPU_CAPABILITY") == "default",
+    reason="torch's attention then packs for AMX, which the processor has, and cannot: pack_vnni2",
+)
 def test_it_takes_bfloat16_for_what_is_rounded() -> None:
     from model.precision import set_precision
 
