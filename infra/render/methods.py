@@ -9,9 +9,8 @@ import numpy as np
 from infra.render.networks import DirectLightRenderer, NetworkRenderer, traced_network
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import FixedSamples
-from pipeline.renders.denoiser import Quality, denoise
 from pipeline.renders.settings import Filtered
-from pipeline.renders.tracer import Features
+from storage.denoiser import Features, Quality, denoise
 from storage.renderer import Renderer
 
 if TYPE_CHECKING:

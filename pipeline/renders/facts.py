@@ -8,8 +8,8 @@ from importlib import metadata
 from pathlib import Path
 
 from pipeline.isolation import die_with_parent
-from pipeline.renders.denoiser import open_device
 from pipeline.renders.variant import Variant, activate, run_module
+from storage.denoiser import open_device
 from storage.installation import child_environment
 
 _ASK_S = 120

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.camera import PixelCamera
-from pipeline.renders.denoiser import Quality, denoise
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer, representable, require_surfaces
 from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.settings import PASS_SPP, Depth, Filtered, RenderSettings, Resolution
-from pipeline.renders.tracer import Features, Tracer
+from pipeline.renders.tracer import Tracer
 from pipeline.renders.view_pictures import require_bounded
+from storage.denoiser import Features, Quality, denoise
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
 from storage.renderer import Sampling

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.camera import PixelCamera
-from pipeline.renders.denoiser import set_denoiser_threads
 from pipeline.renders.frozen_arithmetic.host_pictures import HostPictures
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import MeasuredFloor
@@ -34,6 +33,7 @@ from pipeline.renders.tiles import TileChoice
 from pipeline.renders.tracer import Tracer
 from pipeline.renders.view_pictures import MeasuredLook, ViewPictures
 from storage.conventions import HALF_FLOAT_MAX
+from storage.denoiser import set_denoiser_threads
 from storage.errors import Rejected
 from storage.records.lights import (
     light_rows,

@@ -4,39 +4,15 @@ The tests have another one, Mitsuba's stock path integrator (tests/oracle): an i
 estimates the same integral.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.camera import PixelCamera
+from storage.denoiser import Features
 from storage.records.scene import Scene
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Features:
-    """What guides the denoiser, averaged over the area of each pixel."""
-
-    albedo: NDArray[np.float32]
-    """[R, R, 3] diffuse + specular albedo of the first surface, 0 where there is none."""
-    normal: NDArray[np.float32]
-    """[R, R, 3] its shading normal in world space, 0 where there is none."""
-    lobes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    """[R, R, 3] the diffuse and the specular albedo by these names, where lobes are apart."""
-
-    def of_part(self, name: str) -> "Features":
-        """Return what guides the denoiser of a part (storage.records.parts), by its name.
-
-        A lobe is guided by its own albedo, and by no normal where it has none: there it is black.
-        """
-        albedo = self.lobes.get(name.partition("_")[0])
-        if albedo is None:
-            return self
-        normal = np.where(albedo.any(axis=-1, keepdims=True), self.normal, np.float32(0))
-        return Features(albedo=albedo, normal=normal)
-
 
 Chosen = NDArray[np.bool_] | None
 """[R, R] the pixels of a pass, one at least; None means all of them."""

@@ -27,10 +27,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.renders import probe_picture
-from pipeline.renders.denoiser import DenoiserDevice, set_denoiser_device
 from pipeline.renders.visible_gpus import gpu_identity, visible_gpus
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
+from storage.denoiser import DenoiserDevice, set_denoiser_device
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.installation import IMPORT_ROOT, child_environment

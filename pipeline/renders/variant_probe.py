@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.isolation import die_with_parent
-from pipeline.renders.denoiser import DenoiserDevice, gpu_is_supported, set_denoiser_device
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
 from storage.conventions import look_at_c2w
+from storage.denoiser import DenoiserDevice, gpu_is_supported, set_denoiser_device
 from storage.records.material import completed_rows
 from storage.records.scene import ObjectKind, Scene, SceneObject
 

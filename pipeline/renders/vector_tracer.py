@@ -29,7 +29,8 @@ from pipeline.renders.light_kernel import PhotonRecords, trace_light, trace_phot
 from pipeline.renders.path_kernel import trace
 from pipeline.renders.recorded_calls import KernelInputs, record_launches
 from pipeline.renders.sky_table import SkyTable
-from pipeline.renders.tracer import Chosen, Features, split_triangles
+from pipeline.renders.tracer import Chosen, split_triangles
+from storage.denoiser import Features
 from storage.records.lights import shining_sky
 from storage.records.scene import Scene
 from storage.seeds import seed_for

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from infra.render.raw_references import RawReference, first_camera, true_error
 from pipeline.renders.camera import PixelCamera
-from pipeline.renders.denoiser import denoise
 from pipeline.renders.frozen_arithmetic.halves import (
     Half,
     measure_errors,
@@ -28,9 +27,10 @@ from pipeline.renders.frozen_arithmetic.host_pictures import (
 from pipeline.renders.noise_floor import BLOCK_PX, Curve, clamped_radiance, secant_slope
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import Filtered, RenderSettings
-from pipeline.renders.tracer import Features, Tracer
+from pipeline.renders.tracer import Tracer
 from pipeline.renders.view_pictures import MeasuredLook
 from storage.conventions import log10_radiance
+from storage.denoiser import Features, denoise
 from storage.records.scene import Scene
 from storage.seeds import seed_for
 

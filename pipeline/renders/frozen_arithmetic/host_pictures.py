@@ -17,13 +17,12 @@ from pipeline.renders.denoise_corrections import (
     STANDARD_ERRORS,
     STANDS_OUT,
 )
-from pipeline.renders.denoiser import denoise
 from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error, measure_errors
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tiles import tile_means
-from pipeline.renders.tracer import Features, Tracer
+from pipeline.renders.tracer import Tracer
 from pipeline.renders.view_pictures import (
     MeasuredLook,
     floor_groups,
@@ -33,6 +32,7 @@ from pipeline.renders.view_pictures import (
     to_filter,
 )
 from storage.conventions import log10_radiance
+from storage.denoiser import Features, denoise
 
 _METRICS = (
     ("log", log10_radiance, False),

@@ -2,15 +2,15 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.renders import denoiser, variant_probe
+from pipeline.renders import variant_probe
 from pipeline.renders.denoise_corrections import LEAST_PASSES
-from pipeline.renders.denoiser import denoise, load_oidn, set_denoiser_device
 from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error
 from pipeline.renders.frozen_arithmetic.host_pictures import (
     HostMeans,
@@ -23,7 +23,8 @@ from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tiles import TileChoice
-from pipeline.renders.tracer import Features
+from storage import denoiser
+from storage.denoiser import Features, denoise, load_oidn, set_denoiser_device
 from tests.pipeline.renders.sampling import camera_of, render_view
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 
@@ -49,6 +50,16 @@ def test_noise_goes_edges_stay_and_what_has_no_light_stays_black() -> None:
     # a pixel is background only if neither features nor samples saw anything there
     nothing = Features(albedo=np.zeros_like(noisy), normal=np.zeros_like(noisy))
     assert (denoise(noisy, nothing, "high")[8:] > 0).all()
+
+
+def test_threads_filter_at_the_same_time() -> None:
+    """Each has its own memory: a shared one would mix their pictures."""
+    _, noisy, features = _noisy_step()
+    pictures = [noisy * np.float32(scale) for scale in (0.5, 1, 2, 4)] * 4
+    expected = [denoise(each, features, "fast", 1) for each in pictures]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda each: denoise(each, features, "fast", 1), pictures))
+    np.testing.assert_array_equal(found, expected)
 
 
 class _Card:

@@ -24,7 +24,7 @@ from pipeline.renders.preview import (
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.settings import Filtered, RenderSettings
-from pipeline.renders.tracer import Features
+from storage.denoiser import Features
 from storage.errors import Rejected, TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.scene import Scene

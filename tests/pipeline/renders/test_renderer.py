@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.renders.denoiser import Quality, denoise
 from pipeline.renders.frozen_arithmetic import host_pictures
 from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans, with_mean_of
 from pipeline.renders.load_tracer import choose_tracing_scale, load_tracer
@@ -16,8 +15,8 @@ from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import RenderedView
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import Features
 from storage.conventions import look_at_c2w
+from storage.denoiser import Features, Quality, denoise
 from storage.errors import Rejected
 from storage.metrics import psnr_log_db
 from storage.records.exr import decode_exr, encode_exr

@@ -13,8 +13,8 @@ import mitsuba as mi
 import pytest
 
 from pipeline.generation.environment import environment
-from pipeline.renders import denoiser, variant_probe, vector_tracer
 from pipeline.renders import variant as variant_module
+from pipeline.renders import variant_probe, vector_tracer
 from pipeline.renders.facts import render_facts
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
 from pipeline.renders.variant import (
@@ -26,6 +26,7 @@ from pipeline.renders.variant import (
     llvm_libraries,
 )
 from pipeline.renders.variant_probe import BLOCK, probe_scene, wrong_picture
+from storage import denoiser
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.records.scene_file import encode_scene
 from tests.command_line import trilight
@@ -257,7 +258,7 @@ def test_asking_does_not_import_mitsuba_nor_the_denoiser_torch() -> None:
         "import sys; from pipeline.renders.variant import choose_variant; choose_variant(); "
         "import pipeline.renders.renderer, pipeline.renders.facts; "
         "print(sorted({'mitsuba', 'drjit', 'pyoidn'} & set(sys.modules))); "
-        "from pipeline.renders.denoiser import load_oidn; load_oidn(); "
+        "from storage.denoiser import load_oidn; load_oidn(); "
         "print('torch' in sys.modules)"
     )
     assert printed_by(code) == "[]\nFalse"
