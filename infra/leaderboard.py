@@ -264,8 +264,8 @@ def _notes(board: Board, tables: Sequence[WidthStandings]) -> Iterator[str]:
     yield "targets went through the path tracer's denoiser, which favours its rows a little"
     yield (
         "the references' noise was measured at the width of the set; less is left at smaller ones. "
-        "In log_l1 it is an upper bound, and in SSIM, LPIPS and HDR-FLIP that of independent noise "
-        "of its size, where a denoiser's is smoother: a row may score better than it"
+        "In log_l1 it is an upper bound, and in metrics after it, SSIM, LPIPS and HDR-FLIP that of "
+        "independent noise of its size, where a denoiser's is smoother: a row may score better"
     )
 
 

@@ -3,13 +3,19 @@
 Values in dB never stand alone: report the median, the 5th percentile and the share over a target.
 """
 
+import math
+
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
 from storage.conventions import log10_radiance
 
 MAX_DB = 100.0
 """Reported for pictures that agree exactly, so that means and plots stay finite."""
+
+SEAM_TILES = 16
+"""Tiles a side between which `seam` looks: the anchors of the included network."""
 
 
 def psnr_log_db(a: ArrayLike, b: ArrayLike) -> float:
@@ -62,11 +68,48 @@ def flicker_log_db(before: ArrayLike, now: ArrayLike) -> float:
     return _db(np.square(np.asarray(now, np.float64) - np.asarray(before, np.float64)))
 
 
-def _squared_log_error(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
-    difference = log10_radiance(np.asarray(a, np.float64)) - log10_radiance(
-        np.asarray(b, np.float64)
+def pepper(a: ArrayLike, b: ArrayLike) -> float:
+    """Return how much more a picture varies between neighboring pixels than its reference.
+
+    The mean, over squares of three by three pixels, of sqrt(max(0, var_a - var_b)) of
+    log10(1 + radiance). Noise raises it; a smooth or a blurred error does not.
+
+    Args:
+        a: [R, R, 3] linear radiance, R at least 3.
+        b: the same shape, without noise.
+    """
+    of_a, of_b = (
+        sliding_window_view(_log(each), (3, 3), axis=(0, 1)).var(axis=(-2, -1)) for each in (a, b)
     )
-    return np.square(difference)
+    return float(np.sqrt(np.maximum(of_a - of_b, 0)).mean())
+
+
+def seam(a: ArrayLike, b: ArrayLike) -> float:
+    """Return how much steeper an error is between tiles of a picture than inside them; 1 is equal.
+
+    The mean absolute difference of the error of log10(1 + radiance) from a pixel to the next, where
+    two of SEAM_TILES tiles a side meet, over that elsewhere. A picture without error has 1.
+
+    Args:
+        a: [R, R, 3] linear radiance, R at least 3. Tiles have two pixels or more.
+        b: the same shape.
+    """
+    error = _log(a) - _log(b)
+    step = max(2, len(error) // math.gcd(len(error), SEAM_TILES))
+    is_between = np.arange(1, len(error)) % step == 0
+    steps = np.stack(
+        [np.abs(np.diff(each, axis=0)).mean(axis=(1, 2)) for each in (error, error.swapaxes(0, 1))]
+    )
+    inside = steps[:, ~is_between].mean()
+    return float(steps[:, is_between].mean() / inside) if inside > 0 else 1.0
+
+
+def _log(radiance_rgb: ArrayLike) -> NDArray[np.float64]:
+    return log10_radiance(np.asarray(radiance_rgb, np.float64))
+
+
+def _squared_log_error(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
+    return np.square(_log(a) - _log(b))
 
 
 def _db(squared_error: NDArray[np.float64]) -> float:

@@ -17,7 +17,14 @@ from storage.conventions import (
     srgb8,
 )
 from storage.intervals import mean_interval
-from storage.metrics import MAX_DB, object_psnr_log_db, psnr_linear_db, psnr_log_db
+from storage.metrics import (
+    MAX_DB,
+    object_psnr_log_db,
+    pepper,
+    psnr_linear_db,
+    psnr_log_db,
+    seam,
+)
 
 angles = st.floats(1, 170)
 
@@ -123,3 +130,40 @@ def test_the_interval_of_a_mean_goes_by_clusters() -> None:
     assert low < alone_low < 0.3 < alone_high < high
     assert low == pytest.approx(0.3 - 1.96 * np.sqrt(0.3 * 0.7 / 10), abs=0.06)
     assert mean_interval([0.5] * 4, ["a", "a", "b", "b"]) == (0.5, 0.5)
+
+
+def _smooth_picture() -> np.ndarray:
+    ramp = np.linspace(0.2, 1.5, 64)
+    return np.stack([ramp[:, None] * ramp] * 3, axis=-1)
+
+
+def test_pepper_is_noise_and_not_a_smooth_error() -> None:
+    picture = _smooth_picture()
+    rng = np.random.default_rng(0)
+    peppers = [
+        pepper(
+            radiance_from_log10(log10_radiance(picture) + rng.normal(0, rms, picture.shape)),
+            picture,
+        )
+        for rms in (0.01, 0.02)
+    ]
+    assert 0.007 < peppers[0] < 0.01, "the standard deviation over nine pixels, of their mean"
+    assert 1.9 < peppers[1] / peppers[0] < 2.1
+    offset = radiance_from_log10(log10_radiance(picture) + 0.1)
+    assert pepper(offset, picture) < 1e-6
+    blurred = np.full_like(picture, picture.mean())
+    assert pepper(blurred, picture) == 0
+
+
+def test_seams_are_steps_between_tiles() -> None:
+    picture = _smooth_picture()
+    noise = np.random.default_rng(0).normal(0, 0.01, picture.shape)
+    noisy = radiance_from_log10(log10_radiance(picture) + noise)
+    assert seam(noisy, picture) == pytest.approx(1, abs=0.05)
+    for tile, steps in ((4, True), (8, True), (3, False)):
+        number = np.arange(64) // tile
+        tiles = ((number[:, None] + number) % 2)[..., None] * 0.02
+        tiled = radiance_from_log10(log10_radiance(picture) + noise + tiles)
+        assert (seam(tiled, picture) > 1.2) == steps, tile
+    assert seam(picture, picture) == 1
+    assert seam(noisy[:8, :8], picture[:8, :8]) > 0, "tiles of a pixel have nothing inside"

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from model.precision import tf32
 from storage.conventions import log10_radiance, radiance_from_log10
-from storage.metrics import object_psnr_log_db, psnr_linear_db, psnr_log_db
+from storage.metrics import object_psnr_log_db, pepper, psnr_linear_db, psnr_log_db, seam
 from storage.records.sample import Sample, ViewRecord
 from storage.registry import Registry
 from storage.seeds import rng_for
@@ -205,6 +205,16 @@ METRICS: Registry[Metric] = Registry(
             higher_is_better=False,
             meaning="mean absolute error of log10(1 + radiance), after the output's ELU",
             floor=noise_rms,
+        ),
+        "pepper": Metric(
+            score=lambda picture: pepper(picture.radiance_rgb, picture.target_rgb),
+            higher_is_better=False,
+            meaning="excess of the standard deviation of log10(1 + radiance) over 3 x 3 pixels",
+        ),
+        "seam": Metric(
+            score=lambda picture: seam(picture.radiance_rgb, picture.target_rgb),
+            higher_is_better=False,
+            meaning="steps of the error where 16 x 16 tiles meet, over those elsewhere; 1 is none",
         ),
     },
 )

@@ -206,7 +206,7 @@ def test_floors_of_metrics_without_a_measurement_are_of_drawn_noise() -> None:
         for floor_db in (20.0, 40.0)
     }  # fmt: skip
     assert found[20.0]["ssim"] < found[40.0]["ssim"] < 1
-    for metric in ("lpips", "hdr_flip", "log_l1"):
+    for metric in ("lpips", "hdr_flip", "log_l1", "pepper"):
         assert found[20.0][metric] > found[40.0][metric] > 0
     assert found[40.0]["psnr_log_db"] == 40.0 and found[40.0]["log_l1"] == pytest.approx(0.01)
     # as large as stated, and less where it would make a pixel negative: there at most half is left
