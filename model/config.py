@@ -54,6 +54,11 @@ class HitStage:
     pixel_width: int
     filter_width: int
     sky_rays: int
+    denoise_from_px: int
+
+    def denoises(self, resolution: int) -> bool:
+        """Return whether the light of pictures of a width is denoised before the network."""
+        return 0 < self.denoise_from_px <= resolution
 
 
 @checked("model config")
@@ -124,6 +129,10 @@ class ModelConfig:
     sky_rays: Annotated[int, Within(0, 64, unit="rays")] = 0
     """hits: rays towards the sky from each shaded point; with 0, the network supports no sky. 0
     with bundles."""
+    denoise_from_px: Annotated[int, Within(0, 16_384, unit="pixels")] = 0
+    """hits: picture width from which Open Image Denoise filters direct and mirrored light before
+    the network reads it, in place of filter_width's network; with 0, it never does. 0 with
+    bundles."""
 
     def __post_init__(self) -> None:
         if self.width % self.num_heads or self.head_width % 2:
@@ -168,8 +177,9 @@ class ModelConfig:
                 _wrong("demodulated with view_stage hits", "false")
         elif any([*required.values(), self.gather_rays, self.filter_width, not self.scene_tokens]):
             _wrong("fields of hits beside view_stage bundles", "0, and scene_tokens true")
-        elif self.sky_rays:
-            _wrong(f"sky_rays {self.sky_rays} with view_stage bundles", "0")
+        elif self.sky_rays or self.denoise_from_px:
+            got = f"sky_rays {self.sky_rays} and denoise_from_px {self.denoise_from_px}"
+            _wrong(f"{got} with view_stage bundles", "0")
         elif self.demodulated != (self.hit_rays > 0):
             expected = "1 or more" if self.demodulated else "0, or demodulated true"
             _wrong(f"hit_rays {self.hit_rays} with view_stage bundles", expected)

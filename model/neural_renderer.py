@@ -181,10 +181,15 @@ class NeuralRenderer:
         views = prepared.views
         if resolution not in views:
             decode = functools.partial(_predict_picture, self._model, prepared.groups, resolution)
-            on_card = self.device.type == "cuda" and any(
-                scene.lit.place for each, _ in prepared.groups for scene in each.traced
+            stage = self._model.config.stage
+            # a graph cannot hold the denoiser, which runs on the CPU
+            is_recorded = (
+                self.device.type == "cuda"
+                and isinstance(stage, HitStage)
+                and not stage.denoises(resolution)
+                and any(scene.lit.place for each, _ in prepared.groups for scene in each.traced)
             )
-            views[resolution] = Replayed(decode) if on_card else decode
+            views[resolution] = Replayed(decode) if is_recorded else decode
         picture: NDArray[np.float32] = views[resolution](c2w_44, angle).cpu().numpy()
         return picture
 

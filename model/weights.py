@@ -228,6 +228,7 @@ _OMITTED_AT_DEFAULT = (
     "scene_tokens",
     "demodulated",
     "sky_rays",
+    "denoise_from_px",
 )
 
 

@@ -226,6 +226,8 @@ def stored_settings(settings: TrainSettings) -> dict[str, Any]:
             entries = list(record[group].items())
             place = list(record[group]).index(_BEFORE[name]) + 1
             record[group] = dict([*entries[:place], (name, off), *entries[place:]])
+    if not record["model"]["denoise_from_px"]:
+        del record["model"]["denoise_from_px"]  # a later setting: older files lack it
     return record
 
 

@@ -204,19 +204,19 @@ class PixelHead(nn.Module):
         key_M9W: Tensor,
         value_M9W: Tensor,
         offsets: AnchorOffset,
-        met_M9: Tensor,
+        window_MP9: Tensor,
         gathered_M93: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Return the learned numbers [M, P, 15], and gathered light mixed for the pixels [M, P, 3].
 
-        M parts of the picture have P pixels and nine anchors each; F numbers a pixel.
+        M parts of the picture have P pixels and nine anchors each; F numbers a pixel. `window` is
+        added to how much alike they are.
         """
         pixel_MPW = silu(self.told(features_MPF))
         alike_MP9 = self.query(pixel_MPW) @ key_M9W.mT / math.sqrt(key_M9W.shape[-1])
         for weight, unlike_MP9 in zip(softplus(self.nearness), offsets.unlike, strict=True):
             alike_MP9 = alike_MP9 - weight * unlike_MP9
-        nothing_M19 = torch.where(met_M9, 0.0, -2 * FARTHEST)[:, None]
-        share_MP9 = (alike_MP9 + nothing_M19).softmax(dim=-1)
+        share_MP9 = (alike_MP9 + window_MP9).softmax(dim=-1)
         known_MPW = share_MP9 @ value_M9W + self.place(offsets.mixture_offset(share_MP9))
         gathered_MP3 = share_MP9 @ gathered_M93
         both = torch.cat([pixel_MPW, known_MPW, torch.log1p(4 * gathered_MP3)], dim=-1)
@@ -287,7 +287,8 @@ class HitDecoder(nn.Module):
             lights = torch.log1p(4 * torch.cat([light, mirrored], dim=-1))
             return torch.cat([surface, lights, available], dim=-1)
 
-        if self.filter is not None:
+        is_denoised = hit_stage(self.config).denoises(pixels.shape[2])
+        if self.filter is not None and not is_denoised:
             albedo = pixels[..., Channel.SPECULAR] * pixels[..., Channel.COVERAGE]
             views = mirrored.shape[:2]
             flat = [each.flatten(0, 1) for each in (stack_features(), mirrored, albedo)]
@@ -344,10 +345,15 @@ class HitDecoder(nn.Module):
             _in_parts(each.flatten(0, 1), side) for each in (features, traced.pixels_VRRC, mirrored)
         ]
         every = [each.flatten(0, 1) for each in (*pixel_parts, *around)]
-        rows = [
-            self._some_parts(unit[some], *(each[some] for each in every))
-            for some in _blocks(features, parts)
-        ]
+        meets_M = every[1][..., 0].any(dim=1)
+        is_sparse = features.device.type == "cpu" and not torch.is_grad_enabled()
+        rows = []
+        for block in _blocks(features, parts):
+            radiance_MP3 = torch.zeros_like(every[2][block])
+            # a graph of a GPU and a gradient need all parts; on a CPU, black ones cost nothing
+            some = meets_M[block] if is_sparse else slice(None)
+            radiance_MP3[some] = self._some_parts(*(each[block][some] for each in (unit, *every)))
+            rows.append(radiance_MP3)
         pictures = _whole(torch.cat(rows).unflatten(0, (-1, parts)), side)
         log10 = torch.log1p(pictures) / math.log(10)
         return log10.reshape(*views, resolution, resolution, 3)
@@ -365,8 +371,11 @@ class HitDecoder(nn.Module):
     ) -> Tensor:
         """Return the radiance [M, P, 3] of some parts of pictures."""
         offsets = offsets_to_anchors(pixels_MPC, place_M9C)
-        met_M9 = place_M9C[..., 0] > 0
-        learned, mixed = self.head(features_MPF, key_M9W, value_M9W, offsets, met_M9, gathered_M93)
+        nothing_M19 = torch.where(place_M9C[..., 0] > 0, 0.0, -2 * FARTHEST)[:, None]
+        window_MP9 = nothing_M19 + _log_window(round(pixels_MPC.shape[1] ** 0.5), unit_M13.device)
+        learned, mixed = self.head(
+            features_MPF, key_M9W, value_M9W, offsets, window_MP9, gathered_M93
+        )
         return _compose_radiance(learned, mixed, mirrored_MP3, pixels_MPC, unit_M13)
 
 
@@ -440,6 +449,18 @@ def _around(values_VAK: Tensor, side: int) -> Tensor:
     near = (grid[:, None] + torch.arange(-1, 2, device=grid.device)).clamp(0, side - 1)
     rows = near[:, None, :, None] * side + near[None, :, None, :]
     return values_VAK[:, rows.reshape(side * side, NEIGHBOURS)]
+
+
+def _log_window(step: int, device: torch.device) -> Tensor:
+    """Return the logarithm [P, 9] of the weight of the nine anchors around, for a part's pixels.
+
+    An anchor fades out, row and column apart, over the half part after which it is none of the
+    nine: weights that the network was trained with stay as they are in between.
+    """
+    offset = (torch.arange(step, device=device)[:, None] + 0.5) / step - 0.5
+    sides = torch.arange(-1, 2, device=device)
+    weight = (1 + 2 * offset * sides).clamp(max=1).log()
+    return (weight[:, None, :, None] + weight[:, None]).reshape(step * step, NEIGHBOURS)
 
 
 def _compose_radiance(

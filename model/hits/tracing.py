@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from model.config import HitStage, ModelConfig, hit_stage
+from model.hits.denoised import denoise_light
 from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import DeviceTriangles, compiled_kernel
 from model.hits.lit_scene import LitScene
@@ -186,10 +187,13 @@ def traced_views(
         scene.view(c2w_44, fov_deg, resolution, stage, seed)
         for c2w_44, fov_deg in zip(c2w_V44, fov_deg_V, strict=True)
     ]
+    pixels_VRRC = _stack([view.pixels for view in views])
+    if stage.denoises(resolution):
+        pixels_VRRC = denoise_light(pixels_VRRC, scene.unit_3)
     return Traced(
         sides_T12=scene.sides_T12,
         unit_3=scene.unit_3,
-        pixels_VRRC=_stack([view.pixels for view in views]),
+        pixels_VRRC=pixels_VRRC,
         anchor_VA=_stack([view.anchor for view in views]),
         gathered_VA3=_stack([view.gathered for view in views]),
         given_VI=torch.ones(len(views), len(INPUTS), device=scene.unit_3.device),

@@ -75,6 +75,35 @@ def test_anchors_around_a_part_are_those_beside_it() -> None:
     assert around[0].tolist() == [0, 0, 1, 0, 0, 1, 4, 4, 5], "at the rim the nearest stand again"
 
 
+def test_a_picture_that_moves_by_half_an_anchor_shows_no_seam() -> None:
+    """Other anchors know other light: where nine give way to the next nine, nothing jumps."""
+    model, resolution, side = network(), 64, 8
+    step = resolution // side
+    scene = scene_tensors(corner())
+    inputs = with_traced(scene, resolution, hits_config()).traced
+    assert inputs is not None
+    center = slice(resolution // 2, resolution // 2 + 1)
+    middle = torch.arange(side) * step + step // 2
+    inputs = dataclasses.replace(
+        inputs,
+        pixels_VRRC=inputs.pixels_VRRC[:, center, center].expand_as(inputs.pixels_VRRC),
+        anchor_VA=(middle[:, None] * resolution + middle).reshape(1, -1),
+    )
+    generator = torch.Generator().manual_seed(0)
+    pictures = []
+    for _ in range(2):
+        known = inputs.unit_3 * torch.rand(1, side * side, 3, generator=generator)
+        traced_inputs = dataclasses.replace(inputs, gathered_VA3=known)
+        with torch.no_grad():
+            shown = model(batch_scenes([dataclasses.replace(scene, traced=traced_inputs)]), 64)
+        pictures.append(shown[0, 0])
+    half = step // 2
+    moved = pictures[0][half:-half, half:-half] - pictures[1][2 * half :, 2 * half :]
+    steps = moved.diff(dim=0).abs().mean(dim=(1, 2))
+    between = torch.arange(1, len(moved)) % half == 0
+    assert steps[between].mean() < 1.2 * steps[~between].mean()
+
+
 def test_all_views_at_once_are_the_views_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """While learning on a card; pictures and gradients, in double precision.
 

@@ -1,0 +1,76 @@
+"""Denoised light: less noise, the same surfaces and units, and only in wide pictures."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from model.hits.denoised import denoise_light
+from model.hits.tracing import with_traced
+from model.hits.view_inputs import Channel
+from model.neural_renderer import NeuralRenderer
+from model.renderformer import radiance
+from model.scene_tensors import batch_scenes, scene_tensors
+from storage.metrics import pepper
+from tests.model.hits.kit import corner, traced
+from tests.model.kit import awake, hits_config
+
+PX = 64
+UNIT = torch.tensor([0.5, 1.0, 2.0])
+LIGHTS = (Channel.SHOWN_DIFFUSE, Channel.DIRECT_SPECULAR, Channel.MIRRORED)
+
+
+def _traced(**changes: int) -> Tensor:
+    return torch.from_numpy(traced(corner(), PX, **changes).pixels[None])
+
+
+def _direct(pixels: Tensor) -> Tensor:
+    return pixels[0, ..., Channel.SHOWN_DIFFUSE] + pixels[0, ..., Channel.DIRECT_SPECULAR]
+
+
+def test_noise_goes_and_light_and_surfaces_stay() -> None:
+    noisy = _traced()
+    clean = denoise_light(noisy.clone(), UNIT)
+    truth = torch.stack([_traced(seed=seed) for seed in range(1, 17)]).mean(dim=0)
+    for light in (_direct, lambda pixels: pixels[0, ..., Channel.MIRRORED]):
+        assert pepper(light(clean), light(truth)) < 0.5 * pepper(light(noisy), light(truth))
+        torch.testing.assert_close(light(clean).mean(), light(noisy).mean(), rtol=0.1, atol=0)
+    kept = torch.ones(noisy.shape[-1], dtype=torch.bool)
+    for channel in LIGHTS:
+        kept[channel] = False
+    assert torch.equal(clean[..., kept], noisy[..., kept])
+    nothing = noisy[0, ..., 0] == 0
+    assert nothing.any() and not _direct(clean)[nothing].any(), "nothing is met: black"
+
+
+def test_it_scales_with_the_lamps_and_is_the_same_in_every_thread() -> None:
+    noisy = _traced()
+    brighter = noisy.clone()
+    scale = torch.tensor([8.0, 4.0, 2.0])
+    for channel in LIGHTS:
+        brighter[..., channel] *= scale
+    with ThreadPoolExecutor(2) as pool:
+        one, other = pool.map(denoise_light, (noisy, brighter), (UNIT, UNIT * scale))
+    assert torch.equal(_direct(other), _direct(one) * scale)
+
+
+def test_wide_pictures_are_denoised_wherever_their_light_is_traced() -> None:
+    scene, config = corner(), hits_config(denoise_from_px=PX)
+    tensors = scene_tensors(scene)
+    inputs = {
+        (px, which.denoise_from_px): with_traced(tensors, px, which).traced
+        for px in (PX, PX // 2)
+        for which in (hits_config(), config)
+    }
+    small, plain, wide = (inputs[key] for key in ((PX // 2, PX), (PX, 0), (PX, PX)))
+    assert small is not None and plain is not None and wide is not None
+    below = inputs[PX // 2, 0]
+    assert below is not None and torch.equal(small.pixels_VRRC, below.pixels_VRRC)
+    expected = denoise_light(plain.pixels_VRRC.clone(), plain.unit_3)
+    assert torch.equal(wide.pixels_VRRC, expected)
+    model = awake(config, torch.float32)
+    with torch.no_grad():
+        trained = radiance(model(batch_scenes([with_traced(tensors, PX, config)]), PX)[0, 0])
+    shown = NeuralRenderer(model).render(scene, PX)[0]
+    np.testing.assert_allclose(shown, trained.numpy(), rtol=1e-4, atol=1e-6)
