@@ -23,7 +23,7 @@ from model.hits.decoder import _around
 from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import SOURCE, DeviceTriangles, build_tree
 from model.hits.traced import INPUTS
-from model.hits.tracing import traced_scene, with_traced
+from model.hits.tracing import traced_scene, traced_views, with_traced
 from model.hits.view_inputs import Channel
 from model.neural_renderer import NeuralRenderer
 from model.renderformer import RenderFormer, radiance
@@ -295,6 +295,12 @@ def test_a_view_of_tensors_is_numpys(scene: Scene) -> None:
     for name, array in vars(expected).items():
         tensor = getattr(got, name).tensor
         np.testing.assert_allclose(tensor.numpy(), array, rtol=1e-3, atol=2e-5, err_msg=name)
+    denoising = dataclasses.replace(stage, denoise_from_px=32)
+    views = [
+        traced_views(form, camera[0][None], camera[1][None], 32, denoising).pixels_VRRC
+        for form in (numpy_form, tensor_form)
+    ]
+    torch.testing.assert_close(views[1], views[0], rtol=1e-2, atol=1e-3)
 
 
 def _rays(corners: NDArray, count: int) -> tuple[NDArray, NDArray, NDArray]:
