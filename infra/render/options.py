@@ -18,7 +18,6 @@ from pipeline.renders.settings import (
     Filtered,
     NoiseFloor,
     NoiseTargets,
-    RenderSettings,
     Resolution,
     Samples,
     StatedError,
@@ -58,9 +57,9 @@ class RenderOptions:
     none."""
     max_spp: Samples = MOST_TRACED_SPP
     """mitsuba: maximum number of samples per pixel."""
-    stated_error: StatedError = RenderSettings.stated_error
-    """mitsuba: how the error is stated: as a bound, or calibrated on other scenes, with an expected
-    error."""
+    stated_error: StatedError = ToStatedError.stated_error
+    """mitsuba: how the error is stated: calibrated on other scenes, with an expected error; or as a
+    bound."""
     spp: Annotated[int | None, Within(1, MOST_SPP, unit="samples")] = None
     """mitsuba: samples per pixel of a preview with one denoise; by default sampling goes on to the
     stated error. The error of a preview is not measured."""
@@ -142,7 +141,7 @@ class RenderOptions:
             "--noise-floor": self.noise_floor_db,
             "--noise-floor-linear": self.noise_floor_linear_db,
             "--noise-floor-objects": self.noise_floor_objects_db,
-            "--stated-error": None if self.stated_error == "bound" else self.stated_error,
+            "--stated-error": None if self.stated_error == "calibrated" else self.stated_error,
             "--split": self.split or None,
             "--split-lobes": self.split_lobes or None,
         }

@@ -47,7 +47,15 @@ def smoke() -> BuildSettings:
         assets=AssetSettings(budgets=(1400, 1000, 700, 500, 340, 240)),
         scenes=SceneSettings(families=DEFAULT_FAMILIES, max_triangles=1536, num_views=4),
         renders=RenderSettings(
-            resolution=256, noise_floor_db=38.0, min_spp=64, max_spp=256, arithmetic="device"
+            resolution=256,
+            noise_floor_db=38.0,
+            min_spp=32,
+            min_spp_px=256,
+            max_spp=256,
+            light_paths="scene",
+            arithmetic="device",
+            stated_error="calibrated",
+            picture_within_db=2.0,
         ),
         splits=SplitSettings(scenes_per_shard=4),
     )
