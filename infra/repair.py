@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
-from pipeline.builds.named import named_build
-from pipeline.builds.settings import differences
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.pipeline import make_dataset
 from pipeline.objects.licences import BY_USER
+from pipeline.presets.registry import preset_settings
+from pipeline.presets.settings import differences
 from storage.dataset.asked import read_asked, value_of
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.derived import derivation_of
@@ -147,7 +147,7 @@ def _user_maps(dataset: Dataset, command: Sequence[str]) -> dict[str, str | None
 
 def _changes(manifest: Manifest) -> dict[str, object]:
     """Return the settings of a dataset that differ from its preset's."""
-    build = named_build(manifest.build).as_json()
+    build = preset_settings(manifest.build).as_json()
     changed = {name: now for name, _, now in differences(build, manifest.settings)}
     if _is_of_files(manifest):
         return {name: now for name, now in changed.items() if name not in _OF_SCENE_FILES}

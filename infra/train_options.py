@@ -11,8 +11,8 @@ from storage.extensions import function_name
 from storage.settings.changes import option_words
 from storage.settings.described import checked
 from storage.settings.ranges import Within
+from train.presets import override_training_preset
 from train.resume import StartOptions
-from train.runs import changed_run
 from train.settings import TrainSettings
 
 RESTARTS = "TORCHELASTIC_RESTART_COUNT"
@@ -78,7 +78,7 @@ class TrainOptions:
             TrilightError: an unknown preset or setting, a refused value, or start options that do
                 not fit the run.
         """
-        settings = changed_run(
+        settings = override_training_preset(
             self.run, self.changes, steps=self.steps, most_unusable=self.most_unusable
         )
         self.start().check(settings)

@@ -64,7 +64,7 @@ def train_run(
     """Train a network and evaluate it.
 
     Args:
-        settings: the run; `train.runs.named_run` returns those that have a name.
+        settings: the run; `train.presets.training_preset` returns those that have a name.
         data: root of a dataset, or of several that are mixed (storage.dataset.mixed_data), or a
             list of shards (storage.dataset.training_data), with a train split; without a validation
             split nothing is evaluated.

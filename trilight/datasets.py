@@ -14,7 +14,7 @@ def generate(order: DatasetOrder) -> "Outcome":
     The call may be stopped at any time; the same order resumes and gives the same dataset digest.
 
     Args:
-        order: build, folder, number of scenes: the options of the command line.
+        order: preset, folder, number of scenes: the options of the command line.
 
     Raises:
         TrilightError: an error that the user can fix; finished scenes are safe.

@@ -68,11 +68,11 @@ def with_base_settings(order: Order, base: BaseSettings) -> Order:
         TrilightError: settings cannot be read, or the preset refuses a value, also one that the
             options state.
     """
-    from pipeline.builds.named import named_build, option_changes  # train does without
+    from pipeline.presets.registry import option_changes, preset_settings  # train does without
 
     options = option_changes(order.seed, order.resolution, order.noise_targets)
     stated = {**options, **order.changes}
-    changes = all_changes(named_build(order.build), base, _dataset_record(base), stated)
+    changes = all_changes(preset_settings(order.build), base, _dataset_record(base), stated)
     if not base.is_given:
         return order
     if _LICENCES in changes:  # the option adds licences to those of any source of settings

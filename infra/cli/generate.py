@@ -61,7 +61,7 @@ def make(order: DatasetOrder, runner: ExecutorOptions, output: OutputOptions) ->
     """Make a dataset and print the result; raises TrilightError."""
     folder = dataset_folder(order.place)
     started = time.monotonic()
-    first_words(f"Making {folder.display_name} with the build {order.build}", silent=output.json)
+    first_words(f"Making {folder.display_name} with the preset {order.build}", silent=output.json)
     executor = find_executor(runner.runner, runner.address, order.workers)
     from infra.planning import describe_run  # slow: every stage
     from pipeline.generation.run import choose_dataset_variant
@@ -189,9 +189,9 @@ def _next_steps(folder: DatasetFolder, statistics: Statistics) -> Iterator[Seque
 
 def _fits_training(manifest: Manifest) -> bool:
     """Return whether the smallest training preset fits the pictures, and torch is installed."""
-    from train.runs import named_run  # late, so that the first line is printed sooner
+    from train.presets import training_preset  # late, so that the first line is printed sooner
 
-    run = named_run(_RUN)
+    run = training_preset(_RUN)
     pictures = manifest.settings["renders"]["resolution"]
     has_views = manifest.num_views >= run.views_per_scene
     return has_views and pictures % run.resolution == 0 and find_spec("torch") is not None

@@ -251,16 +251,16 @@ def takes_names(hint: Any) -> bool:
     return get_origin(unwrap(hint)[0]) in (Mapping, dict)
 
 
-def _builds() -> list[str]:
-    from pipeline.builds.named import BUILDS
+def _dataset_presets() -> list[str]:
+    from pipeline.presets.registry import DATASET_PRESETS
 
-    return list(BUILDS)
+    return list(DATASET_PRESETS)
 
 
 def _runs() -> list[str]:
-    from train.runs import RUNS
+    from train.presets import TRAINING_PRESETS
 
-    return list(RUNS)
+    return list(TRAINING_PRESETS)
 
 
 def _sizes() -> list[str]:
@@ -276,7 +276,7 @@ def _runners() -> list[str]:
 
 
 NAMES: dict[str, Callable[[], list[str]]] = {
-    "build": _builds,
+    "build": _dataset_presets,
     "run": _runs,
     "network": _sizes,
     "runner": _runners,

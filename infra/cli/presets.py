@@ -5,7 +5,7 @@ from typing import Any
 
 from infra.cli.console import console, print_json, print_table
 from infra.cli.options import OutputOptions, command
-from storage.aliases import NETWORKS, OBJECTS, PRESETS
+from storage.aliases import NETWORKS, OBJECTS, PRESET_ALIASES
 
 
 @command()
@@ -32,14 +32,14 @@ def _name_for_people(name: str, aliases: Mapping[str, str]) -> str:
 
 
 def _datasets() -> list[dict[str, Any]]:
-    from pipeline.builds.named import BUILDS
+    from pipeline.presets.registry import DATASET_PRESETS
 
     rows = []
-    for name, build in BUILDS.items():
+    for name, build in DATASET_PRESETS.items():
         settings = build.settings()
         rows.append(
             {
-                "name": _name_for_people(name, PRESETS),
+                "name": _name_for_people(name, PRESET_ALIASES),
                 "scenes": build.num_scenes,
                 "views": settings.scenes.num_views,
                 "pixels": settings.renders.resolution,
@@ -51,14 +51,14 @@ def _datasets() -> list[dict[str, Any]]:
 
 
 def _trainings() -> list[dict[str, Any]]:
-    from train.runs import RUNS
+    from train.presets import TRAINING_PRESETS
 
     rows = []
-    for name, run in RUNS.items():
+    for name, run in TRAINING_PRESETS.items():
         settings = run()
         rows.append(
             {
-                "name": _name_for_people(name, PRESETS),
+                "name": _name_for_people(name, PRESET_ALIASES),
                 "pixels": settings.resolution,
                 "steps": settings.num_steps,
                 "scenes a step": settings.scenes_per_step,

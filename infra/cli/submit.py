@@ -146,7 +146,7 @@ def _submit_flow(
     flow: str, order: DatasetOrder, base: BaseSettings, runs: FlowRunOptions, output: OutputOptions
 ) -> None:
     """Submit a flow run and report it; once it has ended, name the next commands."""
-    first_words(f"Submitting {flow} with the build {order.build}", silent=output.json)
+    first_words(f"Submitting {flow} with the preset {order.build}", silent=output.json)
     load_prefect()
     from pipeline.flows.submission import parameters
 

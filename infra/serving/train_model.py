@@ -18,17 +18,17 @@ from pipeline.flows.limits import GPU_LIMIT
 from pipeline.flows.process import run_to_end
 from pipeline.renders.visible_gpus import visible_gpus
 from storage.errors import TrilightError
-from train.runs import RUNS, smoke
+from train.presets import TRAINING_PRESETS, smoke
 from train.settings import TrainSettings
 
-RunName = Literal[tuple(RUNS)]  # type: ignore[valid-type]
+TrainingPresetName = Literal[tuple(TRAINING_PRESETS)]  # type: ignore[valid-type]
 """Names of the training presets, a list of choices in the form."""
 RunChanges = changes_form(TrainSettings, smoke())
 """Form of every setting; an empty one keeps the preset's value."""
 
 
 TRAIN_FORMS: Mapping[str, Any] = {
-    "run": RunName,
+    "run": TrainingPresetName,
     "data": list[PublicUrl],
     "begin_with": PublicUrl | None,
     "branch": PublicUrl | None,

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pipeline.builds.named import BUILDS, named_build
 from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from storage.dataset.dataset import dataset_files
 from storage.dataset.layout import dataset_folder
 from storage.dataset.progress import unfinished_shards
@@ -88,8 +88,8 @@ def array_job(
             "of the cluster could read in the queue; expected env:TRILIGHT_SOURCE_NAME, with the "
             "address in that variable of the tasks."
         )
-    scenes = order.scenes or BUILDS.find(order.build).num_scenes
-    splits = changed(named_build(order.build), order.changes).splits
+    scenes = order.scenes or DATASET_PRESETS.find(order.build).num_scenes
+    splits = changed(preset_settings(order.build), order.changes).splits
     planned = shards_for(scenes, splits)
     is_begun = _is_begun(order.place)
     missing = unfinished_shards(order.place, scenes) if is_begun else list(range(planned))

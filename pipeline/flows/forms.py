@@ -2,7 +2,7 @@
 
 A flow takes the fields of a settings class as its parameters: their descriptions
 (storage.settings.described) become the schema that Prefect checks before a run exists, and from
-which it draws a form. The groups of a build's settings become forms within the form, in which every
+which it draws a form. The groups of a preset's settings become forms within it, in which every
 field may stay empty.
 """
 
@@ -15,10 +15,10 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
-from pipeline.builds.named import BUILDS
-from pipeline.builds.settings import BuildSettings
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.objects.sources import SOURCES
+from pipeline.presets.registry import DATASET_PRESETS
+from pipeline.presets.settings import DatasetSettings
 from storage.dataset.shard_places import MAX_SHARDS
 from storage.errors import TrilightError
 from storage.settings.described import checked
@@ -100,16 +100,16 @@ PublicPlace = Annotated[
     Field(pattern=r"^(?:[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|(?:[^:]|:+[^:/]|:+/[^:/])*:*/?)$"),
 ]
 """An output folder of any name, or a URL without secrets."""
-BuildName = Literal[tuple(BUILDS)]  # type: ignore[valid-type]
-"""Names of the registered builds, as a list to choose from."""
-BuildChanges = changes_form(BuildSettings, BUILDS["smoke"].settings())
-"""Every setting of a build."""
+DatasetPresetName = Literal[tuple(DATASET_PRESETS)]  # type: ignore[valid-type]
+"""Names of the registered presets, as a list to choose from."""
+DatasetChanges = changes_form(DatasetSettings, DATASET_PRESETS["smoke"].settings())
+"""Every setting of a preset."""
 
 DATASET_FORMS: Mapping[str, Any] = {
-    "build": BuildName,
+    "build": DatasetPresetName,
     "objects": PublicUrl | None,
     "out": PublicPlace | None,
-    "changes": BuildChanges | None,
+    "changes": DatasetChanges | None,
 }
 """Types of parameters that are narrower in a form than in the options."""
 
@@ -144,7 +144,7 @@ def order_of(parameters: Mapping[str, Any], kind: Callable[..., Returned]) -> Re
 
 
 def run_name() -> str:
-    """Return the name of the starting flow run: build, number of scenes and output folder."""
+    """Return the name of the starting flow run: preset, number of scenes and output folder."""
     from prefect.runtime import flow_run
 
     parameters = {"build": DatasetOrder.build, **flow_run.parameters}

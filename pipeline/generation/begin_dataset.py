@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from pipeline.builds.settings import BuildSettings, differences
 from pipeline.generation.dataset_writer import (
     PLANNED,
     DatasetWriter,
@@ -15,6 +14,7 @@ from pipeline.generation.dataset_writer import (
     merge_failures,
     published_head,
 )
+from pipeline.presets.settings import DatasetSettings, differences
 from pipeline.renders.variant import device_of
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder, place_of_part
@@ -89,7 +89,7 @@ def _publish_plan(store: Store, num_scenes: int) -> None:
 
 def begin_dataset(
     folder: DatasetFolder,
-    settings: BuildSettings,
+    settings: DatasetSettings,
     environment: Mapping[str, Any],
     num_scenes: int,
     *,
@@ -139,7 +139,7 @@ def begin_dataset(
 def _require_same_dataset(
     folder: DatasetFolder,
     manifest: Manifest,
-    settings: BuildSettings,
+    settings: DatasetSettings,
     environment: Mapping[str, Any],
     accept_environment: bool,
 ) -> None:
@@ -150,7 +150,7 @@ def _require_same_dataset(
             "and cannot grow; extend its sources and make it again, or choose another --out."
         )
     require_same_extensions(folder.display_name, manifest.extensions, extension_digests("data"))
-    stored = from_record(BuildSettings, manifest.settings).as_json()  # fields may come later
+    stored = from_record(DatasetSettings, manifest.settings).as_json()  # fields may come later
     _require_same(folder, "setting", stored, settings.as_json(), "choose another --out")
     if not accept_environment:
         before = device_of(manifest.environment)

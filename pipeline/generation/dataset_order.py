@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from dataclasses import field
 from typing import Annotated, Any
 
-from pipeline.builds.named import BUILDS
 from pipeline.exchange.from_description import AlbedoOverOne
+from pipeline.presets.registry import DATASET_PRESETS
 from pipeline.renders.settings import NoiseFloor, NoiseTargets, Resolution
 from pipeline.renders.variant import Device
 from storage.dataset.layout import dataset_folder
@@ -74,7 +74,7 @@ class DatasetOrder:
     """Continue a dataset that was started with other library versions or on another device."""
     scenes_from: str | None = None
     """Folder of scene files (RenderFormer JSON) to render; by default scenes are composed of
-    objects. Scene k is the k-th *.json, all scenes belong to the split test, and the build's limits
+    objects. Scene k is the k-th *.json, all scenes are of the split test, and the preset's limits
     on scenes do not apply."""
     views: Annotated[int | None, Within(1, 1000, unit="cameras")] = None
     """Number of cameras to use of each scene file, from its first; by default the smallest number
@@ -93,7 +93,7 @@ class DatasetOrder:
     (values are JSON); by default there are none."""
 
     def __post_init__(self) -> None:
-        BUILDS.find(self.build)
+        DATASET_PRESETS.find(self.build)
         if self.scenes_from is not None and (self.objects, self.scenes) != (None, None):
             raise TrilightError(
                 f"--scenes-from {self.scenes_from} was given with --objects or --scenes; expected "

@@ -30,7 +30,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from pipeline.builds.named import BUILDS, object_source
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.sheets import write_first_pictures
 from pipeline.generation.accept_maps import map_folders
@@ -62,6 +61,7 @@ from pipeline.generation.scene_worker import MAX_ATTEMPTS, SceneAttempt, SceneWo
 from pipeline.generation.tasks import FIRST_PAUSE_S, Piece, TaskCutter, wait_for_others
 from pipeline.generation.unfinished_shard import UnfinishedShard
 from pipeline.isolation import ChildFailed, IsolatedChild, with_retries
+from pipeline.presets.registry import DATASET_PRESETS, object_source
 from storage.dataset.asked import write_asked
 from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import ShardEntry
@@ -117,7 +117,7 @@ def _begin_run(order: DatasetOrder) -> Iterator[Run]:
             folder,
             settings,
             environment(variant),
-            BUILDS[order.build].num_scenes if order.scenes is None else order.scenes,
+            DATASET_PRESETS[order.build].num_scenes if order.scenes is None else order.scenes,
             accept_environment=order.accept_environment,
         )
         requested = order.shard_range()

@@ -7,9 +7,9 @@ from dataclasses import field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pipeline.builds.revisit import MOST_CAMERAS, GivenCamera, RevisitSettings
 from pipeline.exchange.open_scene import load_cameras, scene_source
 from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.presets.revisit import MOST_CAMERAS, GivenCamera, RevisitSettings
 from pipeline.renders.settings import NoiseFloor, Resolution
 from pipeline.renders.variant import Device
 from pipeline.shards.finished_dataset import open_finished
@@ -59,13 +59,13 @@ class RevisitOptions:
     noise_floor_objects_db: NoiseFloor | None = None
     """The same as object_psnr_log_db; by default as the dataset was made."""
     build: str | None = None
-    """Build that fills in settings which the dataset does not state, since it was merged; by
+    """Preset that fills in settings which the dataset does not state, since it was merged; by
     default the dataset's own."""
     workers: Annotated[int | None, Within(1, 1024, unit="processes")] = None
     """Number of render processes, which share the cores; by default one, or four for each GPU, or
     as many as its memory holds."""
     device: Device | None = None
-    """Device that renders: cpu, gpu or auto; by default as `trilight generate` with its build."""
+    """Device that renders: cpu, gpu or auto; by default as `trilight generate` with its preset."""
     failure_budget: Share = 0.1
     """Share of scenes that may fail for good before the run stops."""
     accept_environment: bool = False

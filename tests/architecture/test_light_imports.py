@@ -20,7 +20,7 @@ STEPS = (
         "trilight.pictures, trilight.scenes",
         HEAVY,
     ),
-    ("import pipeline.builds.named", HEAVY),
+    ("import pipeline.presets.registry", HEAVY),
     ("import infra.cli.app", {"torch", "mitsuba", "prefect", "pymeshlab"}),
     # a worker may have only what making data needs, and a wrong form need not wait for torch
     ("import infra.serving.train_model", {"torch"}),

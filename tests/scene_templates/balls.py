@@ -21,7 +21,7 @@ from storage.seeds import rng_for
 from storage.settings.changes import changed
 
 DEFAULTS = SceneSettings(families=DEFAULT_FAMILIES)
-"""What the training builds draw from; their budgets mean nothing where there are no meshes."""
+"""What the training presets draw from; their budgets mean nothing where there are no meshes."""
 
 
 ROOMS = [name for name, template in TEMPLATES.items() if template.parts]

@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.builds.named import named_build
+from pipeline.presets.registry import preset_settings
 from scene_templates.layout import Emitter, SurfaceLook
 from scene_templates.settings import SceneSettings
 from storage.settings.changes import changed
@@ -208,7 +208,7 @@ STATED = {
 
 
 def _settings(build: str) -> SceneSettings:
-    return named_build(build).scenes
+    return preset_settings(build).scenes
 
 
 def _table(scenes: list[Drawn], stated: Stated) -> Table:
@@ -333,7 +333,7 @@ WRONG: list[tuple[str, Mapping[str, Any], set[str]]] = [
         | {"object by triangle", "overlaps"},
     ),
 ]
-"""A build, what is changed behind its back, and some of what must be noticed."""
+"""A preset, what is changed behind its back, and some of what must be noticed."""
 
 
 @pytest.mark.parametrize(("build", "changes", "rows"), WRONG, ids=["ranges", "kinds"])

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.builds.named import named_build
+from pipeline.presets.registry import preset_settings
 from scene_templates.cameras import CameraSettings
 from scene_templates.exact import cosine, dot, lerp, ramp, sine, smoothstep
 from scene_templates.families import Family
@@ -256,7 +256,7 @@ def test_families_in_turn_have_exactly_their_share() -> None:
 @pytest.mark.parametrize("turns", [1, 3])
 def test_every_excursion_meets_every_family_equally_often(turns: int) -> None:
     """Were both to turn with the index, 37 and 4 would still meet; 36 and 4 would not."""
-    settings = named_build("out-of-range").scenes
+    settings = preset_settings("out-of-range").scenes
     for count in (37, 36):
         chosen = dataclasses.replace(settings, excursions=settings.excursions[:count])
         found = Counter(

@@ -62,9 +62,9 @@ from train.loop.distributed import DistributedContext
 from train.loop.schedule import learning_rate
 from train.loop.state import TrainState, new_state
 from train.loss.lpips import LINEAR_FILE, VGG16_FILE, load_lpips
+from train.presets import override_training_preset
 from train.resume import StartOptions
 from train.run import stream_settings, train_run
-from train.runs import changed_run
 from train.settings import AugmentationSettings, TrainSettings
 
 SMALL = dataclasses.replace(
@@ -302,7 +302,7 @@ def one_step_of(run: str, size: str) -> TrainSettings:
         "validation_scenes": 1,
         "from_weights": False,
     }
-    return changed_run(run, changes)
+    return override_training_preset(run, changes)
 
 
 def train_and_judge(run: str, size: str, data: str, lpips: str, out: Path) -> None:

@@ -16,10 +16,10 @@ from infra.bench.workloads.recorded_looks import FIGURES, record_looks, unreacha
 from infra.bench_options import BenchOptions
 from infra.render.held_out_scenes import first_composed
 from infra.render.raw_references import first_camera
-from pipeline.builds.settings import BuildSettings
-from pipeline.builds.training import smoke
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK, PREFIX
+from pipeline.presets.settings import DatasetSettings
+from pipeline.presets.training import smoke
 from pipeline.renders.calibrated_error import versions_of_pictures
 from scene_templates.settings import SceneSettings
 from storage.dataset.splits import JUDGED_SPLIT
@@ -127,7 +127,7 @@ def _record(context: BenchContext, trial: str) -> dict[tuple[int, int], Figures]
     return figures
 
 
-def _one_split() -> BuildSettings:
+def _one_split() -> DatasetSettings:
     return changed(smoke(), {"splits.one_split": True})
 
 

@@ -12,9 +12,9 @@ import h5py
 import numpy as np
 
 from infra.planning import measure_scenes
-from pipeline.builds.named import named_build
 from pipeline.exchange.renderformer_h5 import TextureType, write_renderformer_h5
 from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.presets.registry import preset_settings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, index_shard, write_manifest
 from storage.dataset.shard import write_shard
@@ -44,7 +44,7 @@ def render_scenes(px: int, place: Path) -> tuple[dict[str, float], list[Members]
     Returns:
         Wall-clock milliseconds and CPU seconds of a view; and the files of each scene.
     """
-    splits = named_build(BUILD).splits
+    splits = preset_settings(BUILD).splits
     order = DatasetOrder(build=BUILD, resolution=px, scenes=splits.scenes_per_shard)
     marks: list[float] = []
     measured = measure_scenes(order, SCENES, place, lambda: marks.append(time.monotonic()))

@@ -11,8 +11,6 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from pipeline.builds.named import named_build
-from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles, find_scene_files
 from pipeline.generation import render_children
 from pipeline.generation.accept_scene_files import (
@@ -22,6 +20,8 @@ from pipeline.generation.accept_scene_files import (
 )
 from pipeline.generation.begin_dataset import begin_dataset
 from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.presets.registry import preset_settings
+from pipeline.presets.settings import DatasetSettings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
 from storage.errors import Rejected, TrilightError
@@ -71,15 +71,15 @@ def _build(folder: Path, name: str = "a.json") -> Scene:
 
 
 def _digests(folder: Path, name: str) -> dict[str, str]:
-    assets = named_build("smoke").assets
+    assets = preset_settings("smoke").assets
     return dict(build_once(folder.resolve(), name, assets, 1, "scale").sha256)
 
 
-def _settings(folder: Path, views: int | None = None) -> BuildSettings:
-    return settings_for_files(named_build("smoke"), find_scene_files(str(folder)), views)
+def _settings(folder: Path, views: int | None = None) -> DatasetSettings:
+    return settings_for_files(preset_settings("smoke"), find_scene_files(str(folder)), views)
 
 
-def _scene(files: SceneFiles, scene_index: int, settings: BuildSettings) -> Scene:
+def _scene(files: SceneFiles, scene_index: int, settings: DatasetSettings) -> Scene:
     views = settings.scenes.num_views
     return files.scene(scene_index, settings.assets, num_views=views, seed=settings.seed)
 

@@ -7,12 +7,12 @@ import pytest
 from prefect.exceptions import ParameterTypeError
 
 from infra.serving.train_model import train_model
-from pipeline.builds.settings import BuildSettings
 from pipeline.flows.array_flow import make_by_array
 from pipeline.flows.dataset_flows import build_dataset, generate_scenes, prepare_assets
-from pipeline.flows.forms import BuildChanges, changed_values, order_of
+from pipeline.flows.forms import DatasetChanges, changed_values, order_of
 from pipeline.flows.prefect_runner import is_retryable
 from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.presets.settings import DatasetSettings
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.for_each import for_each
 
@@ -48,8 +48,8 @@ def test_the_forms_within_have_every_setting_of_a_build_and_its_range() -> None:
     renders = groups["RenderSettingsChanges"]["properties"]
     assert renders["max_spp"]["description"].startswith("The cap")
     assert renders["denoiser"]["anyOf"][0]["enum"] == ["high", "fast", "off"]
-    assert set(groups["BuildSettingsChanges"]["properties"]) == set(
-        BuildSettings.__dataclass_fields__
+    assert set(groups["DatasetSettingsChanges"]["properties"]) == set(
+        DatasetSettings.__dataclass_fields__
     )
     # As declared at the fields, but for what no form can hold exactly.
     shown = schema["properties"]
@@ -64,7 +64,7 @@ def test_the_forms_within_have_every_setting_of_a_build_and_its_range() -> None:
 
 
 def test_changes_become_dotted_names() -> None:
-    form = BuildChanges(**{"renders": {"max_spp": 64}, "storage": {"profile": "lossless"}})
+    form = DatasetChanges(**{"renders": {"max_spp": 64}, "storage": {"profile": "lossless"}})
     expected = {"renders.max_spp": 64, "storage.profile": "lossless"}
     assert changed_values(form) == expected
     order = order_of(_defaults(scenes=3, changes=form), DatasetOrder)

@@ -307,7 +307,7 @@ def test_rejections_follow_their_scenes(tmp_path: Path) -> None:
 
 
 def test_objects_that_two_sources_prepared_otherwise_are_both_named(tmp_path: Path) -> None:
-    """Two builds cut the same object to other budgets: one uid, two assets, one split."""
+    """Two presets cut the same object to other budgets: one uid, two assets, one split."""
     a = finished(tmp_path / "a", scenes(0))
     rows = [
         dataclasses.replace(entry, asset_sha256=f"{number}" * 64)

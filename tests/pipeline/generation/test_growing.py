@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.builds.named import BUILDS, named_build
 from pipeline.generation import pipeline
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.pipeline import make_dataset, prepare_dataset
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.shards import pack
 from storage.dataset.dataset import open_dataset, open_listed
 from storage.dataset.layout import DatasetFolder
@@ -36,7 +36,7 @@ from tests.for_each import case
 from tests.pipeline.generation.bucket_kit import OUT, Killed, Machines, Writes
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
-SMOKE = named_build("smoke").splits
+SMOKE = preset_settings("smoke").splits
 GIVEN_UP = (1, 6, 7)
 """Of shards of four: in the middle of one, and at the end of one."""
 
@@ -243,8 +243,8 @@ def test_a_bucket_without_notes_grows(
 
 
 def test_every_preset_makes_one_scene() -> None:
-    for name in BUILDS:
-        splits = named_build(name).splits
+    for name in DATASET_PRESETS:
+        splits = preset_settings(name).splits
         assert planned_scenes(1, splits) == shards_for(1, splits) == 1, name
         assert scenes_of_shard(0, cut_splits(1, splits)) == range(1)
         most = min(MOST_SCENES, MOST_SHARDS * splits.scenes_per_shard)

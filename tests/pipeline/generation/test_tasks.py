@@ -99,7 +99,7 @@ def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
 @for_each(
     ("changes", "message"),
     [
-        ({"build": "nonsense"}, "build 'nonsense'"),
+        ({"build": "nonsense"}, "preset 'nonsense'"),
         ({"scenes": 0}, "scenes is 0"),
         ({"failure_budget": 1.5}, "failure_budget is 1.5"),
         ({"shards": "4:4"}, "shards is '4:4'"),

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.builds.named import named_build
 from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
+from pipeline.presets.registry import preset_settings
 from pipeline.renders import kernel_scene
 from pipeline.renders.device_memory import read_back
 from pipeline.renders.device_pictures import DevicePictures
@@ -144,7 +144,7 @@ def test_all_views_and_lights_share_one_load(monkeypatch: pytest.MonkeyPatch) ->
     scene = scene.with_provenance({"camera_attempts": [0] * 2})
     changes = {"renders.min_spp": 8, "renders.max_spp": 8, "renders.per_light": True}
     changes["scenes.num_views"] = 2
-    settings = named_build("smoke", resolution=16, changes=changes)
+    settings = preset_settings("smoke", resolution=16, changes=changes)
     sample = render_sample(
         "000000000", RenderInput(scene=scene), settings, [], ViewProgress(None, 0)
     )
