@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 
 from storage.errors import TrilightError
 from storage.extensions import function_name
-from storage.settings.changes import option_words
 from storage.settings.described import checked
+from storage.settings.overrides import option_words
 from storage.settings.ranges import Within
 from train.presets import override_training_preset
 from train.resume import StartOptions

@@ -21,7 +21,7 @@ class Family:
     """A layout, how many objects of which size it holds, and how often it is drawn."""
 
     PRESETS: ClassVar[Mapping[str, Callable[[], "Family"]]] = {}
-    """Functions that return a family, by its name, for `storage.settings.changes`."""
+    """Functions that return a family, by its name, for `storage.settings.overrides`."""
     name: str
     """Unique name, such as `corner-multi`."""
     template: str

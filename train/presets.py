@@ -21,7 +21,7 @@ from model.config import smoke as smoke_model
 from storage.aliases import PRESET_ALIASES
 from storage.errors import TrilightError
 from storage.registry import Registry
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
 
 
@@ -324,7 +324,7 @@ def override_training_preset(
     """Return the settings of a training preset with some values replaced.
 
     Args:
-        changes: values by dotted name, as `storage.settings.changes` takes them.
+        changes: values by dotted name, as `storage.settings.overrides` takes them.
         steps: replaces the number of steps; if it is smaller, the warm-up and the intervals that
             `changes` does not name shrink in proportion.
         most_unusable: replaces that setting, after the changes.
@@ -338,7 +338,7 @@ def override_training_preset(
         every |= {**scale_intervals(run, steps, changes), "num_steps": steps}
     if most_unusable is not None:
         every["most_unusable"] = most_unusable
-    return changed(run, every)
+    return apply_overrides(run, every)
 
 
 def scale_intervals(run: TrainSettings, steps: int, stated: Mapping[str, Any]) -> dict[str, int]:

@@ -69,8 +69,8 @@ if TYPE_CHECKING:
     from storage.records.scene import Scene as Scene
     from storage.records.scene import SceneObject as SceneObject
     from storage.seeds import rng_for as rng_for
-    from storage.settings.changes import changed as changed
     from storage.settings.described import checked as checked
+    from storage.settings.overrides import apply_overrides as apply_overrides
     from storage.settings.ranges import Within as Within
     from train.evaluation.metrics import METRICS as METRICS
     from train.evaluation.metrics import JudgedPicture as JudgedPicture

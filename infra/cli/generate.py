@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 from rich.progress import Progress as Bars
 
-from infra.cli.changes import BaseSettings, with_base_settings
 from infra.cli.console import first_words, next_step, note, print_json, print_rows, progress_bars
 from infra.cli.options import OutputOptions, command
+from infra.cli.overrides import BaseSettings, with_base_settings
 from pipeline.executors.registry import find_executor
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.objects.licences import USER_PROVIDED

@@ -20,8 +20,8 @@ from typing import Annotated, Any, get_origin
 
 from cyclopts import Group, Parameter, Token
 
-from infra.cli.changes import parse_changes
 from infra.cli.extend_option import resolve_reference
+from infra.cli.overrides import parse_overrides
 from storage.errors import TrilightError
 from storage.remote.url import parse_local_path
 from storage.settings.described import checked
@@ -214,7 +214,7 @@ def value_of(words: bool | str | Sequence[str], hint: Any) -> Any:
     if isinstance(words, str):
         return _one(words, hint)
     if takes_names(hint):
-        return parse_changes(words)
+        return parse_overrides(words)
     return tuple(_one(word, hint) for word in words)
 
 

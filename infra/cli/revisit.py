@@ -1,9 +1,9 @@
 """`trilight revisit`: makes a new dataset from the scenes of a finished one."""
 
-from infra.cli.changes import BaseSettings, with_base_settings
 from infra.cli.console import first_words
 from infra.cli.generate import ExecutorOptions, make
 from infra.cli.options import OutputOptions, command
+from infra.cli.overrides import BaseSettings, with_base_settings
 from pipeline.generation.revisit_options import RevisitOptions, revisit_order
 
 

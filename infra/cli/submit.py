@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Group
 
-from infra.cli.changes import BaseSettings, with_base_settings
 from infra.cli.console import (
     console,
     first_words,
@@ -19,6 +18,7 @@ from infra.cli.console import (
 )
 from infra.cli.everyday import HELP_FLAGS
 from infra.cli.options import OutputOptions, command
+from infra.cli.overrides import BaseSettings, with_base_settings
 from pipeline.executors.array_job import ArrayJob, DatasetByArray, array_job
 from pipeline.executors.kubernetes_array import (
     KubernetesOptions,

@@ -21,7 +21,7 @@ from storage.dataset.splits import JUDGED_SPLIT
 from storage.errors import Rejected
 from storage.machine import available_cores
 from storage.records.scene import Scene
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 
 TRIANGLES = 768
 """Maximum number of triangles of a scene, as in the training data of the built-in networks."""
@@ -67,11 +67,11 @@ def held_out_settings() -> DatasetSettings:
 
     All objects belong to the evaluation split, as those of `builtin:benchmark-v1` do.
     """
-    settings = changed(smoke(), {"splits.one_split": True})
+    settings = apply_overrides(smoke(), {"splits.one_split": True})
     most = settings.scenes.max_triangles
     budgets = [max(_LEAST_LEVEL, b * TRIANGLES // most) for b in settings.assets.budgets]
     levels = sorted(set(budgets), reverse=True)
-    return changed(settings, {"scenes.max_triangles": TRIANGLES, "assets.budgets": levels})
+    return apply_overrides(settings, {"scenes.max_triangles": TRIANGLES, "assets.budgets": levels})
 
 
 def held_out_scene(child: IsolatedChild, index: int) -> Scene:

@@ -13,7 +13,7 @@ from prefect.concurrency.sync import concurrency
 from prefect.logging import get_run_logger
 
 from infra.train_options import TrainOptions
-from pipeline.flows.forms import PublicUrl, changes_form, order_of, parameters_of
+from pipeline.flows.forms import PublicUrl, order_of, overrides_form, parameters_of
 from pipeline.flows.limits import GPU_LIMIT
 from pipeline.flows.process import run_to_end
 from pipeline.renders.visible_gpus import visible_gpus
@@ -23,7 +23,7 @@ from train.settings import TrainSettings
 
 TrainingPresetName = Literal[tuple(TRAINING_PRESETS)]  # type: ignore[valid-type]
 """Names of the training presets, a list of choices in the form."""
-RunChanges = changes_form(TrainSettings, smoke())
+RunChanges = overrides_form(TrainSettings, smoke())
 """Form of every setting; an empty one keeps the preset's value."""
 
 

@@ -18,8 +18,8 @@ from storage.dataset.progress import unfinished_shards
 from storage.dataset.splits import shards_for
 from storage.errors import TrilightError
 from storage.remote.safe_url import safe_url
-from storage.settings.changes import changed
 from storage.settings.described import checked
+from storage.settings.overrides import apply_overrides
 from storage.settings.ranges import Within
 
 MAX_TASKS = 1000
@@ -89,7 +89,7 @@ def array_job(
             "address in that variable of the tasks."
         )
     scenes = order.scenes or DATASET_PRESETS.find(order.build).num_scenes
-    splits = changed(preset_settings(order.build), order.changes).splits
+    splits = apply_overrides(preset_settings(order.build), order.changes).splits
     planned = shards_for(scenes, splits)
     is_begun = _is_begun(order.place)
     missing = unfinished_shards(order.place, scenes) if is_begun else list(range(planned))

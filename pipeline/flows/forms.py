@@ -55,7 +55,7 @@ def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
     return with_signature
 
 
-def changes_form(settings: type, example: Any) -> type[BaseModel]:
+def overrides_form(settings: type, example: Any) -> type[BaseModel]:
     """Return a form of all fields of a settings class, in which every field may stay empty.
 
     Args:
@@ -67,7 +67,7 @@ def changes_form(settings: type, example: Any) -> type[BaseModel]:
         value = getattr(example, field.name)
         first = value[0] if isinstance(value, tuple) and value else value
         is_group = dataclasses.is_dataclass(first) and not isinstance(first, type)
-        kind = changes_form(type(first), first) if is_group else field.hint
+        kind = overrides_form(type(first), first) if is_group else field.hint
         fields[field.name] = (kind | None, Field(default=None, description=field.sentence))
     return create_model(
         f"{settings.__name__}Changes", __config__=ConfigDict(extra="forbid"), **fields
@@ -75,7 +75,7 @@ def changes_form(settings: type, example: Any) -> type[BaseModel]:
 
 
 def changed_values(form: BaseModel | None) -> dict[str, Any]:
-    """Return the filled-in fields by dotted name, as `storage.settings.changes` takes them."""
+    """Return the filled-in fields by dotted name, as `storage.settings.overrides` takes them."""
     values: dict[str, Any] = {}
     for name, value in form or ():  # in declared order; `model_fields_set` has none
         if isinstance(value, BaseModel):
@@ -102,14 +102,14 @@ PublicPlace = Annotated[
 """An output folder of any name, or a URL without secrets."""
 DatasetPresetName = Literal[tuple(DATASET_PRESETS)]  # type: ignore[valid-type]
 """Names of the registered presets, as a list to choose from."""
-DatasetChanges = changes_form(DatasetSettings, DATASET_PRESETS["smoke"].settings())
+DatasetOverrides = overrides_form(DatasetSettings, DATASET_PRESETS["smoke"].settings())
 """Every setting of a preset."""
 
 DATASET_FORMS: Mapping[str, Any] = {
     "build": DatasetPresetName,
     "objects": PublicUrl | None,
     "out": PublicPlace | None,
-    "changes": DatasetChanges | None,
+    "changes": DatasetOverrides | None,
 }
 """Types of parameters that are narrower in a form than in the options."""
 

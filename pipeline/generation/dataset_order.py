@@ -14,8 +14,8 @@ from storage.dataset.settings import MOST_SCENES
 from storage.errors import TrilightError
 from storage.extensions import function_name
 from storage.remote.safe_url import safe_url
-from storage.settings.changes import option_words
 from storage.settings.described import checked
+from storage.settings.overrides import option_words
 from storage.settings.ranges import Seed, Share, Within
 
 _RANGE = re.compile(r"(\d+):(\d+)")

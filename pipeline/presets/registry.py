@@ -16,7 +16,7 @@ from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
 from storage.registry import Registry
 from storage.remote.safe_url import safe_url
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 
 DATASET_PRESETS: Registry[DatasetPreset] = Registry(
     "dataset preset",
@@ -81,12 +81,14 @@ def preset_settings(
             f"Trilight's own; expected another name, such as dataclasses.replace(..., "
             f"build='my-{settings.build}')."
         )
-    settings = changed(settings, option_changes(seed, resolution, noise_targets or NoiseTargets()))
+    settings = apply_overrides(
+        settings, option_overrides(seed, resolution, noise_targets or NoiseTargets())
+    )
     licences = tuple(sorted({*settings.allowed_licences, *allow_licences}))
-    return changed(dataclasses.replace(settings, allowed_licences=licences), changes or {})
+    return apply_overrides(dataclasses.replace(settings, allowed_licences=licences), changes or {})
 
 
-def option_changes(
+def option_overrides(
     seed: int | None, resolution: int | None, noise_targets: NoiseTargets
 ) -> dict[str, Any]:
     """Return the settings that single options state, by dotted name; None states nothing."""

@@ -24,7 +24,7 @@ from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
 from storage.records.scene_file import decode_scene_file, encode_scene
 from storage.seeds import rng_for
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 from tests.end_to_end.conftest import Trilight
 from tests.end_to_end.production_kit import FEW_SAMPLES
 from tests.extensions_kit import EXAMPLES, loaded, room_for_extensions
@@ -168,7 +168,7 @@ def test_a_size_is_a_setting(copied: Callable[[str], Path]) -> None:
     with loaded(copied("model_size.py")):
         run = override_training_preset("smoke", {"model": "nano", "model.num_registers": 3})
         assert (run.model.width, run.model.num_registers) == (72, 3)
-        assert SIZES["nano"]() == changed(run, {"model.num_registers": 2}).model
+        assert SIZES["nano"]() == apply_overrides(run, {"model.num_registers": 2}).model
     assert "nano" not in ModelConfig.PRESETS
 
 

@@ -19,7 +19,7 @@ from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.records.asset import Asset
 from storage.records.scene import Scene
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 from tests.for_each import case
 from tests.pipeline.assets.meshes_by_hand import (
     cube,
@@ -95,7 +95,7 @@ def _one_triangle(pool: list[PooledAsset]) -> PooledAsset:
 def test_objects_of_one_triangle_compose(
     pool: list[PooledAsset], changes: Mapping[str, Any]
 ) -> None:
-    settings = changed(SETTINGS, changes)
+    settings = apply_overrides(SETTINGS, changes)
     for index in range(3):
         scene = first_scene(settings, [_one_triangle(pool)], seed=0, scene_index=index)
         require_laws(scene, settings)

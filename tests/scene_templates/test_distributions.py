@@ -19,7 +19,7 @@ from scipy import stats
 from pipeline.presets.registry import preset_settings
 from scene_templates.layout import Emitter, SurfaceLook
 from scene_templates.settings import SceneSettings
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 from tests.scene_templates.balls import MANY, Drawn, drawn
 from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row
 from tests.scene_templates.statistics import (
@@ -340,7 +340,7 @@ WRONG: list[tuple[str, Mapping[str, Any], set[str]]] = [
 def test_a_wrong_distribution_is_noticed(
     build: str, changes: Mapping[str, Any], rows: set[str]
 ) -> None:
-    wrong = changed(_settings(build), changes)
+    wrong = apply_overrides(_settings(build), changes)
     table = _table(drawn(wrong, FEWER), STATED[build])
     assert rows <= set(implausible(table))
     # What has not been changed is not blamed.

@@ -33,9 +33,9 @@ from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import TrilightError
 from storage.seeds import rng_for
-from storage.settings.changes import changed
 from storage.settings.described import from_record, settings_record
 from storage.settings.fields import describe_fields
+from storage.settings.overrides import apply_overrides
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.scene_templates.balls import DEFAULTS, ROOMS, template_settings
@@ -132,7 +132,7 @@ def test_strata_are_refused_in_one_sentence() -> None:
     """They were parts of the scenes with weights; records never held the empty list."""
     strata = [{"name": "all", "weight": 1}]
     with pytest.raises(TrilightError, match=r"setting 'strata': removed since, and commit"):
-        changed(DEFAULTS, {"strata": strata})
+        apply_overrides(DEFAULTS, {"strata": strata})
     with pytest.raises(TrilightError, match=r"setting 'strata': removed since, and commit"):
         from_record(SceneSettings, {**settings_record(DEFAULTS), "strata": strata})
 

@@ -25,7 +25,7 @@ from scene_templates.settings import SceneSettings
 from storage.dataset.splits import JUDGED_SPLIT
 from storage.digests import canonical_json, sha256_hex
 from storage.records.scene import Scene
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 
 SEED = 20_261_129
 """Seed of the layouts; no dataset preset and no other experiment uses it."""
@@ -128,12 +128,12 @@ def _record(context: BenchContext, trial: str) -> dict[tuple[int, int], Figures]
 
 
 def _one_split() -> DatasetSettings:
-    return changed(smoke(), {"splits.one_split": True})
+    return apply_overrides(smoke(), {"splits.one_split": True})
 
 
 def _scene(child: IsolatedChild, index: int, kind: str) -> Scene:
     shares = {"textured": {"textures.share": 0.5}, "sky": {"skies.share": 1.0}}
-    settings: SceneSettings = changed(
+    settings: SceneSettings = apply_overrides(
         dataclasses.replace(smoke().scenes, num_views=1, families_in_turn=True),
         shares.get(kind, {}),
     )

@@ -39,7 +39,7 @@ from storage.records.profiles import Profile
 from storage.records.sample import Sample, encode_sample
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene, scene_digest
-from storage.settings.changes import option_words
+from storage.settings.overrides import option_words
 from tests.command_line import trilight
 from tests.crash import CrashingRenderer
 from tests.for_each import case

@@ -14,16 +14,21 @@ from typing import Any, NoReturn
 
 import pytest
 
-from infra.cli.changes import BaseSettings, all_changes, read_settings_file, with_base_settings
 from infra.cli.console import progress_bars
+from infra.cli.overrides import (
+    BaseSettings,
+    merge_overrides,
+    read_settings_file,
+    with_base_settings,
+)
 from infra.cli.train import _BarProgress, _QuietProgress, _report, _validation_rows
 from model.checkpoint_format import saved_steps
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
-from storage.settings.changes import changed
 from storage.settings.described import settings_record
+from storage.settings.overrides import apply_overrides
 from tests.command_line import run_program, trilight
 from tests.conftest import ROOT
 from tests.for_each import case
@@ -212,9 +217,9 @@ def test_a_preset_like_another_is_that_other() -> None:
     for smoke, other in [*builds, *runs]:
         with case(other):
             record = settings_record(other)
-            changes = all_changes(smoke, BaseSettings(), record, {})
-            assert settings_record(changed(smoke, changes)) == record
-            assert all_changes(other, BaseSettings(), record, {}) == {}
+            changes = merge_overrides(smoke, BaseSettings(), record, {})
+            assert settings_record(apply_overrides(smoke, changes)) == record
+            assert merge_overrides(other, BaseSettings(), record, {}) == {}
 
 
 def test_a_dataset_is_followed_and_options_count_more(tmp_path: Path) -> None:
@@ -266,7 +271,7 @@ def test_a_file_says_what_set_would(tmp_path: Path) -> None:
     }
     # a preset takes the place of single settings
     base = BaseSettings(settings=_file(tmp_path, "model: {width: 60}\nloss.perceptual: none\n"))
-    changes = all_changes(training_preset("smoke"), base, {}, {"model": "tiny"})
+    changes = merge_overrides(training_preset("smoke"), base, {}, {"model": "tiny"})
     assert changes == {"loss.perceptual": "none", "model": "tiny"}
 
 
@@ -308,7 +313,7 @@ def test_a_run_is_followed_on_the_command_line(tmp_path: Path) -> None:
     (tmp_path / "settings.json").write_text(json.dumps({"settings": record}))
     words = ["train", "smoke", "--like", str(tmp_path), "--data", str(tmp_path / "no")]
     with pytest.raises(TrilightError, match="warmup_steps is 50"):
-        changed(training_preset("smoke"), {"num_steps": 7})
+        apply_overrides(training_preset("smoke"), {"num_steps": 7})
     assert "warmup_steps is 50" in trilight(words).mistake
     ended = trilight([*words, "--set", "warmup_steps=2"])
     assert "Run smoke: 7 steps" in ended.stdout

@@ -9,7 +9,7 @@ from prefect.exceptions import ParameterTypeError
 from infra.serving.train_model import train_model
 from pipeline.flows.array_flow import make_by_array
 from pipeline.flows.dataset_flows import build_dataset, generate_scenes, prepare_assets
-from pipeline.flows.forms import DatasetChanges, changed_values, order_of
+from pipeline.flows.forms import DatasetOverrides, changed_values, order_of
 from pipeline.flows.prefect_runner import is_retryable
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.presets.settings import DatasetSettings
@@ -64,7 +64,7 @@ def test_the_forms_within_have_every_setting_of_a_build_and_its_range() -> None:
 
 
 def test_changes_become_dotted_names() -> None:
-    form = DatasetChanges(**{"renders": {"max_spp": 64}, "storage": {"profile": "lossless"}})
+    form = DatasetOverrides(**{"renders": {"max_spp": 64}, "storage": {"profile": "lossless"}})
     expected = {"renders.max_spp": 64, "storage.profile": "lossless"}
     assert changed_values(form) == expected
     order = order_of(_defaults(scenes=3, changes=form), DatasetOrder)

@@ -24,7 +24,7 @@ from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene
 from storage.renderer import Sampling
 from storage.seeds import SceneKey, seed_for
-from storage.settings.changes import json_or_word
+from storage.settings.overrides import json_or_word
 from tests.pipeline.scenes.small_pool import small_pool
 from tests.scenes_by_hand import tiny_scene
 

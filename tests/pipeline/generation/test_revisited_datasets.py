@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from infra.cli.changes import BaseSettings, with_base_settings
+from infra.cli.overrides import BaseSettings, with_base_settings
 from infra.repair import repair
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation import render_children

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infra.cli.changes import parse_changes
 from infra.cli.options import SHOWN
+from infra.cli.overrides import parse_overrides
 from pipeline.generation.dataset_order import DatasetOrder, generate_words
 from pipeline.generation.run import TaskResult, children_of_gpu
 from pipeline.generation.runner import Runner
@@ -151,7 +151,7 @@ def test_every_option_that_was_given_is_there() -> None:
     }
     assert "--accept-environment" in words
     changes = [words[i + 1] for i, word in enumerate(words) if word == "--changes"]
-    assert parse_changes(changes) == json.loads(json.dumps(dict(ASKED.changes)))
+    assert parse_overrides(changes) == json.loads(json.dumps(dict(ASKED.changes)))
     shown = trilight(["generate", "--help-all"], env={"COLUMNS": "200"}).output
     fields = [word[2:].replace("-", "_") for word in words if word.startswith("--")]
     for field in fields:  # a field's own name works beside the name that help shows
@@ -161,7 +161,7 @@ def test_every_option_that_was_given_is_there() -> None:
 def test_words_are_what_was_asked_for_and_no_more() -> None:
     assert generate_words(DatasetOrder(workers=3, shards="0:2", out="x")) == ["generate", "smoke"]
     changes = {"source": "12", "storage.profile": "true"}  # words that are JSON stay words
-    assert parse_changes(generate_words(DatasetOrder(changes=changes))[3::2]) == changes
+    assert parse_overrides(generate_words(DatasetOrder(changes=changes))[3::2]) == changes
     with_password = DatasetOrder(objects="https://me:secret@host/objects?key=1")
     assert generate_words(with_password)[3] == "https://host/objects"
 

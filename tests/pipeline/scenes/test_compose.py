@@ -25,7 +25,7 @@ from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
 from storage.seeds import SceneKey
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
 from tests.pipeline.scenes.scene_facts import counts_of, digest, planes_of, points_of, rows_of
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
@@ -235,7 +235,7 @@ def test_a_mesh_without_usable_triangles_is_rejected(pool: list[PooledAsset], bu
     nothing: both must end alike.
     """
     settings = preset_settings(build, changes={"scenes.num_views": 1}).scenes
-    overlapping = changed(settings, {"placement.overlap_share": 1.0})
+    overlapping = apply_overrides(settings, {"placement.overlap_share": 1.0})
     for damage, each, index in itertools.product(DAMAGES, (settings, overlapping), range(4)):
         try:
             scene = compose_scene(each, [_damaged(pool[1], damage)], SceneKey(0, index))
