@@ -26,8 +26,8 @@ from storage.remote.store import Store
 from storage.settings.described import from_record
 
 
-def hold_membership(folder: DatasetFolder) -> contextlib.AbstractContextManager[None]:
-    """Hold the membership of a dataset's workers; who is alone brings the folder up to date.
+def hold_dataset_lock(folder: DatasetFolder) -> contextlib.AbstractContextManager[None]:
+    """Hold the lock that a dataset's workers share; one that is alone updates the folder.
 
     Before a bucket it gets the bucket's state. Elsewhere, the manifest of a dataset without any
     object, scene or shard is deleted: it begins again.
@@ -36,7 +36,7 @@ def hold_membership(folder: DatasetFolder) -> contextlib.AbstractContextManager[
         TrilightError: the folder cannot be written, or the bucket not be read.
     """
     store = folder.store()
-    return folder.hold_membership(
+    return folder.hold_shared_lock(
         partial(_forget_unused, folder) if store.is_here else partial(_adopt, folder, store)
     )
 
@@ -97,7 +97,7 @@ def begin_dataset(
 ) -> DatasetWriter:
     """Begin a dataset in a folder or a bucket, or resume the one that is there.
 
-    The number of scenes never falls. Call while holding the folder's membership.
+    The number of scenes never falls. Call while holding the dataset's lock.
 
     Raises:
         TrilightError: the dataset was begun with other settings, or in another environment and

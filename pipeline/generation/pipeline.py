@@ -18,7 +18,7 @@ crash costs one attempt.
 
 The files on disk are the only state, and every step may be killed at any moment. A mesh is kept in
 the asset store, a scene in the staging folder, a shard in the dataset; the next run looks for these
-and makes the rest. Several runs on one folder share the work (storage.claims), and those on one
+and makes the rest. Several runs on one folder share the work (storage.file_locks), and those on one
 bucket share batches of objects (storage.remote.store) and shards (pipeline.shards.published).
 """
 
@@ -35,7 +35,7 @@ from pipeline.documents.sheets import write_first_pictures
 from pipeline.generation.accept_maps import map_folders
 from pipeline.generation.accept_revisited import accept_revisited
 from pipeline.generation.accept_scene_files import accept_scene_files
-from pipeline.generation.begin_dataset import begin_dataset, hold_membership
+from pipeline.generation.begin_dataset import begin_dataset, hold_dataset_lock
 from pipeline.generation.dataset_order import DatasetOrder, generate_words
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.environment import environment
@@ -110,7 +110,7 @@ def _begin_run(order: DatasetOrder) -> Iterator[Run]:
     settings, listed = resolve_settings(
         order, folder
     )  # refuses an order before anything is written
-    with hold_membership(folder):
+    with hold_dataset_lock(folder):
         user_folders = map_folders(order, settings)
         variant = choose_dataset_variant(order, folder)
         writer = begin_dataset(

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from pipeline.generation import dataset_writer
-from pipeline.generation.begin_dataset import begin_dataset, hold_membership
+from pipeline.generation.begin_dataset import begin_dataset, hold_dataset_lock
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.presets.registry import preset_settings
 from pipeline.shards.pack import pack_shard
@@ -91,7 +91,7 @@ class Machines:
         self.use(name)
         folder = dataset_folder(OUT)
         build = preset_settings("smoke", changes=changes) if changes else _build()
-        with hold_membership(folder):
+        with hold_dataset_lock(folder):
             yield begin_dataset(folder, build, ENVIRONMENT, scenes, accept_environment=False)
 
 
