@@ -133,13 +133,13 @@ def test_guided_passes_have_one_more_set_of_kernels_for_every_scene() -> None:
 
 def test_all_views_and_lights_share_one_load(monkeypatch: pytest.MonkeyPatch) -> None:
     loads = list[Scene]()
-    load = kernel_scene.load_triangles
+    load = kernel_scene.build_mitsuba_scene
 
     def counted(scene: Scene, *rest: Any, **named: Any) -> Any:
         loads.append(scene)
         return load(scene, *rest, **named)
 
-    monkeypatch.setattr(kernel_scene, "load_triangles", counted)
+    monkeypatch.setattr(kernel_scene, "build_mitsuba_scene", counted)
     scene = sampled_like_scene(np.random.default_rng(3), num_views=2)
     scene = scene.with_provenance({"camera_attempts": [0] * 2})
     changes = {"renders.min_spp": 8, "renders.max_spp": 8, "renders.per_light": True}
