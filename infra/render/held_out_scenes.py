@@ -7,7 +7,7 @@ Previews and methods are evaluated and timed on these scenes.
 import dataclasses
 from pathlib import Path
 
-from pipeline.generation.begin_dataset import begin_dataset
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
 from pipeline.generation.environment import environment
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
@@ -49,7 +49,7 @@ def composing_child(
     """
     variant = variant or choose_variant()
     workers = threads or available_cores()
-    publication = begin_dataset(
+    publication = begin_or_resume_dataset(
         DatasetFolder(folder), settings, environment(variant), 1, accept_environment=False
     )
     accepted = ObjectLock(

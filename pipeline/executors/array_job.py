@@ -14,7 +14,7 @@ from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from storage.dataset.dataset import dataset_files
 from storage.dataset.layout import dataset_folder
-from storage.dataset.progress import unfinished_shards
+from storage.dataset.progress import missing_shards
 from storage.dataset.splits import shards_for
 from storage.errors import TrilightError
 from storage.remote.safe_url import safe_url
@@ -92,7 +92,7 @@ def array_job(
     splits = apply_overrides(preset_settings(order.build), order.changes).splits
     planned = shards_for(scenes, splits)
     is_begun = _is_begun(order.place)
-    missing = unfinished_shards(order.place, scenes) if is_begun else list(range(planned))
+    missing = missing_shards(order.place, scenes) if is_begun else list(range(planned))
     each = per_task or -(-planned // MAX_TASKS)
     tasks = sorted({shard // each for shard in missing})
     if tasks and tasks[-1] >= MAX_TASKS:

@@ -18,7 +18,7 @@ from pipeline.executors.kubernetes_array import options_from_environment, submit
 from pipeline.executors.slurm_array import submit_array
 from pipeline.flows.forms import DATASET_FORMS, order_of, parameters_of, run_name
 from pipeline.flows.run_artifacts import ArtifactPage
-from storage.dataset.progress import DatasetStatus, read_status, unfinished_shards
+from storage.dataset.progress import DatasetStatus, missing_shards, read_status
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
 
@@ -60,7 +60,7 @@ def _watch_until_finished(order: DatasetByArray, artifacts: "ArrayArtifacts") ->
     changed_s = time.monotonic()
     while True:
         status = _status(order.place)
-        if status and status.finished and not unfinished_shards(order.place, order.scenes or 0):
+        if status and status.finished and not missing_shards(order.place, order.scenes or 0):
             return status  # a lost shard of a finished dataset is made again
         progress = (status.shards_done, status.scenes_done) if status else None
         if progress != before:

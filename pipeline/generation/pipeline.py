@@ -35,7 +35,7 @@ from pipeline.documents.sheets import write_first_pictures
 from pipeline.generation.accept_maps import map_folders
 from pipeline.generation.accept_revisited import accept_revisited
 from pipeline.generation.accept_scene_files import accept_scene_files
-from pipeline.generation.begin_dataset import begin_dataset, hold_dataset_lock
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
 from pipeline.generation.dataset_order import DatasetOrder, generate_words
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.environment import environment
@@ -113,7 +113,7 @@ def _begin_run(order: DatasetOrder) -> Iterator[Run]:
     with hold_dataset_lock(folder):
         user_folders = map_folders(order, settings)
         variant = choose_dataset_variant(order, folder)
-        writer = begin_dataset(
+        writer = begin_or_resume_dataset(
             folder,
             settings,
             environment(variant),

@@ -18,7 +18,7 @@ from pipeline.generation.accept_scene_files import (
     build_once,
     settings_for_files,
 )
-from pipeline.generation.begin_dataset import begin_dataset
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
@@ -86,7 +86,9 @@ def _scene(files: SceneFiles, scene_index: int, settings: DatasetSettings) -> Sc
 
 def _accept(folder: Path, out: Path, licence: str | None = None) -> None:
     found, settings = find_scene_files(str(folder)), _settings(folder)
-    publication = begin_dataset(DatasetFolder(out), settings, {}, 1, accept_environment=False)
+    publication = begin_or_resume_dataset(
+        DatasetFolder(out), settings, {}, 1, accept_environment=False
+    )
     accept_scene_files(found, licence, settings, publication)
 
 
@@ -272,7 +274,7 @@ def test_a_bad_file_keeps_its_number_and_stops_nobody(folder: Path, tmp_path: Pa
     found, settings = find_scene_files(str(folder)), _settings(folder)
     assert found.names == ("a.json", "aa.json", "b.json", "c.json")
     assert settings.splits.listed_scenes == 4
-    publication = begin_dataset(
+    publication = begin_or_resume_dataset(
         DatasetFolder(tmp_path / "set"), settings, {}, 1, accept_environment=False
     )
     files = accept_scene_files(found, None, settings, publication).origin

@@ -19,7 +19,7 @@ from pipeline.executors.slurm import shards_of_task
 from pipeline.executors.slurm_array import sbatch_command, sbatch_environment
 from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.dataset import open_dataset
-from storage.dataset.progress import unfinished_shards
+from storage.dataset.progress import missing_shards
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges, numbers_of
@@ -185,7 +185,7 @@ def test_tasks_that_died_are_all_that_is_submitted_again(
     first = array_job(order, per_task=2, at_once=None)
     assert first.tasks == [0, 1, 2]
     run(first)
-    left = unfinished_shards(order.place)
+    left = missing_shards(order.place)
     assert left and set(left) <= {2, 3}
     said = trilight(["status", order.place, "--missing", "--shards-per-task", "2"])
     assert said.stdout.strip() == "1"
@@ -195,7 +195,7 @@ def test_tasks_that_died_are_all_that_is_submitted_again(
     run(again)
     assert verify_dataset(order.place).problems == []
     # what is left are the documents, which these tasks do not write
-    assert unfinished_shards(order.place) == [0]
+    assert missing_shards(order.place) == [0]
     (tmp_path / "set" / "README.md").write_text("# A set")
     assert array_job(order, per_task=2, at_once=None).tasks == []
     assert trilight(["status", order.place, "--missing"]).stdout == ""

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from pipeline.generation import dataset_writer
-from pipeline.generation.begin_dataset import begin_dataset, hold_dataset_lock
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.presets.registry import preset_settings
 from pipeline.shards.pack import pack_shard
@@ -92,7 +92,9 @@ class Machines:
         folder = dataset_folder(OUT)
         build = preset_settings("smoke", changes=changes) if changes else _build()
         with hold_dataset_lock(folder):
-            yield begin_dataset(folder, build, ENVIRONMENT, scenes, accept_environment=False)
+            yield begin_or_resume_dataset(
+                folder, build, ENVIRONMENT, scenes, accept_environment=False
+            )
 
 
 def other_shard(writer: DatasetWriter) -> Any:

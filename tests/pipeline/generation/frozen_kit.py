@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.assets.stage import PreparedObject
 from pipeline.generation import object_batches
-from pipeline.generation.begin_dataset import begin_dataset
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects, ObjectLock
 from pipeline.generation.prepare_isolated import asset_store
@@ -62,7 +62,9 @@ def prepared(number: int) -> PreparedObject:
 
 def begun(root: Path) -> DatasetWriter:
     """Begin a dataset of four scenes."""
-    return begin_dataset(DatasetFolder(root), build(), ENVIRONMENT, 4, accept_environment=False)
+    return begin_or_resume_dataset(
+        DatasetFolder(root), build(), ENVIRONMENT, 4, accept_environment=False
+    )
 
 
 def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = None) -> ObjectLock:

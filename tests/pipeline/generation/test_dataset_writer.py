@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.generation import dataset_writer
-from pipeline.generation.begin_dataset import begin_dataset
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.environment import environment
@@ -45,7 +45,7 @@ def _build() -> DatasetSettings:
 def _begin(
     root: Path, build: DatasetSettings, scenes: int = 4, **environment: str
 ) -> DatasetWriter:
-    return begin_dataset(
+    return begin_or_resume_dataset(
         DatasetFolder(root), build, {**ENVIRONMENT, **environment}, scenes, accept_environment=False
     )
 
@@ -113,7 +113,9 @@ def test_other_settings_and_another_environment_are_refused_by_name(tmp_path: Pa
     with pytest.raises(TrilightError, match="mitsuba_variant was 'llvm_ad_rgb', now 'scalar_rgb'"):
         _begin(tmp_path, _build(), mitsuba_variant="scalar_rgb")
     elsewhere = {**ENVIRONMENT, "mitsuba_variant": "scalar_rgb"}
-    begin_dataset(DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True)
+    begin_or_resume_dataset(
+        DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True
+    )
 
 
 @for_each(
@@ -165,7 +167,9 @@ def test_a_dataset_goes_on_with_another_device_only_where_that_is_accepted(
     with pytest.raises(TrilightError, match=f"{said} {first} or another --out, or .*--accept-env"):
         _begin(tmp_path, _build(), mitsuba_variant=now)
     elsewhere = {**ENVIRONMENT, "mitsuba_variant": now}
-    begin_dataset(DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True)
+    begin_or_resume_dataset(
+        DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True
+    )
 
 
 def test_a_shard_that_missed_the_manifest_is_found(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from prefect.exceptions import ParameterTypeError
 from infra.repair import repair
 from pipeline.exchange.reader import file_child
 from pipeline.executors.threads import ThreadRunner
-from pipeline.generation.begin_dataset import begin_dataset, hold_dataset_lock
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
 from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.pipeline import make_dataset, make_task, prepare_dataset
 from pipeline.isolation import call_with_retries
@@ -44,7 +44,7 @@ TRAP = "from pathlib import Path\nPath(__file__).with_suffix('.ran').touch()\n"
 
 def _begin(root: Path) -> None:
     build = preset_settings("smoke")
-    begin_dataset(DatasetFolder(root), build, ENVIRONMENT, 4, accept_environment=False)
+    begin_or_resume_dataset(DatasetFolder(root), build, ENVIRONMENT, 4, accept_environment=False)
 
 
 def test_the_manifest_records_what_had_part_in_a_dataset(tmp_path: Path) -> None:
@@ -248,7 +248,9 @@ def test_what_was_only_begun_is_begun_anew(tmp_path: Path, monkeypatch: pytest.M
     without_rendering(monkeypatch)
     folder = DatasetFolder(tmp_path / "set")
     with folder.hold_shared_lock():
-        begin_dataset(folder, preset_settings("smoke", seed=5), {}, 24, accept_environment=False)
+        begin_or_resume_dataset(
+            folder, preset_settings("smoke", seed=5), {}, 24, accept_environment=False
+        )
     run = prepare_dataset(tiny_order(out=str(folder.root), scenes=4, seed=7))
     assert run.publication.manifest.settings["seed"] == 7
     assert run.publication.manifest.num_scenes == 4
@@ -269,7 +271,9 @@ def test_what_has_objects_or_scenes_is_not(tmp_path: Path, monkeypatch: pytest.M
 def test_nobody_forgets_while_another_is_at_work(tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path / "set")
     with hold_dataset_lock(folder):
-        begin_dataset(folder, preset_settings("smoke", seed=5), {}, 4, accept_environment=False)
+        begin_or_resume_dataset(
+            folder, preset_settings("smoke", seed=5), {}, 4, accept_environment=False
+        )
         with hold_dataset_lock(folder):
             assert read_manifest(folder.manifest).settings["seed"] == 5
 
@@ -278,11 +282,13 @@ def test_who_was_replaced_all_the_same_stops(tmp_path: Path) -> None:
     """Locks do not reach every machine: a maker whose manifest has become another's says so."""
     folder = DatasetFolder(tmp_path / "set")
     with folder.hold_shared_lock():
-        mine = begin_dataset(
+        mine = begin_or_resume_dataset(
             folder, preset_settings("smoke", seed=5), {}, 4, accept_environment=False
         )
         folder.manifest.unlink()
-        begin_dataset(folder, preset_settings("smoke", seed=7), {}, 4, accept_environment=False)
+        begin_or_resume_dataset(
+            folder, preset_settings("smoke", seed=7), {}, 4, accept_environment=False
+        )
         with pytest.raises(TrilightError, match="another dataset has been begun here"):
             mine.lock_objects([])
 

@@ -19,7 +19,7 @@ from pipeline.shards import pack
 from storage.dataset.dataset import open_dataset, open_listed
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
-from storage.dataset.progress import read_progress, read_status, unfinished_shards
+from storage.dataset.progress import missing_shards, read_progress, read_status
 from storage.dataset.settings import MOST_SCENES
 from storage.dataset.splits import (
     MOST_SHARDS,
@@ -160,8 +160,8 @@ def test_a_shard_that_grows_is_missing_and_readable(tmp_path: Path, made: Counte
     root, whole = tmp_path / "set", make(tmp_path / "whole", 9)
     make(root, 3)
     (root / "README.md").touch()  # no documents are written here
-    assert unfinished_shards(str(root), 3) == []
-    assert unfinished_shards(str(root), 9) == [0, 1, 2]
+    assert missing_shards(str(root), 3) == []
+    assert missing_shards(str(root), 9) == [0, 1, 2]
     assert make(root, 9, shards="1:3") == ""
     status = read_status(str(root))
     assert (status.shards_done, status.shards_planned) == (2, 3)
@@ -169,7 +169,7 @@ def test_a_shard_that_grows_is_missing_and_readable(tmp_path: Path, made: Counte
     assert status.scenes_given_up == 3
     assert not verify_dataset(root).is_finished
     assert [shard.num_samples for shard in open_dataset(str(root)).manifest.shards] == [2, 2, 1]
-    assert unfinished_shards(str(root)) == [0]
+    assert missing_shards(str(root)) == [0]
     (root / "train-000000.tar").write_bytes(b"damaged")  # its scenes are made again
     shutil.rmtree(root / ".staging")
     assert make(root, 9, shards="0:1") == whole

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.generation.begin_dataset import begin_dataset, hold_dataset_lock
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
 from pipeline.generation.dataset_order import DatasetOrder
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import dataset_folder
@@ -200,7 +200,7 @@ def test_a_server_that_ignores_the_condition_is_refused_before_anything_is_begun
         pytest.raises(TrilightError, match="^out 'gs://shards/made': .*conditional writes"),
         hold_dataset_lock(folder),
     ):
-        begin_dataset(folder, _build(), ENVIRONMENT, 8, accept_environment=False)
+        begin_or_resume_dataset(folder, _build(), ENVIRONMENT, 8, accept_environment=False)
     assert BucketStore(place("gs://shards/made")).list_all() == {".staging/once"}
     assert not folder.manifest.exists()
 

@@ -1,4 +1,4 @@
-"""Begins a dataset in a folder or a bucket; resumes the one there if its settings are the same."""
+"""Begins a dataset in a folder or a bucket, or resumes the one there with the same settings."""
 
 import contextlib
 import dataclasses
@@ -87,7 +87,7 @@ def _publish_plan(store: Store, num_scenes: int) -> None:
         store.put(f"{PLANNED}{num_scenes:012d}", b"\n")
 
 
-def begin_dataset(
+def begin_or_resume_dataset(
     folder: DatasetFolder,
     settings: DatasetSettings,
     environment: Mapping[str, Any],
