@@ -59,7 +59,7 @@ CHOSEN = (
     "tests/storage/test_metrics.py",
     "tests/storage/dataset/test_shard.py",
     "tests/train/data/test_augment.py",
-    "tests/train/data/test_stream.py",
+    "tests/train/data/test_loader.py",
     "tests/train/evaluation/test_judge.py",
     "tests/train/loop/test_optim.py",
     "tests/train/loop/test_step.py",

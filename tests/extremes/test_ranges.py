@@ -270,8 +270,8 @@ def test_no_number_is_without_a_range() -> None:
 
 
 INTERNAL = {
-    "StreamSettings": "made of TrainSettings",
-    "OrderSettings": "made of StreamSettings",
+    "LoaderSettings": "made of TrainSettings",
+    "OrderSettings": "made of LoaderSettings",
     "PublishedConfig": "a ModelConfig, and one number that the published code fixes",
     "PreviewSettings": "made of RenderOptions",
     "StorageSettings": "has no number",

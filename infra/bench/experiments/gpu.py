@@ -123,10 +123,10 @@ def _step(run: str, context: BenchContext, device: "torch.device") -> Figures:
 
 def _reading(threads: int, context: BenchContext, device: "torch.device") -> Figures:
     """Decode and augment samples as a training preset does."""
-    from train.data.stream import StreamSettings
+    from train.data.loader import LoaderSettings
 
     run = training_preset(READ_AS)
-    settings = StreamSettings(
+    settings = LoaderSettings(
         seed=0,
         window=run.shuffle_shards,
         batch_size=_BATCH,

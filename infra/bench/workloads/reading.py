@@ -26,7 +26,7 @@ from storage.records.sample import Sample, decode_sample, encode_sample, sample_
 from storage.records.scene import ARRAY_FIELDS
 
 if TYPE_CHECKING:
-    from train.data.stream import StreamSettings
+    from train.data.loader import LoaderSettings
 
 BUILD = "smoke"
 SCENES = 3
@@ -80,7 +80,7 @@ def write_copies(
 
 def time_reading(
     data: TrainingData,
-    settings: "StreamSettings",
+    settings: "LoaderSettings",
     threads: int,
     *,
     least_count: int = 1,
@@ -96,10 +96,10 @@ def time_reading(
         TrilightError: the data cannot be read at this width.
     """
     from train.data.bad_samples import BadSampleCounter
+    from train.data.loader import load_batches
     from train.data.order import RankSlice
-    from train.data.stream import stream_batches
 
-    stream = stream_batches(
+    stream = load_batches(
         data.split("train"), settings, 0, rank_slice=RankSlice(),
         workers=threads, unusable=BadSampleCounter(0),
     )  # fmt: skip
