@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_task, prepare_dataset
 from pipeline.generation.render_children import close_children
 from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece
@@ -96,7 +96,7 @@ class Prediction:
 
 
 def measure_scenes(
-    order: DatasetOrder, count: int, place: Path, scene_done: Callable[[], None]
+    order: GenerateOptions, count: int, place: Path, scene_done: Callable[[], None]
 ) -> MeasuredScenes:
     """Make the first scenes of a dataset in another folder.
 
@@ -129,7 +129,7 @@ def measure_scenes(
 
 
 def predict_cost(
-    measured: MeasuredScenes, order: DatasetOrder, *, cores: int, usd_per_core_hour: float
+    measured: MeasuredScenes, order: GenerateOptions, *, cores: int, usd_per_core_hour: float
 ) -> Prediction:
     """Return the predicted cost of the whole dataset from the means of measured scenes.
 
@@ -161,7 +161,7 @@ def predict_cost(
     return dataclasses.replace(prediction, notes=tuple(_notes(prediction)))
 
 
-def describe_run(order: DatasetOrder, folder: DatasetFolder) -> str:
+def describe_run(order: GenerateOptions, folder: DatasetFolder) -> str:
     """Return a line on the scenes that a run will make, and its time by earlier scenes.
 
     It is empty if files or another dataset define the scenes.
@@ -227,11 +227,11 @@ def _notes(prediction: Prediction) -> Iterator[str]:
         )
 
 
-def _num_scenes(order: DatasetOrder) -> int:
+def _num_scenes(order: GenerateOptions) -> int:
     return DATASET_PRESETS[order.build].num_scenes if order.scenes is None else order.scenes
 
 
-def _settings(order: DatasetOrder) -> DatasetSettings:
+def _settings(order: GenerateOptions) -> DatasetSettings:
     return preset_settings(
         order.build,
         resolution=order.resolution,

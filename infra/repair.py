@@ -6,7 +6,7 @@ from typing import cast
 
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.executors.threads import ThreadRunner
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset
 from pipeline.objects.licences import BY_USER
 from pipeline.presets.registry import preset_settings
@@ -58,7 +58,7 @@ def repair(
     command = read_asked(opened) or ()
     revisits = _revisit_source(opened, command)
     maps = _user_maps(opened, command)
-    order = DatasetOrder(
+    order = GenerateOptions(
         build=manifest.build,
         objects=None if scenes_from or revisits else objects,
         out=str(root),

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from pipeline.executors.registry import EXECUTORS as EXECUTORS
     from pipeline.executors.registry import Executor as Executor
     from pipeline.executors.threads import ThreadRunner as ThreadRunner
-    from pipeline.generation.dataset_order import DatasetOrder as DatasetOrder
-    from pipeline.generation.dataset_order import generate_words as generate_words
+    from pipeline.generation.generate_options import GenerateOptions as GenerateOptions
+    from pipeline.generation.generate_options import generate_words as generate_words
     from pipeline.generation.pipeline import make_dataset as make_dataset
     from pipeline.generation.pipeline import prepare_dataset as prepare_dataset
     from pipeline.generation.run import Outcome as Outcome

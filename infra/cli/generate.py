@@ -18,7 +18,7 @@ from infra.cli.console import first_words, next_step, note, print_json, print_ro
 from infra.cli.options import OutputOptions, command
 from infra.cli.overrides import BaseSettings, with_base_settings
 from pipeline.executors.registry import find_executor
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.objects.licences import USER_PROVIDED
 from storage.dataset.layout import DatasetFolder, dataset_folder
 from storage.dataset.manifest import Manifest, read_head
@@ -52,12 +52,12 @@ class ExecutorOptions:
 
 @command("build")
 def generate(
-    order: DatasetOrder, base: BaseSettings, runner: ExecutorOptions, output: OutputOptions
+    order: GenerateOptions, base: BaseSettings, runner: ExecutorOptions, output: OutputOptions
 ) -> None:
     make(with_base_settings(order, base), runner, output)
 
 
-def make(order: DatasetOrder, runner: ExecutorOptions, output: OutputOptions) -> None:
+def make(order: GenerateOptions, runner: ExecutorOptions, output: OutputOptions) -> None:
     """Make a dataset and print the result; raises TrilightError."""
     folder = dataset_folder(order.place)
     started = time.monotonic()

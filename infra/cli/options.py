@@ -1,7 +1,7 @@
 """Commands whose options are the fields of settings classes, so that each is described once.
 
     @command("build")
-    def generate(order: DatasetOrder, shown: Shown) -> None: ...
+    def generate(order: GenerateOptions, shown: Shown) -> None: ...
 
 makes the argument BUILD, and an option of every other field. Each parameter of the function is a
 class of settings (storage.settings.described) and a section of the help, with the class's first

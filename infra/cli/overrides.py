@@ -12,9 +12,9 @@ from storage.settings.overrides import apply_overrides, differences, json_or_wor
 from storage.typed_json import read_json
 
 if TYPE_CHECKING:
-    from pipeline.generation.dataset_order import DatasetOrder
+    from pipeline.generation.generate_options import GenerateOptions
 
-Order = TypeVar("Order", bound="DatasetOrder")
+Options = TypeVar("Options", bound="GenerateOptions")
 
 _LICENCES = "allowed_licences"
 _OF_SOURCES = ("build", "derived", "revisit")
@@ -61,7 +61,7 @@ def parse_overrides(texts: Iterable[str]) -> dict[str, Any]:
     return changes
 
 
-def with_base_settings(order: Order, base: BaseSettings) -> Order:
+def with_base_settings(order: Options, base: BaseSettings) -> Options:
     """Return dataset options whose `changes` hold all differences from the preset.
 
     Raises:

@@ -4,11 +4,11 @@ from infra.cli.console import first_words
 from infra.cli.generate import ExecutorOptions, make
 from infra.cli.options import OutputOptions, command
 from infra.cli.overrides import BaseSettings, with_base_settings
-from pipeline.generation.revisit_options import RevisitOptions, revisit_order
+from pipeline.generation.revisit_options import RevisitOptions, to_generate_options
 
 
 @command("dataset")
 def revisit(options: RevisitOptions, runner: ExecutorOptions, output: OutputOptions) -> None:
     first_words(f"Reading {options.dataset}", silent=output.json)
-    order = with_base_settings(revisit_order(options), BaseSettings(like=options.dataset))
+    order = with_base_settings(to_generate_options(options), BaseSettings(like=options.dataset))
     make(order, runner, output)

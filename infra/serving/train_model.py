@@ -13,7 +13,7 @@ from prefect.concurrency.sync import concurrency
 from prefect.logging import get_run_logger
 
 from infra.train_options import TrainOptions
-from pipeline.flows.forms import PublicUrl, order_of, overrides_form, parameters_of
+from pipeline.flows.forms import PublicUrl, options_of_form, overrides_form, parameters_of
 from pipeline.flows.limits import GPU_LIMIT
 from pipeline.flows.process import run_to_end
 from pipeline.renders.visible_gpus import visible_gpus
@@ -45,7 +45,7 @@ def train_order(parameters: Mapping[str, Any]) -> TrainOptions:
         TrilightError: a value that no schema can refuse, such as one that contradicts another
             setting; the message names it.
     """
-    order = order_of(parameters, TrainOptions)
+    order = options_of_form(parameters, TrainOptions)
     order.settings()
     return order
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from storage.dataset.dataset import dataset_files
 from storage.dataset.layout import dataset_folder
@@ -27,7 +27,7 @@ MAX_TASKS = 1000
 
 
 @checked()
-class DatasetByArray(DatasetOrder):
+class DatasetByArray(GenerateOptions):
     """A dataset made by the tasks of a scheduler's array."""
 
     scheduler: Literal["slurm", "kubernetes", "none"] = "slurm"
@@ -41,10 +41,10 @@ class DatasetByArray(DatasetOrder):
     fails; the array is left as it is."""
 
     @property
-    def dataset(self) -> DatasetOrder:
+    def dataset(self) -> GenerateOptions:
         """The options of the dataset alone, without those of the array."""
-        return DatasetOrder(
-            **{each.name: getattr(self, each.name) for each in dataclasses.fields(DatasetOrder)}
+        return GenerateOptions(
+            **{each.name: getattr(self, each.name) for each in dataclasses.fields(GenerateOptions)}
         )
 
 
@@ -52,7 +52,7 @@ class DatasetByArray(DatasetOrder):
 class ArrayJob:
     """One submission of an array."""
 
-    order: DatasetOrder
+    order: GenerateOptions
     """Options of the dataset, with its number of scenes."""
     tasks: Sequence[int]
     """Numbers of the tasks with missing shards; empty if nothing is missing."""
@@ -63,7 +63,7 @@ class ArrayJob:
 
 
 def array_job(
-    order: DatasetOrder, *, per_task: int | None, at_once: int | None, on: str = "slurm"
+    order: GenerateOptions, *, per_task: int | None, at_once: int | None, on: str = "slurm"
 ) -> ArrayJob:
     """Return the array that makes the missing shards of a dataset, which need not exist yet.
 

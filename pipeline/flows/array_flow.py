@@ -16,7 +16,7 @@ from prefect.logging import get_run_logger
 from pipeline.executors.array_job import DatasetByArray, array_job
 from pipeline.executors.kubernetes_array import options_from_environment, submit_job
 from pipeline.executors.slurm_array import submit_array
-from pipeline.flows.forms import DATASET_FORMS, order_of, parameters_of, run_name
+from pipeline.flows.forms import DATASET_FORMS, options_of_form, parameters_of, run_name
 from pipeline.flows.run_artifacts import ArtifactPage
 from storage.dataset.progress import DatasetStatus, missing_shards, read_status
 from storage.errors import TrilightError
@@ -33,7 +33,7 @@ def make_by_array(**parameters: Any) -> None:
 
     Start it again when no task is left in the queue: it submits what is still missing.
     """
-    order = order_of(parameters, DatasetByArray)
+    order = options_of_form(parameters, DatasetByArray)
     artifacts = ArrayArtifacts(order.place)
     if order.scheduler != "none":
         _submit(order)

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.objects.sources import SOURCES
 from pipeline.presets.registry import DATASET_PRESETS
 from pipeline.presets.settings import DatasetSettings
@@ -115,7 +115,7 @@ DATASET_FORMS: Mapping[str, Any] = {
 
 
 @checked()
-class DatasetInRuns(DatasetOrder):
+class DatasetInRuns(GenerateOptions):
     """A dataset made by several flow runs, each of which makes a range of the shards."""
 
     flow_runs: Annotated[int, Within(1, MAX_SHARDS, unit="flow runs")] = 1
@@ -132,7 +132,7 @@ class DatasetInRuns(DatasetOrder):
             )
 
 
-def order_of(parameters: Mapping[str, Any], kind: Callable[..., Returned]) -> Returned:
+def options_of_form(parameters: Mapping[str, Any], kind: Callable[..., Returned]) -> Returned:
     """Return the options of a class that a flow's parameters state.
 
     Raises:
@@ -147,6 +147,6 @@ def run_name() -> str:
     """Return the name of the starting flow run: preset, number of scenes and output folder."""
     from prefect.runtime import flow_run
 
-    parameters = {"build": DatasetOrder.build, **flow_run.parameters}
+    parameters = {"build": GenerateOptions.build, **flow_run.parameters}
     parts = (parameters["build"], parameters.get("scenes"), parameters.get("out"))
     return "-".join(str(part) for part in parts if part is not None)

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.prepare_isolated import ChildPool
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, call_with_retries, reach
 from pipeline.objects.maps.listing import PLURALS, FoundMap, find_maps
@@ -57,7 +57,7 @@ class MapFolders:
 NO_FOLDERS = MapFolders()
 
 
-def map_folders(order: DatasetOrder, settings: DatasetSettings) -> MapFolders:
+def map_folders(order: GenerateOptions, settings: DatasetSettings) -> MapFolders:
     """Return the folders of textures and maps that the options name.
 
     Raises:

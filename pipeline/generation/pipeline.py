@@ -36,10 +36,10 @@ from pipeline.generation.accept_maps import map_folders
 from pipeline.generation.accept_revisited import accept_revisited
 from pipeline.generation.accept_scene_files import accept_scene_files
 from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
-from pipeline.generation.dataset_order import DatasetOrder, generate_words
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.environment import environment
 from pipeline.generation.freeze_objects import ObjectLock
+from pipeline.generation.generate_options import GenerateOptions, generate_words
 from pipeline.generation.render_children import (
     close_children,
     cores_of_child,
@@ -74,7 +74,7 @@ from storage.records.scene import Scene
 
 
 def make_dataset(
-    order: DatasetOrder, runner: Runner, watch: Watcher = lambda run, outcome: None
+    order: GenerateOptions, runner: Runner, watch: Watcher = lambda run, outcome: None
 ) -> Outcome:
     """Make a dataset: all its missing shards, or those of a range.
 
@@ -96,14 +96,14 @@ def make_dataset(
     return run.outcome(finished, statistics)
 
 
-def prepare_dataset(order: DatasetOrder) -> Run:
+def prepare_dataset(order: GenerateOptions) -> Run:
     """Begin a dataset and freeze its objects, without rendering; raises as `make_dataset`."""
     with _begin_run(order) as run:
         return run
 
 
 @contextlib.contextmanager
-def _begin_run(order: DatasetOrder) -> Iterator[Run]:
+def _begin_run(order: GenerateOptions) -> Iterator[Run]:
     """Join a dataset's workers and yield the run; the first worker freezes the objects."""
     folder = dataset_folder(order.place)
     folder = replace(folder, root=Path(os.path.realpath(folder.root)))

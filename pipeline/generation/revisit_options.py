@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pipeline.exchange.open_scene import load_cameras, scene_source
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.presets.revisit import MOST_CAMERAS, GivenCamera, RevisitSettings
 from pipeline.renders.settings import NoiseFloor, Resolution
 from pipeline.renders.variant import Device
@@ -77,7 +77,7 @@ class RevisitOptions:
     (values are JSON); by default there are none."""
 
 
-def revisit_order(options: RevisitOptions) -> DatasetOrder:
+def to_generate_options(options: RevisitOptions) -> GenerateOptions:
     """Return the options of the new dataset, without the settings of the finished one.
 
     Raises:
@@ -92,7 +92,7 @@ def revisit_order(options: RevisitOptions) -> DatasetOrder:
     )
     same = {
         each.name: getattr(options, each.name)
-        for each in fields(DatasetOrder)
+        for each in fields(GenerateOptions)
         if hasattr(options, each.name)
     }
     stated = {
@@ -100,7 +100,7 @@ def revisit_order(options: RevisitOptions) -> DatasetOrder:
         "revisits": os.path.realpath(options.dataset),
         "changes": {**options.changes, "revisit": settings_record(revisit)},
     }
-    return DatasetOrder(**{**same, **stated})
+    return GenerateOptions(**{**same, **stated})
 
 
 def _cameras(words: str, num_views: int) -> dict[str, Any]:

@@ -7,9 +7,9 @@ from typing import Any
 from pipeline.exchange.scene_files import SceneFiles, SceneFolder, find_scene_files
 from pipeline.generation.accept_revisited import settings_for_revisit
 from pipeline.generation.accept_scene_files import settings_for_files
-from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.objects.sources import check_source
 from pipeline.presets.registry import DATASET_PRESETS, frozen_note, object_source, preset_settings
 from pipeline.presets.settings import DatasetSettings
@@ -40,7 +40,7 @@ _USED = 0.9
 class Run:
     """A dataset that has begun, with its objects frozen: the input of every later step."""
 
-    order: DatasetOrder
+    order: GenerateOptions
     """The command's options."""
     settings: DatasetSettings
     """The preset with the options' changes."""
@@ -205,7 +205,7 @@ Watcher = Callable[[Run, TaskResult], None]
 
 
 def resolve_settings(
-    order: DatasetOrder, folder: DatasetFolder
+    order: GenerateOptions, folder: DatasetFolder
 ) -> tuple[DatasetSettings, SceneFolder | None]:
     """Return the dataset's settings, and the scene files if scenes come from files.
 
@@ -230,7 +230,7 @@ def resolve_settings(
     return settings_for_files(settings, listed, order.views), listed
 
 
-def choose_dataset_variant(order: DatasetOrder, folder: DatasetFolder) -> Variant:
+def choose_dataset_variant(order: GenerateOptions, folder: DatasetFolder) -> Variant:
     """Return the variant that renders a dataset.
 
     It is that of the device which the dataset was begun on, unless the options or TRILIGHT_VARIANT

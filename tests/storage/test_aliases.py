@@ -1,7 +1,7 @@
 """Names for people mean what the stored names mean, and are never stored."""
 
 from model.open import find_network
-from pipeline.generation.dataset_order import DatasetOrder, generate_words
+from pipeline.generation.generate_options import GenerateOptions, generate_words
 from pipeline.presets.registry import DATASET_PRESETS, object_source, preset_settings
 from storage.aliases import NETWORKS, OBJECTS, PRESET_ALIASES, stored_name
 from train.presets import TRAINING_PRESETS, training_preset
@@ -24,5 +24,5 @@ def test_what_is_stored_keeps_its_name() -> None:
 
 
 def test_a_command_that_is_printed_keeps_the_typed_name() -> None:
-    assert generate_words(DatasetOrder(build="tiny"))[:2] == ["generate", "tiny"]
-    assert DatasetOrder(build="tiny").place == "data/tiny"
+    assert generate_words(GenerateOptions(build="tiny"))[:2] == ["generate", "tiny"]
+    assert GenerateOptions(build="tiny").place == "data/tiny"

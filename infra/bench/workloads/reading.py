@@ -13,7 +13,7 @@ import numpy as np
 
 from infra.planning import measure_scenes
 from pipeline.exchange.renderformer_h5 import TextureType, write_renderformer_h5
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.presets.registry import preset_settings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, index_shard, write_manifest
@@ -45,7 +45,7 @@ def render_scenes(px: int, place: Path) -> tuple[dict[str, float], list[Members]
         Wall-clock milliseconds and CPU seconds of a view; and the files of each scene.
     """
     splits = preset_settings(BUILD).splits
-    order = DatasetOrder(build=BUILD, resolution=px, scenes=splits.scenes_per_shard)
+    order = GenerateOptions(build=BUILD, resolution=px, scenes=splits.scenes_per_shard)
     marks: list[float] = []
     measured = measure_scenes(order, SCENES, place, lambda: marks.append(time.monotonic()))
     staged = DatasetFolder(place).staged_shard(shard_name(0, splits))

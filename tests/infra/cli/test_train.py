@@ -23,7 +23,7 @@ from infra.cli.overrides import (
 )
 from infra.cli.train import _BarProgress, _QuietProgress, _report, _validation_rows
 from model.checkpoint_format import saved_steps
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
@@ -229,10 +229,10 @@ def test_a_dataset_is_followed_and_options_count_more(tmp_path: Path) -> None:
         like=str(tmp_path / "set"),
         settings=_file(tmp_path, "renders: {resolution: 96, max_spp: 64}\nseed: 1\n"),
     )
-    alike = with_base_settings(DatasetOrder(build=FAR), BaseSettings(like=shared.like))
+    alike = with_base_settings(GenerateOptions(build=FAR), BaseSettings(like=shared.like))
     found = preset_settings(FAR, changes=alike.changes).as_json()
     assert found == {**record, "build": FAR}
-    order = DatasetOrder(build=FAR, resolution=32, changes={"renders.max_spp": 128})
+    order = GenerateOptions(build=FAR, resolution=32, changes={"renders.max_spp": 128})
     changes = with_base_settings(order, shared).changes
     settings = preset_settings(FAR, changes=changes)
     assert (settings.seed, settings.renders.resolution, settings.renders.max_spp) == (1, 32, 128)
@@ -242,12 +242,12 @@ def test_a_dataset_is_followed_and_options_count_more(tmp_path: Path) -> None:
 def test_a_floor_that_is_asked_for_replaces_those_of_a_file(tmp_path: Path) -> None:
     file = _file(tmp_path, "renders: {noise_floor_db: 44, noise_floor_objects_db: 43}\n")
     order = with_base_settings(
-        DatasetOrder(noise_floor_linear_db=36.0), BaseSettings(settings=file)
+        GenerateOptions(noise_floor_linear_db=36.0), BaseSettings(settings=file)
     )
     assert preset_settings("smoke", changes=order.changes).renders.targets_db == {
         "psnr_linear_db": 36.0
     }
-    as_filed = with_base_settings(DatasetOrder(), BaseSettings(settings=file)).changes
+    as_filed = with_base_settings(GenerateOptions(), BaseSettings(settings=file)).changes
     assert preset_settings("smoke", changes=as_filed).renders.targets_db == {
         "psnr_log_db": 44.0,
         "object_psnr_log_db": 43.0,
@@ -320,7 +320,7 @@ def test_a_run_is_followed_on_the_command_line(tmp_path: Path) -> None:
 
 
 def test_licences_are_allowed_beside_those_of_a_file(tmp_path: Path) -> None:
-    order = DatasetOrder(allow_licences=("CC-BY-NC-4.0",))
+    order = GenerateOptions(allow_licences=("CC-BY-NC-4.0",))
     for text, others in (
         ("seed: 1\n", preset_settings("smoke").allowed_licences),
         ("allowed_licences: [MIT]\n", ("MIT",)),

@@ -19,7 +19,7 @@ from pipeline.generation.accept_scene_files import (
     settings_for_files,
 )
 from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from storage.dataset.layout import DatasetFolder
@@ -169,7 +169,7 @@ def test_without_wish_there_are_as_many_views_as_every_file_has(folder: Path) ->
     with pytest.raises(TrilightError, match="--views is 0"):
         _settings(folder, views=0)
     with pytest.raises(TrilightError, match="only with --scenes-from"):
-        DatasetOrder(views=1)
+        GenerateOptions(views=1)
 
 
 @pytest.mark.usefixtures("no_child")

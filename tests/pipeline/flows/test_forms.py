@@ -9,9 +9,9 @@ from prefect.exceptions import ParameterTypeError
 from infra.serving.train_model import train_model
 from pipeline.flows.array_flow import make_by_array
 from pipeline.flows.dataset_flows import build_dataset, generate_scenes, prepare_assets
-from pipeline.flows.forms import DatasetOverrides, changed_values, order_of
+from pipeline.flows.forms import DatasetOverrides, changed_values, options_of_form
 from pipeline.flows.prefect_runner import is_retryable
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.presets.settings import DatasetSettings
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.for_each import for_each
@@ -27,7 +27,7 @@ FLOWS = {
 
 
 def _defaults(**given: Any) -> dict[str, Any]:
-    plain = {field.name: field.default for field in dataclasses.fields(DatasetOrder)}
+    plain = {field.name: field.default for field in dataclasses.fields(GenerateOptions)}
     return {**plain, "changes": None, **given}
 
 
@@ -67,9 +67,9 @@ def test_changes_become_dotted_names() -> None:
     form = DatasetOverrides(**{"renders": {"max_spp": 64}, "storage": {"profile": "lossless"}})
     expected = {"renders.max_spp": 64, "storage.profile": "lossless"}
     assert changed_values(form) == expected
-    order = order_of(_defaults(scenes=3, changes=form), DatasetOrder)
-    assert order == DatasetOrder(scenes=3, changes=expected)
-    assert order_of(_defaults(), DatasetOrder) == DatasetOrder()
+    order = options_of_form(_defaults(scenes=3, changes=form), GenerateOptions)
+    assert order == GenerateOptions(scenes=3, changes=expected)
+    assert options_of_form(_defaults(), GenerateOptions) == GenerateOptions()
 
 
 @for_each(
@@ -126,7 +126,7 @@ def test_a_place_that_cannot_be_written_is_refused_by_name() -> None:
     """Before anything is begun: a flow makes its order first."""
     for out in ("https://host/set", "hf://datasets/ada/set", "ftp://host/set"):
         with pytest.raises(TrilightError, match=f"^out '{out}'"):
-            order_of(_defaults(out=out), DatasetOrder)
+            options_of_form(_defaults(out=out), GenerateOptions)
 
 
 def test_only_what_can_pass_is_tried_again() -> None:

@@ -7,9 +7,9 @@ import pytest
 
 from pipeline.generation import dataset_writer
 from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
-from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.environment import environment
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.run import choose_dataset_variant
 from pipeline.objects.generated import generate_objects
 from pipeline.presets.registry import preset_settings
@@ -152,7 +152,7 @@ def test_a_dataset_stays_on_the_device_that_it_began_on(
     monkeypatch.setattr("pipeline.renders.variant._probe", lambda variant: _ProbeResult())
     on_cpu = Variant(name="llvm_ad_rgb", libllvm="", note="")
     monkeypatch.setattr("pipeline.renders.variant._on_processor", lambda: on_cpu)
-    order = DatasetOrder(build=build, device=device)
+    order = GenerateOptions(build=build, device=device)
     variant = choose_dataset_variant(order, folder)
     assert variant.device == device_of(environment(variant)) == chosen
 

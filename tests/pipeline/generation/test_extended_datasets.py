@@ -12,7 +12,7 @@ from infra.repair import repair
 from pipeline.exchange.reader import file_child
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, make_task, prepare_dataset
 from pipeline.isolation import call_with_retries
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings, resolve_dataset_preset
@@ -239,7 +239,7 @@ def test_a_mistyped_source_leaves_nothing_behind(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     with pytest.raises(TrilightError, match="objects"):
-        make_dataset(DatasetOrder(objects=source, out="set"), ThreadRunner())
+        make_dataset(GenerateOptions(objects=source, out="set"), ThreadRunner())
     assert [path.name for path in tmp_path.iterdir()] == ["empty"]
 
 

@@ -14,10 +14,10 @@ from pipeline.documents.attribution import encode_attribution
 from pipeline.generation import accept_maps as accepting
 from pipeline.generation import freeze_objects, frozen_pool, pipeline, restore_object
 from pipeline.generation.accept_maps import AcceptedMaps, MapFolders, accept_maps, map_folders
-from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects, require_same
 from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, SplitPool, user_maps
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.scene_worker import SceneAttempt
 from pipeline.objects.maps.prepared import MapFiles, prepare_map
@@ -373,13 +373,13 @@ def test_share_alike_licences_never_meet() -> None:
 
 def test_folders_and_shares_belong_together() -> None:
     with pytest.raises(TrilightError, match="--skies is not given"):
-        map_folders(DatasetOrder(textures="t"), preset_settings("smoke", changes=SHARES))
+        map_folders(GenerateOptions(textures="t"), preset_settings("smoke", changes=SHARES))
     with pytest.raises(TrilightError, match=r"--textures is given, but .*own_share 0"):
-        map_folders(DatasetOrder(textures="t"), preset_settings("smoke"))
+        map_folders(GenerateOptions(textures="t"), preset_settings("smoke"))
     with pytest.raises(TrilightError, match="only where scenes are composed"):
-        DatasetOrder(textures="t", scenes_from="scenes")
+        GenerateOptions(textures="t", scenes_from="scenes")
     with pytest.raises(TrilightError, match="only with --textures or --skies"):
-        DatasetOrder(map_licence="MIT")
+        GenerateOptions(map_licence="MIT")
 
 
 def test_files_that_lie_are_refused_with_their_part(tmp_path: Path) -> None:

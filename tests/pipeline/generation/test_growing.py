@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pipeline.generation import pipeline
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, prepare_dataset
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.shards import pack
@@ -58,7 +58,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
     return count
 
 
-def order(root: Path | str, scenes: int, **changes: Any) -> DatasetOrder:
+def order(root: Path | str, scenes: int, **changes: Any) -> GenerateOptions:
     return tiny_order(out=str(root), scenes=scenes, failure_budget=1.0, **changes)
 
 

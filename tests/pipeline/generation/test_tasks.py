@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from infra.cli.options import SHOWN
 from infra.cli.overrides import parse_overrides
-from pipeline.generation.dataset_order import DatasetOrder, generate_words
+from pipeline.generation.generate_options import GenerateOptions, generate_words
 from pipeline.generation.run import TaskResult, children_of_gpu
 from pipeline.generation.runner import Runner
 from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece, TaskCutter
@@ -109,11 +109,11 @@ def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
 )
 def test_wrong_orders_are_named(changes: dict[str, object], message: str) -> None:
     with pytest.raises(TrilightError, match=message):
-        dataclasses.replace(DatasetOrder(), **changes)  # type: ignore[arg-type]
-    assert DatasetOrder(shards="4:7").shard_range() == range(4, 7)
+        dataclasses.replace(GenerateOptions(), **changes)  # type: ignore[arg-type]
+    assert GenerateOptions(shards="4:7").shard_range() == range(4, 7)
 
 
-ASKED = DatasetOrder(
+ASKED = GenerateOptions(
     build="pretrain-256",
     objects="my objects",
     scenes=2_000_000,
@@ -159,10 +159,13 @@ def test_every_option_that_was_given_is_there() -> None:
 
 
 def test_words_are_what_was_asked_for_and_no_more() -> None:
-    assert generate_words(DatasetOrder(workers=3, shards="0:2", out="x")) == ["generate", "smoke"]
+    assert generate_words(GenerateOptions(workers=3, shards="0:2", out="x")) == [
+        "generate",
+        "smoke",
+    ]
     changes = {"source": "12", "storage.profile": "true"}  # words that are JSON stay words
-    assert parse_overrides(generate_words(DatasetOrder(changes=changes))[3::2]) == changes
-    with_password = DatasetOrder(objects="https://me:secret@host/objects?key=1")
+    assert parse_overrides(generate_words(GenerateOptions(changes=changes))[3::2]) == changes
+    with_password = GenerateOptions(objects="https://me:secret@host/objects?key=1")
     assert generate_words(with_password)[3] == "https://host/objects"
 
 

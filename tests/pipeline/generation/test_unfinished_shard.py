@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from pipeline.generation import pipeline, render_children, tasks, unfinished_shard
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, make_piece
 from pipeline.generation.prepare_isolated import ChildPool
 from pipeline.generation.run import Run, ShardJob, TaskResult
@@ -236,7 +236,7 @@ class Idle(Runner[Any]):
 
 def _run(root: Path, scenes: int) -> Run:
     return Run(
-        order=DatasetOrder(out=str(root), scenes=scenes),
+        order=GenerateOptions(out=str(root), scenes=scenes),
         settings=_build(),
         scene_folder=None,
         publication=begin_tiny(root, scenes),

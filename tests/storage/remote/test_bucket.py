@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import dataset_folder
 from storage.dataset.training_data import open_training_data
@@ -218,7 +218,7 @@ def test_a_server_that_ignores_the_condition_is_refused_before_anything_is_begun
 )
 def test_places_that_cannot_be_written_are_refused_by_name(out: str, message: str) -> None:
     with pytest.raises(TrilightError, match="^out ") as caught:
-        DatasetOrder(out=out)
+        GenerateOptions(out=out)
     assert message in str(caught.value)
     assert "hunter2" not in str(caught.value)
 

@@ -1,4 +1,4 @@
-"""`DatasetOrder`: the options of `trilight generate`, also for a scheduler's form."""
+"""`GenerateOptions`: the options of `trilight generate`, also for a scheduler's form."""
 
 import re
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ _PER_MACHINE = ("build", "out", "shards", "workers")
 
 
 @checked()
-class DatasetOrder:
+class GenerateOptions:
     """The dataset to make, the range of its shards, and how."""
 
     build: str = "smoke"
@@ -144,7 +144,7 @@ class DatasetOrder:
         return range(int(match[1]), int(match[2]))
 
 
-def _refuse_maps(order: DatasetOrder) -> None:
+def _refuse_maps(order: GenerateOptions) -> None:
     """Raise if map folders are given for scenes that are not composed, or a licence without any."""
     for name, value in (("--textures", order.textures), ("--skies", order.skies)):
         if value is not None and (order.scenes_from or order.revisits):
@@ -158,7 +158,7 @@ def _refuse_maps(order: DatasetOrder) -> None:
         )
 
 
-def generate_words(order: DatasetOrder) -> list[str]:
+def generate_words(order: GenerateOptions) -> list[str]:
     """Return the arguments of `generate` that repeat these options, without `--out`.
 
     Options of this machine alone (the range of shards, the number of processes) are left out; so
