@@ -96,7 +96,7 @@ def _require_generated(manifest: Manifest, scenes_from: str | None) -> None:
     of_files = _is_of_files(manifest)
     if of_files and scenes_from is None:
         raise TrilightError(
-            f"build {manifest.build!r} was made from scene files; expected --scenes-from FOLDER, "
+            f"preset {manifest.build!r} was made from scene files; expected --scenes-from FOLDER, "
             "the folder that it was made from."
         )
     if scenes_from is not None and not of_files:

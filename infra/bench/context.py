@@ -68,10 +68,10 @@ class BenchContext:
         return Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
 
     def render_child(
-        self, build: DatasetSettings, objects: str, threads: int | None = None
+        self, settings: DatasetSettings, objects: str, threads: int | None = None
     ) -> IsolatedChild:
         """Return a child that composes scenes of a preset and renders them, until `close`."""
-        allowed = dataclasses.replace(build, allowed_licences=self.options.allowed_licences)
+        allowed = dataclasses.replace(settings, allowed_licences=self.options.allowed_licences)
         return self.until_closed(composing_child(allowed, objects, self.folder(), threads))
 
     def until_closed(self, child: Closable) -> Closable:

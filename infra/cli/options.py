@@ -257,7 +257,7 @@ def _dataset_presets() -> list[str]:
     return list(DATASET_PRESETS)
 
 
-def _runs() -> list[str]:
+def _training_presets() -> list[str]:
     from train.presets import TRAINING_PRESETS
 
     return list(TRAINING_PRESETS)
@@ -277,7 +277,7 @@ def _runners() -> list[str]:
 
 NAMES: dict[str, Callable[[], list[str]]] = {
     "build": _dataset_presets,
-    "run": _runs,
+    "run": _training_presets,
     "network": _sizes,
     "runner": _runners,
 }

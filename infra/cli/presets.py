@@ -35,12 +35,12 @@ def _datasets() -> list[dict[str, Any]]:
     from pipeline.presets.registry import DATASET_PRESETS
 
     rows = []
-    for name, build in DATASET_PRESETS.items():
-        settings = build.settings()
+    for name, preset in DATASET_PRESETS.items():
+        settings = preset.settings()
         rows.append(
             {
                 "name": _name_for_people(name, PRESET_ALIASES),
-                "scenes": build.num_scenes,
+                "scenes": preset.num_scenes,
                 "views": settings.scenes.num_views,
                 "pixels": settings.renders.resolution,
                 "dB": settings.renders.noise_floor_db or "",
@@ -54,8 +54,8 @@ def _trainings() -> list[dict[str, Any]]:
     from train.presets import TRAINING_PRESETS
 
     rows = []
-    for name, run in TRAINING_PRESETS.items():
-        settings = run()
+    for name, preset in TRAINING_PRESETS.items():
+        settings = preset()
         rows.append(
             {
                 "name": _name_for_people(name, PRESET_ALIASES),

@@ -235,7 +235,7 @@ def _require_bucket_alone(order: GenerateOptions) -> None:
             )
     if is_reference(order.build):
         raise TrilightError(
-            f"submit kubernetes: the build is {order.build}, a file of this machine; expected a "
+            f"submit kubernetes: the preset is {order.build}, a file of this machine; expected a "
             "name. Put the file into an image of your own, with TRILIGHT_EXTEND, and name its "
-            "build."
+            "preset."
         )
