@@ -1,4 +1,4 @@
-"""Frozen settings of the published sets, with every number stated: no default may change them.
+"""Frozen preset settings of the published sets, all numbers stated: no default may change them.
 
 See scene_templates.frozen_v1. A preset for training may change in later versions; these may not, so
 they use no settings that do.
