@@ -118,14 +118,14 @@ def test_what_was_not_calibrated_has_the_bound(
 
 @pytest.mark.usefixtures("measured")
 def test_a_bound_in_its_place_is_measured_later() -> None:
-    for changes, spp in (
+    cases: list[tuple[dict[str, Any], int]] = [
         ({}, 32), ({"stated_error": "bound"}, 32), ({"per_light": True}, 64), ({"split": True}, 64),
         ({"denoiser": "fast"}, 64), ({"resolution": 512}, 64), ({"resolution": 128}, 64),
         ({"split": True, "max_spp": 32}, 32),
-    ):  # fmt: skip
-        settings = dataclasses.replace(
-            SETTINGS, **{"resolution": 256, "min_spp_px": 256, **changes}
-        )
+    ]  # fmt: skip
+    for changes, spp in cases:
+        asked: dict[str, Any] = {"resolution": 256, "min_spp_px": 256, **changes}
+        settings = dataclasses.replace(SETTINGS, **asked)
         assert first_spp(settings) == spp, changes
 
 
