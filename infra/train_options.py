@@ -29,7 +29,7 @@ class TrainOptions:
     """Dataset (a folder or a URL), or shards by name or pattern. Several are mixed by the setting
     data_weights; a pattern is such as s3://b/{train,validation}-{000000..000007}.tar."""
     out: str | None = None
-    """Folder for the run, on the machine that trains; by default runs/RUN."""
+    """Folder for the run, on the machine that trains; by default runs/PRESET."""
     resume: bool = False
     """Continue from the newest checkpoint, with the settings of the start. Settings of execution
     may differ."""

@@ -61,9 +61,9 @@ class AssetOptions:
     own_materials: bool = False
     """Keep the materials and textures of the objects, as GLB files."""
     licence: str | None = None
-    """Licence of object files that state none; by default your own work."""
+    """License of object files that state none; by default your own work."""
     allow_licences: tuple[str, ...] = ()
-    """Licences to allow in addition to the usual ones; by default none."""
+    """Licenses to allow in addition to the usual ones; by default none."""
     workers: Annotated[int | None, Within(1, 1024, unit="objects")] = None
     """Objects to process at the same time; by default the number of cores."""
 

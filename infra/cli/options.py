@@ -59,6 +59,8 @@ SHOWN = {
 """Name of an option that help shows, by field or Class.field, where the field's own name is not the
 best for people; that one works too."""
 
+PRESETS = {"build": "PRESET", "run": "PRESET"}
+"""Arguments by what help calls them."""
 _METAVARS = {int: "INT", float: "NUMBER"}
 _BY_DEFAULT = re.compile(r"; by default (.+?)\.(?=\s|$)")
 _NONE = re.compile(r"^there (is|are) none$")
@@ -125,7 +127,7 @@ def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> insp
     names = dict.fromkeys([shown_name(field), option_of(field.name)])
     metavar = "CHOICE" if choices else _METAVARS.get(kind, "TEXT")
     declared = Parameter(
-        name=None if by_place else tuple(names),
+        name=PRESETS.get(field.name) if by_place else tuple(names),
         help=_help(field, choices, several=several, required=required),
         group=group,
         metavar=None if kind is bool else "NAME=VALUE" if takes_names(field.hint) else metavar,

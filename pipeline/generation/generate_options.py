@@ -34,7 +34,7 @@ class GenerateOptions:
     the variable of a worker that holds the source; by default the preset's, or procedural:."""
     out: str | None = None
     """Folder or bucket (s3://bucket/folder) for the dataset, on the machine that makes it; by
-    default data/BUILD."""
+    default data/PRESET."""
     scenes: Annotated[int | None, Within(1, MOST_SCENES, unit="scenes")] = None
     """Number of scenes; a larger one lets a dataset grow; by default the preset's."""
     seed: Seed | None = None
@@ -51,17 +51,17 @@ class GenerateOptions:
     """The same as object_psnr_log_db, which leaves out empty background; by default the preset's,
     unless another target is given."""
     allow_licences: tuple[str, ...] = ()
-    """Licences to allow in addition to the preset's; by default there are none."""
+    """Licenses to allow in addition to the preset's; by default there are none."""
     licence: str | None = None
-    """Licence of object files that state none; by default such files count as your own work."""
+    """License of object files that state none; by default such files count as your own work."""
     textures: str | None = None
-    """Folder of your own textures: base colours, with their maps beside them; by default all
+    """Folder of your own textures: base colors, with their maps beside them; by default all
     textures are procedural. The settings scenes.textures say how many are used."""
     skies: str | None = None
     """Folder of your own environment maps, .hdr or .exr; by default all skies are procedural. The
     settings scenes.skies say how many are used."""
     map_licence: str | None = None
-    """Licence of textures and maps of folders without a catalogue; by default such files count as
+    """License of textures and maps of folders without a catalog; by default such files count as
     your own work."""
     workers: Annotated[int | None, Within(1, 1024, unit="processes")] = None
     """Number of render processes, which share the cores; by default one, or up to four a GPU."""
@@ -74,7 +74,7 @@ class GenerateOptions:
     """Continue a dataset that was started with other library versions or on another device."""
     scenes_from: str | None = None
     """Folder of scene files (RenderFormer JSON) to render; by default scenes are composed of
-    objects. Scene k is the k-th *.json, all scenes are of the split test, and the preset's limits
+    objects. Scene k is the k-th *.json. All scenes belong to the test split. The preset's limits
     on scenes do not apply."""
     views: Annotated[int | None, Within(1, 1000, unit="cameras")] = None
     """Number of cameras to use of each scene file, from its first; by default the smallest number
@@ -83,8 +83,8 @@ class GenerateOptions:
     """How to treat a material of a scene file whose diffuse and specular albedos add up to more
     than 1: scale multiplies both by one factor, refuse leaves the file out."""
     revisits: str | None = None
-    """Folder of a finished dataset whose scenes to render again, with what the settings `revisit`
-    say is new (`trilight revisit` writes them); by default scenes are composed of objects."""
+    """Folder of a finished dataset to render again by the settings `revisit`, which `trilight
+    revisit` writes; by default scenes are composed of objects."""
     shards: str | None = None
     """Range A:B of the shards to make, from A up to but not including B; by default all. The run
     that makes the last missing shard finishes the dataset."""

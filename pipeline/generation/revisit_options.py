@@ -36,31 +36,30 @@ class RevisitOptions:
     """Folder of the new dataset, or a bucket such as s3://bucket/folder. Run the same command again
     to resume."""
     cameras: str = "keep"
-    """Cameras of each scene: keep; a number, such as 4, for so many, those that it has first; new:4
-    for new ones only; plane:4 for new ones as another layout has them; or a file with cameras
-    (RenderFormer JSON, USD, or any scene), the same for every scene."""
+    """Cameras of each scene: keep; 4 for four, the present ones first; new:4 for new ones only;
+    plane:4 for new ones as another layout has them; or a file with cameras for every scene
+    (RenderFormer JSON, USD, or any scene)."""
     lights: str = "keep"
-    """Lights of each scene: keep; new for as many drawn anew; or a number of new ones, such as 3.
+    """Lights of each scene: keep; new for as many new ones; or a number of new ones, such as 3.
     `--set scenes.lights.NAME=VALUE` changes what they are drawn from."""
     materials: Literal["keep", "new"] = "keep"
-    """Materials of each scene: keep, or new for ones drawn anew. `--set
-    scenes.materials.NAME=VALUE` changes what they are drawn from."""
+    """Materials of each scene: keep, or new ones. `--set scenes.materials.NAME=VALUE`
+    changes what they are drawn from."""
     seed: Seed | None = None
-    """Seed of all that is drawn anew, and of the samples: with another one, every picture is
-    rendered again; by default the dataset's."""
+    """Seed of new draws and samples; another one renders every image; by default the
+    dataset's."""
     resolution: Resolution | None = None
-    """Width of a picture in pixels; by default the dataset's."""
+    """Width of an image in pixels; by default the dataset's."""
     noise_floor_db: NoiseFloor | None = None
-    """Sampling stops at this measured noise floor in dB (psnr_log_db); by default as the dataset
-    was made."""
+    """Stated error in dB (psnr_log_db) at which sampling stops; by default as the dataset was
+    made."""
     noise_floor_linear_db: NoiseFloor | None = None
-    """The same as psnr_linear_db; by default as the dataset was made. Of several floors, all are
+    """The same as psnr_linear_db; by default as the dataset was made. Of several errors, all are
     reached."""
     noise_floor_objects_db: NoiseFloor | None = None
     """The same as object_psnr_log_db; by default as the dataset was made."""
     build: str | None = None
-    """Preset that fills in settings which the dataset does not state, since it was merged; by
-    default the dataset's own."""
+    """Preset for settings that a merged dataset does not state; by default the dataset's own."""
     workers: Annotated[int | None, Within(1, 1024, unit="processes")] = None
     """Number of render processes, which share the cores; by default one, or four for each GPU, or
     as many as its memory holds."""
