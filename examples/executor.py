@@ -13,8 +13,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 from trilight.extend import (
     EXECUTORS,
-    DatasetOrder,
     Executor,
+    GenerateOptions,
     Outcome,
     ThreadRunner,
     TrilightError,
@@ -26,7 +26,7 @@ from trilight.extend import (
 TRILIGHT = (sys.executable, "-m", "trilight")
 
 
-def by_commands(order: DatasetOrder, address: str | None) -> Outcome:
+def by_commands(order: GenerateOptions, address: str | None) -> Outcome:
     """Make every missing shard in a process of its own, then finish what is left here."""
     missing = prepare_dataset(order).publication.unfinished_shards()
     words = (*TRILIGHT, *generate_words(order), "--out", order.place)

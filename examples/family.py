@@ -2,8 +2,8 @@
 
     trilight generate smoke --extend family.py --set 'scenes.families=["crowd", "plane-single"]'
 
-No build asks for all families there are: a build of your own lists this one (see build.py), or
-`--set scenes.families` names it in place of the build's.
+No preset asks for all families there are: a preset of your own lists this one (see
+dataset_preset.py), or `--set scenes.families` names it in place of the preset's.
 """
 
 from trilight.extend import FAMILIES, Family, SharedRoom

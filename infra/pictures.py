@@ -31,7 +31,7 @@ from pipeline.executors.threads import ThreadRunner
 from pipeline.foreign.load import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import NoiseTargets
@@ -248,7 +248,7 @@ class Pictures:
         self, name: str, changes: Mapping[str, Any], build: str = "tiny"
     ) -> Iterator[Sample]:
         """Make one of the datasets, unless it is there, and yield its training scenes."""
-        order = DatasetOrder(
+        order = GenerateOptions(
             build=build,
             objects=str(self._objects),
             out=str(self._data / name),

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.builds.named import BUILDS, named_build
-from pipeline.builds.settings import BuildSettings
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_task, prepare_dataset
 from pipeline.generation.render_children import close_children
 from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings
+from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.visible_gpus import visible_gpus
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
@@ -96,7 +96,7 @@ class Prediction:
 
 
 def measure_scenes(
-    order: DatasetOrder, count: int, place: Path, scene_done: Callable[[], None]
+    order: GenerateOptions, count: int, place: Path, scene_done: Callable[[], None]
 ) -> MeasuredScenes:
     """Make the first scenes of a dataset in another folder.
 
@@ -129,7 +129,7 @@ def measure_scenes(
 
 
 def predict_cost(
-    measured: MeasuredScenes, order: DatasetOrder, *, cores: int, usd_per_core_hour: float
+    measured: MeasuredScenes, order: GenerateOptions, *, cores: int, usd_per_core_hour: float
 ) -> Prediction:
     """Return the predicted cost of the whole dataset from the means of measured scenes.
 
@@ -161,7 +161,7 @@ def predict_cost(
     return dataclasses.replace(prediction, notes=tuple(_notes(prediction)))
 
 
-def describe_run(order: DatasetOrder, folder: DatasetFolder) -> str:
+def describe_run(order: GenerateOptions, folder: DatasetFolder) -> str:
     """Return a line on the scenes that a run will make, and its time by earlier scenes.
 
     It is empty if files or another dataset define the scenes.
@@ -192,7 +192,7 @@ def describe_run(order: DatasetOrder, folder: DatasetFolder) -> str:
     return f"{counts}{lacking}{part}{size}; {_expected_time(settings, remaining, core_s)}"
 
 
-def _expected_time(settings: BuildSettings, remaining: int, core_s: Sequence[float]) -> str:
+def _expected_time(settings: DatasetSettings, remaining: int, core_s: Sequence[float]) -> str:
     """Return about how long the remaining scenes take, by earlier ones of the set or by ours."""
     cores = available_cores()
     on_cores = f"on {_count_text(cores, 'core')}"
@@ -227,12 +227,12 @@ def _notes(prediction: Prediction) -> Iterator[str]:
         )
 
 
-def _num_scenes(order: DatasetOrder) -> int:
-    return BUILDS[order.build].num_scenes if order.scenes is None else order.scenes
+def _num_scenes(order: GenerateOptions) -> int:
+    return DATASET_PRESETS[order.build].num_scenes if order.scenes is None else order.scenes
 
 
-def _settings(order: DatasetOrder) -> BuildSettings:
-    return named_build(
+def _settings(order: GenerateOptions) -> DatasetSettings:
+    return preset_settings(
         order.build,
         resolution=order.resolution,
         noise_targets=order.noise_targets,

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
-from pipeline.builds.named import named_build
-from pipeline.builds.settings import differences
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.executors.threads import ThreadRunner
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset
 from pipeline.objects.licences import BY_USER
+from pipeline.presets.registry import preset_settings
+from pipeline.presets.settings import differences
 from storage.dataset.asked import read_asked, value_of
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.derived import derivation_of
@@ -58,7 +58,7 @@ def repair(
     command = read_asked(opened) or ()
     revisits = _revisit_source(opened, command)
     maps = _user_maps(opened, command)
-    order = DatasetOrder(
+    order = GenerateOptions(
         build=manifest.build,
         objects=None if scenes_from or revisits else objects,
         out=str(root),
@@ -96,7 +96,7 @@ def _require_generated(manifest: Manifest, scenes_from: str | None) -> None:
     of_files = _is_of_files(manifest)
     if of_files and scenes_from is None:
         raise TrilightError(
-            f"build {manifest.build!r} was made from scene files; expected --scenes-from FOLDER, "
+            f"preset {manifest.build!r} was made from scene files; expected --scenes-from FOLDER, "
             "the folder that it was made from."
         )
     if scenes_from is not None and not of_files:
@@ -147,7 +147,7 @@ def _user_maps(dataset: Dataset, command: Sequence[str]) -> dict[str, str | None
 
 def _changes(manifest: Manifest) -> dict[str, object]:
     """Return the settings of a dataset that differ from its preset's."""
-    build = named_build(manifest.build).as_json()
+    build = preset_settings(manifest.build).as_json()
     changed = {name: now for name, _, now in differences(build, manifest.settings)}
     if _is_of_files(manifest):
         return {name: now for name, now in changed.items() if name not in _OF_SCENE_FILES}

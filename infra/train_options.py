@@ -8,11 +8,11 @@ from typing import Annotated, Any, Literal
 
 from storage.errors import TrilightError
 from storage.extensions import function_name
-from storage.settings.changes import option_words
 from storage.settings.described import checked
+from storage.settings.overrides import option_words
 from storage.settings.ranges import Within
+from train.presets import override_training_preset
 from train.resume import StartOptions
-from train.runs import changed_run
 from train.settings import TrainSettings
 
 RESTARTS = "TORCHELASTIC_RESTART_COUNT"
@@ -29,7 +29,7 @@ class TrainOptions:
     """Dataset (a folder or a URL), or shards by name or pattern. Several are mixed by the setting
     data_weights; a pattern is such as s3://b/{train,validation}-{000000..000007}.tar."""
     out: str | None = None
-    """Folder for the run, on the machine that trains; by default runs/RUN."""
+    """Folder for the run, on the machine that trains; by default runs/PRESET."""
     resume: bool = False
     """Continue from the newest checkpoint, with the settings of the start. Settings of execution
     may differ."""
@@ -78,7 +78,7 @@ class TrainOptions:
             TrilightError: an unknown preset or setting, a refused value, or start options that do
                 not fit the run.
         """
-        settings = changed_run(
+        settings = override_training_preset(
             self.run, self.changes, steps=self.steps, most_unusable=self.most_unusable
         )
         self.start().check(settings)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import elu
 
-from model.published import NORMAL, decode_published, load_published
+from model.published import NORMAL, decode_published_config, load_published_weights
 from model.renderformer import ELU_ALPHA, RenderFormer
 from model.scene_tensors import SceneBatch
 from model.weights import read_tensors
@@ -80,7 +80,9 @@ def read_reference(path: Path) -> Reference:
         if name.startswith(_PARAMETER)
     }
     return Reference(
-        model=load_published(parameters, decode_published(json.loads(metadata["config"]))),
+        model=load_published_weights(
+            parameters, decode_published_config(json.loads(metadata["config"]))
+        ),
         batch=_batch(*(tensors[name] for name in inputs)),
         resolution=int(metadata["resolution"]),
         expected_BVRR3=tensors[_OUTPUT].float().movedim(2, -1),

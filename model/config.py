@@ -66,7 +66,7 @@ class ModelConfig:
     """Configuration of one network. Files store it flat; `stage` is the view stage in use."""
 
     PRESETS: ClassVar[Mapping[str, Callable[[], "ModelConfig"]]] = {}
-    """Named sizes, which a setting of this type accepts (storage.settings.changes)."""
+    """Named sizes, which a setting of this type accepts (storage.settings.overrides)."""
     REMOVED: ClassVar = tuple(REMOVED)
     """Names of settings of earlier versions, which old files may hold."""
     width: Annotated[int, Within(2 * VERTEX_COORDINATES, 16_384)]

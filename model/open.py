@@ -18,10 +18,10 @@ from safetensors.torch import save
 from model.checkpoint_format import find_checkpoint, read_checkpoint
 from model.published import (
     PublishedConfig,
-    decode_published,
-    encode_published,
-    load_published,
-    to_published,
+    decode_published_config,
+    encode_published_config,
+    export_published_weights,
+    load_published_weights,
 )
 from model.renderformer import RenderFormer
 from model.weights import (
@@ -129,7 +129,7 @@ def find_network(place: str | Path) -> NetworkFile:
         path=weights,
         trained=PUBLISHED_RANGE,
         any_width=False,
-        open=lambda: load_published(
+        open=lambda: load_published_weights(
             read_tensors(weights)[0], _read_config(weights.parent / CONFIG_NAME)
         ),
     )
@@ -186,8 +186,10 @@ def save_published(model: RenderFormer, folder: Path) -> None:
     """
     texture_patch = 1 if model.config.window_bundles else 32
     config = PublishedConfig(model=model.config, texture_patch=texture_patch)
-    text = json.dumps(encode_published(config), indent=2)
-    tensors = {name: x.contiguous() for name, x in to_published(model, texture_patch).items()}
+    text = json.dumps(encode_published_config(config), indent=2)
+    tensors = {
+        name: x.contiguous() for name, x in export_published_weights(model, texture_patch).items()
+    }
     folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / WEIGHTS_NAME, save(tensors, metadata={"format": "pt"}))
     write_atomically(folder / CONFIG_NAME, text.encode())
@@ -206,7 +208,7 @@ def _read_config(path: Path) -> PublishedConfig:
         raise TrilightError(f"{path}: not JSON ({error}).") from error
     if not isinstance(fields, dict):
         raise TrilightError(f"{path}: expected a JSON object.")
-    return decode_published(fields)
+    return decode_published_config(fields)
 
 
 def _download(name: str) -> Path:

@@ -1,4 +1,4 @@
-"""Published checkpoints: their configuration and tensors, and ours, converted both ways.
+"""Published RenderFormer checkpoints: configuration and weights, converted to ours and back.
 
 Of the configurations that their JSON allows, two families were published: V1-Base, and V1.1-Large
 with Swin windows. Any other value of a field is refused by name.
@@ -107,7 +107,7 @@ class PublishedConfig:
     """Width P of its texture input in cells."""
 
 
-def decode_published(fields: Mapping[str, Any]) -> PublishedConfig:
+def decode_published_config(fields: Mapping[str, Any]) -> PublishedConfig:
     """Return the content of a published config.json.
 
     Raises:
@@ -131,7 +131,7 @@ def decode_published(fields: Mapping[str, Any]) -> PublishedConfig:
     return PublishedConfig(model=model, texture_patch=got["texture_encode_patch_size"])
 
 
-def encode_published(config: PublishedConfig) -> dict[str, Any]:
+def encode_published_config(config: PublishedConfig) -> dict[str, Any]:
     """Return the config.json of a network, with all fields.
 
     Raises:
@@ -211,15 +211,15 @@ FREQUENCY_TOLERANCE = 1e-6
 """Maximum relative difference of stored frequencies from the formula: float32's rounding."""
 
 
-def load_published(tensors: Mapping[str, Tensor], config: PublishedConfig) -> RenderFormer:
-    """Return the network of published tensors, float32, in evaluation mode on the CPU.
+def load_published_weights(tensors: Mapping[str, Tensor], config: PublishedConfig) -> RenderFormer:
+    """Return the network of published weights, float32, in evaluation mode on the CPU.
 
     Raises:
         TrilightError: names or shapes do not match the configuration (all are listed), or the
             rotary frequencies do not.
     """
     with torch.device("meta"):
-        expected = to_published(RenderFormer(config.model), config.texture_patch)
+        expected = export_published_weights(RenderFormer(config.model), config.texture_patch)
     require_tensors(tensors, expected)
     single = {name: tensor.float() for name, tensor in tensors.items()}
     weight, bias = fold(
@@ -242,7 +242,7 @@ def load_published(tensors: Mapping[str, Tensor], config: PublishedConfig) -> Re
     return model
 
 
-def to_published(model: RenderFormer, texture_patch: int) -> dict[str, Tensor]:
+def export_published_weights(model: RenderFormer, texture_patch: int) -> dict[str, Tensor]:
     """Return a network's tensors under published names, with the texture encoder unfolded.
 
     Reading them back gives exactly the same network.

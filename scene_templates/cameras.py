@@ -65,7 +65,7 @@ of golden angles. `orbit`: equal steps of azimuth at one elevation, which is dra
 _GOLDEN = (math.sqrt(5) - 1) / 2
 
 _LATER: dict[str, Any] = {"path": "random", "elevation_deg": None}
-"""Settings that no record holds at these values, so that digests of earlier builds stay."""
+"""Settings that no record holds at these values, so that digests of earlier presets stay."""
 
 
 @checked("scene settings")

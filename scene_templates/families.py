@@ -21,7 +21,7 @@ class Family:
     """A layout, how many objects of which size it holds, and how often it is drawn."""
 
     PRESETS: ClassVar[Mapping[str, Callable[[], "Family"]]] = {}
-    """Functions that return a family, by its name, for `storage.settings.changes`."""
+    """Functions that return a family, by its name, for `storage.settings.overrides`."""
     name: str
     """Unique name, such as `corner-multi`."""
     template: str
@@ -52,7 +52,7 @@ class Family:
 
 
 LAYOUTS = ("plane", "wall", "corner", "open_box")
-"""A template that is registered later joins a build when its name is written here."""
+"""A template that is registered later joins a preset when its name is written here."""
 
 DEFAULT_FAMILIES = tuple(
     family
@@ -100,8 +100,8 @@ FAMILIES: Registry[Callable[[], Family]] = Registry(
     {**{family.name: partial(_itself, family) for family in DEFAULT_FAMILIES}, "alone": alone},
     decides=("data",),
 )
-"""Functions that return a family, by its name. A build states its families in full and asks for no
-list of all, so that registering one changes no build: `--set 'scenes.families=["plane-single"]'`
-and a build's own function choose from them."""
+"""Functions that return a family, by its name. A preset states its families in full and asks for no
+list of all, so that registering one changes no preset: `--set 'scenes.families=["plane-single"]'`
+and a preset's own function choose from them."""
 
 Family.PRESETS = FAMILIES

@@ -55,7 +55,7 @@ class MaterialSettings:
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out the source where materials are drawn: digests of earlier builds stay."""
+        """Leave out the source where materials are drawn: digests of earlier presets stay."""
         record: dict[str, Any] = as_usual(self)
         absent = ("source", "own_share", "own_emission") if self.source == "drawn" else ()
         absent = absent if self.own_emission else (*absent, "own_emission")

@@ -101,7 +101,7 @@ class ObjectSpace:
         return all(bool((plane.height(points) >= -TOUCHING).all()) for plane in self.planes)
 
 
-def sample_poses(
+def place_objects(
     rng: np.random.Generator,
     settings: PlacementSettings,
     space: ObjectSpace,

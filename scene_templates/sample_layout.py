@@ -15,7 +15,7 @@ from scene_templates.families import Family
 from scene_templates.layout import Layout, ObjectPlacement, ShellPart, SurfaceLook
 from scene_templates.lights import sample_emitters
 from scene_templates.materials import sample_material
-from scene_templates.placement import ObjectSpace, PlaceableShape, sample_poses
+from scene_templates.placement import ObjectSpace, PlaceableShape, place_objects
 from scene_templates.rooms import PATCH_FACES, SIDES, patch, plane_of
 from scene_templates.separate_sides import SeparateSides
 from scene_templates.settings import SceneSettings
@@ -88,7 +88,7 @@ def sample_layout(
     placed = zip(template.parts, room.patches, strict=True)
     positions = [patch(SIDES[name], placement) for name, placement in placed]
     space = ObjectSpace(room=room, parts=template.parts, planes=tuple(map(plane_of, positions)))
-    poses = sample_poses(
+    poses = place_objects(
         rng,
         settings.placement,
         space,

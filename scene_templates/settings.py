@@ -21,8 +21,8 @@ from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
 from scene_templates.skies.settings import SkySettings
 from scene_templates.textures import TextureSettings
-from storage.settings.changes import changed
 from storage.settings.described import checked
+from storage.settings.overrides import apply_overrides
 from storage.settings.ranges import FLOAT32_MAX, Share, Within
 
 
@@ -35,7 +35,7 @@ class Excursion:
     value: Annotated[int | float, Within(-FLOAT32_MAX, FLOAT32_MAX)]
     """The value itself; recorded in the provenance too."""
     changes: tuple[tuple[str, Any], ...]
-    """Scene settings to change, by dotted name, with their values (storage.settings.changes)."""
+    """Scene settings to change, by dotted name, with their values (storage.settings.overrides)."""
 
 
 MAX_TRIANGLES = 65_535
@@ -137,7 +137,7 @@ class SceneSettings:
 
     def _after(self, excursion: Excursion) -> "SceneSettings":
         plain = dataclasses.replace(self, excursions=())
-        return changed(plain, dict(excursion.changes))
+        return apply_overrides(plain, dict(excursion.changes))
 
     def _check_budget(self) -> None:
         for family in self.families:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-PRESETS = {"tiny": "smoke"}
+PRESET_ALIASES = {"tiny": "smoke"}
 """Dataset presets and training presets."""
 
 OBJECTS = {"procedural:": "builtin:"}

@@ -1,7 +1,7 @@
 """`Registry`: a table of things that have a name, ours first, to which extensions may add.
 
 Each kind of thing that can be added from outside has one such table beside its own type: templates,
-families, builds, runs, sizes of networks, object sources, decimations, metrics, scene formats and
+families, presets, sizes of networks, object sources, decimations, metrics, scene formats and
 executors. Listing the table shows all of them.
 """
 

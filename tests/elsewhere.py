@@ -44,7 +44,7 @@ LLVM_TARGET = ("haswell", 8)
 """What Dr.Jit compiles for in both, and its lanes: the least that it supports."""
 
 CHOSEN = (
-    "tests/pipeline/builds/test_frozen_builds.py",
+    "tests/pipeline/presets/test_frozen_presets.py",
     "tests/model/hits/test_decoder.py",
     "tests/model/hits/test_view_inputs.py",
     "tests/model/test_open.py",
@@ -59,7 +59,7 @@ CHOSEN = (
     "tests/storage/test_metrics.py",
     "tests/storage/dataset/test_shard.py",
     "tests/train/data/test_augment.py",
-    "tests/train/data/test_stream.py",
+    "tests/train/data/test_loader.py",
     "tests/train/evaluation/test_judge.py",
     "tests/train/loop/test_optim.py",
     "tests/train/loop/test_step.py",

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from storage.claims import describe_holder, hold_claim
 from storage.errors import TrilightError
+from storage.file_locks import describe_holder, hold_lock
 
 if TYPE_CHECKING:
     from train.loop.distributed import DistributedContext
@@ -85,7 +85,7 @@ def claim_run(folder: RunFolder, dist_context: "DistributedContext") -> Iterator
     with contextlib.ExitStack() as stack:
         if dist_context.is_first:
             try:
-                if not stack.enter_context(hold_claim(folder.claim)):
+                if not stack.enter_context(hold_lock(folder.claim)):
                     problem = TrilightError(
                         f"{folder.root}: {describe_holder(folder.claim)}, trains there; expected a "
                         "folder for this trainer alone. Wait until it has ended, or choose another "

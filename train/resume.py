@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from storage.errors import TrilightError
-from storage.settings.changes import changed, differences
 from storage.settings.described import from_record, settings_record
 from storage.settings.fields import describe_fields
+from storage.settings.overrides import apply_overrides, differences
 from train.loop.schedule import decay_start_step
 from train.settings import TrainSettings, known_settings
 
@@ -156,7 +156,7 @@ def plan_resume(
     execution_changes = {
         name: typed_otherwise[name] for name in typed_otherwise if name in _EXECUTION
     }
-    settings = changed(before, execution_changes | named_decisions)
+    settings = apply_overrides(before, execution_changes | named_decisions)
     new_values = differences(old_record, settings_record(settings))
     stated = _original_values(past_events)
     events = list[Event]()

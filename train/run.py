@@ -17,8 +17,8 @@ from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.buckets import decodes_on_device, step_scenes
+from train.data.loader import LoaderSettings, load_batches
 from train.data.scenes import TrainingScene, training_scene
-from train.data.stream import StreamSettings, stream_batches
 from train.data.workers import choose_workers, detect_machine
 from train.evaluation.judge import Judge
 from train.evaluation.stored_pictures import median_picture
@@ -64,7 +64,7 @@ def train_run(
     """Train a network and evaluate it.
 
     Args:
-        settings: the run; `train.runs.named_run` returns those that have a name.
+        settings: the run; `train.presets.training_preset` returns those that have a name.
         data: root of a dataset, or of several that are mixed (storage.dataset.mixed_data), or a
             list of shards (storage.dataset.training_data), with a train split; without a validation
             split nothing is evaluated.
@@ -186,9 +186,9 @@ def _batches(
 ) -> Generator[list[TrainingScene], None, None]:
     """Return the scenes of this process for each step, beginning with the state's step."""
     stream = dataclasses.replace(
-        stream_settings(settings), lookup_in_threads=not decodes_on_device(dist_context.device)
+        loader_settings(settings), lookup_in_threads=not decodes_on_device(dist_context.device)
     )
-    return stream_batches(
+    return load_batches(
         data.split("train"),
         stream,
         state.step,
@@ -211,9 +211,9 @@ class _NoteBuffer(TrainProgress):
         self.texts.append(text)
 
 
-def stream_settings(settings: TrainSettings) -> StreamSettings:
-    """Return the settings of the stream that feeds a run."""
-    return StreamSettings(
+def loader_settings(settings: TrainSettings) -> LoaderSettings:
+    """Return the settings of the data loader that feeds a run."""
+    return LoaderSettings(
         seed=settings.seed,
         window=settings.shuffle_shards,
         batch_size=settings.scenes_per_step,

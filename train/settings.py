@@ -1,6 +1,6 @@
 """Settings of a training run: everything that decides the weights. Imports no torch.
 
-A run is a Python function that returns all settings (train.runs); the command line picks one and
+A run is a Python function that returns all settings (train.presets); the command line picks one and
 may replace fields. Fields marked EXECUTION may differ at every resume: the weights are equal up to
 rounding, or do not depend on them. All other fields are the meaning of the run, and change only by
 a decision that the run records (train.resume).

@@ -11,7 +11,7 @@ milliseconds, and no torch, Mitsuba, USD or Prefect. Mistakes raise `TrilightErr
 names the value, the expectation and a remedy.
 
 World: meters, +Z up, right-handed; networks were trained on scenes within [-0.5, 0.5]^3. Colors
-are linear with Rec.709 primaries. `trilight.extend` serves extensions: templates, builds, runs.
+are linear with Rec.709 primaries. `trilight.extend` serves extensions: templates, presets.
 """
 
 from importlib import import_module
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from infra.judging import judge_network as judge_network
     from infra.judging import write_judgement as write_judgement
     from model.neural_renderer import NeuralRenderer as NeuralRenderer
-    from pipeline.generation.dataset_order import DatasetOrder as DatasetOrder
+    from pipeline.generation.generate_options import GenerateOptions as GenerateOptions
     from pipeline.generation.run import Outcome as Outcome
     from pipeline.renders.results import RenderedView as RenderedView
     from storage.conventions import preview_srgb8 as preview_srgb8
@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from storage.records.scene import Scene as Scene
     from storage.records.scene import SceneObject as SceneObject
     from train.monitoring.settings import WatchSettings as WatchSettings
+    from train.presets import training_preset as training_preset
     from train.result import TrainResult as TrainResult
-    from train.runs import named_run as named_run
     from train.settings import TrainSettings as TrainSettings
     from trilight.compose import SceneBuilder as SceneBuilder
     from trilight.datasets import generate as generate

@@ -2,19 +2,19 @@
 
 from typing import TYPE_CHECKING
 
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 
 if TYPE_CHECKING:
     from pipeline.generation.run import Outcome
 
 
-def generate(order: DatasetOrder) -> "Outcome":
+def generate(options: GenerateOptions) -> "Outcome":
     """Generate a dataset, or its missing scenes, as `trilight generate` does.
 
-    The call may be stopped at any time; the same order resumes and gives the same dataset digest.
+    The call may be stopped at any time; the same options resume and give the same dataset digest.
 
     Args:
-        order: build, folder, number of scenes: the options of the command line.
+        options: preset, folder, number of scenes: the options of the command line.
 
     Raises:
         TrilightError: an error that the user can fix; finished scenes are safe.
@@ -22,4 +22,4 @@ def generate(order: DatasetOrder) -> "Outcome":
     from pipeline.executors.threads import ThreadRunner
     from pipeline.generation.pipeline import make_dataset
 
-    return make_dataset(order, ThreadRunner())
+    return make_dataset(options, ThreadRunner())

@@ -1,9 +1,9 @@
-"""Building blocks of extensions: templates, builds, sources, metrics and runs.
+"""Building blocks of extensions: templates, presets, sources and metrics.
 
 An extension imports from `trilight` alone, because the packages behind it have other names in a
-checkout than in an installed wheel. Entries of a table (TEMPLATES, BUILDS, METRICS ...) are added
-with `TABLE.register(name, entry)`; docs/how-to has a page and examples/ a file for each table. A
-module is loaded when one of its names is first used, so a template needs no torch.
+checkout than in an installed wheel. Entries of a table (TEMPLATES, METRICS ...) are added with
+`TABLE.register(name, entry)`; docs/how-to has a page and examples/ a file for each table. A module
+is loaded when one of its names is first used, so a template needs no torch.
 """
 
 from importlib import import_module
@@ -15,10 +15,6 @@ if TYPE_CHECKING:
     from model.config import SIZES as SIZES
     from model.config import ModelConfig as ModelConfig
     from pipeline.assets.settings import AssetSettings as AssetSettings
-    from pipeline.builds.named import BUILDS as BUILDS
-    from pipeline.builds.named import named_build as named_build
-    from pipeline.builds.settings import BuildSettings as BuildSettings
-    from pipeline.builds.settings import NamedBuild as NamedBuild
     from pipeline.exchange.formats import FORMATS as FORMATS
     from pipeline.exchange.formats import LoadedScene as LoadedScene
     from pipeline.exchange.formats import Pictures as Pictures
@@ -27,8 +23,8 @@ if TYPE_CHECKING:
     from pipeline.executors.registry import EXECUTORS as EXECUTORS
     from pipeline.executors.registry import Executor as Executor
     from pipeline.executors.threads import ThreadRunner as ThreadRunner
-    from pipeline.generation.dataset_order import DatasetOrder as DatasetOrder
-    from pipeline.generation.dataset_order import generate_words as generate_words
+    from pipeline.generation.generate_options import GenerateOptions as GenerateOptions
+    from pipeline.generation.generate_options import generate_words as generate_words
     from pipeline.generation.pipeline import make_dataset as make_dataset
     from pipeline.generation.pipeline import prepare_dataset as prepare_dataset
     from pipeline.generation.run import Outcome as Outcome
@@ -38,6 +34,10 @@ if TYPE_CHECKING:
     from pipeline.objects.sources import SOURCES as SOURCES
     from pipeline.objects.sources import ObjectSource as ObjectSource
     from pipeline.objects.sources import SourceQuery as SourceQuery
+    from pipeline.presets.registry import DATASET_PRESETS as DATASET_PRESETS
+    from pipeline.presets.registry import preset_settings as preset_settings
+    from pipeline.presets.settings import DatasetPreset as DatasetPreset
+    from pipeline.presets.settings import DatasetSettings as DatasetSettings
     from pipeline.renders.settings import RenderSettings as RenderSettings
     from scene_templates.cameras import Sector as Sector
     from scene_templates.families import FAMILIES as FAMILIES
@@ -69,15 +69,15 @@ if TYPE_CHECKING:
     from storage.records.scene import Scene as Scene
     from storage.records.scene import SceneObject as SceneObject
     from storage.seeds import rng_for as rng_for
-    from storage.settings.changes import changed as changed
     from storage.settings.described import checked as checked
+    from storage.settings.overrides import apply_overrides as apply_overrides
     from storage.settings.ranges import Within as Within
     from train.evaluation.metrics import METRICS as METRICS
     from train.evaluation.metrics import JudgedPicture as JudgedPicture
     from train.evaluation.metrics import Metric as Metric
-    from train.runs import RUNS as RUNS
-    from train.runs import changed_run as changed_run
-    from train.runs import named_run as named_run
+    from train.presets import TRAINING_PRESETS as TRAINING_PRESETS
+    from train.presets import override_training_preset as override_training_preset
+    from train.presets import training_preset as training_preset
     from train.settings import TrainSettings as TrainSettings
 
 _HOME = offered_names(__file__)

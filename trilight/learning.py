@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from infra.torch_library import require_torch
 from train.monitoring.settings import WatchSettings
+from train.presets import override_training_preset
 from train.resume import StartOptions
-from train.runs import changed_run
 
 if TYPE_CHECKING:
     from train.progress import TrainProgress
@@ -58,7 +58,7 @@ def train_network(
             already holds a run.
     """
     require_torch("train_network")
-    settings = changed_run(run, changes or {}, steps=steps)
+    settings = override_training_preset(run, changes or {}, steps=steps)
     start = StartOptions(
         resume=resume,
         branch=branch,

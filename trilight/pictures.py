@@ -13,7 +13,7 @@ from infra.render.quality import MOST_TRACED_SPP, ToStatedError
 from infra.render.sources import own_camera
 from infra.torch_library import require_torch
 from pipeline.renders.results import RenderedView
-from pipeline.renders.settings import NoiseTargets, RenderSettings, StatedError
+from pipeline.renders.settings import NoiseTargets, StatedError
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX, preview_srgb8
 from storage.errors import TrilightError
@@ -32,7 +32,7 @@ def render(
     noise_floor_linear_db: float | None = None,
     noise_floor_objects_db: float | None = None,
     max_spp: int = MOST_TRACED_SPP,
-    stated_error: StatedError = RenderSettings.stated_error,
+    stated_error: StatedError = ToStatedError.stated_error,
     split: bool = False,
     split_lobes: bool = False,
     seed: int = 0,
@@ -52,7 +52,7 @@ def render(
         noise_floor_linear_db: the same for psnr_linear_db; all given floors are reached.
         noise_floor_objects_db: the same for object_psnr_log_db: pixels that show geometry.
         max_spp: sampling also stops at this many samples per pixel.
-        stated_error: `bound`, or `calibrated` for floors that are calibrated on other scenes.
+        stated_error: `calibrated` for floors that are calibrated on other scenes, or `bound`.
         split: also return direct and indirect light, whose sum is the picture.
         split_lobes: also return the light of the diffuse and of the specular lobe of the visible
             surface; with `split` there are four layers.
@@ -93,7 +93,7 @@ def render_views(
     noise_floor_linear_db: float | None = None,
     noise_floor_objects_db: float | None = None,
     max_spp: int = MOST_TRACED_SPP,
-    stated_error: StatedError = RenderSettings.stated_error,
+    stated_error: StatedError = ToStatedError.stated_error,
     split: bool = False,
     split_lobes: bool = False,
     seed: int = 0,

@@ -19,11 +19,11 @@ from infra.bench.workloads.reading import Members, render_scenes, write_copies
 from infra.bench_options import BenchOptions
 from infra.render.held_out_scenes import composing_child
 from infra.render.path_tracer import RenderChild
-from pipeline.builds.settings import BuildSettings
-from pipeline.builds.training import smoke
 from pipeline.generation.prepare_isolated import preload_mesh_libraries
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from pipeline.objects.sources import find_objects
+from pipeline.presets.settings import DatasetSettings
+from pipeline.presets.training import smoke
 from storage.cache import cache_folder
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import Rejected
@@ -68,10 +68,10 @@ class BenchContext:
         return Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
 
     def render_child(
-        self, build: BuildSettings, objects: str, threads: int | None = None
+        self, settings: DatasetSettings, objects: str, threads: int | None = None
     ) -> IsolatedChild:
         """Return a child that composes scenes of a preset and renders them, until `close`."""
-        allowed = dataclasses.replace(build, allowed_licences=self.options.allowed_licences)
+        allowed = dataclasses.replace(settings, allowed_licences=self.options.allowed_licences)
         return self.until_closed(composing_child(allowed, objects, self.folder(), threads))
 
     def until_closed(self, child: Closable) -> Closable:

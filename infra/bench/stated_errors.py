@@ -148,7 +148,7 @@ ESTIMATORS: dict[str, Callable[[str, Look], float]] = {
     "empirical Bernstein": _bernstein,
     "agreement of the halves + 6 dB": lambda metric, look: _db("agreement", metric, look),
     "Mitsuba's threshold": _relative,
-    "oracle: three other pictures (64 samples)": lambda metric, look: _db("oracle", metric, look),
+    "oracle: three other images (64 samples)": lambda metric, look: _db("oracle", metric, look),
 }
 """Statements in dB that need no fit, without a shift."""
 
@@ -220,7 +220,7 @@ def _tables(looks: Sequence[Look]) -> Iterator[str]:
         sum(use_of(layout) == use for layout in layouts) for use in ("fit", "calibrate", "judge")
     ]
     yield (
-        f"{len(looks)} pictures of {len(layouts)} layouts: {uses[0] + uses[1]} fit and calibrate, "
+        f"{len(looks)} images of {len(layouts)} layouts: {uses[0] + uses[1]} fit and calibrate, "
         f"{uses[2]} judge. Cells: share over 1 dB worse than stated in %, with its 95 % interval "
         "over layouts; share over 3 dB in %; median caution in dB."
     )
@@ -230,7 +230,7 @@ def _tables(looks: Sequence[Look]) -> Iterator[str]:
         judging = [look for look in counted if look.use == "judge"]
         left_out = 100 - 100 * len(counted) / len(looks)
         yield from ("", f"## {metric.capitalize()} error", "")
-        yield f"{left_out:.0f} % of the pictures are left out: the reference leaves too much open."
+        yield f"{left_out:.0f} % of the images are left out: the reference leaves too much open."
         yield from (
             "",
             "Every statement with the shifts that keep its risk on the first layouts:",
@@ -264,8 +264,8 @@ def _parts(metric: str, mine: Sequence[Look], judging: Sequence[Look]) -> Iterat
     """Yield the record of the six measures by kind of picture, and under shifts."""
     head = ["64 px", "128 px", "256 px"]
     name = "six measures"
-    yield from ("", "Six measures, by kind of picture:", "")
-    yield _line("pictures", *head)
+    yield from ("", "Six measures, by kind of image:", "")
+    yield _line("images", *head)
     yield "|---|---|---|---|"
     some, stated = _calibrate(metric, name, mine, judging)
     for label, group in [*_GROUPINGS.items()][:-1]:
@@ -282,7 +282,7 @@ def _parts(metric: str, mine: Sequence[Look], judging: Sequence[Look]) -> Iterat
     )
     yield from (
         "",
-        "Fitted and calibrated without the pictures that are judged, under a shift:",
+        "Fitted and calibrated without the images that are judged, under a shift:",
         "",
     )
     yield _line("left out", *head)

@@ -19,8 +19,8 @@ from infra.cli.console import (
 )
 from infra.cli.options import OutputOptions, command
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings, Profile
-from pipeline.builds.named import BUILDS, named_build
 from pipeline.objects.licences import DEFAULT_ALLOWED
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from storage.dataset.splits import shards_for, split_of_object, split_of_shard
 from storage.errors import TrilightError
 from storage.machine import available_cores
@@ -61,9 +61,9 @@ class AssetOptions:
     own_materials: bool = False
     """Keep the materials and textures of the objects, as GLB files."""
     licence: str | None = None
-    """Licence of object files that state none; by default your own work."""
+    """License of object files that state none; by default your own work."""
     allow_licences: tuple[str, ...] = ()
-    """Licences to allow in addition to the usual ones; by default none."""
+    """Licenses to allow in addition to the usual ones; by default none."""
     workers: Annotated[int | None, Within(1, 1024, unit="objects")] = None
     """Objects to process at the same time; by default the number of cores."""
 
@@ -222,10 +222,10 @@ def generate_from_meshes(
         allow_licences: licences that were allowed in addition to the usual ones.
         own_materials: whether meshes keep the materials of their source.
     """
-    splits = named_build(_BUILD).splits
+    splits = preset_settings(_BUILD).splits
     present = {split_of_object(digest, splits) for digest in geometry_sha256}
     words = ["generate", _BUILD, "--objects", str(folder), "--out", f"{folder}-{_BUILD}"]
-    shards = shards_for(BUILDS[_BUILD].num_scenes, splits)
+    shards = shards_for(DATASET_PRESETS[_BUILD].num_scenes, splits)
     usable = next((i for i in range(shards) if split_of_shard(i, splits) not in present), shards)
     if own_materials:
         words += ["--set", "scenes.materials.source=object"]

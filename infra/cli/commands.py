@@ -112,15 +112,15 @@ COMMANDS = {
     "status": "Report a dataset's progress, estimated finish and failures; needs no server.",
     "verify": "Check all hashes, members and rules of a dataset; exit 1 on problems."
     "\n\nAn unfinished dataset is checked as far as it exists; the exit status is 1 then too.",
-    "view": "Open a local page: a scene in 3D with its pictures, or a dataset.",
+    "view": "Open a local page: a scene in 3D with its images, or a dataset.",
     "inspect": "Rewrite report, gallery and contact sheet, and print a summary."
     "\n\nFor the folder of a training run, its progress and last figures are printed."
     "\n\nFor a dataset that is read-only or on a server, only a summary is printed, unless --out "
     "names a folder. For a scene file, a summary and what its format lost are printed.",
     "render": "Render scenes: path traced to a stated error, or by a network.",
-    "train": "Train a model; writes checkpoints, TensorBoard curves and a sheet of pictures."
+    "train": "Train a model; writes checkpoints, TensorBoard curves and a sheet of images."
     "\n\nTo train with processes on several machines, run torchrun -m trilight train ...",
-    "evaluate": "Evaluate a network; writes evaluation.json, evaluation.md and sheets of pictures.",
+    "evaluate": "Evaluate a network; writes evaluation.json, evaluation.md and sheets of images.",
     "leaderboard": "Compare all methods and networks on one dataset by error and cost."
     "\n\nWrites a table, a chart and rows; an interrupted run resumes.",
     "convert": "Convert scenes by file extension, and report what is lost.",

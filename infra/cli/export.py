@@ -17,11 +17,11 @@ class ExportOptions:
     source: str
     """Dataset, a folder or a URL."""
     form: ExportForm
-    """Format of the files. nerfstudio: transforms.json, pictures and depth. coco: masks and boxes.
-    huggingface: pictures, depth and ids for datasets.load_dataset. hypersim: HDF5 of reflectance,
+    """Format of the files. nerfstudio: transforms.json, images and depth. coco: masks and boxes.
+    huggingface: images, depth and ids for datasets.load_dataset. hypersim: HDF5 of reflectance,
     illumination, residual and geometry (needs renders.split_lobes=true). energon: the shards as
     they are, with NVIDIA Energon's metadata. h5, json, usd: each scene
-    as RenderFormer's HDF5, as its JSON with meshes, or as USD. exr: pictures as OpenEXR. benchmark:
+    as RenderFormer's HDF5, as its JSON with meshes, or as USD. exr: images as OpenEXR. benchmark:
     the last four, each in its folder, with a table of views."""
     out: Path
     """Folder to write, which must be empty or not exist."""

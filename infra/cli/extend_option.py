@@ -80,11 +80,11 @@ def resolve_reference(option: str, value: Any) -> Any:
     if not isinstance(value, str) or not is_reference(value):
         return value
     if option == "build":
-        from pipeline.builds.named import typed_build
+        from pipeline.presets.registry import resolve_dataset_preset
 
-        return typed_build(value)
+        return resolve_dataset_preset(value)
     if option == "run":
-        from train.runs import typed_run
+        from train.presets import resolve_training_preset
 
-        return typed_run(value)
+        return resolve_training_preset(value)
     return value

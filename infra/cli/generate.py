@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 
 from rich.progress import Progress as Bars
 
-from infra.cli.changes import BaseSettings, with_base_settings
 from infra.cli.console import first_words, next_step, note, print_json, print_rows, progress_bars
 from infra.cli.options import OutputOptions, command
+from infra.cli.overrides import BaseSettings, with_base_settings
 from pipeline.executors.registry import find_executor
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.objects.licences import USER_PROVIDED
 from storage.dataset.layout import DatasetFolder, dataset_folder
 from storage.dataset.manifest import Manifest, read_head
@@ -52,16 +52,16 @@ class ExecutorOptions:
 
 @command("build")
 def generate(
-    order: DatasetOrder, base: BaseSettings, runner: ExecutorOptions, output: OutputOptions
+    order: GenerateOptions, base: BaseSettings, runner: ExecutorOptions, output: OutputOptions
 ) -> None:
     make(with_base_settings(order, base), runner, output)
 
 
-def make(order: DatasetOrder, runner: ExecutorOptions, output: OutputOptions) -> None:
+def make(order: GenerateOptions, runner: ExecutorOptions, output: OutputOptions) -> None:
     """Make a dataset and print the result; raises TrilightError."""
     folder = dataset_folder(order.place)
     started = time.monotonic()
-    first_words(f"Making {folder.display_name} with the build {order.build}", silent=output.json)
+    first_words(f"Making {folder.display_name} with the preset {order.build}", silent=output.json)
     executor = find_executor(runner.runner, runner.address, order.workers)
     from infra.planning import describe_run  # slow: every stage
     from pipeline.generation.run import choose_dataset_variant
@@ -189,9 +189,9 @@ def _next_steps(folder: DatasetFolder, statistics: Statistics) -> Iterator[Seque
 
 def _fits_training(manifest: Manifest) -> bool:
     """Return whether the smallest training preset fits the pictures, and torch is installed."""
-    from train.runs import named_run  # late, so that the first line is printed sooner
+    from train.presets import training_preset  # late, so that the first line is printed sooner
 
-    run = named_run(_RUN)
+    run = training_preset(_RUN)
     pictures = manifest.settings["renders"]["resolution"]
     has_views = manifest.num_views >= run.views_per_scene
     return has_views and pictures % run.resolution == 0 and find_spec("torch") is not None

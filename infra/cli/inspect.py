@@ -40,7 +40,7 @@ _STATED = ("noise_floor_db", "expected_error_db", "noise_floor_linear_db", "obje
 
 @checked()
 class InspectOptions:
-    """Source and pictures."""
+    """Source and images."""
 
     source: str
     """Dataset (folder or URL), training run's folder, or one scene file."""
@@ -51,7 +51,7 @@ class InspectOptions:
     out: Path | None = None
     """Folder for the report and the sheet; by default the dataset's own."""
     turntable: Path | None = None
-    """Picture file X.png for views of one scene from all sides; by default none."""
+    """Image file X.png for views of one scene from all sides; by default none."""
 
 
 @command("source")

@@ -1,7 +1,7 @@
 """Commands whose options are the fields of settings classes, so that each is described once.
 
     @command("build")
-    def generate(order: DatasetOrder, shown: Shown) -> None: ...
+    def generate(order: GenerateOptions, shown: Shown) -> None: ...
 
 makes the argument BUILD, and an option of every other field. Each parameter of the function is a
 class of settings (storage.settings.described) and a section of the help, with the class's first
@@ -20,8 +20,8 @@ from typing import Annotated, Any, get_origin
 
 from cyclopts import Group, Parameter, Token
 
-from infra.cli.changes import parse_changes
 from infra.cli.extend_option import resolve_reference
+from infra.cli.overrides import parse_overrides
 from storage.errors import TrilightError
 from storage.remote.url import parse_local_path
 from storage.settings.described import checked
@@ -59,6 +59,8 @@ SHOWN = {
 """Name of an option that help shows, by field or Class.field, where the field's own name is not the
 best for people; that one works too."""
 
+PRESETS = {"build": "PRESET", "run": "PRESET"}
+"""Arguments by what help calls them."""
 _METAVARS = {int: "INT", float: "NUMBER"}
 _BY_DEFAULT = re.compile(r"; by default (.+?)\.(?=\s|$)")
 _NONE = re.compile(r"^there (is|are) none$")
@@ -125,7 +127,7 @@ def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> insp
     names = dict.fromkeys([shown_name(field), option_of(field.name)])
     metavar = "CHOICE" if choices else _METAVARS.get(kind, "TEXT")
     declared = Parameter(
-        name=None if by_place else tuple(names),
+        name=PRESETS.get(field.name) if by_place else tuple(names),
         help=_help(field, choices, several=several, required=required),
         group=group,
         metavar=None if kind is bool else "NAME=VALUE" if takes_names(field.hint) else metavar,
@@ -214,7 +216,7 @@ def value_of(words: bool | str | Sequence[str], hint: Any) -> Any:
     if isinstance(words, str):
         return _one(words, hint)
     if takes_names(hint):
-        return parse_changes(words)
+        return parse_overrides(words)
     return tuple(_one(word, hint) for word in words)
 
 
@@ -251,16 +253,16 @@ def takes_names(hint: Any) -> bool:
     return get_origin(unwrap(hint)[0]) in (Mapping, dict)
 
 
-def _builds() -> list[str]:
-    from pipeline.builds.named import BUILDS
+def _dataset_presets() -> list[str]:
+    from pipeline.presets.registry import DATASET_PRESETS
 
-    return list(BUILDS)
+    return list(DATASET_PRESETS)
 
 
-def _runs() -> list[str]:
-    from train.runs import RUNS
+def _training_presets() -> list[str]:
+    from train.presets import TRAINING_PRESETS
 
-    return list(RUNS)
+    return list(TRAINING_PRESETS)
 
 
 def _sizes() -> list[str]:
@@ -276,8 +278,8 @@ def _runners() -> list[str]:
 
 
 NAMES: dict[str, Callable[[], list[str]]] = {
-    "build": _builds,
-    "run": _runs,
+    "build": _dataset_presets,
+    "run": _training_presets,
     "network": _sizes,
     "runner": _runners,
 }

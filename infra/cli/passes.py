@@ -27,7 +27,7 @@ class PassOptions:
     view: Annotated[int | None, Within(0, 10_000)] = None
     """Number of the only view, from 0; by default all."""
     resolution: Annotated[int | None, Within(1, MAX_RESOLUTION, unit="pixels")] = None
-    """Width of the pictures; by default the dataset's width, or 256 for a scene file."""
+    """Width of the images; by default the dataset's width, or 256 for a scene file."""
     rays_a_side: Annotated[int, Within(1, MOST_A_SIDE, unit="rays")] = 1
     """Rays along each pixel side, for averaged passes; stored ones have one."""
 

@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 from typing import TYPE_CHECKING, Annotated
 
-from infra.cli.changes import BaseSettings, with_base_settings
 from infra.cli.console import (
     duration,
     first_words,
@@ -14,8 +13,9 @@ from infra.cli.console import (
     progress_bars,
 )
 from infra.cli.options import OutputOptions, command
+from infra.cli.overrides import BaseSettings, with_base_settings
 from infra.cli.process_exit import temporary_folder
-from pipeline.generation.dataset_order import DatasetOrder, generate_words
+from pipeline.generation.generate_options import GenerateOptions, generate_words
 from pipeline.generation.price import CorePrice
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
@@ -39,7 +39,7 @@ class PlanOptions:
 
 @command("build")
 def plan(
-    order: DatasetOrder,
+    order: GenerateOptions,
     base: BaseSettings,
     options: PlanOptions,
     core: CorePrice,

@@ -5,7 +5,7 @@ from typing import Any
 
 from infra.cli.console import console, print_json, print_table
 from infra.cli.options import OutputOptions, command
-from storage.aliases import NETWORKS, OBJECTS, PRESETS
+from storage.aliases import NETWORKS, OBJECTS, PRESET_ALIASES
 
 
 @command()
@@ -32,15 +32,15 @@ def _name_for_people(name: str, aliases: Mapping[str, str]) -> str:
 
 
 def _datasets() -> list[dict[str, Any]]:
-    from pipeline.builds.named import BUILDS
+    from pipeline.presets.registry import DATASET_PRESETS
 
     rows = []
-    for name, build in BUILDS.items():
-        settings = build.settings()
+    for name, preset in DATASET_PRESETS.items():
+        settings = preset.settings()
         rows.append(
             {
-                "name": _name_for_people(name, PRESETS),
-                "scenes": build.num_scenes,
+                "name": _name_for_people(name, PRESET_ALIASES),
+                "scenes": preset.num_scenes,
                 "views": settings.scenes.num_views,
                 "pixels": settings.renders.resolution,
                 "dB": settings.renders.noise_floor_db or "",
@@ -51,14 +51,14 @@ def _datasets() -> list[dict[str, Any]]:
 
 
 def _trainings() -> list[dict[str, Any]]:
-    from train.runs import RUNS
+    from train.presets import TRAINING_PRESETS
 
     rows = []
-    for name, run in RUNS.items():
-        settings = run()
+    for name, preset in TRAINING_PRESETS.items():
+        settings = preset()
         rows.append(
             {
-                "name": _name_for_people(name, PRESETS),
+                "name": _name_for_people(name, PRESET_ALIASES),
                 "pixels": settings.resolution,
                 "steps": settings.num_steps,
                 "scenes a step": settings.scenes_per_step,

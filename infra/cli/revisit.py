@@ -1,14 +1,14 @@
 """`trilight revisit`: makes a new dataset from the scenes of a finished one."""
 
-from infra.cli.changes import BaseSettings, with_base_settings
 from infra.cli.console import first_words
 from infra.cli.generate import ExecutorOptions, make
 from infra.cli.options import OutputOptions, command
-from pipeline.generation.revisit_options import RevisitOptions, revisit_order
+from infra.cli.overrides import BaseSettings, with_base_settings
+from pipeline.generation.revisit_options import RevisitOptions, to_generate_options
 
 
 @command("dataset")
 def revisit(options: RevisitOptions, runner: ExecutorOptions, output: OutputOptions) -> None:
     first_words(f"Reading {options.dataset}", silent=output.json)
-    order = with_base_settings(revisit_order(options), BaseSettings(like=options.dataset))
+    order = with_base_settings(to_generate_options(options), BaseSettings(like=options.dataset))
     make(order, runner, output)

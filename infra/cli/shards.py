@@ -58,7 +58,7 @@ class SelectOptions:
     template: str | None = None
     """Keep only the scenes of this layout, such as plane; by default all."""
     min_noise_floor_db: Annotated[float | None, Within(-100, 200, unit="dB")] = None
-    """Keep only scenes whose views all have this noise floor (psnr_log_db); by default all."""
+    """Keep only scenes whose views all have this stated error (psnr_log_db); by default all."""
     where: str | None = None
     """Keep only scenes that meet a condition such as "max(roughness) < 0.3"; by default all. The
     reference page Quantities has the names."""

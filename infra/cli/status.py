@@ -15,7 +15,7 @@ from infra.cli.console import (
 )
 from infra.cli.options import OutputOptions, command
 from pipeline.generation.price import CorePrice
-from storage.dataset.progress import DatasetStatus, read_status, unfinished_shards
+from storage.dataset.progress import DatasetStatus, missing_shards, read_status
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
 from storage.settings.described import checked
@@ -79,7 +79,7 @@ def status(options: StatusOptions, core: CorePrice, output: OutputOptions) -> No
 
 def _print_missing(options: StatusOptions, *, as_json: bool) -> None:
     each = options.shards_per_task
-    tasks = sorted({shard // each for shard in unfinished_shards(options.dataset)})
+    tasks = sorted({shard // each for shard in missing_shards(options.dataset)})
     ranges = [f"{task * each}:{(task + 1) * each}" for task in tasks]
     if as_json:
         print_json(

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Group
 
-from infra.cli.changes import BaseSettings, with_base_settings
 from infra.cli.console import (
     console,
     first_words,
@@ -19,6 +18,7 @@ from infra.cli.console import (
 )
 from infra.cli.everyday import HELP_FLAGS
 from infra.cli.options import OutputOptions, command
+from infra.cli.overrides import BaseSettings, with_base_settings
 from pipeline.executors.array_job import ArrayJob, DatasetByArray, array_job
 from pipeline.executors.kubernetes_array import (
     KubernetesOptions,
@@ -28,7 +28,7 @@ from pipeline.executors.kubernetes_array import (
 )
 from pipeline.executors.slurm_array import sbatch_command, sbatch_environment, submit_array
 from pipeline.flows.prefect_server import load_prefect
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
 from storage.settings.described import checked
@@ -101,7 +101,7 @@ class SlurmOptions:
 def submit(
     submission: SubmitOptions,
     runs: FlowRunOptions,
-    order: DatasetOrder,
+    order: GenerateOptions,
     base: BaseSettings,
     output: OutputOptions,
 ) -> None:
@@ -111,7 +111,7 @@ def submit(
 @app.command(name=SLURM, help="Submit the missing shards to Slurm, as an array of tasks.")
 @command("build")
 def submit_to_slurm(
-    order: DatasetOrder,
+    order: GenerateOptions,
     base: BaseSettings,
     array: ArrayOptions,
     batch: SlurmOptions,
@@ -124,7 +124,7 @@ def submit_to_slurm(
 @app.command(name=KUBERNETES, help="Submit the missing shards to Kubernetes, as an indexed job.")
 @command("build")
 def submit_to_kubernetes(
-    order: DatasetOrder,
+    order: GenerateOptions,
     base: BaseSettings,
     array: ArrayOptions,
     machines: KubernetesOptions,
@@ -143,10 +143,14 @@ def submit_by_array(
 
 
 def _submit_flow(
-    flow: str, order: DatasetOrder, base: BaseSettings, runs: FlowRunOptions, output: OutputOptions
+    flow: str,
+    order: GenerateOptions,
+    base: BaseSettings,
+    runs: FlowRunOptions,
+    output: OutputOptions,
 ) -> None:
     """Submit a flow run and report it; once it has ended, name the next commands."""
-    first_words(f"Submitting {flow} with the build {order.build}", silent=output.json)
+    first_words(f"Submitting {flow} with the preset {order.build}", silent=output.json)
     load_prefect()
     from pipeline.flows.submission import parameters
 
@@ -157,7 +161,7 @@ def _submit_flow(
 
 
 def submit_to_array(
-    order: DatasetOrder,
+    order: GenerateOptions,
     array: ArrayOptions,
     options: SlurmOptions | KubernetesOptions,
     *,

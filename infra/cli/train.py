@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, NoReturn
 from rich.progress import Progress as Bars
 from rich.progress import TaskID
 
-from infra.cli.changes import BaseSettings, all_changes, run_record
 from infra.cli.console import console, next_step, note, print_rows, progress_bars, suggest_look
 from infra.cli.options import OutputOptions, command
+from infra.cli.overrides import BaseSettings, merge_overrides, run_record
 from infra.run_record import tensorboard_command
 from infra.torch_library import require_torch
 from infra.train_options import TrainOptions
 from storage.errors import TrilightError
 from storage.installation import child_environment
-from storage.settings.changes import option_words
+from storage.settings.overrides import option_words
 from train.monitoring.settings import WatchSettings
+from train.presets import scale_intervals, training_preset
 from train.progress import TrainProgress
-from train.runs import named_run, scale_intervals
 from train.settings import TrainSettings
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def train(
     order: TrainOptions, watched: WatchSettings, base: BaseSettings, output: OutputOptions
 ) -> None:
     if base.is_given:
-        changes = all_changes(named_run(order.run), base, run_record(base), order.changes)
+        changes = merge_overrides(training_preset(order.run), base, run_record(base), order.changes)
         order = dataclasses.replace(order, changes=changes)
     settings = order.settings()  # without torch, so that mistakes are named at once
     if order.processes > 1:
@@ -166,7 +166,7 @@ def _announce(order: TrainOptions, settings: TrainSettings) -> None:
         console.print(f"Run {settings.run} goes on. Loading torch and the checkpoint ...")
         return
     if (steps := order.steps) is not None:
-        shorter = scale_intervals(named_run(order.run), steps, order.changes)
+        shorter = scale_intervals(training_preset(order.run), steps, order.changes)
         if shorter:
             text = ", ".join(f"{name}={value}" for name, value in shorter.items())
             console.print(f"In proportion to {steps} steps: {text}")

@@ -7,13 +7,13 @@ Previews and methods are evaluated and timed on these scenes.
 import dataclasses
 from pathlib import Path
 
-from pipeline.builds.settings import BuildSettings
-from pipeline.builds.training import smoke
-from pipeline.generation.begin_dataset import begin_dataset
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
 from pipeline.generation.environment import environment
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
 from pipeline.isolation import ChildLimits, IsolatedChild
+from pipeline.presets.settings import DatasetSettings
+from pipeline.presets.training import smoke
 from pipeline.renders.variant import Variant, choose_variant
 from scene_templates.settings import SceneSettings
 from storage.dataset.layout import DatasetFolder
@@ -21,7 +21,7 @@ from storage.dataset.splits import JUDGED_SPLIT
 from storage.errors import Rejected
 from storage.machine import available_cores
 from storage.records.scene import Scene
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 
 TRIANGLES = 768
 """Maximum number of triangles of a scene, as in the training data of the built-in networks."""
@@ -34,7 +34,7 @@ _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=4 * 3600, calls_per_child=10
 
 
 def composing_child(
-    build: BuildSettings,
+    settings: DatasetSettings,
     objects: str,
     folder: Path,
     threads: int | None = None,
@@ -49,36 +49,38 @@ def composing_child(
     """
     variant = variant or choose_variant()
     workers = threads or available_cores()
-    publication = begin_dataset(
-        DatasetFolder(folder), build, environment(variant), 1, accept_environment=False
+    publication = begin_or_resume_dataset(
+        DatasetFolder(folder), settings, environment(variant), 1, accept_environment=False
     )
     accepted = ObjectLock(
-        source=objects, licence=None, settings=build, writer=publication, workers=workers
+        source=objects, licence=None, settings=settings, writer=publication, workers=workers
     ).freeze()
-    recipe = SceneRecipe(settings=build, variant=variant, threads=workers, origin=accepted.origin)
+    recipe = SceneRecipe(
+        settings=settings, variant=variant, threads=workers, origin=accepted.origin
+    )
     limits = dataclasses.replace(_LIMITS, memory_bytes=variant.address_space(_LIMITS.memory_bytes))
     return IsolatedChild(limits=limits, factory=SceneWorker, args=(recipe,))
 
 
-def held_out_build() -> BuildSettings:
+def held_out_settings() -> DatasetSettings:
     """Return the preset `smoke` with at most TRIANGLES triangles a scene and coarser objects.
 
     All objects belong to the evaluation split, as those of `builtin:benchmark-v1` do.
     """
-    build = changed(smoke(), {"splits.one_split": True})
-    most = build.scenes.max_triangles
-    budgets = [max(_LEAST_LEVEL, b * TRIANGLES // most) for b in build.assets.budgets]
+    settings = apply_overrides(smoke(), {"splits.one_split": True})
+    most = settings.scenes.max_triangles
+    budgets = [max(_LEAST_LEVEL, b * TRIANGLES // most) for b in settings.assets.budgets]
     levels = sorted(set(budgets), reverse=True)
-    return changed(build, {"scenes.max_triangles": TRIANGLES, "assets.budgets": levels})
+    return apply_overrides(settings, {"scenes.max_triangles": TRIANGLES, "assets.budgets": levels})
 
 
 def held_out_scene(child: IsolatedChild, index: int) -> Scene:
-    """Return a scene of `held_out_build` with one camera, composed in a child of that build.
+    """Return a scene of `held_out_settings` with one camera, composed in a child of that preset.
 
     Raises:
         Rejected: every attempt at it was rejected.
     """
-    settings = dataclasses.replace(held_out_build().scenes, num_views=1)
+    settings = dataclasses.replace(held_out_settings().scenes, num_views=1)
     return first_composed(child, settings, index, seed=_SEED, split=JUDGED_SPLIT)
 
 

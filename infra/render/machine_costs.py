@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from infra.render.held_out_scenes import composing_child, held_out_build, held_out_scene
+from infra.render.held_out_scenes import composing_child, held_out_scene, held_out_settings
 from infra.render.networks import NetworkRenderer
 from infra.render.preview_table import (
     NETWORK_SCENE,
@@ -48,7 +48,7 @@ def measure_costs(table: PreviewTable) -> PictureCosts:
     cores = available_cores()
     variant = choose_variant("auto")
     with tempfile.TemporaryDirectory() as name:
-        child = composing_child(held_out_build(), BENCHMARK, Path(name), variant=variant)
+        child = composing_child(held_out_settings(), BENCHMARK, Path(name), variant=variant)
         with contextlib.closing(child):
             scenes = [held_out_scene(child, index) for index in PROBES]
             timed = [_time_scene(child, scene, cores) for scene in scenes]

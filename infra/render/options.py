@@ -18,7 +18,6 @@ from pipeline.renders.settings import (
     Filtered,
     NoiseFloor,
     NoiseTargets,
-    RenderSettings,
     Resolution,
     Samples,
     StatedError,
@@ -34,57 +33,56 @@ EngineChoice = Literal["mitsuba", "neural", "both"]
 
 @checked()
 class RenderOptions:
-    """Scene, renderer and pictures."""
+    """Scene, renderer and images."""
 
     source: str
     """Scene file, or SHARD.tar::KEY; for many, a shard, a folder, or 'NAME{000..119}.json'."""
     out: Path
-    """X.exr for one picture; a folder, X.mp4 or X.webp for many. A PNG for viewing is written
-    beside each EXR, enlarged below 256 pixels; existing pictures of a folder or video are kept."""
+    """X.exr for one image; a folder, X.mp4 or X.webp for many. A PNG for viewing is written
+    beside each EXR, enlarged below 256 pixels; existing images of a folder or video are kept."""
     engine: EngineChoice = "mitsuba"
     """Renderer: mitsuba (path tracer), neural (network), or both side by side."""
     checkpoint: str | None = None
-    """neural: model.safetensors of a run; by default the built-in network."""
+    """neural: folder or weights of a run, or a published name; by default the included network."""
     resolution: Resolution | None = None
-    """Width of a picture in pixels; by default 512, or the training width of a pure network."""
+    """Width of an image in pixels; by default 512, or the training width of a pure network."""
     noise_floor_db: NoiseFloor | None = None
     """mitsuba: stop at this stated error (psnr_log_db; higher is cleaner); by default 40, unless
     another target is given. Of several, all are reached."""
     noise_floor_linear_db: NoiseFloor | None = None
     """mitsuba: stop at this stated error as psnr_linear_db (radiance within [0, 1]); by default
-    none. In most pictures it is 5 to 10 dB below psnr_log_db."""
+    none. In most images it is 5 to 10 dB below psnr_log_db."""
     noise_floor_objects_db: NoiseFloor | None = None
     """mitsuba: stop at this stated error as object_psnr_log_db (without background); by default
     none."""
     max_spp: Samples = MOST_TRACED_SPP
     """mitsuba: maximum number of samples per pixel."""
-    stated_error: StatedError = RenderSettings.stated_error
-    """mitsuba: how the error is stated: as a bound, or calibrated on other scenes, with an expected
-    error."""
+    stated_error: StatedError = ToStatedError.stated_error
+    """mitsuba: how the error is stated: calibrated on other scenes, with an expected error; or as a
+    bound."""
     spp: Annotated[int | None, Within(1, MOST_SPP, unit="samples")] = None
-    """mitsuba: samples per pixel of a preview with one denoise; by default sampling goes on to the
+    """mitsuba: samples per pixel of a preview with one denoise; by default sampling ends at the
     stated error. The error of a preview is not measured."""
     seconds: Annotated[float | None, Within(0, 1e9, low_open=True, unit="seconds")] = None
-    """mitsuba: best preview within these seconds a picture after start-up; by default none."""
+    """mitsuba: best preview within these seconds per image after start-up; by default none."""
     error_db: Annotated[float | None, Within(0, MAX_DB, unit="dB")] = None
     """mitsuba: fastest preview with this expected median error (psnr_log_db); by default none."""
     denoiser: Filtered | None = None
     """mitsuba with --spp: filter of Open Image Denoise, or off; by default fast up to 16 samples
     and high beyond."""
     split: bool = False
-    """mitsuba: write direct and indirect light as layers of the EXR, too."""
+    """mitsuba: also write direct and indirect light as layers. Their errors are less sure."""
     split_lobes: bool = False
-    """mitsuba: write diffuse and specular light as layers, too; with --split four."""
+    """mitsuba: also write diffuse and specular light as layers; with --split four."""
     view: Annotated[int, Within(0, 999)] = 0
     """Number of the scene's camera, counted from 0."""
-    orbit: Annotated[int | None, Within(1, 100_000, unit="pictures")] = None
-    """Number of pictures from a circle of cameras around the scene; by default one picture, from
-    the scene's camera."""
+    orbit: Annotated[int | None, Within(1, 100_000, unit="images")] = None
+    """Number of images from a circle of cameras around the scene; by default its camera alone."""
     arc_deg: Annotated[float, Within(0, 360, low_open=True, unit="degrees")] = 360.0
     """Angle of the orbit; below 360 the scene's camera is its middle."""
     cameras: str | None = None
     """File (.json or a scene) whose cameras are rendered; by default only the scene's camera."""
-    fps: Annotated[int, Within(1, 240, unit="pictures a second")] = 24
+    fps: Annotated[int, Within(1, 240, unit="images a second")] = 24
     """Frames per second of a video."""
     tone_map: ToneMap = "plain"
     """Tone mapping of PNG and video: plain (sRGB) or filmic (ACES 2.0)."""
@@ -117,7 +115,7 @@ class RenderOptions:
 
     @property
     def quality(self) -> Quality:
-        """Quality of traced pictures, or the budget that chooses it."""
+        """Quality of traced images, or the budget that chooses it."""
         if self.seconds is not None:
             return TimeBudget(seconds=self.seconds)
         if self.error_db is not None:
@@ -137,12 +135,12 @@ class RenderOptions:
         )
 
     def _require_one_kind(self) -> None:
-        """Raise TrilightError where options of a preview and of a measured picture are mixed."""
+        """Raise TrilightError where options of a preview and of a measured image are mixed."""
         floors = {
             "--noise-floor": self.noise_floor_db,
             "--noise-floor-linear": self.noise_floor_linear_db,
             "--noise-floor-objects": self.noise_floor_objects_db,
-            "--stated-error": None if self.stated_error == "bound" else self.stated_error,
+            "--stated-error": None if self.stated_error == "calibrated" else self.stated_error,
             "--split": self.split or None,
             "--split-lobes": self.split_lobes or None,
         }

@@ -31,7 +31,7 @@ class ToStatedError:
     """True to keep diffuse and specular light apart."""
     max_depth: int = RenderSettings.max_depth
     """Maximum length of a path in edges; 2 is direct light."""
-    stated_error: StatedError = RenderSettings.stated_error
+    stated_error: StatedError = "calibrated"
 
     def settings(self, resolution: int) -> RenderSettings:
         """Return the settings at a width in pixels, of a picture that may be dark.
@@ -40,12 +40,14 @@ class ToStatedError:
             TrilightError: a value is invalid; the message names it.
         """
         targets = self.targets if self.targets.overrides else USUAL_TARGETS
+        is_calibrated = self.stated_error == "calibrated"
         return RenderSettings(
             resolution=resolution,
             noise_floor_db=targets.log_db,
             noise_floor_linear_db=targets.linear_db,
             noise_floor_objects_db=targets.objects_db,
-            min_spp=min(FIRST_SPP, self.max_spp),
+            min_spp=min(FIRST_SPP // 2 if is_calibrated else FIRST_SPP, self.max_spp),
+            min_spp_px=256 if is_calibrated else 128,
             max_spp=self.max_spp,
             max_depth=self.max_depth,
             min_mean_radiance=0.0,
@@ -53,6 +55,7 @@ class ToStatedError:
             split_lobes=self.split_lobes,
             arithmetic="device",
             stated_error=self.stated_error,
+            picture_within_db=2.0 if is_calibrated else None,
         )
 
 

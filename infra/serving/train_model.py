@@ -13,22 +13,22 @@ from prefect.concurrency.sync import concurrency
 from prefect.logging import get_run_logger
 
 from infra.train_options import TrainOptions
-from pipeline.flows.forms import PublicUrl, changes_form, order_of, parameters_of
+from pipeline.flows.forms import PublicUrl, options_of_form, overrides_form, parameters_of
 from pipeline.flows.limits import GPU_LIMIT
 from pipeline.flows.process import run_to_end
 from pipeline.renders.visible_gpus import visible_gpus
 from storage.errors import TrilightError
-from train.runs import RUNS, smoke
+from train.presets import TRAINING_PRESETS, smoke
 from train.settings import TrainSettings
 
-RunName = Literal[tuple(RUNS)]  # type: ignore[valid-type]
+TrainingPresetName = Literal[tuple(TRAINING_PRESETS)]  # type: ignore[valid-type]
 """Names of the training presets, a list of choices in the form."""
-RunChanges = changes_form(TrainSettings, smoke())
+RunChanges = overrides_form(TrainSettings, smoke())
 """Form of every setting; an empty one keeps the preset's value."""
 
 
 TRAIN_FORMS: Mapping[str, Any] = {
-    "run": RunName,
+    "run": TrainingPresetName,
     "data": list[PublicUrl],
     "begin_with": PublicUrl | None,
     "branch": PublicUrl | None,
@@ -45,7 +45,7 @@ def train_order(parameters: Mapping[str, Any]) -> TrainOptions:
         TrilightError: a value that no schema can refuse, such as one that contradicts another
             setting; the message names it.
     """
-    order = order_of(parameters, TrainOptions)
+    order = options_of_form(parameters, TrainOptions)
     order.settings()
     return order
 

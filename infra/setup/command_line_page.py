@@ -7,6 +7,7 @@ from typing import Any
 from cyclopts import App
 
 from infra.cli.commands import COMMANDS, app
+from infra.cli.options import PRESETS
 from storage.markdown import table
 
 _HEAD = """# Command line
@@ -67,7 +68,7 @@ def _option(argument: Any) -> Option:
     name: str = argument.field_info.name
     return Option(
         field=name,
-        names=(name.upper(),) if by_place else tuple(argument.names),
+        names=(PRESETS.get(name, name.upper()),) if by_place else tuple(argument.names),
         takes=argument.parameter.metavar or "",
         help=argument.parameter.help,
     )

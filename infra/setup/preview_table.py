@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from infra.processor import processor
-from infra.render.held_out_scenes import composing_child, held_out_build, held_out_scene
+from infra.render.held_out_scenes import composing_child, held_out_scene, held_out_settings
 from infra.render.machine_costs import PROBES
 from infra.render.methods import SAMPLE_SEED
 from infra.render.networks import NetworkRenderer
@@ -134,7 +134,7 @@ def _children() -> Iterator[tuple[IsolatedChild, RenderChild]]:
     with (
         tempfile.TemporaryDirectory() as name,
         contextlib.closing(
-            composing_child(held_out_build(), BENCHMARK, Path(name), threads=1)
+            composing_child(held_out_settings(), BENCHMARK, Path(name), threads=1)
         ) as composing,
         contextlib.closing(RenderChild(choose_variant(), threads=1)) as rendering,
     ):

@@ -8,10 +8,10 @@ from typing import Any
 
 from infra.render.options import RenderOptions
 from infra.serving.train_model import TrainOptions
-from pipeline.builds.settings import BuildSettings
 from pipeline.flows.forms import DatasetInRuns
 from pipeline.generation.price import CorePrice
 from pipeline.generation.revisit_options import RevisitOptions
+from pipeline.presets.settings import DatasetSettings
 from storage.markdown import table
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
 from storage.records.scene import Scene
@@ -27,7 +27,7 @@ from train.settings import TrainSettings
 
 ROOTS: dict[str, tuple[type, ...]] = {
     "Scene": (Scene,),
-    "Generate": (DatasetInRuns, BuildSettings),
+    "Generate": (DatasetInRuns, DatasetSettings),
     "Revisit": (RevisitOptions,),
     "Render": (RenderOptions,),
     "Plan": (CorePrice,),
@@ -44,7 +44,7 @@ are also what is checked and what the command line and Prefect's forms show: a v
 refused in one line that names the field. Tests go to both ends of every range and one step outside
 (`tests/extremes/test_ranges.py`), and run what both ends make where that is cheap. Laws between
 fields, such as `min_spp` of at most `max_spp`, are not here: the complaint about one says what it
-expects. Every setting of a build or a run can be changed with `--set NAME=VALUE`, by its dotted
+expects. Every setting of a preset can be changed with `--set NAME=VALUE`, by its dotted
 name, such as `--set scenes.lights.count=[2,4]`, `--set scenes.families.0.weight=2` or `--set
 model=large`. Settings of a run that say *free* are how it is executed: the weights do not depend on
 them, or by rounding alone. All others are what the run means, and change by `--change`, which the

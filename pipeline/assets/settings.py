@@ -75,7 +75,7 @@ class OwnMaterialSettings:
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out later settings at their defaults: digests of earlier builds stay equal."""
+        """Leave out later settings at their defaults: digests of earlier presets stay equal."""
         record: dict[str, Any] = as_usual(self)
         defaults = {"emission": False, "normal_maps": False, "transmission": "opaque"}
         return {
@@ -137,7 +137,7 @@ class AssetSettings:
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what is as it always was, so that digests of earlier builds stay equal."""
+        """Leave out what is as it always was, so that digests of earlier presets stay equal."""
         record: dict[str, Any] = as_usual(self)
         if not self.own_materials.keep:
             record.pop("own_materials", None)

@@ -15,9 +15,9 @@ from pathlib import Path
 from pipeline.assets.recipe import READERS, RECIPE
 from pipeline.assets.settings import AssetSettings
 from storage.atomic import TEMPORARY_SUFFIX, write_atomically
-from storage.claims import hold_claim
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
+from storage.file_locks import hold_lock
 from storage.records.asset import Asset, encode_asset
 from storage.typed_json import read_json
 
@@ -96,7 +96,7 @@ class AssetStore:
         Raises:
             TrilightError: the store cannot be written.
         """
-        with hold_claim(self.root / "locks" / key[:_LOCKS], wait=True):
+        with hold_lock(self.root / "locks" / key[:_LOCKS], wait=True):
             yield
 
     def _unread_path(self, key: str) -> Path:

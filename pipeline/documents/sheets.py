@@ -71,7 +71,7 @@ def write_template_sheet(
 ) -> None:
     """Write `templates.png`: the first view of the first `per_template` scenes of every layout.
 
-    Each layout has a row, so that builds can be compared. Arguments and errors are those of
+    Each layout has a row, so that presets can be compared. Arguments and errors are those of
     `write_contact_sheet`.
     """
     rows = _first_scenes(dataset, per_template)

@@ -10,16 +10,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pipeline.builds.named import BUILDS, named_build
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from storage.dataset.dataset import dataset_files
 from storage.dataset.layout import dataset_folder
-from storage.dataset.progress import unfinished_shards
+from storage.dataset.progress import missing_shards
 from storage.dataset.splits import shards_for
 from storage.errors import TrilightError
 from storage.remote.safe_url import safe_url
-from storage.settings.changes import changed
 from storage.settings.described import checked
+from storage.settings.overrides import apply_overrides
 from storage.settings.ranges import Within
 
 MAX_TASKS = 1000
@@ -27,7 +27,7 @@ MAX_TASKS = 1000
 
 
 @checked()
-class DatasetByArray(DatasetOrder):
+class DatasetByArray(GenerateOptions):
     """A dataset made by the tasks of a scheduler's array."""
 
     scheduler: Literal["slurm", "kubernetes", "none"] = "slurm"
@@ -41,10 +41,10 @@ class DatasetByArray(DatasetOrder):
     fails; the array is left as it is."""
 
     @property
-    def dataset(self) -> DatasetOrder:
+    def dataset(self) -> GenerateOptions:
         """The options of the dataset alone, without those of the array."""
-        return DatasetOrder(
-            **{each.name: getattr(self, each.name) for each in dataclasses.fields(DatasetOrder)}
+        return GenerateOptions(
+            **{each.name: getattr(self, each.name) for each in dataclasses.fields(GenerateOptions)}
         )
 
 
@@ -52,7 +52,7 @@ class DatasetByArray(DatasetOrder):
 class ArrayJob:
     """One submission of an array."""
 
-    order: DatasetOrder
+    order: GenerateOptions
     """Options of the dataset, with its number of scenes."""
     tasks: Sequence[int]
     """Numbers of the tasks with missing shards; empty if nothing is missing."""
@@ -63,7 +63,7 @@ class ArrayJob:
 
 
 def array_job(
-    order: DatasetOrder, *, per_task: int | None, at_once: int | None, on: str = "slurm"
+    order: GenerateOptions, *, per_task: int | None, at_once: int | None, on: str = "slurm"
 ) -> ArrayJob:
     """Return the array that makes the missing shards of a dataset, which need not exist yet.
 
@@ -88,11 +88,11 @@ def array_job(
             "of the cluster could read in the queue; expected env:TRILIGHT_SOURCE_NAME, with the "
             "address in that variable of the tasks."
         )
-    scenes = order.scenes or BUILDS.find(order.build).num_scenes
-    splits = changed(named_build(order.build), order.changes).splits
+    scenes = order.scenes or DATASET_PRESETS.find(order.build).num_scenes
+    splits = apply_overrides(preset_settings(order.build), order.changes).splits
     planned = shards_for(scenes, splits)
     is_begun = _is_begun(order.place)
-    missing = unfinished_shards(order.place, scenes) if is_begun else list(range(planned))
+    missing = missing_shards(order.place, scenes) if is_begun else list(range(planned))
     each = per_task or -(-planned // MAX_TASKS)
     tasks = sorted({shard // each for shard in missing})
     if tasks and tasks[-1] >= MAX_TASKS:

@@ -12,7 +12,7 @@ import os
 from collections.abc import Mapping
 
 from pipeline.executors.threads import make_part, number, variable
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.run import Outcome
 from storage.errors import TrilightError
 from storage.number_ranges import MOST_NUMBERS, numbers_of
@@ -21,7 +21,7 @@ PLACE = "JOB_COMPLETION_INDEX"
 """Variable with the index of a task in the Job, from 0."""
 
 
-def make(order: DatasetOrder, address: str | None) -> Outcome:
+def make(order: GenerateOptions, address: str | None) -> Outcome:
     """Make the shards of this task.
 
     Raises:

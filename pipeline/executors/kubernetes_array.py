@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar
 import yaml
 
 from pipeline.executors.array_job import ArrayJob
-from pipeline.generation.dataset_order import DatasetOrder, generate_words
+from pipeline.generation.generate_options import GenerateOptions, generate_words
 from storage.atomic import write_atomically
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -218,7 +218,7 @@ def _image(options: KubernetesOptions) -> str:
     return image
 
 
-def _require_bucket_alone(order: DatasetOrder) -> None:
+def _require_bucket_alone(order: GenerateOptions) -> None:
     """Raise TrilightError if a task would need a file of this machine."""
     if order.place.partition("://")[0] not in WRITABLE:
         raise TrilightError(
@@ -235,7 +235,7 @@ def _require_bucket_alone(order: DatasetOrder) -> None:
             )
     if is_reference(order.build):
         raise TrilightError(
-            f"submit kubernetes: the build is {order.build}, a file of this machine; expected a "
+            f"submit kubernetes: the preset is {order.build}, a file of this machine; expected a "
             "name. Put the file into an image of your own, with TRILIGHT_EXTEND, and name its "
-            "build."
+            "preset."
         )

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from storage.errors import TrilightError, expected_one_of
 from storage.installation import module_name
 from storage.registry import Registry
@@ -18,7 +18,7 @@ from storage.registry import Registry
 if TYPE_CHECKING:
     from pipeline.generation.run import Outcome
 
-Make = Callable[[DatasetOrder, str | None], "Outcome"]
+Make = Callable[[GenerateOptions, str | None], "Outcome"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +39,7 @@ def _load_on_use(module: str) -> Make:
     The import loads every stage, and for some executors packages that may not be installed.
     """
 
-    def make(order: DatasetOrder, address: str | None) -> "Outcome":
+    def make(order: GenerateOptions, address: str | None) -> "Outcome":
         outcome: Outcome = import_module(module_name(module)).make(order, address)
         return outcome
 

@@ -10,14 +10,14 @@ import os
 from collections.abc import Callable, Mapping
 
 from pipeline.executors.threads import make_part, number
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import prepare_dataset
 from pipeline.generation.run import Outcome
 from pipeline.generation.tasks import shard_ranges
 from storage.errors import TrilightError
 
 
-def make(order: DatasetOrder, address: str | None) -> Outcome:
+def make(order: GenerateOptions, address: str | None) -> Outcome:
     """Make the shards of this array task.
 
     Raises:

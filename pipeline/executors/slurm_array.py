@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pipeline.executors.array_job import ArrayJob
-from pipeline.generation.dataset_order import generate_words
+from pipeline.generation.generate_options import generate_words
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
 

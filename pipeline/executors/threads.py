@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, make_task
 from pipeline.generation.run import Outcome, ShardJob, TaskResult
 from pipeline.generation.runner import Runner
@@ -16,12 +16,12 @@ from pipeline.generation.tasks import Piece
 from storage.errors import TrilightError
 
 
-def make(order: DatasetOrder, address: str | None) -> Outcome:
+def make(order: GenerateOptions, address: str | None) -> Outcome:
     """Make a dataset here; raises as `make_dataset`."""
     return make_dataset(order, ThreadRunner())
 
 
-def make_part(order: DatasetOrder, runner: str, shards: Callable[[], str]) -> Outcome:
+def make_part(order: GenerateOptions, runner: str, shards: Callable[[], str]) -> Outcome:
     """Make the shards of one task of an array.
 
     Args:

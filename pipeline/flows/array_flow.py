@@ -16,9 +16,9 @@ from prefect.logging import get_run_logger
 from pipeline.executors.array_job import DatasetByArray, array_job
 from pipeline.executors.kubernetes_array import options_from_environment, submit_job
 from pipeline.executors.slurm_array import submit_array
-from pipeline.flows.forms import DATASET_FORMS, order_of, parameters_of, run_name
+from pipeline.flows.forms import DATASET_FORMS, options_of_form, parameters_of, run_name
 from pipeline.flows.run_artifacts import ArtifactPage
-from storage.dataset.progress import DatasetStatus, read_status, unfinished_shards
+from storage.dataset.progress import DatasetStatus, missing_shards, read_status
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
 
@@ -33,7 +33,7 @@ def make_by_array(**parameters: Any) -> None:
 
     Start it again when no task is left in the queue: it submits what is still missing.
     """
-    order = order_of(parameters, DatasetByArray)
+    order = options_of_form(parameters, DatasetByArray)
     artifacts = ArrayArtifacts(order.place)
     if order.scheduler != "none":
         _submit(order)
@@ -60,7 +60,7 @@ def _watch_until_finished(order: DatasetByArray, artifacts: "ArrayArtifacts") ->
     changed_s = time.monotonic()
     while True:
         status = _status(order.place)
-        if status and status.finished and not unfinished_shards(order.place, order.scenes or 0):
+        if status and status.finished and not missing_shards(order.place, order.scenes or 0):
             return status  # a lost shard of a finished dataset is made again
         progress = (status.shards_done, status.scenes_done) if status else None
         if progress != before:

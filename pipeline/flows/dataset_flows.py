@@ -10,13 +10,13 @@ from prefect.logging import get_run_logger
 from pipeline.flows.forms import (
     DATASET_FORMS,
     DatasetInRuns,
-    order_of,
+    options_of_form,
     parameters_of,
     run_name,
 )
 from pipeline.flows.prefect_runner import PrefectRunner
 from pipeline.flows.run_artifacts import make_with_artifacts
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import prepare_dataset
 from pipeline.generation.run import Outcome
 from pipeline.generation.tasks import shard_ranges
@@ -24,20 +24,20 @@ from storage.dataset.progress import read_status
 
 
 @flow(name="prepare-assets", flow_run_name=run_name, persist_result=False)
-@parameters_of(DatasetOrder, **DATASET_FORMS)
+@parameters_of(GenerateOptions, **DATASET_FORMS)
 def prepare_assets(**parameters: Any) -> None:
     """Begin a dataset: list, clean, decimate and freeze its objects, without a picture."""
-    run = prepare_dataset(order_of(parameters, DatasetOrder))
+    run = prepare_dataset(options_of_form(parameters, GenerateOptions))
     get_run_logger().info(
         "%d of %d objects accepted", run.accepted.num_objects, run.accepted.num_found
     )
 
 
 @flow(name="generate-scenes", flow_run_name=run_name, persist_result=False)
-@parameters_of(DatasetOrder, **DATASET_FORMS)
+@parameters_of(GenerateOptions, **DATASET_FORMS)
 def generate_scenes(**parameters: Any) -> Outcome:
     """Make a dataset: all its missing shards, or those of a range."""
-    return make_with_artifacts(order_of(parameters, DatasetOrder), PrefectRunner())
+    return make_with_artifacts(options_of_form(parameters, GenerateOptions), PrefectRunner())
 
 
 @flow(name="build-dataset", flow_run_name=run_name, persist_result=False)
@@ -49,8 +49,8 @@ def build_dataset(**parameters: Any) -> None:
     the first. Then it makes all remaining shards that no worker has claimed, so that it ends even
     if no other worker ever starts.
     """
-    order = order_of(parameters, DatasetInRuns)
-    values = {field.name: parameters[field.name] for field in dataclasses.fields(DatasetOrder)}
+    order = options_of_form(parameters, DatasetInRuns)
+    values = {field.name: parameters[field.name] for field in dataclasses.fields(GenerateOptions)}
     prepare_assets(**values)
     if order.flow_runs > 1:
         first, *rest = shard_ranges(read_status(order.place).shards_planned, order.flow_runs)

@@ -2,7 +2,7 @@
 
 A flow takes the fields of a settings class as its parameters: their descriptions
 (storage.settings.described) become the schema that Prefect checks before a run exists, and from
-which it draws a form. The groups of a build's settings become forms within the form, in which every
+which it draws a form. The groups of a preset's settings become forms within it, in which every
 field may stay empty.
 """
 
@@ -15,10 +15,10 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
-from pipeline.builds.named import BUILDS
-from pipeline.builds.settings import BuildSettings
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.objects.sources import SOURCES
+from pipeline.presets.registry import DATASET_PRESETS
+from pipeline.presets.settings import DatasetSettings
 from storage.dataset.shard_places import MAX_SHARDS
 from storage.errors import TrilightError
 from storage.settings.described import checked
@@ -55,7 +55,7 @@ def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
     return with_signature
 
 
-def changes_form(settings: type, example: Any) -> type[BaseModel]:
+def overrides_form(settings: type, example: Any) -> type[BaseModel]:
     """Return a form of all fields of a settings class, in which every field may stay empty.
 
     Args:
@@ -67,7 +67,7 @@ def changes_form(settings: type, example: Any) -> type[BaseModel]:
         value = getattr(example, field.name)
         first = value[0] if isinstance(value, tuple) and value else value
         is_group = dataclasses.is_dataclass(first) and not isinstance(first, type)
-        kind = changes_form(type(first), first) if is_group else field.hint
+        kind = overrides_form(type(first), first) if is_group else field.hint
         fields[field.name] = (kind | None, Field(default=None, description=field.sentence))
     return create_model(
         f"{settings.__name__}Changes", __config__=ConfigDict(extra="forbid"), **fields
@@ -75,7 +75,7 @@ def changes_form(settings: type, example: Any) -> type[BaseModel]:
 
 
 def changed_values(form: BaseModel | None) -> dict[str, Any]:
-    """Return the filled-in fields by dotted name, as `storage.settings.changes` takes them."""
+    """Return the filled-in fields by dotted name, as `storage.settings.overrides` takes them."""
     values: dict[str, Any] = {}
     for name, value in form or ():  # in declared order; `model_fields_set` has none
         if isinstance(value, BaseModel):
@@ -100,22 +100,22 @@ PublicPlace = Annotated[
     Field(pattern=r"^(?:[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|(?:[^:]|:+[^:/]|:+/[^:/])*:*/?)$"),
 ]
 """An output folder of any name, or a URL without secrets."""
-BuildName = Literal[tuple(BUILDS)]  # type: ignore[valid-type]
-"""Names of the registered builds, as a list to choose from."""
-BuildChanges = changes_form(BuildSettings, BUILDS["smoke"].settings())
-"""Every setting of a build."""
+DatasetPresetName = Literal[tuple(DATASET_PRESETS)]  # type: ignore[valid-type]
+"""Names of the registered presets, as a list to choose from."""
+DatasetOverrides = overrides_form(DatasetSettings, DATASET_PRESETS["smoke"].settings())
+"""Every setting of a preset."""
 
 DATASET_FORMS: Mapping[str, Any] = {
-    "build": BuildName,
+    "build": DatasetPresetName,
     "objects": PublicUrl | None,
     "out": PublicPlace | None,
-    "changes": BuildChanges | None,
+    "changes": DatasetOverrides | None,
 }
 """Types of parameters that are narrower in a form than in the options."""
 
 
 @checked()
-class DatasetInRuns(DatasetOrder):
+class DatasetInRuns(GenerateOptions):
     """A dataset made by several flow runs, each of which makes a range of the shards."""
 
     flow_runs: Annotated[int, Within(1, MAX_SHARDS, unit="flow runs")] = 1
@@ -132,7 +132,7 @@ class DatasetInRuns(DatasetOrder):
             )
 
 
-def order_of(parameters: Mapping[str, Any], kind: Callable[..., Returned]) -> Returned:
+def options_of_form(parameters: Mapping[str, Any], kind: Callable[..., Returned]) -> Returned:
     """Return the options of a class that a flow's parameters state.
 
     Raises:
@@ -144,9 +144,9 @@ def order_of(parameters: Mapping[str, Any], kind: Callable[..., Returned]) -> Re
 
 
 def run_name() -> str:
-    """Return the name of the starting flow run: build, number of scenes and output folder."""
+    """Return the name of the starting flow run: preset, number of scenes and output folder."""
     from prefect.runtime import flow_run
 
-    parameters = {"build": DatasetOrder.build, **flow_run.parameters}
+    parameters = {"build": GenerateOptions.build, **flow_run.parameters}
     parts = (parameters["build"], parameters.get("scenes"), parameters.get("out"))
     return "-".join(str(part) for part in parts if part is not None)

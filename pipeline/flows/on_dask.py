@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.flows.on_prefect import as_flow
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.render_children import close_idle_children
 from pipeline.generation.run import Outcome
 from storage.atomic import write_atomically
@@ -27,7 +27,7 @@ _AHEAD = 2
 """Tasks submitted for each thread of the cluster, so that none waits for the next one."""
 
 
-def make(order: DatasetOrder, address: str | None) -> Outcome:
+def make(order: GenerateOptions, address: str | None) -> Outcome:
     """Make a dataset with the workers of a Dask cluster, as a flow run of this process.
 
     Raises:
@@ -40,7 +40,7 @@ def make(order: DatasetOrder, address: str | None) -> Outcome:
         return _make(order, address)
 
 
-def _make(order: DatasetOrder, address: str) -> Outcome:
+def _make(order: GenerateOptions, address: str) -> Outcome:
     try:
         from prefect_dask import DaskTaskRunner
     except ImportError as error:
@@ -88,7 +88,7 @@ def _threads(client: "Client", address: str) -> list[int]:
     return [int(worker["nthreads"]) for worker in workers.values()]
 
 
-def _require_shared(client: "Client", order: DatasetOrder) -> None:
+def _require_shared(client: "Client", order: GenerateOptions) -> None:
     """Raise if a worker of the cluster cannot see the output folder."""
     folder = dataset_folder(order.place)
     seen_by_all = folder.staging.resolve() / f"met-{uuid.uuid4().hex}"

@@ -6,14 +6,14 @@ The server is the one of PREFECT_API_URL; where that is not set, a private one f
 from typing import TYPE_CHECKING, Any
 
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 
 if TYPE_CHECKING:
     from pipeline.flows.prefect_runner import PrefectRunner
     from pipeline.generation.run import Outcome
 
 
-def make(order: DatasetOrder, address: str | None) -> "Outcome":
+def make(order: GenerateOptions, address: str | None) -> "Outcome":
     """Make a dataset; raises as `make_dataset`, or if the private server does not start."""
     quiet_prefect()
     with prefect_server():
@@ -24,7 +24,7 @@ def make(order: DatasetOrder, address: str | None) -> "Outcome":
         return as_flow(order, PrefectRunner())
 
 
-def as_flow(order: DatasetOrder, runner: "PrefectRunner", **options: Any) -> "Outcome":
+def as_flow(order: GenerateOptions, runner: "PrefectRunner", **options: Any) -> "Outcome":
     """Make a dataset as a flow run, with its artifacts; `options` are Prefect's of a flow."""
     from prefect import flow
 

@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from storage.cache import cache_folder, open_private, private_folder
-from storage.claims import hold_claim
 from storage.errors import TrilightError
+from storage.file_locks import hold_lock
 from storage.installation import IMPORT_ROOT, child_environment
 from storage.remote.safe_url import safe_text
 
@@ -182,7 +182,7 @@ def prefect_server() -> Iterator[str]:
     password = new_password()
     with contextlib.ExitStack() as starting, open_private(home / _LOG_NAME, "ab") as log:
         # two first starts at once would both migrate the database
-        starting.enter_context(hold_claim(home / "start.lock", wait=True))
+        starting.enter_context(hold_lock(home / "start.lock", wait=True))
         port = _free_port()
         server = subprocess.Popen(
             [*SERVER, "--port", str(port), "--with-parent"],

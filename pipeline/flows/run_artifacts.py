@@ -24,7 +24,7 @@ from prefect.artifacts import (
 )
 from prefect.logging import get_run_logger
 
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset
 from pipeline.generation.price import PRICES, USD_PER_CORE_HOUR
 from pipeline.generation.run import Outcome, Run, TaskResult
@@ -40,7 +40,7 @@ _SHEET_PX = 1024
 """Longest side of the contact sheet on the page: about 100 kB."""
 
 
-def make_with_artifacts(order: DatasetOrder, runner: Runner) -> Outcome:
+def make_with_artifacts(order: GenerateOptions, runner: Runner) -> Outcome:
     """Make a dataset within a flow run and show its artifacts; the summary includes failures."""
     # one line per scene; PREFECT_LOGGING_EXTRA_LOGGERS=trilight brings it to the server
     logging.getLogger("trilight").setLevel(logging.INFO)
@@ -106,7 +106,7 @@ class ArtifactPage:
 class RunArtifacts(ArtifactPage):
     """The artifacts of one flow run."""
 
-    def __init__(self, order: DatasetOrder) -> None:
+    def __init__(self, order: GenerateOptions) -> None:
         """Create the first artifact of a run.
 
         Raises:

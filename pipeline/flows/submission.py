@@ -81,7 +81,7 @@ def server() -> Iterator[SyncPrefectClient]:
 
 
 def parameters(order: Any) -> dict[str, Any]:
-    """Return the build and all fields that are not defaults, in the layout of the flow's form.
+    """Return the preset and all fields that are not defaults, in the layout of the flow's form.
 
     Args:
         order: options of a class whose fields are the flow's parameters.

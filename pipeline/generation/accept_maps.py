@@ -10,12 +10,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.builds.settings import BuildSettings
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.prepare_isolated import ChildPool
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, call_with_retries, reach
 from pipeline.objects.maps.listing import PLURALS, FoundMap, find_maps
 from pipeline.objects.maps.prepared import MapFiles, decode_prepared, map_cache_key, prepare_map
+from pipeline.presets.settings import DatasetSettings
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.conventions import SPLITS
@@ -57,7 +57,7 @@ class MapFolders:
 NO_FOLDERS = MapFolders()
 
 
-def map_folders(order: DatasetOrder, settings: BuildSettings) -> MapFolders:
+def map_folders(order: GenerateOptions, settings: DatasetSettings) -> MapFolders:
     """Return the folders of textures and maps that the options name.
 
     Raises:
@@ -88,12 +88,14 @@ def map_folders(order: DatasetOrder, settings: BuildSettings) -> MapFolders:
     )
 
 
-def accept_maps(user_folders: MapFolders, settings: BuildSettings, *, workers: int) -> AcceptedMaps:
+def accept_maps(
+    user_folders: MapFolders, settings: DatasetSettings, *, workers: int
+) -> AcceptedMaps:
     """Prepare the textures and maps of folders.
 
     Args:
         user_folders: the folders.
-        settings: the build: sizes, licences and splits.
+        settings: the preset: sizes, licences and splits.
         workers: number of files that are decoded at the same time.
 
     Raises:
@@ -125,7 +127,7 @@ def accept_maps(user_folders: MapFolders, settings: BuildSettings, *, workers: i
 
 
 def _prepare_maps(
-    kind: str, maps: Sequence[FoundMap], settings: BuildSettings, workers: int
+    kind: str, maps: Sequence[FoundMap], settings: DatasetSettings, workers: int
 ) -> list[tuple[LockedObject, Path] | Failure]:
     scenes = settings.scenes
     size = scenes.textures.surfaces.size if kind == TEXTURE else scenes.skies.maps.height
@@ -177,7 +179,9 @@ def _prepare_file(map_files: MapFiles, child: IsolatedChild) -> Path:
     return path
 
 
-def _lock_entry(kind: str, user_map: FoundMap, path: Path, settings: BuildSettings) -> LockedObject:
+def _lock_entry(
+    kind: str, user_map: FoundMap, path: Path, settings: DatasetSettings
+) -> LockedObject:
     data = path.read_bytes()
     return LockedObject(
         **user_map.record.identity,

@@ -2,11 +2,11 @@
 
 import dataclasses
 
-from pipeline.builds.revisit import RevisitSettings
-from pipeline.builds.settings import BuildSettings
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects, read_frozen_objects
 from pipeline.generation.revisited_scenes import RevisitedScenes, require_digest, shards_with_scenes
+from pipeline.presets.revisit import RevisitSettings
+from pipeline.presets.settings import DatasetSettings
 from pipeline.shards.finished_dataset import open_finished
 from storage.dataset.settings import ListedShard
 from storage.digests import canonical_json
@@ -14,7 +14,7 @@ from storage.errors import TrilightError
 from storage.records.objects import OBJECT
 
 
-def settings_for_revisit(settings: BuildSettings, path: str | None) -> BuildSettings:
+def settings_for_revisit(settings: DatasetSettings, path: str | None) -> DatasetSettings:
     """Return the settings of a dataset that has the views and shards of a finished one.
 
     Without a path, the settings stay as they are.
@@ -48,7 +48,7 @@ def settings_for_revisit(settings: BuildSettings, path: str | None) -> BuildSett
     return dataclasses.replace(settings, scenes=scenes, splits=splits)
 
 
-def _require_layouts(settings: BuildSettings, revisit: RevisitSettings, path: str) -> None:
+def _require_layouts(settings: DatasetSettings, revisit: RevisitSettings, path: str) -> None:
     """Raise if scenes of files should get cameras or lights that only a layout can draw."""
     if settings.splits.listed_scenes is None:
         return
@@ -64,7 +64,9 @@ def _require_layouts(settings: BuildSettings, revisit: RevisitSettings, path: st
         )
 
 
-def accept_revisited(path: str, settings: BuildSettings, writer: DatasetWriter) -> AcceptedObjects:
+def accept_revisited(
+    path: str, settings: DatasetSettings, writer: DatasetWriter
+) -> AcceptedObjects:
     """Freeze the objects of a finished dataset for the new one, with their licences and splits.
 
     Raises:

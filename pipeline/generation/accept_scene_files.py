@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
 from pipeline.exchange.scene_files import SceneFiles, SceneFolder, build_scene, require_usable
 from pipeline.generation.dataset_writer import DatasetWriter
@@ -14,6 +13,7 @@ from pipeline.generation.freeze_objects import AcceptedObjects, read_frozen_obje
 from pipeline.generation.prepare_isolated import asset_child
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
 from pipeline.objects.licences import StatedLicence, stated_licence
+from pipeline.presets.settings import DatasetSettings
 from storage.dataset.progress import announce_objects, count_object
 from storage.dataset.splits import JUDGED_SPLIT
 from storage.errors import EnvironmentFailure, TrilightError
@@ -21,9 +21,9 @@ from storage.records.objects import LockedObject
 
 
 def settings_for_files(
-    settings: BuildSettings, folder: SceneFolder | None, views: int | None
-) -> BuildSettings:
-    """Return the build's settings with the number of scenes and views of a folder.
+    settings: DatasetSettings, folder: SceneFolder | None, views: int | None
+) -> DatasetSettings:
+    """Return the preset's settings with the number of scenes and views of a folder.
 
     Without a folder, the settings stay as they are.
 
@@ -44,7 +44,7 @@ def settings_for_files(
 def accept_scene_files(
     folder: SceneFolder,
     licence: str | None,
-    settings: BuildSettings,
+    settings: DatasetSettings,
     writer: DatasetWriter,
 ) -> AcceptedObjects:
     """Build every scene once, without rendering; the first run freezes their files.
@@ -71,7 +71,7 @@ def accept_scene_files(
 
 
 def _build_all(
-    folder: SceneFolder, stated: StatedLicence, settings: BuildSettings, writer: DatasetWriter
+    folder: SceneFolder, stated: StatedLicence, settings: DatasetSettings, writer: DatasetWriter
 ) -> SceneFiles:
     """Build every scene; return digests of the usable files, and errors of the others."""
     announce_objects(writer.folder, len(folder.names))
@@ -136,7 +136,7 @@ def build_once(
 
 
 def _build_in_child(
-    child: IsolatedChild, folder: SceneFolder, name: str, settings: BuildSettings
+    child: IsolatedChild, folder: SceneFolder, name: str, settings: DatasetSettings
 ) -> BuiltScene:
     """Build a scene in a child; raises TrilightError, or EnvironmentFailure for the machine."""
     num_views = settings.scenes.num_views
@@ -161,7 +161,7 @@ def _build_in_child(
         ) from failure
 
 
-def _require_allowed(stated: StatedLicence, settings: BuildSettings) -> StatedLicence:
+def _require_allowed(stated: StatedLicence, settings: DatasetSettings) -> StatedLicence:
     if stated.licence.casefold() not in {name.casefold() for name in settings.allowed_licences}:
         raise TrilightError(
             f"--licence is {stated.licence}, which is not on the allow-list; if you may use the "

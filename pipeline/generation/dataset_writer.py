@@ -161,7 +161,7 @@ class DatasetWriter:
         if path.exists():
             yield True
             return
-        with self.store.hold_claim(self.folder.name_of(path)) as ours:
+        with self.store.hold_lock(self.folder.name_of(path)) as ours:
             if ours:
                 fetch(self.folder, self.store, path)  # its last holder may have published it
             yield ours

@@ -47,7 +47,7 @@ def derive_dataset(
         )
     sources = [open_finished(path) for path in paths]
     work = DatasetFolder(out.with_name(f".{out.name}.part"))
-    with work.hold_exclusively():
+    with work.hold_exclusive_lock():
         work.clear()  # what a killed run has left
         try:
             derive_shards(sources, derive, work, progress=progress)

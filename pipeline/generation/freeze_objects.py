@@ -12,7 +12,6 @@ from operator import attrgetter
 from pathlib import Path
 
 from pipeline.assets.stage import PreparedObject
-from pipeline.builds.settings import BuildSettings
 from pipeline.generation.accept_maps import (
     NO_FOLDERS,
     NO_MAPS,
@@ -32,6 +31,7 @@ from pipeline.generation.revisited_scenes import SceneOrigin
 from pipeline.generation.unread_notes import format_unread, write_unread
 from pipeline.isolation import is_transient
 from pipeline.objects.sources import ListedObjects, list_objects
+from pipeline.presets.settings import DatasetSettings
 from storage.conventions import SPLITS
 from storage.dataset.progress import announce_downloads, announce_objects, count_object
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
@@ -72,8 +72,8 @@ class ObjectLock:
     """Source of the objects, as `find_objects` takes it; may hold a secret."""
     licence: str | None
     """Licence that the user states for files without one."""
-    settings: BuildSettings
-    """Settings of the build: how objects are prepared and assigned to splits."""
+    settings: DatasetSettings
+    """Settings of the preset: how objects are prepared and assigned to splits."""
     writer: DatasetWriter
     """Writer of the dataset that the objects are frozen for."""
     workers: int

@@ -25,9 +25,9 @@ from pipeline.isolation import is_transient
 from pipeline.objects.listing import SUFFIXES, Fetched
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
-from storage.claims import WaitNotice
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
+from storage.file_locks import WaitNotice
 from storage.records.objects import Failure, ObjectRecord
 from storage.remote.store import claim_of
 from storage.typed_json import read_json_lines

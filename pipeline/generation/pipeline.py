@@ -18,7 +18,7 @@ crash costs one attempt.
 
 The files on disk are the only state, and every step may be killed at any moment. A mesh is kept in
 the asset store, a scene in the staging folder, a shard in the dataset; the next run looks for these
-and makes the rest. Several runs on one folder share the work (storage.claims), and those on one
+and makes the rest. Several runs on one folder share the work (storage.file_locks), and those on one
 bucket share batches of objects (storage.remote.store) and shards (pipeline.shards.published).
 """
 
@@ -30,17 +30,16 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from pipeline.builds.named import BUILDS, object_source
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.sheets import write_first_pictures
 from pipeline.generation.accept_maps import map_folders
 from pipeline.generation.accept_revisited import accept_revisited
 from pipeline.generation.accept_scene_files import accept_scene_files
-from pipeline.generation.begin_dataset import begin_dataset, hold_membership
-from pipeline.generation.dataset_order import DatasetOrder, generate_words
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.environment import environment
 from pipeline.generation.freeze_objects import ObjectLock
+from pipeline.generation.generate_options import GenerateOptions, generate_words
 from pipeline.generation.render_children import (
     close_children,
     cores_of_child,
@@ -62,6 +61,7 @@ from pipeline.generation.scene_worker import MAX_ATTEMPTS, SceneAttempt, SceneWo
 from pipeline.generation.tasks import FIRST_PAUSE_S, Piece, TaskCutter, wait_for_others
 from pipeline.generation.unfinished_shard import UnfinishedShard
 from pipeline.isolation import ChildFailed, IsolatedChild, with_retries
+from pipeline.presets.registry import DATASET_PRESETS, object_source
 from storage.dataset.asked import write_asked
 from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import ShardEntry
@@ -74,7 +74,7 @@ from storage.records.scene import Scene
 
 
 def make_dataset(
-    order: DatasetOrder, runner: Runner, watch: Watcher = lambda run, outcome: None
+    order: GenerateOptions, runner: Runner, watch: Watcher = lambda run, outcome: None
 ) -> Outcome:
     """Make a dataset: all its missing shards, or those of a range.
 
@@ -96,28 +96,28 @@ def make_dataset(
     return run.outcome(finished, statistics)
 
 
-def prepare_dataset(order: DatasetOrder) -> Run:
+def prepare_dataset(order: GenerateOptions) -> Run:
     """Begin a dataset and freeze its objects, without rendering; raises as `make_dataset`."""
     with _begin_run(order) as run:
         return run
 
 
 @contextlib.contextmanager
-def _begin_run(order: DatasetOrder) -> Iterator[Run]:
+def _begin_run(order: GenerateOptions) -> Iterator[Run]:
     """Join a dataset's workers and yield the run; the first worker freezes the objects."""
     folder = dataset_folder(order.place)
     folder = replace(folder, root=Path(os.path.realpath(folder.root)))
     settings, listed = resolve_settings(
         order, folder
     )  # refuses an order before anything is written
-    with hold_membership(folder):
+    with hold_dataset_lock(folder):
         user_folders = map_folders(order, settings)
         variant = choose_dataset_variant(order, folder)
-        writer = begin_dataset(
+        writer = begin_or_resume_dataset(
             folder,
             settings,
             environment(variant),
-            BUILDS[order.build].num_scenes if order.scenes is None else order.scenes,
+            DATASET_PRESETS[order.build].num_scenes if order.scenes is None else order.scenes,
             accept_environment=order.accept_environment,
         )
         requested = order.shard_range()

@@ -11,13 +11,13 @@ from dataclasses import replace
 from typing import Any
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.builds.settings import differences
 from pipeline.exchange.scene_files import SceneFiles
 from pipeline.generation.environment import environment
 from pipeline.generation.prepare_isolated import ChildPool, asset_child
 from pipeline.generation.run import ShardJob
 from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
 from pipeline.isolation import ChildLimits, IsolatedChild, call_with_retries, reach
+from pipeline.presets.settings import differences
 from pipeline.renders.variant import choose_variant
 from pipeline.renders.visible_gpus import visible_gpus
 from storage.errors import TrilightError

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.builds.settings import BuildSettings
+from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
@@ -98,7 +98,7 @@ class _AcceptedView:
 def render_sample(
     key: str,
     render_input: RenderInput,
-    settings: BuildSettings,
+    settings: DatasetSettings,
     failures: list[Failure],
     progress: ViewProgress,
 ) -> Sample:
@@ -157,7 +157,7 @@ def _stack_views(
     key: str,
     scene: Scene,
     views: Sequence[_AcceptedView],
-    settings: BuildSettings,
+    settings: DatasetSettings,
     members: Mapping[str, bytes],
 ) -> Sample:
     lights = [view.lights_rgb for view in views if view.lights_rgb is not None]
@@ -185,7 +185,7 @@ def _kept_view(sample: Sample, view: int) -> _AcceptedView:
     )
 
 
-def _passes_exr(scene: Scene, settings: BuildSettings) -> tuple[bytes, ...] | None:
+def _passes_exr(scene: Scene, settings: DatasetSettings) -> tuple[bytes, ...] | None:
     names = settings.storage.passes
     resolution = settings.renders.resolution
     if not names:
@@ -201,7 +201,7 @@ def _accepted_view(
     rendered: RenderedView,
     seed: int,
     sight: Visibility,
-    settings: BuildSettings,
+    settings: DatasetSettings,
 ) -> _AcceptedView:
     grid = settings.scenes.views.coverage_grid
     facts = sight.facts(camera.c2w, float(camera.fov_deg), grid)

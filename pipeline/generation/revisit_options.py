@@ -7,9 +7,9 @@ from dataclasses import field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pipeline.builds.revisit import MOST_CAMERAS, GivenCamera, RevisitSettings
 from pipeline.exchange.open_scene import load_cameras, scene_source
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
+from pipeline.presets.revisit import MOST_CAMERAS, GivenCamera, RevisitSettings
 from pipeline.renders.settings import NoiseFloor, Resolution
 from pipeline.renders.variant import Device
 from pipeline.shards.finished_dataset import open_finished
@@ -36,36 +36,35 @@ class RevisitOptions:
     """Folder of the new dataset, or a bucket such as s3://bucket/folder. Run the same command again
     to resume."""
     cameras: str = "keep"
-    """Cameras of each scene: keep; a number, such as 4, for so many, those that it has first; new:4
-    for new ones only; plane:4 for new ones as another layout has them; or a file with cameras
-    (RenderFormer JSON, USD, or any scene), the same for every scene."""
+    """Cameras of each scene: keep; 4 for four, the present ones first; new:4 for new ones only;
+    plane:4 for new ones as another layout has them; or a file with cameras for every scene
+    (RenderFormer JSON, USD, or any scene)."""
     lights: str = "keep"
-    """Lights of each scene: keep; new for as many drawn anew; or a number of new ones, such as 3.
+    """Lights of each scene: keep; new for as many new ones; or a number of new ones, such as 3.
     `--set scenes.lights.NAME=VALUE` changes what they are drawn from."""
     materials: Literal["keep", "new"] = "keep"
-    """Materials of each scene: keep, or new for ones drawn anew. `--set
-    scenes.materials.NAME=VALUE` changes what they are drawn from."""
+    """Materials of each scene: keep, or new ones. `--set scenes.materials.NAME=VALUE`
+    changes what they are drawn from."""
     seed: Seed | None = None
-    """Seed of all that is drawn anew, and of the samples: with another one, every picture is
-    rendered again; by default the dataset's."""
+    """Seed of new draws and samples; another one renders every image; by default the
+    dataset's."""
     resolution: Resolution | None = None
-    """Width of a picture in pixels; by default the dataset's."""
+    """Width of an image in pixels; by default the dataset's."""
     noise_floor_db: NoiseFloor | None = None
-    """Sampling stops at this measured noise floor in dB (psnr_log_db); by default as the dataset
-    was made."""
+    """Stated error in dB (psnr_log_db) at which sampling stops; by default as the dataset was
+    made."""
     noise_floor_linear_db: NoiseFloor | None = None
-    """The same as psnr_linear_db; by default as the dataset was made. Of several floors, all are
+    """The same as psnr_linear_db; by default as the dataset was made. Of several errors, all are
     reached."""
     noise_floor_objects_db: NoiseFloor | None = None
     """The same as object_psnr_log_db; by default as the dataset was made."""
     build: str | None = None
-    """Build that fills in settings which the dataset does not state, since it was merged; by
-    default the dataset's own."""
+    """Preset for settings that a merged dataset does not state; by default the dataset's own."""
     workers: Annotated[int | None, Within(1, 1024, unit="processes")] = None
     """Number of render processes, which share the cores; by default one, or four for each GPU, or
     as many as its memory holds."""
     device: Device | None = None
-    """Device that renders: cpu, gpu or auto; by default as `trilight generate` with its build."""
+    """Device that renders: cpu, gpu or auto; by default as `trilight generate` with its preset."""
     failure_budget: Share = 0.1
     """Share of scenes that may fail for good before the run stops."""
     accept_environment: bool = False
@@ -77,7 +76,7 @@ class RevisitOptions:
     (values are JSON); by default there are none."""
 
 
-def revisit_order(options: RevisitOptions) -> DatasetOrder:
+def to_generate_options(options: RevisitOptions) -> GenerateOptions:
     """Return the options of the new dataset, without the settings of the finished one.
 
     Raises:
@@ -92,7 +91,7 @@ def revisit_order(options: RevisitOptions) -> DatasetOrder:
     )
     same = {
         each.name: getattr(options, each.name)
-        for each in fields(DatasetOrder)
+        for each in fields(GenerateOptions)
         if hasattr(options, each.name)
     }
     stated = {
@@ -100,7 +99,7 @@ def revisit_order(options: RevisitOptions) -> DatasetOrder:
         "revisits": os.path.realpath(options.dataset),
         "changes": {**options.changes, "revisit": settings_record(revisit)},
     }
-    return DatasetOrder(**{**same, **stated})
+    return GenerateOptions(**{**same, **stated})
 
 
 def _cameras(words: str, num_views: int) -> dict[str, Any]:

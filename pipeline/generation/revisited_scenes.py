@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.builds.revisit import RevisitSettings
-from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles
 from pipeline.generation.frozen_pool import ComposedScenes
 from pipeline.generation.render_sample import KeptPictures, RenderInput
+from pipeline.presets.revisit import RevisitSettings
+from pipeline.presets.settings import DatasetSettings
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
 from pipeline.scenes.scene_checks import require_valid
 from pipeline.scenes.views import ViewCamera, cameras_of, with_first_cameras
@@ -40,7 +40,7 @@ class RevisitedScenes:
     """Dataset digest of the finished dataset."""
     _checked: set[str] = field(default_factory=set, compare=False, repr=False)
 
-    def scene(self, index: int, attempt: int, settings: BuildSettings) -> RenderInput:
+    def scene(self, index: int, attempt: int, settings: DatasetSettings) -> RenderInput:
         """Return the scene of an index, which counts the scenes of the source shard by shard.
 
         Args:
@@ -83,7 +83,7 @@ class RevisitedScenes:
         require_digest(dataset, self.digest)
         return dataset
 
-    def _locate(self, index: int, settings: BuildSettings) -> tuple[ShardEntry, str]:
+    def _locate(self, index: int, settings: DatasetSettings) -> tuple[ShardEntry, str]:
         """Return the shard and key of a scene; a shard is hashed before its first scene is read."""
         starts = settings.splits.first_scenes
         row = int(np.searchsorted(starts, index, side="right")) - 1
@@ -105,7 +105,7 @@ class RevisitedScenes:
             origin["new_cameras"] = {"layout": layout, "seed": seed}
         return origin
 
-    def _pictures_stay(self, settings: BuildSettings) -> bool:
+    def _pictures_stay(self, settings: DatasetSettings) -> bool:
         """Return True if an equal scene and camera would give equal picture files."""
         was = self._source.manifest.settings
         now = settings.as_json()
@@ -132,7 +132,7 @@ def require_digest(dataset: FinishedDataset, digest: str) -> None:
         )
 
 
-def _redraw(scene: Scene, index: int, attempt: int, settings: BuildSettings) -> Scene:
+def _redraw(scene: Scene, index: int, attempt: int, settings: DatasetSettings) -> Scene:
     revisit = settings.revisit
     scene_key = SceneKey(settings.seed, index, attempt)
     assert revisit is not None

@@ -4,15 +4,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.builds.named import BUILDS, frozen_note, named_build, object_source
-from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles, SceneFolder, find_scene_files
 from pipeline.generation.accept_revisited import settings_for_revisit
 from pipeline.generation.accept_scene_files import settings_for_files
-from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.objects.sources import check_source
+from pipeline.presets.registry import DATASET_PRESETS, frozen_note, object_source, preset_settings
+from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.variant import Device, Variant, choose_variant, device_of
 from pipeline.renders.visible_gpus import gpu_memory_bytes, visible_gpus
 from storage.dataset.layout import DatasetFolder
@@ -40,10 +40,10 @@ _USED = 0.9
 class Run:
     """A dataset that has begun, with its objects frozen: the input of every later step."""
 
-    order: DatasetOrder
+    order: GenerateOptions
     """The command's options."""
-    settings: BuildSettings
-    """The build with the options' changes."""
+    settings: DatasetSettings
+    """The preset with the options' changes."""
     scene_folder: SceneFolder | None
     """The scene files, where scenes come from files."""
     publication: DatasetWriter
@@ -144,7 +144,7 @@ class ShardJob:
 
     folder: DatasetFolder
     """The dataset, at the same path on every machine."""
-    settings: BuildSettings
+    settings: DatasetSettings
     """Settings of the dataset, with all changes applied."""
     environment: Mapping[str, Any]
     """Environment of the dataset's first run, required of every worker; empty to accept any."""
@@ -205,14 +205,14 @@ Watcher = Callable[[Run, TaskResult], None]
 
 
 def resolve_settings(
-    order: DatasetOrder, folder: DatasetFolder
-) -> tuple[BuildSettings, SceneFolder | None]:
+    order: GenerateOptions, folder: DatasetFolder
+) -> tuple[DatasetSettings, SceneFolder | None]:
     """Return the dataset's settings, and the scene files if scenes come from files.
 
     Raises:
         TrilightError: the settings contradict each other, or the source or files are unusable.
     """
-    settings = named_build(
+    settings = preset_settings(
         order.build,
         seed=order.seed,
         resolution=order.resolution,
@@ -230,13 +230,13 @@ def resolve_settings(
     return settings_for_files(settings, listed, order.views), listed
 
 
-def choose_dataset_variant(order: DatasetOrder, folder: DatasetFolder) -> Variant:
+def choose_dataset_variant(order: GenerateOptions, folder: DatasetFolder) -> Variant:
     """Return the variant that renders a dataset.
 
     It is that of the device which the dataset was begun on, unless the options or TRILIGHT_VARIANT
-    name another one. A new dataset takes its build's device. Raises as `choose_variant`.
+    name another one. A new dataset takes its preset's device. Raises as `choose_variant`.
     """
-    default = BUILDS[order.build].device
+    default = DATASET_PRESETS[order.build].device
     device = order.device
     if folder.manifest.exists():
         default = device_of(read_head(folder.manifest).environment)

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from pipeline.assets.store import AssetStore
-from pipeline.builds.settings import BuildSettings
 from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, user_maps
 from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
 from pipeline.generation.revisited_scenes import RevisitedScenes, SceneOrigin
+from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.renderer import set_threads
 from pipeline.renders.variant import Variant, activate
 from pipeline.scenes.compose import compose_scene
@@ -32,7 +32,7 @@ MAX_ATTEMPTS = 16
 class SceneRecipe:
     """Configuration of a render child, sent once when it starts."""
 
-    settings: BuildSettings
+    settings: DatasetSettings
     """Settings of the dataset."""
     variant: Variant
     """Mitsuba variant and denoiser device."""

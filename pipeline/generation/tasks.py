@@ -15,10 +15,10 @@ from dataclasses import dataclass
 
 from pipeline.generation.run import Run, TaskResult
 from pipeline.generation.unfinished_shard import UnfinishedShard
-from storage.claims import WaitNotice
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure
+from storage.file_locks import WaitNotice
 
 MAX_TASKS = 1000
 """Most task runs of one flow run: Prefect's server accepts about 20 a second, of 19 kB each."""

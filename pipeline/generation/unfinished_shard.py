@@ -1,8 +1,8 @@
 """`UnfinishedShard`: the missing, claimed and staged scenes of a shard that several workers make.
 
 A finished scene waits in the staging folder until all scenes of its shard are there. A claim
-(storage.claims) marks a scene that a worker is making, or a shard that it is packing; it ends with
-the process that holds it, so that nothing has to be cleaned up after a kill.
+(storage.file_locks) marks a scene that a worker is making, or a shard that it is packing; it ends
+with the process that holds it, so that nothing has to be cleaned up after a kill.
 """
 
 import contextlib
@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline.shards.pack import pack_shard
-from storage.claims import hold_claim, is_claimed
 from storage.dataset.layout import DatasetFolder, numbered_path
 from storage.dataset.manifest import ShardEntry, read_head
 from storage.dataset.progress import count_given_up
@@ -20,6 +19,7 @@ from storage.dataset.scene_logs import log_scene
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, split_of_shard
 from storage.dataset.staging import is_staged, stage_scene
+from storage.file_locks import hold_lock, is_locked
 from storage.records.objects import Failure
 from storage.records.profiles import Profile
 from storage.records.sample import Sample, sample_key
@@ -49,7 +49,7 @@ class UnfinishedShard:
         if self._is_done(scene_index):
             yield False
             return
-        with hold_claim(self._claim(scene_index)) as ours:
+        with hold_lock(self._claim(scene_index)) as ours:
             yield ours and not self._is_done(scene_index)  # finished meanwhile
 
     def stage(
@@ -92,7 +92,7 @@ class UnfinishedShard:
         if self._is_packed() or not all(is_staged(self._staged, index) for index in scenes):
             return None
         with contextlib.ExitStack() as stack:
-            if not stack.enter_context(hold_claim(self._packing)):
+            if not stack.enter_context(hold_lock(self._packing)):
                 return None
             if grows or scenes != scenes_of_shard(self._index, self._splits):
                 stack.enter_context(self._folder.mutex("manifest"))  # no plan changes meanwhile
@@ -111,7 +111,7 @@ class UnfinishedShard:
         claims = self.missing_claims()
         if self._is_packed():  # checked last: packing empties the staging folder
             return False
-        return not all(map(is_claimed, claims))
+        return not all(map(is_locked, claims))
 
     def missing_claims(self) -> list[Path]:
         """Return the claim files of the missing scenes; without any, the one of the packing."""

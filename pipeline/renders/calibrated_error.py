@@ -28,7 +28,7 @@ from pipeline.renders.denoise_corrections import (
 )
 from pipeline.renders.noise_floor import BLOCK_PX, ErrorMeasures, MeasuredFloor
 from pipeline.renders.samples import DualBuffer
-from pipeline.renders.settings import PASS_SPP, RenderSettings
+from pipeline.renders.settings import FIRST_SPP, PASS_SPP, RenderSettings
 from pipeline.renders.stopping import gaps_db
 from pipeline.renders.tiles import TILE_PX
 from storage.digests import canonical_json, sha256_hex
@@ -188,14 +188,31 @@ def statement_for(settings: RenderSettings, samples: DualBuffer) -> CalibratedSt
     The bound states pictures that were not calibrated: of lights or layers apart, with another
     denoiser, with guided paths, of more or fewer samples, or of other widths.
     """
-    if settings.stated_error == "bound":
+    statement = _statement_of(settings)
+    if statement is None or samples.is_guided:
         return None
-    is_plain = not settings.per_light and not settings.part_names and not samples.is_guided
-    statement = load_statement()
-    if statement is None or not is_plain or settings.denoiser != "high":
+    least, most = statement.spp
+    return statement if least <= samples.spp <= most else None
+
+
+def first_spp(settings: RenderSettings) -> int:
+    """Return the samples per pixel of the first measurement.
+
+    A bound that takes the place of a calibrated statement is measured after FIRST_SPP or more.
+    """
+    is_other = settings.stated_error == "calibrated" and _statement_of(settings) is None
+    spp = max(settings.first_spp, FIRST_SPP) if is_other else settings.first_spp
+    return min(spp, settings.max_spp)
+
+
+def _statement_of(settings: RenderSettings) -> CalibratedStatement | None:
+    """Return what states errors of pictures with these settings, within its range of samples."""
+    is_plain = not settings.per_light and not settings.part_names and settings.denoiser == "high"
+    statement = load_statement() if is_plain and settings.stated_error == "calibrated" else None
+    if statement is None:
         return None
-    ranges = (statement.spp, samples.spp), (statement.widths, settings.resolution)
-    return statement if all(low <= value <= high for (low, high), value in ranges) else None
+    narrowest, widest = statement.widths
+    return statement if narrowest <= settings.resolution <= widest else None
 
 
 def is_far(bound: MeasuredFloor, settings: RenderSettings, spp: int) -> bool:

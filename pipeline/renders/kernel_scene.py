@@ -1,4 +1,4 @@
-"""One scene as kernels see it, and the surface code that both kinds of paths share."""
+"""One scene as Mitsuba and our kernels see it, and the surface code that all paths share."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -53,9 +53,9 @@ class KernelScene:
         surfaces, emitters = split_triangles(scene)
         order = np.concatenate([surfaces, emitters])
         sky = shining_sky(scene)
-        self.surfaces = load_triangles(scene, surfaces)
+        self.surfaces = build_mitsuba_scene(scene, surfaces)
         """mi.Scene without emitters: what camera rays meet."""
-        self.everything = load_triangles(scene, order, child=self.surfaces)
+        self.everything = build_mitsuba_scene(scene, order, child=self.surfaces)
         """mi.Scene with emitters: what all other rays meet."""
         self.table = surface_table(scene, order)
         self.emitters = EmitterTable(scene, emitters, may_be_dark=sky is not None)
@@ -75,8 +75,10 @@ class KernelScene:
         return pdf if self.sky is None else self.sky.of_lamps(pdf)
 
 
-def build_mesh(name: str, counts: tuple[int, int], properties: Any = None, **fields: Any) -> Any:
-    """Return a mi.Mesh; nothing else knows its constructor, which Mitsuba 3.10 changes.
+def build_mitsuba_mesh(
+    name: str, counts: tuple[int, int], properties: Any = None, **fields: Any
+) -> Any:
+    """Return a Mitsuba mesh; nothing else knows its constructor, which Mitsuba 3.10 changes.
 
     Args:
         name: of the mesh.
@@ -99,14 +101,14 @@ def build_mesh(name: str, counts: tuple[int, int], properties: Any = None, **fie
     return mesh
 
 
-def load_triangles(scene: Scene, triangles: NDArray[np.intp], child: Any = None) -> Any:
-    """Return a mi.Scene of one mesh, whose triangle numbers are positions in `triangles`.
+def build_mitsuba_scene(scene: Scene, triangles: NDArray[np.intp], child: Any = None) -> Any:
+    """Return a Mitsuba scene of one mesh, whose triangle numbers are positions in `triangles`.
 
     One kernel may trace rays into this scene and into `child`. On a GPU all rays of a
     kernel use one OptiX shader binding table, and miss whatever is in another table. A scene that
     has another scene as a child shares its table.
     """
-    mesh = build_mesh(
+    mesh = build_mitsuba_mesh(
         "triangles",
         (len(scene.vertex_positions), len(triangles)),
         faces=own_integers(scene.faces[triangles]),

@@ -14,6 +14,7 @@ from typing import Annotated, Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.renders.calibrated_error import first_spp
 from pipeline.renders.camera import PixelCamera
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer, representable, require_surfaces
@@ -266,7 +267,7 @@ class ProgressiveRenderer:
             preview = run_to_end(steps)
             yield GrowingPicture(
                 spp=preview.spp,
-                expected_spp=self._settings.first_spp,
+                expected_spp=first_spp(self._settings),
                 missing_db=None,
                 radiance_rgb=preview.radiance_rgb,
                 floor=None,

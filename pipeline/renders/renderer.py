@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.renders.calibrated_error import first_spp
 from pipeline.renders.camera import PixelCamera
 from pipeline.renders.frozen_arithmetic.host_pictures import HostPictures
 from pipeline.renders.load_tracer import load_tracer
@@ -135,7 +136,7 @@ class SceneRenderer:
         settings = self._settings
         self._began_s = time.process_time()
         camera = self._camera(c2w, fov_deg)
-        settled = settings.first_spp
+        settled = first_spp(settings)
         samples = DualBuffer(
             self._tracers,
             camera,

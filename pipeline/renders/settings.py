@@ -69,7 +69,7 @@ _LATER = {
     "stated_error": "bound",
     "picture_within_db": None,
 }
-"""Settings that no record holds at these values, so that digests of earlier builds stay."""
+"""Settings that no record holds at these values, so that digests of earlier presets stay."""
 
 Samples = Annotated[int, Within(2 * PASS_SPP[-1], MAX_SPP, unit="samples")]
 """Of both halves of a picture together, per pixel."""
@@ -80,7 +80,7 @@ Depth = Annotated[int, Within(1, 1024, unit="edges")]
 
 @checked("render settings")
 class RenderSettings:
-    """The target, the budget and the estimator of every picture of a build."""
+    """The target, the budget and the estimator of every picture of a preset."""
 
     resolution: Resolution
     """Width and height in pixels, a multiple of 8 up to MAX_RESOLUTION."""
@@ -130,7 +130,7 @@ class RenderSettings:
     min_spp_px: Resolution = 128
     """Width in pixels from which `min_spp` samples of each tell the error of a picture."""
     light_paths: LightPaths = "view"
-    """`scene` traces the light paths of a build once for all views of a scene: their errors go
+    """`scene` traces the light paths of a preset once for all views of a scene: their errors go
     together, and each alone is what it was."""
     arithmetic: Arithmetic = "numpy"
     """Where means, corrections and stated errors are worked out: `device` keeps pictures where they

@@ -17,7 +17,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.shards.pack import unpack_shard
-from storage.claims import hold_claim
 from storage.dataset.dataset import DatasetFiles, RemoteDatasetFiles, read_beside
 from storage.dataset.layout import DatasetFolder, place_of_part, shard_names_in, shard_names_in_part
 from storage.dataset.manifest import (
@@ -41,6 +40,7 @@ from storage.dataset.shard_notes import (
     noted_shard,
 )
 from storage.errors import TrilightError
+from storage.file_locks import hold_lock
 from storage.remote.cache import shard_cache
 from storage.remote.store import Store
 
@@ -135,7 +135,7 @@ class PublishedShards:
     def _send(self, name: str) -> ShardNote | None:
         folder = self._folder
         path = folder.shard(name)
-        with hold_claim(folder.staging / "sending" / f"{name}.claim") as ours:
+        with hold_lock(folder.staging / "sending" / f"{name}.claim") as ours:
             head = read_head(folder.manifest)
             if not ours or not path.exists() or name in head.growing:
                 return None
@@ -172,7 +172,7 @@ class PublishedShards:
         if theirs and (theirs.scenes is None or theirs.scenes >= (made.scenes or MOST_SCENES)):
             note_shard(folder, theirs)
             return theirs
-        with self._store.hold_claim(note) if theirs else contextlib.nullcontext(True) as ours:
+        with self._store.hold_lock(note) if theirs else contextlib.nullcontext(True) as ours:
             if theirs and not (ours and self._read_note(name) in (theirs, None)):
                 return None
             if theirs:

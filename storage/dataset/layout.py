@@ -21,9 +21,9 @@ from typing import Any
 
 from storage.atomic import remove_leftovers
 from storage.cache import cache_folder
-from storage.claims import hold_claim, open_lock, take_lock
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from storage.file_locks import hold_lock, open_lock, take_lock
 from storage.remote.safe_url import printable, safe_url
 from storage.remote.store import WRITABLE, BucketStore, LocalStore, Store
 from storage.remote.url import RemoteUrl, parse_url
@@ -188,13 +188,13 @@ class DatasetFolder:
         return sorted(self.root / name for name in shard_names_in(self.root))
 
     @contextlib.contextmanager
-    def hold_exclusively(self) -> Iterator[None]:
-        """Hold the folder exclusively; the lock ends with the process that holds it.
+    def hold_exclusive_lock(self) -> Iterator[None]:
+        """Hold the folder's lock exclusively; it ends with the process that holds it.
 
         Raises:
             TrilightError: the folder cannot be written, or another process is at work in it.
         """
-        with hold_claim(self._lock) as ours:
+        with hold_lock(self._lock) as ours:
             if not ours:
                 raise TrilightError(
                     f"{self.root}: another process is making this dataset. Wait for it, or choose "
@@ -203,8 +203,8 @@ class DatasetFolder:
             yield
 
     @contextlib.contextmanager
-    def hold_membership(self, when_alone: Callable[[], None] = lambda: None) -> Iterator[None]:
-        """Join the workers that make the dataset.
+    def hold_shared_lock(self, when_alone: Callable[[], None] = lambda: None) -> Iterator[None]:
+        """Hold the lock that the workers of a dataset share.
 
         A worker that is alone at first removes what killed writers left more than an hour ago,
         unless another one has looked within that hour: to look costs the whole set.
@@ -246,7 +246,7 @@ class DatasetFolder:
 
     def mutex(self, what: str) -> "contextlib.AbstractContextManager[bool]":
         """Hold the lock of a step that one worker does at a time, such as `manifest`."""
-        return hold_claim(self.staging / "turns" / what, wait=True)
+        return hold_lock(self.staging / "turns" / what, wait=True)
 
 
 _ADMITTED = f"expected a folder, or a URL of {' or '.join(WRITABLE)}"

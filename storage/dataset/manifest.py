@@ -73,7 +73,7 @@ class _Fields:
     build: ShortText
     """Name of the dataset preset."""
     settings: Annotated[Mapping[str, Any], FINITE]
-    """All settings of the build; a dataset keeps them for life."""
+    """All settings of the preset; a dataset keeps them for life."""
     environment: Annotated[Mapping[str, Any], FINITE]
     """Inputs of the bytes other than settings: variant, processor, library versions."""
     num_scenes: Scenes

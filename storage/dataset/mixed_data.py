@@ -81,7 +81,7 @@ def _mix_split(opened: Sequence[TrainingData], split: str) -> MixedShards | None
     having = [row for row, each in enumerate(opened) if split in each.splits]
     if not having:
         return None
-    # by number too, since folders may have one name and datasets one build
+    # by number too, since folders may have one name and datasets one preset
     return MixedShards({f"dataset {row + 1}": opened[row].split(split) for row in having})
 
 

@@ -192,8 +192,8 @@ def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
     return listed
 
 
-def unfinished_shards(url: str, num_scenes: int = 0) -> list[int]:
-    """Return the indices of the shards that are not there, of a dataset that is begun.
+def missing_shards(url: str, num_scenes: int = 0) -> list[int]:
+    """Return the indices of the shards that a dataset of any folder or URL lacks.
 
     Of more scenes than were planned so far, also what those need.
 

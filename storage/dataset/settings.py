@@ -88,5 +88,5 @@ class StorageSettings:
 
 
 def _without_empty(record: Mapping[str, Any], field: str) -> dict[str, Any]:
-    """Leave a later field out where it holds nothing: digests of earlier builds stay."""
+    """Leave a later field out where it holds nothing: digests of earlier presets stay."""
     return {name: value for name, value in record.items() if name != field or value}

@@ -27,9 +27,7 @@ Place = TypeVar("Place")
 
 
 def write_shard(path: Path, samples: Iterable[tuple[str, Mapping[str, bytes]]]) -> None:
-    """Write samples, given as (key, members by suffix) in order of keys, as one tar file.
-
-    The layout is that of WebDataset's ShardWriter.
+    """Write samples, (key, members by suffix) in order of keys, as one WebDataset tar file.
 
     Equal samples give equal bytes. The file appears under its name only when it is complete, and
     never in the place of another: the first writer of a shard wins.

@@ -45,7 +45,7 @@ class TrainingData:
     num_views: int | None
     """Pictures per scene, where a manifest says it."""
     build: str | None = None
-    """Name of the build, where a manifest says it."""
+    """Name of the preset, where a manifest says it."""
     max_triangles: int | None = None
     """Most triangles of a scene, where a manifest says it."""
     notes: tuple[str, ...] = ()

@@ -122,14 +122,14 @@ class Sample(SceneRecord):
     lights_rgb: NDArray[np.float32] | None = None
     """[C, L, R, R, 3] radiance of each emitter object alone, in the order of `scene.objects`, and
     last of a sky that shines; their sum is the picture (storage.records.lights). None where the
-    build keeps lights together."""
+    preset keeps lights together."""
     parts_rgb: Parts | None = None
     """[C, R, R, 3] radiance of each part by its name, or [C, L, R, R, 3] where lights are apart;
-    their sum is the picture, or that of the light (storage.records.parts). None where the build
+    their sum is the picture, or that of the light (storage.records.parts). None where the preset
     keeps all light together."""
     passes_exr: tuple[bytes, ...] | None = None
-    """OpenEXR files of the passes that the build stores, one per camera; `view_passes` reads them.
-    None where the build stores none."""
+    """OpenEXR files of the passes that the preset stores, one per camera; `view_passes` reads them.
+    None where the preset stores none."""
     kept_members: Mapping[str, bytes] = dataclasses.field(default_factory=dict)
     """Packed pictures by suffix that stay as another dataset has them, byte for byte."""
 

@@ -13,9 +13,9 @@ from typing import BinaryIO
 
 from storage.atomic import TEMPORARY_SUFFIX, atomic_writer
 from storage.cache import cache_folder
-from storage.claims import hold_claim, take_lock
 from storage.digests import canonical_json, sha256_hex, sha256_of_file
 from storage.errors import TrilightError
+from storage.file_locks import hold_lock, take_lock
 from storage.remote.fetch import download, facts_of, unreadable
 from storage.remote.tries import TransferFailed
 from storage.remote.url import RemoteUrl
@@ -62,7 +62,7 @@ class ShardCache:
             while True:
                 if (stream := _open_shared(path)) is not None:
                     return stream
-                with hold_claim(self._lock_of(path), wait=True):
+                with hold_lock(self._lock_of(path), wait=True):
                     if not path.exists():
                         self._fetch(url, path, num_bytes, sha256)
         except TransferFailed as error:

@@ -6,8 +6,8 @@ of an upload that was cut off are invisible, and a rule of the bucket may delete
 (AbortIncompleteMultipartUpload). "Only once" is a condition that its server itself checks.
 
 Claims only avoid that work is done twice. In a folder a claim is a lock, which ends with its holder
-(storage.claims). A bucket does not see that a machine dies: there a claim is a file, and one that a
-worker has seen for `LEASE_S` counts as that of a dead machine; the next one may then be made.
+(storage.file_locks). A bucket does not see that a machine dies: there a claim is a file, and one
+that a worker has seen for `LEASE_S` counts as a dead machine's; the next one may then be made.
 """
 
 import contextlib
@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import Any
 
 from storage.atomic import atomic_writer, write_atomically
-from storage.claims import hold_claim
 from storage.errors import EnvironmentFailure, TrilightError
+from storage.file_locks import hold_lock
 from storage.remote.fetch import fetch_if_there
 from storage.remote.tries import TransferFailed, is_missing, is_taken, may_pass, with_tries
 from storage.remote.url import RemoteUrl, shared_driver
@@ -80,7 +80,7 @@ class Store(ABC):
         """Return the names of the files in one folder; as `get` raises."""
 
     @abstractmethod
-    def hold_claim(self, name: str) -> contextlib.AbstractContextManager[bool]:
+    def hold_lock(self, name: str) -> contextlib.AbstractContextManager[bool]:
         """Hold the claim on a file for the block; yield whether it is ours; as `put` raises."""
 
     @abstractmethod
@@ -135,8 +135,8 @@ class LocalStore(Store):
             return {f"{place}/{name}" if place else name for name in names}
         return set()
 
-    def hold_claim(self, name: str) -> contextlib.AbstractContextManager[bool]:
-        return hold_claim(claim_of(self.root / name))
+    def hold_lock(self, name: str) -> contextlib.AbstractContextManager[bool]:
+        return hold_lock(claim_of(self.root / name))
 
     def require_create(self) -> None:
         """Pass: storage.atomic sees to it."""
@@ -222,9 +222,9 @@ class BucketStore(Store):
         return {path.removeprefix(f"{root}/") for path in paths if path.startswith(f"{root}/")}
 
     @contextlib.contextmanager
-    def hold_claim(self, name: str) -> Iterator[bool]:
+    def hold_lock(self, name: str) -> Iterator[bool]:
         assert self._work is not None
-        with hold_claim(claim_of(self._work / name)) as ours_here:  # one process of this machine
+        with hold_lock(claim_of(self._work / name)) as ours_here:  # one process of this machine
             claim = self._create_claim(name) if ours_here else None
             try:
                 yield claim is not None
@@ -251,7 +251,7 @@ class BucketStore(Store):
     def _worker(self) -> bytes:
         assert self._work is not None
         path = self._work / ".staging" / "worker"
-        with hold_claim(claim_of(path), wait=True):  # other processes are the same worker
+        with hold_lock(claim_of(path), wait=True):  # other processes are the same worker
             if not path.exists():
                 write_atomically(path, uuid.uuid4().hex.encode())
         return path.read_bytes()

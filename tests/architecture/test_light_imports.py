@@ -20,7 +20,7 @@ STEPS = (
         "trilight.pictures, trilight.scenes",
         HEAVY,
     ),
-    ("import pipeline.builds.named", HEAVY),
+    ("import pipeline.presets.registry", HEAVY),
     ("import infra.cli.app", {"torch", "mitsuba", "prefect", "pymeshlab"}),
     # a worker may have only what making data needs, and a wrong form need not wait for torch
     ("import infra.serving.train_model", {"torch"}),
@@ -86,6 +86,6 @@ sys.meta_path.insert(0, Finder())
 def test_what_streams_shards_needs_no_checker_of_settings() -> None:
     """Workers start often, and only read: nobody sets anything there."""
     reading = "import storage.dataset.training_data, storage.records.sample"
-    _, read, streamed = _loaded_after(HOLLOW_TORCH, reading, "import train.data.stream")
+    _, read, streamed = _loaded_after(HOLLOW_TORCH, reading, "import train.data.loader")
     assert not read & (CHECKERS | HEAVY)
     assert "torch" in streamed and not streamed & CHECKERS

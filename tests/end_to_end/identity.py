@@ -21,14 +21,14 @@ from model.neural_renderer import NeuralRenderer
 from model.open import BUILTIN, BUILTIN_NETWORKS
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
-from pipeline.builds.named import BUILDS, named_build
-from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.usd.write import write_usd
 from pipeline.generation.environment import vector_extension
 from pipeline.generation.prepare_isolated import asset_store, prepare_isolated
 from pipeline.generation.scene_worker import MAX_ATTEMPTS
 from pipeline.objects.generated import generate_objects
 from pipeline.objects.local.folder import list_folder
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings
+from pipeline.presets.settings import DatasetSettings
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
 from storage.dataset.dataset import open_dataset
@@ -59,12 +59,12 @@ SETS = {
 
 def settings_digests() -> dict[str, str]:
     """Return the digest of every preset's settings."""
-    return {name: named_build(name).digest for name in BUILDS}
+    return {name: preset_settings(name).digest for name in DATASET_PRESETS}
 
 
 def benchmark_digests() -> dict[str, str]:
     """Return the scene digests of the benchmarks, as composed here."""
-    full = BUILDS["benchmark-v1"]
+    full = DATASET_PRESETS["benchmark-v1"]
     settings = full.settings()
     members = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -72,11 +72,11 @@ def benchmark_digests() -> dict[str, str]:
         for scene_index in range(full.num_scenes):
             arrays = encode_arrays(_composed(settings, pool, scene_index))
             members[f"{sample_key(scene_index)}.scene.safetensors"] = sha256_hex(arrays)
-    mini = dict(list(members.items())[: BUILDS["benchmark-v1-mini"].num_scenes])
+    mini = dict(list(members.items())[: DATASET_PRESETS["benchmark-v1-mini"].num_scenes])
     return {"whole": digest_of_scenes(members), "mini": digest_of_scenes(mini)}
 
 
-def _pool(settings: BuildSettings, folder: Path) -> list[PooledAsset]:
+def _pool(settings: DatasetSettings, folder: Path) -> list[PooledAsset]:
     records = generate_objects(str(settings.source), folder)
     prepared, rejected = prepare_isolated(records, settings.assets, workers=2, done=lambda: None)
     assert not rejected
@@ -90,7 +90,7 @@ def _pool(settings: BuildSettings, folder: Path) -> list[PooledAsset]:
     return sorted(pool, key=lambda entry: entry.locked.uid)
 
 
-def _composed(settings: BuildSettings, pool: list[PooledAsset], scene_index: int) -> Scene:
+def _composed(settings: DatasetSettings, pool: list[PooledAsset], scene_index: int) -> Scene:
     for attempt in range(MAX_ATTEMPTS):
         try:
             return compose_scene(

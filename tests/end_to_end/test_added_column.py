@@ -38,11 +38,11 @@ from tests.train.kit import TINY_MODEL, tiny_run, trained
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.augment import permute_channels, scale_light
 from train.data.bad_samples import BadSampleCounter
+from train.data.loader import load_batches
 from train.data.order import RankSlice
 from train.data.scenes import training_scene
-from train.data.stream import stream_batches
 from train.loop.state import new_state
-from train.run import stream_settings
+from train.run import loader_settings
 from train.settings import TrainSettings
 
 SETTINGS = SceneSettings(families=DEFAULT_FAMILIES, num_views=2, max_triangles=600)
@@ -109,8 +109,8 @@ def test_a_draw_outside_of_the_range_is_named(number: float) -> None:
 
 
 def test_the_stream_shows_what_was_composed(data: Dataset) -> None:
-    settings = dataclasses.replace(stream_settings(coated_run()), batch_size=4)
-    batches = stream_batches(
+    settings = dataclasses.replace(loader_settings(coated_run()), batch_size=4)
+    batches = load_batches(
         open_training_data([str(data.folder.root)]).split("train"),
         settings,
         0,

@@ -13,18 +13,18 @@ import pytest
 
 from infra.cli.extend_option import load_extensions
 from model.config import SIZES, ModelConfig
-from pipeline.builds.named import BUILDS, named_build, typed_build
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.executors.registry import EXECUTORS
 from pipeline.objects.sources import check_source, find_objects
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings, resolve_dataset_preset
 from scene_templates.skies.draw import draw_sky
 from scene_templates.textures import draw_look
 from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
 from storage.records.scene_file import decode_scene_file, encode_scene
 from storage.seeds import rng_for
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 from tests.end_to_end.conftest import Trilight
 from tests.end_to_end.production_kit import FEW_SAMPLES
 from tests.extensions_kit import EXAMPLES, loaded, room_for_extensions
@@ -32,7 +32,7 @@ from tests.for_each import for_each
 from tests.scene_templates.balls import one_drawn
 from tests.scenes_by_hand import tiny_scene
 from train.evaluation.metrics import METRICS, picture_scores
-from train.runs import changed_run, typed_run
+from train.presets import override_training_preset, resolve_training_preset
 
 FILES = sorted(path.name for path in EXAMPLES.glob("*.py"))
 
@@ -56,20 +56,20 @@ def test_an_example_is_short_and_shows_its_command(name: str) -> None:
 
 def test_a_template_and_a_family_make_scenes(copied: Callable[[str], Path]) -> None:
     with loaded(copied("template.py")):
-        settings = named_build("smoke", changes={"scenes.families": "corridor"}).scenes
+        settings = preset_settings("smoke", changes={"scenes.families": "corridor"}).scenes
         layouts = [one_drawn(settings, index).layout for index in range(8)]
     assert {tuple(part.name for part in layout.shell) for layout in layouts} == {
         ("floor", "wall1", "wall2")
     }
     with loaded(copied("family.py")):
-        settings = named_build("smoke", changes={"scenes.families": "crowd"}).scenes
+        settings = preset_settings("smoke", changes={"scenes.families": "crowd"}).scenes
         assert 5 <= len(one_drawn(settings, 0).layout.objects) <= 8
 
 
 def test_a_surface_repeats_and_lies_in_scenes(copied: Callable[[str], Path]) -> None:
     with loaded(copied("surface.py")):
         changes = {"scenes.textures.surfaces.families": ["polka_dots"], "scenes.textures.share": 1}
-        settings = named_build("smoke", changes=changes).scenes.textures
+        settings = preset_settings("smoke", changes=changes).scenes.textures
         look = draw_look(rng_for(0, "look"), settings)
     assert look is not None and look.maps.family == "polka_dots"
     diffuse = look.maps.diffuse_rgb
@@ -81,7 +81,9 @@ def test_a_surface_repeats_and_lies_in_scenes(copied: Callable[[str], Path]) -> 
 def test_a_sky_is_drawn(copied: Callable[[str], Path]) -> None:
     with loaded(copied("sky.py")):
         changes = {"scenes.skies.maps.families": ["ring"], "scenes.skies.maps.height": 16}
-        sky = draw_sky(rng_for(0, "sky"), named_build("smoke", changes=changes).scenes.skies.maps)
+        sky = draw_sky(
+            rng_for(0, "sky"), preset_settings("smoke", changes=changes).scenes.skies.maps
+        )
     assert sky.family == "ring" and "height of the ring" in "".join(sky.parameters)
     rows = sky.radiance_rgb.mean(axis=(1, 2))
     assert np.unravel_index(rows.argmax(), rows.shape)[0] <= 8 and rows.min() > 0
@@ -99,14 +101,18 @@ def test_a_material_column_is_drawn_and_stored(copied: Callable[[str], Path]) ->
         decode_scene_file(stored, "scene")
 
 
-def test_a_build_and_a_run_of_a_file(copied: Callable[[str], Path]) -> None:
+def test_a_dataset_preset_and_a_training_preset_of_a_file(copied: Callable[[str], Path]) -> None:
     with room_for_extensions():
-        build = typed_build(f"{copied('build.py')}:sunsets")
-        settings = named_build(build, seed=3)
-        assert (settings.build, settings.seed, BUILDS[build].num_scenes) == ("sunsets", 3, 32)
+        build = resolve_dataset_preset(f"{copied('dataset_preset.py')}:sunsets")
+        settings = preset_settings(build, seed=3)
+        assert (settings.build, settings.seed, DATASET_PRESETS[build].num_scenes) == (
+            "sunsets",
+            3,
+            32,
+        )
         assert settings.scenes.lights.count == (1, 2)
-        run = typed_run(f"{copied('run.py')}:quick_lights")
-        assert changed_run(run, {"seed": 4}, steps=60).warmup_steps == 10
+        run = resolve_training_preset(f"{copied('training_preset.py')}:quick_lights")
+        assert override_training_preset(run, {"seed": 4}, steps=60).warmup_steps == 10
 
 
 def test_a_source_lists_objects(
@@ -160,9 +166,9 @@ def test_a_format_carries_a_scene_and_says_what_it_lost(
 
 def test_a_size_is_a_setting(copied: Callable[[str], Path]) -> None:
     with loaded(copied("model_size.py")):
-        run = changed_run("smoke", {"model": "nano", "model.num_registers": 3})
+        run = override_training_preset("smoke", {"model": "nano", "model.num_registers": 3})
         assert (run.model.width, run.model.num_registers) == (72, 3)
-        assert SIZES["nano"]() == changed(run, {"model.num_registers": 2}).model
+        assert SIZES["nano"]() == apply_overrides(run, {"model.num_registers": 2}).model
     assert "nano" not in ModelConfig.PRESETS
 
 
@@ -225,7 +231,7 @@ def test_data_of_one_s_own_files_by_the_real_command(
 def test_a_run_of_one_s_own_file_by_the_real_command(
     copied: Callable[[str], Path], trilight: Trilight, tmp_path: Path
 ) -> None:
-    path, build = copied("run.py"), copied("build.py")
+    path, build = copied("training_preset.py"), copied("dataset_preset.py")
     trilight("generate", f"{build.name}:sunsets", *TINY, "--out", "d")
     quick = ("--set", "resolution=32", "--set", "views_per_scene=1", "--data", "d", "--out", "r")
     train = ("train", f"{path.name}:quick_lights", "--steps", "4", *quick)
@@ -234,5 +240,5 @@ def test_a_run_of_one_s_own_file_by_the_real_command(
     with path.open("a") as file:
         file.write("# changed\n")
     refused = trilight(*train, "--resume", status=1)
-    assert "was begun with another extension run.py" in refused.stderr
+    assert "was begun with another extension training_preset.py" in refused.stderr
     trilight("model", "r")  # the network itself asks for no file

@@ -34,7 +34,7 @@ def test_real_objects_with_their_licences(trilight: Trilight, shared: Path, tmp_
 
 
 BAD_INPUT = [
-    (("generate", "nonsense"), "build 'nonsense' is unknown; expected one of tiny, smoke"),
+    (("generate", "nonsense"), "dataset preset 'nonsense' is unknown; expected one of tiny, smoke"),
     (("generate", "smoke", "--objects", "nowhere"), "nowhere"),
     (("generate", "smoke", "--objects", "broken"), "none was accepted"),
     (("generate", "smoke", "--objects", "twice"), "objects.jsonl:2: uid 'a' is already used"),

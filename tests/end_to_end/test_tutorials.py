@@ -17,7 +17,7 @@ import pytest
 
 from infra.viewer.deferred_handlers import page_of
 from infra.viewer.open_source import open_handlers
-from pipeline.builds.named import named_build
+from pipeline.presets.registry import preset_settings
 from storage.digests import sha256_of_file
 from storage.records.objects import write_objects_lock
 from storage.records.scene import Scene
@@ -29,7 +29,7 @@ from tests.train.toy import toy_scene, write_toy_dataset
 
 PX = 16
 """Width of the toys' pictures, where the pages have 64."""
-SMOKE = named_build("smoke").as_json()
+SMOKE = preset_settings("smoke").as_json()
 RENDERS = SMOKE["renders"]
 SMALL = ["--set", "resolution=16", "--set", "views_per_scene=2"]
 """Of trainings."""

@@ -17,9 +17,9 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from infra.bench.workloads.cost_scene import cost_scene
-from pipeline.builds.named import named_build
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
+from pipeline.presets.registry import preset_settings
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_exr
@@ -340,7 +340,7 @@ def test_numbers_of_json_come_back_digit_by_digit_and_none_that_is_no_number(
     assert json.dumps(dict(back), sort_keys=True) == json.dumps(NUMBERS, sort_keys=True)
     for suffix in (".usda", ".usdc"):
         assert_usd_keeps_all(scene, tmp_path, suffix)
-    build = named_build("smoke", seed=2**256 - 1)
+    build = preset_settings("smoke", seed=2**256 - 1)
     assert json.loads(json.dumps(build.as_json()))["seed"] == 2**256 - 1
     sample = dataclasses.replace(tiny_sample(), scene=tiny_scene(provenance={"value": math.nan}))
     with pytest.raises(ValueError, match="JSON compliant"):

@@ -41,8 +41,8 @@ from storage.dataset.settings import MOST_SCENES, SplitSettings
 from storage.dataset.splits import MOST_SHARDS, scenes_of_shard, shard_name, shards_for
 from storage.errors import Rejected, TrilightError
 from storage.seeds import SceneKey
-from storage.settings.changes import changed
 from storage.settings.fields import FieldDescription
+from storage.settings.overrides import apply_overrides
 from tests.extremes.test_ranges import FIELDS, SMOKE, End
 from tests.extremes.test_scenes import require_laws
 from tests.for_each import case, for_each
@@ -131,7 +131,7 @@ def _require_scene_or_reason(
 ) -> None:
     blind = {} if name.startswith("views.") else BLIND
     beside = BESIDE.get((name, end), {})
-    wanted = changed(ONE_FAMILY, {**blind, **beside, name: _value(field, end)})
+    wanted = apply_overrides(ONE_FAMILY, {**blind, **beside, name: _value(field, end)})
     with case((name, end)):
         try:
             scene = compose_scene(wanted, pool, SceneKey(0, 0))
@@ -160,7 +160,7 @@ def test_scenes_at_several_ends_keep_their_laws_or_have_a_reason(
     fields = dict(SCENE_FIELDS)
     changes = {name: _value(fields[name], end) for name, end in ends.items()}
     try:
-        wanted = changed(ONE_FAMILY, {"num_views": 1, **changes})
+        wanted = apply_overrides(ONE_FAMILY, {"num_views": 1, **changes})
     except TrilightError:
         reject()  # laws between fields
     try:

@@ -22,12 +22,12 @@ from infra.setup.settings_page import ROOTS, reachable
 from model.base_widths import BaseWidths
 from model.config import ModelConfig, smoke, tiny
 from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSettings
-from pipeline.builds.named import named_build
-from pipeline.builds.revisit import GivenCamera, RevisitSettings
-from pipeline.builds.settings import BuildSettings
 from pipeline.flows.forms import DatasetInRuns
 from pipeline.generation.price import CorePrice
 from pipeline.generation.revisit_options import RevisitOptions
+from pipeline.presets.registry import preset_settings
+from pipeline.presets.revisit import GivenCamera, RevisitSettings
+from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.settings import MAX_SPP, RenderSettings
 from scene_templates.cameras import CameraSettings
 from scene_templates.families import Family
@@ -58,7 +58,7 @@ from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import bumpy_scene
 from train.evaluation.options import EvaluationOptions, LeaderboardOptions
 from train.monitoring.settings import WatchSettings
-from train.runs import named_run
+from train.presets import training_preset
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
 
 End = Literal["low", "high"]
@@ -69,12 +69,12 @@ ASKED = RenderOptions(
     tone_map="plain", exposure_ev=0.0, precision="float32", lights_per_pass=8,
     seed=0, threads=None,
 )  # fmt: skip
-SMOKE = named_build("smoke")
-RUN = named_run("smoke")
+SMOKE = preset_settings("smoke")
+RUN = training_preset("smoke")
 
 EXAMPLES: dict[type, Any] = {
     DatasetInRuns: DatasetInRuns(),
-    BuildSettings: SMOKE,
+    DatasetSettings: SMOKE,
     AssetSettings: SMOKE.assets,
     GateSettings: SMOKE.assets.gate,
     OwnMaterialSettings: SMOKE.assets.own_materials,
@@ -270,8 +270,8 @@ def test_no_number_is_without_a_range() -> None:
 
 
 INTERNAL = {
-    "StreamSettings": "made of TrainSettings",
-    "OrderSettings": "made of StreamSettings",
+    "LoaderSettings": "made of TrainSettings",
+    "OrderSettings": "made of LoaderSettings",
     "PublishedConfig": "a ModelConfig, and one number that the published code fixes",
     "PreviewSettings": "made of RenderOptions",
     "StorageSettings": "has no number",
@@ -282,7 +282,7 @@ INTERNAL = {
 
 
 def _is_settings(name: str) -> bool:
-    return name.endswith(("Settings", "Order", "Config"))
+    return name.endswith(("Settings", "GenerateOptions", "Config"))
 
 
 def test_no_class_of_settings_is_forgotten() -> None:
@@ -295,7 +295,7 @@ def test_no_class_of_settings_is_forgotten() -> None:
         if _is_settings(name)
     }
     reached = {settings.__name__ for settings, _ in FIELDS}
-    assert named - reached - set(INTERNAL) == {"DatasetOrder"}, "which DatasetInRuns is"
+    assert named - reached - set(INTERNAL) == {"GenerateOptions"}, "which DatasetInRuns is"
     assert set(EXAMPLES) == {settings for settings, _ in FIELDS}
 
 

@@ -164,7 +164,7 @@ REASONS = {
 
 
 def test_what_cannot_be_rendered_or_lit_has_a_reason() -> None:
-    """With the bound on darkness that builds have; and each is rejected again for the same."""
+    """With the bound on darkness that presets have; and each is rejected again for the same."""
     settings = dataclasses.replace(SETTINGS, min_mean_radiance=0.01)
     for name, (scene, reason) in REASONS.items():
         messages = []

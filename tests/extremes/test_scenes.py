@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.builds.named import BUILDS, named_build
 from pipeline.foreign.mesh import TriangleMesh
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.records.asset import Asset
 from storage.records.scene import Scene
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 from tests.for_each import case
 from tests.pipeline.assets.meshes_by_hand import (
     cube,
@@ -55,14 +55,14 @@ FAR = [(0, LAST), (2**63, LAST), (2**64 + 1, 30), (2**200, 10**9 + 7)]
 
 def test_far_seeds_and_indices_are_seeds_and_indices_of_their_own(pool: list[PooledAsset]) -> None:
     """Beyond 32 and 64 bits; a sample's name holds indices of nine digits."""
-    for number, build in enumerate(BUILDS):
-        settings = named_build(build, changes={"scenes.num_views": 1}).scenes
+    for number, build in enumerate(DATASET_PRESETS):
+        settings = preset_settings(build, changes={"scenes.num_views": 1}).scenes
         seed, index = FAR[number % len(FAR)]
         with case((build, f"{seed}", f"{index}")):
             scene = first_scene(settings, pool, seed=seed, scene_index=index)
             require_laws(scene, settings.of_scene(index))
             assert scene.provenance["scene_index"] == index
-    settings = named_build("pretrain-256", changes={"scenes.num_views": 1}).scenes
+    settings = preset_settings("pretrain-256", changes={"scenes.num_views": 1}).scenes
     first, again = (
         [digest(first_scene(settings, pool, seed=seed, scene_index=index)) for seed, index in FAR]
         for _ in range(2)
@@ -95,7 +95,7 @@ def _one_triangle(pool: list[PooledAsset]) -> PooledAsset:
 def test_objects_of_one_triangle_compose(
     pool: list[PooledAsset], changes: Mapping[str, Any]
 ) -> None:
-    settings = changed(SETTINGS, changes)
+    settings = apply_overrides(SETTINGS, changes)
     for index in range(3):
         scene = first_scene(settings, [_one_triangle(pool)], seed=0, scene_index=index)
         require_laws(scene, settings)
@@ -108,7 +108,7 @@ def test_objects_of_one_triangle_compose(
 
 @pytest.mark.parametrize("build", ["pretrain-256", "out-of-range"])
 def test_a_pool_of_one_object_fills_every_scene(pool: list[PooledAsset], build: str) -> None:
-    settings = named_build(build, changes={"scenes.num_views": 1}).scenes
+    settings = preset_settings(build, changes={"scenes.num_views": 1}).scenes
     for entry in (pool[1], pool[4]):
         for index in range(30, 32):
             scene = first_scene(settings, [entry], seed=0, scene_index=index)

@@ -11,7 +11,7 @@ from infra import doctor
 from infra.planning import MeasuredScenes, describe_run, measure_scenes, predict_cost
 from pipeline.executors.threads import ThreadRunner
 from pipeline.flows import prefect_server
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset
 from pipeline.generation.tasks import MAX_TASKS
 from pipeline.isolation import confinement
@@ -29,7 +29,7 @@ def _measured(core_s: tuple[float, ...], num_bytes: int = 150_000) -> MeasuredSc
 
 def test_equal_scenes_add_up_exactly() -> None:
     """The first scene, which compiles, is left out; nothing varies, so intervals are points."""
-    order = DatasetOrder(build="pretrain-256", scenes=2560)
+    order = GenerateOptions(build="pretrain-256", scenes=2560)
     found = predict_cost(_measured((99.0, 36.0, 36.0)), order, cores=16, usd_per_core_hour=0.5)
     assert (found.num_scenes, found.num_shards) == (2560, 10)
     assert found.core_hours.value == pytest.approx(25.6)  # floating point only
@@ -47,7 +47,7 @@ def test_an_interval_covers_the_mean_as_often_as_it_says() -> None:
     import numpy as np
 
     rng = np.random.default_rng(0)
-    order = DatasetOrder(build="smoke", scenes=3600)
+    order = GenerateOptions(build="smoke", scenes=3600)
     truth = float(np.exp(0.5 * 0.6**2))
     hits = 0
     for _ in range(200):
@@ -59,7 +59,7 @@ def test_an_interval_covers_the_mean_as_often_as_it_says() -> None:
 
 
 def test_two_million_scenes_come_with_warnings() -> None:
-    order = DatasetOrder(build="pretrain-256", scenes=2_000_000)
+    order = GenerateOptions(build="pretrain-256", scenes=2_000_000)
     measured = _measured((400.0, 400.0))
     found = predict_cost(measured, order, cores=4096, usd_per_core_hour=0.04)
     assert found.num_tasks == MAX_TASKS
@@ -124,7 +124,7 @@ def test_what_a_run_will_make_is_said_before_it_begins(
     scenes = f"3 scenes of 2 views each in 1 shard ({lacking})"
     assert describe_run(order, folder) == f"{scenes}; {rough}; `trilight plan` measures it"
     for build, said in (("smoke", "3 minutes"), ("textured-256", "94 hours")):
-        text = describe_run(DatasetOrder(build=build, out=str(tmp_path / build)), folder)
+        text = describe_run(GenerateOptions(build=build, out=str(tmp_path / build)), folder)
         assert f"roughly {said} on 3 cores" in text
     assert lacking in make_dataset(order, ThreadRunner()).notes
     said = describe_run(dataclasses.replace(order, scenes=9, shards="1:3"), folder)

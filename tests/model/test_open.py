@@ -46,11 +46,11 @@ from model.published import (
     TEXTURE_CHANNELS,
     PublishedConfig,
     _require_frequencies,
-    decode_published,
-    encode_published,
+    decode_published_config,
+    encode_published_config,
+    export_published_weights,
     fold,
-    load_published,
-    to_published,
+    load_published_weights,
     unfold,
 )
 from model.renderformer import RenderFormer, count_parameters
@@ -314,7 +314,7 @@ FREQS = "view_transformer.transformer.rope_emb.freqs"
 
 def test_the_published_sizes_are_the_named_ones() -> None:
     for fields, name, patch in (({}, "base", 32), (SWIN_LARGE, "large", 1)):
-        got = decode_published(fields)
+        got = decode_published_config(fields)
         assert dataclasses.replace(got.model, register_eps=0.0) == SIZES[name]()
         assert got.model.register_eps == 1e-5
         assert got.texture_patch == patch
@@ -324,9 +324,11 @@ def test_the_published_sizes_are_the_named_ones() -> None:
 @for_each("patch", [1, 8])
 def test_export_and_import_give_the_same_network(family: str, patch: int) -> None:
     config = PublishedConfig(model=publishable(family), texture_patch=patch)
-    assert decode_published(json.loads(json.dumps(encode_published(config)))) == config
+    assert (
+        decode_published_config(json.loads(json.dumps(encode_published_config(config)))) == config
+    )
     model = awake(config.model, torch.float32)
-    again = load_published(to_published(model, patch), config)
+    again = load_published_weights(export_published_weights(model, patch), config)
     assert again.state_dict().keys() == model.state_dict().keys()
     for name, tensor in again.state_dict().items():
         assert torch.equal(tensor, model.state_dict()[name]), name
@@ -339,13 +341,15 @@ def test_export_gives_back_what_was_published(shared: Path, name: str) -> None:
     if not path.exists():
         pytest.skip(f"{path} is missing")
     _, metadata = read_tensors(path)
-    config = decode_published(json.loads(metadata["config"]))
+    config = decode_published_config(json.loads(metadata["config"]))
     published = {
         key.removeprefix("param."): tensor.float()
         for key, tensor in load_file(path).items()
         if key.startswith("param.")
     }
-    exported = to_published(load_published(published, config), config.texture_patch)
+    exported = export_published_weights(
+        load_published_weights(published, config), config.texture_patch
+    )
     assert exported.keys() == published.keys()
     for key, tensor in exported.items():
         assert tensor.shape == published[key].shape, key
@@ -375,7 +379,7 @@ def test_frequencies_differ_by_their_rounding_alone() -> None:
 )
 def test_what_was_never_published_is_refused_by_name(fields: dict, message: str) -> None:
     with pytest.raises(TrilightError, match=message):
-        decode_published(fields)
+        decode_published_config(fields)
 
 
 @for_each(
@@ -390,7 +394,7 @@ def test_what_was_never_published_is_refused_by_name(fields: dict, message: str)
 def test_what_their_code_cannot_build_is_not_exported(changes: dict, message: str) -> None:
     model = dataclasses.replace(publishable("dpt"), **changes)
     with pytest.raises(TrilightError, match=message):
-        encode_published(PublishedConfig(model=model, texture_patch=1))
+        encode_published_config(PublishedConfig(model=model, texture_patch=1))
 
 
 @for_each(
@@ -405,12 +409,12 @@ def test_what_their_code_cannot_build_is_not_exported(changes: dict, message: st
 )
 def test_wrong_published_tensors_are_listed(name: str, tensor: Tensor | None, message: str) -> None:
     config = PublishedConfig(model=publishable("dpt"), texture_patch=1)
-    tensors = to_published(awake(config.model, torch.float32), 1)
+    tensors = export_published_weights(awake(config.model, torch.float32), 1)
     tensors.pop(name, None)
     if tensor is not None:
         tensors[name] = tensor
     with pytest.raises(TrilightError, match=message):
-        load_published(tensors, config)
+        load_published_weights(tensors, config)
 
 
 WIDTH = 5

@@ -205,13 +205,14 @@ def _mesh(scene: Scene, triangles: NDArray[np.intp], material: Any) -> Any:
 
 
 def _build_mesh(name: str, faces: NDArray[Any], properties: Any, **rows: NDArray[Any]) -> Any:
-    from pipeline.renders.kernel_scene import build_mesh  # its types are those of the variant
+    # its types are those of the variant
+    from pipeline.renders.kernel_scene import build_mitsuba_mesh
 
     flat: dict[str, Any] = {
         f"vertex_{field}": each.astype(np.float32).ravel() for field, each in rows.items()
     }
     flat["faces"] = faces.astype(np.uint32).ravel()
-    return build_mesh(name, (len(rows["positions"]), len(faces)), properties, **flat)
+    return build_mitsuba_mesh(name, (len(rows["positions"]), len(faces)), properties, **flat)
 
 
 def _two_sided(material: dict[str, Any]) -> Any:

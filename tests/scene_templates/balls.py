@@ -18,10 +18,10 @@ from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
 from storage.seeds import rng_for
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 
 DEFAULTS = SceneSettings(families=DEFAULT_FAMILIES)
-"""What the training builds draw from; their budgets mean nothing where there are no meshes."""
+"""What the training presets draw from; their budgets mean nothing where there are no meshes."""
 
 
 ROOMS = [name for name, template in TEMPLATES.items() if template.parts]
@@ -69,7 +69,7 @@ class Drawn:
 def template_settings(name: str, changes: Mapping[str, Any] | None = None) -> SceneSettings:
     """Return the default settings with one layout only, of 1 to 3 objects."""
     family = next(family for family in ONE_FAMILY_EACH if family.template == name)
-    return changed(SceneSettings(families=(family,)), changes or {})
+    return apply_overrides(SceneSettings(families=(family,)), changes or {})
 
 
 BALL = Ball()

@@ -16,10 +16,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.builds.named import named_build
+from pipeline.presets.registry import preset_settings
 from scene_templates.layout import Emitter, SurfaceLook
 from scene_templates.settings import SceneSettings
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 from tests.scene_templates.balls import MANY, Drawn, drawn
 from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row
 from tests.scene_templates.statistics import (
@@ -208,7 +208,7 @@ STATED = {
 
 
 def _settings(build: str) -> SceneSettings:
-    return named_build(build).scenes
+    return preset_settings(build).scenes
 
 
 def _table(scenes: list[Drawn], stated: Stated) -> Table:
@@ -333,14 +333,14 @@ WRONG: list[tuple[str, Mapping[str, Any], set[str]]] = [
         | {"object by triangle", "overlaps"},
     ),
 ]
-"""A build, what is changed behind its back, and some of what must be noticed."""
+"""A preset, what is changed behind its back, and some of what must be noticed."""
 
 
 @pytest.mark.parametrize(("build", "changes", "rows"), WRONG, ids=["ranges", "kinds"])
 def test_a_wrong_distribution_is_noticed(
     build: str, changes: Mapping[str, Any], rows: set[str]
 ) -> None:
-    wrong = changed(_settings(build), changes)
+    wrong = apply_overrides(_settings(build), changes)
     table = _table(drawn(wrong, FEWER), STATED[build])
     assert rows <= set(implausible(table))
     # What has not been changed is not blamed.

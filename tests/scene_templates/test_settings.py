@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.builds.named import named_build
+from pipeline.presets.registry import preset_settings
 from scene_templates.cameras import CameraSettings
 from scene_templates.exact import cosine, dot, lerp, ramp, sine, smoothstep
 from scene_templates.families import Family
@@ -33,9 +33,9 @@ from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import TrilightError
 from storage.seeds import rng_for
-from storage.settings.changes import changed
 from storage.settings.described import from_record, settings_record
 from storage.settings.fields import describe_fields
+from storage.settings.overrides import apply_overrides
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.scene_templates.balls import DEFAULTS, ROOMS, template_settings
@@ -132,7 +132,7 @@ def test_strata_are_refused_in_one_sentence() -> None:
     """They were parts of the scenes with weights; records never held the empty list."""
     strata = [{"name": "all", "weight": 1}]
     with pytest.raises(TrilightError, match=r"setting 'strata': removed since, and commit"):
-        changed(DEFAULTS, {"strata": strata})
+        apply_overrides(DEFAULTS, {"strata": strata})
     with pytest.raises(TrilightError, match=r"setting 'strata': removed since, and commit"):
         from_record(SceneSettings, {**settings_record(DEFAULTS), "strata": strata})
 
@@ -256,7 +256,7 @@ def test_families_in_turn_have_exactly_their_share() -> None:
 @pytest.mark.parametrize("turns", [1, 3])
 def test_every_excursion_meets_every_family_equally_often(turns: int) -> None:
     """Were both to turn with the index, 37 and 4 would still meet; 36 and 4 would not."""
-    settings = named_build("out-of-range").scenes
+    settings = preset_settings("out-of-range").scenes
     for count in (37, 36):
         chosen = dataclasses.replace(settings, excursions=settings.excursions[:count])
         found = Counter(

@@ -1,28 +1,28 @@
 """Names for people mean what the stored names mean, and are never stored."""
 
 from model.open import find_network
-from pipeline.builds.named import BUILDS, named_build, object_source
-from pipeline.generation.dataset_order import DatasetOrder, generate_words
-from storage.aliases import NETWORKS, OBJECTS, PRESETS, stored_name
-from train.runs import RUNS, named_run
+from pipeline.generation.generate_options import GenerateOptions, generate_words
+from pipeline.presets.registry import DATASET_PRESETS, object_source, preset_settings
+from storage.aliases import NETWORKS, OBJECTS, PRESET_ALIASES, stored_name
+from train.presets import TRAINING_PRESETS, training_preset
 
 
 def test_a_name_for_people_is_the_stored_one() -> None:
-    assert stored_name("tiny", PRESETS) == "smoke"
+    assert stored_name("tiny", PRESET_ALIASES) == "smoke"
     assert stored_name("procedural:benchmark-v1", OBJECTS) == "builtin:benchmark-v1"
     for other in ("tiny2", "FOLDER/procedural", "builtin:8", "default:tokens"):
-        for names in (PRESETS, OBJECTS, NETWORKS):
+        for names in (PRESET_ALIASES, OBJECTS, NETWORKS):
             assert stored_name(other, names) == other
 
 
 def test_what_is_stored_keeps_its_name() -> None:
-    assert named_build("tiny") == named_build("smoke")
-    assert named_run("tiny") == named_run("smoke")
-    assert object_source(named_build("tiny"), "procedural:8") == "builtin:8"
+    assert preset_settings("tiny") == preset_settings("smoke")
+    assert training_preset("tiny") == training_preset("smoke")
+    assert object_source(preset_settings("tiny"), "procedural:8") == "builtin:8"
     assert find_network("default").path == find_network("builtin:").path
-    assert "tiny" not in list(BUILDS) and "tiny" not in list(RUNS)
+    assert "tiny" not in list(DATASET_PRESETS) and "tiny" not in list(TRAINING_PRESETS)
 
 
 def test_a_command_that_is_printed_keeps_the_typed_name() -> None:
-    assert generate_words(DatasetOrder(build="tiny"))[:2] == ["generate", "tiny"]
-    assert DatasetOrder(build="tiny").place == "data/tiny"
+    assert generate_words(GenerateOptions(build="tiny"))[:2] == ["generate", "tiny"]
+    assert GenerateOptions(build="tiny").place == "data/tiny"

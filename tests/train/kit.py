@@ -18,10 +18,10 @@ from storage.dataset.training_data import TrainingData, open_training_data
 from tests.train.toy import toy_sample
 from train.data.bad_samples import BadSampleCounter
 from train.data.buckets import TrainingBatch, collate_batch
+from train.data.loader import LoaderSettings, load_batches
 from train.data.mixture import Mixture
 from train.data.order import RankSlice
 from train.data.scenes import TrainingScene, training_scene
-from train.data.stream import StreamSettings, stream_batches
 from train.evaluation.evaluate import EvalConfig
 from train.loop.distributed import DistributedContext
 from train.loop.state import TrainState, new_state
@@ -151,7 +151,7 @@ def stepper(state: TrainState, settings: TrainSettings) -> Stepper:
 
 def take(
     data: TrainingData | Dataset,
-    settings: StreamSettings,
+    settings: LoaderSettings,
     count: int,
     *,
     first: int = 0,
@@ -163,7 +163,7 @@ def take(
 ) -> list[list[TrainingScene]]:
     """Return the batches first, first + 1, ... of the training split."""
     opened = open_training_data([str(data.folder.root)]) if isinstance(data, Dataset) else data
-    batches = stream_batches(
+    batches = load_batches(
         opened.split("train"),
         settings,
         first,

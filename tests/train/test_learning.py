@@ -62,9 +62,9 @@ from train.loop.distributed import DistributedContext
 from train.loop.schedule import learning_rate
 from train.loop.state import TrainState, new_state
 from train.loss.lpips import LINEAR_FILE, VGG16_FILE, load_lpips
+from train.presets import override_training_preset
 from train.resume import StartOptions
-from train.run import stream_settings, train_run
-from train.runs import changed_run
+from train.run import loader_settings, train_run
 from train.settings import AugmentationSettings, TrainSettings
 
 SMALL = dataclasses.replace(
@@ -157,11 +157,11 @@ def hits_run(**changes: object) -> TrainSettings:
 def test_what_is_traced_depends_on_no_thread_and_no_rank(dataset: Dataset) -> None:
     alone = {
         scene.key: scene.tensors.traced
-        for scene in take(dataset, stream_settings(hits_run()), 1, first=3)[0]
+        for scene in take(dataset, loader_settings(hits_run()), 1, first=3)[0]
     }
     for rank in range(3):
         part = {"workers": 3, "rank": rank, "world_size": 3}
-        ((other,),) = take(dataset, stream_settings(hits_run()), 1, first=3, **part)  # type: ignore[arg-type]
+        ((other,),) = take(dataset, loader_settings(hits_run()), 1, first=3, **part)  # type: ignore[arg-type]
         a, b = alone.pop(other.key), other.tensors.traced
         assert a is not None
         assert b is not None
@@ -170,7 +170,7 @@ def test_what_is_traced_depends_on_no_thread_and_no_rank(dataset: Dataset) -> No
 
 
 def test_views_are_traced_after_the_symmetries_and_lack_inputs_by_chance(dataset: Dataset) -> None:
-    scenes = take(dataset, stream_settings(hits_run()), 1, first=3)[0]
+    scenes = take(dataset, loader_settings(hits_run()), 1, first=3)[0]
     given = torch.cat([s.tensors.traced.given_VI for s in scenes if s.tensors.traced])
     assert given.shape == (6, len(INPUTS))
     assert 0 < given.mean() < 1
@@ -302,7 +302,7 @@ def one_step_of(run: str, size: str) -> TrainSettings:
         "validation_scenes": 1,
         "from_weights": False,
     }
-    return changed_run(run, changes)
+    return override_training_preset(run, changes)
 
 
 def train_and_judge(run: str, size: str, data: str, lpips: str, out: Path) -> None:

@@ -18,8 +18,13 @@ from storage.removed import LAST_COMMIT
 from storage.settings.described import settings_record
 from tests.for_each import for_each
 from tests.train.kit import TINY_MODEL, tiny_run
+from train.presets import (
+    TRAINING_PRESETS,
+    override_training_preset,
+    scale_intervals,
+    training_preset,
+)
 from train.resume import ResumePlan, event_records, plan_resume
-from train.runs import RUNS, changed_run, named_run, scale_intervals
 from train.settings import AugmentationSettings, TrainSettings, known_settings, stored_settings
 
 DIGEST = "d" * 64
@@ -228,22 +233,22 @@ def test_a_rate_that_rises_again_is_said() -> None:
     assert not any("falling" in note for note in early.notes)
 
 
-def test_unknown_runs_are_refused() -> None:
-    message = "'smoek': no such run; did you mean smoke.* builtin, fine"
+def test_unknown_presets_are_refused() -> None:
+    message = "'smoek' is unknown; did you mean smoke.* builtin, hits"
     with pytest.raises(TrilightError, match=message):
-        named_run("smoek")
+        training_preset("smoek")
 
 
-@for_each("name", sorted(RUNS))
-def test_named_runs_survive_json_and_fewer_steps_bring_warm_up_and_intervals_along(
+@for_each("name", sorted(TRAINING_PRESETS))
+def test_presets_survive_json_and_fewer_steps_bring_warm_up_and_intervals_along(
     name: str,
 ) -> None:
     """So that any number of steps is a run that is logged, judged and saved as the whole one is."""
-    run = named_run(name)
+    run = training_preset(name)
     record = settings_record(run)
     assert run.run == name and json.loads(json.dumps(record)) == record
     for steps in (1, 2, 7, 24, 331, run.num_steps // 2):
-        shorter = changed_run(name, {}, steps=steps)
+        shorter = override_training_preset(name, {}, steps=steps)
         assert shorter.num_steps == steps
         share = steps / run.num_steps
         # rounded to a whole number of rows, and never to none
@@ -253,24 +258,24 @@ def test_named_runs_survive_json_and_fewer_steps_bring_warm_up_and_intervals_alo
             assert abs(getattr(shorter, field) - getattr(run, field) * share) <= shorter.log_every
         assert shorter.keep_every % shorter.checkpoint_every == 0
         assert (shorter.keep_every > 0) == (run.keep_every > 0)
-    assert changed_run(name, {}, steps=run.num_steps) == run
-    longer = changed_run(name, {}, steps=3 * run.num_steps)
+    assert override_training_preset(name, {}, steps=run.num_steps) == run
+    longer = override_training_preset(name, {}, steps=3 * run.num_steps)
     assert dataclasses.replace(longer, num_steps=run.num_steps) == run
 
 
 def test_what_is_stated_is_not_brought_along() -> None:
     stated = {"warmup_steps": 5, "validate_every": 12, "checkpoint_every": 24}
-    found = changed_run("smoke", stated, steps=24)
+    found = override_training_preset("smoke", stated, steps=24)
     assert {name: getattr(found, name) for name in stated} == stated
-    assert changed_run("smoke", {"checkpoint_every": 9}, steps=80).log_every in (1, 3)
-    assert not scale_intervals(named_run("smoke"), 24, stated).keys() & stated.keys()
+    assert override_training_preset("smoke", {"checkpoint_every": 9}, steps=80).log_every in (1, 3)
+    assert not scale_intervals(training_preset("smoke"), 24, stated).keys() & stated.keys()
     with pytest.raises(TrilightError, match="warmup_steps is 50; expected 0 to 23"):
-        changed_run("smoke", {"warmup_steps": 50}, steps=24)
+        override_training_preset("smoke", {"warmup_steps": 50}, steps=24)
     with pytest.raises(TrilightError, match="num_steps'? is 0; expected a whole number from 1"):
-        changed_run("smoke", {}, steps=0)
+        override_training_preset("smoke", {}, steps=0)
     for value, message in ((0, "is 0; expected a whole number from 1"), ("often", "is 'often'")):
         with pytest.raises(TrilightError, match=f"log_every'? {message}"):
-            changed_run("pretrain", {"log_every": value}, steps=24)
+            override_training_preset("pretrain", {"log_every": value}, steps=24)
 
 
 @for_each(
@@ -290,8 +295,8 @@ def test_contradictory_settings_are_refused(changes: dict[str, object], message:
 
 def test_the_paper_runs_are_the_papers() -> None:
     """Zeng et al. 2025, section 4, and the published configuration."""
-    first, second = named_run("paper-pretrain"), named_run("paper-finetune")
-    longer = named_run("paper-pretrain-launcher")
+    first, second = training_preset("paper-pretrain"), training_preset("paper-finetune")
+    longer = training_preset("paper-pretrain-launcher")
     assert (longer.run, longer.num_steps) == ("paper-pretrain-launcher", 1_300_000)
     same = {"run": first.run, "num_steps": first.num_steps, "keep_every": first.keep_every}
     assert settings_record(longer) | same == settings_record(first)
@@ -310,13 +315,13 @@ def test_the_paper_runs_are_the_papers() -> None:
 
 def test_every_size_can_be_asked_for_by_name() -> None:
     for name, make in SIZES.items():
-        assert changed_run("smoke", {"model": name}).model == make()
-    without = changed_run("pretrain", {"model.window_bundles": 0, "model": "large"})
+        assert override_training_preset("smoke", {"model": name}).model == make()
+    without = override_training_preset("pretrain", {"model.window_bundles": 0, "model": "large"})
     assert without.model == dataclasses.replace(large(), window_bundles=0)
     with pytest.raises(TrilightError, match="'model' is 'larg'; did you mean large"):
-        changed_run("smoke", {"model": "larg"})
+        override_training_preset("smoke", {"model": "larg"})
     with pytest.raises(TrilightError, match="resolution is 72; expected a multiple of 64"):
-        changed_run("smoke", {"model": "large", "resolution": 72})
+        override_training_preset("smoke", {"model": "large", "resolution": 72})
 
 
 SHIPPED = {
@@ -332,6 +337,6 @@ another name."""
 
 def test_the_runs_of_the_shipped_networks_stay_what_they_are() -> None:
     for name, digest in SHIPPED.items():
-        record = settings_record(named_run(name), stated=True)
+        record = settings_record(training_preset(name), stated=True)
         del record["run"]
         assert sha256_hex(canonical_json(record))[:16] == digest, name

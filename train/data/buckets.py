@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from model.scene_tensors import SceneBatch, batch_scenes, map_tensors
+from train.data.loader import prefetch
 from train.data.scenes import TrainingScene, with_target
-from train.data.stream import prefetch
 
 MOST_WASTE = 0.05
 """Maximum extra cost by padding, as a fraction of the cost of the scenes without it."""

@@ -11,7 +11,7 @@ from storage.settings.ranges import Within
 from train.folder import RunFolder
 
 Width = Annotated[int, Within(1, 8192, unit="pixels")]
-"""Width of a picture in pixels."""
+"""Width of an image in pixels."""
 SceneCount = Annotated[int, Within(1, 10**9, unit="scenes")]
 """Maximum number of scenes to evaluate."""
 TracedViews = Annotated[int, Within(0, 10**6, unit="views")]
@@ -24,19 +24,19 @@ TimedScenes = Annotated[int, Within(1, 10**6, unit="scenes")]
 
 @checked()
 class LeaderboardOptions:
-    """Dataset, networks and pictures."""
+    """Dataset, networks and images."""
 
     source: str
-    """Dataset (folder or URL) with pictures, such as one of preset benchmark-v1."""
+    """Dataset (folder or URL) with images, such as one of preset benchmark-v1."""
     checkpoint: tuple[str, ...] = ()
     """Networks in addition to the built-in ones; by default none. A network is a run, weights, or a
     name on the Hugging Face hub such as microsoft/renderformer-v1-base. All other rows are compared
     with the first one."""
     pictures: tuple[Path, ...] = ()
-    """Folders of OpenEXR pictures from elsewhere, named as export names them; by default none. Each
-    has one picture a view, such as 000000003_view_0.exr."""
+    """Folders of OpenEXR images from elsewhere, named as export names them; by default none. Each
+    has one image a view, such as 000000003_view_0.exr."""
     width: tuple[Width, ...] = ()
-    """Widths of pictures in pixels, divisors of the dataset's; by default those of 64, 256 and 512
+    """Widths of images in pixels, divisors of the dataset's; by default those of 64, 256 and 512
     that divide it, else the dataset's own."""
     scenes: SceneCount = 10**6
     """Maximum number of scenes, from the start of the split."""
@@ -45,7 +45,7 @@ class LeaderboardOptions:
     split: Literal["train", "validation", "test"] = "test"
     """Split of the dataset for the evaluation."""
     train_data: tuple[str, ...] = ()
-    """Datasets whose training pictures are looked up; by default the set itself, else the other
+    """Datasets whose training images are looked up; by default the set itself, else the other
     scenes of the split."""
     lpips: str | None = None
     """Folder of the LPIPS weights, or hub; by default the value of TRILIGHT_LPIPS. Without weights
@@ -71,20 +71,20 @@ class EvaluationOptions:
     """Networks to compare it with on a leaderboard of all methods, which is written into the same
     folder; by default none."""
     pictures: tuple[Path, ...] = ()
-    """Folders of OpenEXR pictures from elsewhere for that leaderboard; by default none."""
+    """Folders of OpenEXR images from elsewhere for that leaderboard; by default none."""
     split: Literal["train", "validation", "test"] = "test"
     """Split of the dataset to evaluate on."""
     train_data: tuple[str, ...] = ()
-    """Datasets whose training pictures the baselines use; by default those of --data, if they have
+    """Datasets whose training images the baselines use; by default those of --data, if they have
     any."""
     resolution: Width | None = None
-    """Width of a picture in pixels, which divides the dataset's; by default the run's if known,
+    """Width of an image in pixels, which divides the dataset's; by default the run's if known,
     else the dataset's."""
     most_scenes: SceneCount = 10**6
     """Maximum number of scenes to evaluate, taken from the start of the split."""
     tracer_views: TracedViews = 64
-    """Maximum number of views to judge the path tracer on as well, denoised, with the samples that
-    take it the network's own time; 0 leaves it out."""
+    """Maximum number of views on which the denoised path tracer is judged in the network's own
+    time; 0 leaves it out."""
     lpips: str | None = None
     """Folder of the LPIPS weights, or hub to download them; by default the value of TRILIGHT_LPIPS,
     and without either LPIPS is n/a."""

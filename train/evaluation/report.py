@@ -16,7 +16,7 @@ from train.evaluation.judged_view import (
 from train.evaluation.metrics import METRICS
 
 BENCHMARK = "benchmark-v1"
-"""Name of our public test set (pipeline.builds.judging)."""
+"""Name of our public test set (pipeline.presets.judging)."""
 
 _METRICS = ("psnr_linear_db", "ssim", "lpips", "hdr_flip")
 

@@ -109,7 +109,7 @@ def scene_flops(settings: TrainSettings, num_triangles: int) -> int:
 
 
 class Trainer:
-    """Runs all remaining steps, in lockstep with the other processes.
+    """Training loop: runs all remaining steps, in lockstep with the other processes.
 
     Attributes:
         pending: launched steps that are not synced yet, oldest first.

@@ -22,8 +22,8 @@ class WatchSettings:
     """Action on a hang, after it is reported and the stacks of all threads are written: wait, or
     stop the run, which --resume continues from the last checkpoint."""
     spike_bound: Annotated[float, Within(1, 1e6, unit="deviations")] = 8.0
-    """Distance of a loss or gradient above the recent median, in robust standard deviations, from
-    which on it is recorded with the scenes of its step."""
+    """Robust standard deviations above the recent median at which a loss or gradient is recorded
+    with the scenes of its step."""
     profile: Annotated[int, Within(0, 1000, unit="steps")] = 0
     """Number of steps to trace with PyTorch's profiler, after the first three; 0 traces none."""
     wandb: str | None = None

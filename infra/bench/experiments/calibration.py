@@ -16,16 +16,16 @@ from infra.bench.workloads.recorded_looks import FIGURES, record_looks, unreacha
 from infra.bench_options import BenchOptions
 from infra.render.held_out_scenes import first_composed
 from infra.render.raw_references import first_camera
-from pipeline.builds.settings import BuildSettings
-from pipeline.builds.training import smoke
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK, PREFIX
+from pipeline.presets.settings import DatasetSettings
+from pipeline.presets.training import smoke
 from pipeline.renders.calibrated_error import versions_of_pictures
 from scene_templates.settings import SceneSettings
 from storage.dataset.splits import JUDGED_SPLIT
 from storage.digests import canonical_json, sha256_hex
 from storage.records.scene import Scene
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 
 SEED = 20_261_129
 """Seed of the layouts; no dataset preset and no other experiment uses it."""
@@ -127,13 +127,13 @@ def _record(context: BenchContext, trial: str) -> dict[tuple[int, int], Figures]
     return figures
 
 
-def _one_split() -> BuildSettings:
-    return changed(smoke(), {"splits.one_split": True})
+def _one_split() -> DatasetSettings:
+    return apply_overrides(smoke(), {"splits.one_split": True})
 
 
 def _scene(child: IsolatedChild, index: int, kind: str) -> Scene:
     shares = {"textured": {"textures.share": 0.5}, "sky": {"skies.share": 1.0}}
-    settings: SceneSettings = changed(
+    settings: SceneSettings = apply_overrides(
         dataclasses.replace(smoke().scenes, num_views=1, families_in_turn=True),
         shares.get(kind, {}),
     )

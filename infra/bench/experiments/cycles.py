@@ -15,7 +15,7 @@ from infra.bench.workloads.named_scenes import SKIES, given_scenes, mapped_scene
 from infra.bench.workloads.traced_pictures import render_shot, render_shots
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera, raw_reference, true_error_db
-from pipeline.builds.training import object_views
+from pipeline.presets.training import object_views
 from pipeline.renders.camera import PixelCamera
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.results import RenderedView

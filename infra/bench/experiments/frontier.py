@@ -37,7 +37,7 @@ from infra.render.raw_references import (
     first_camera,
     true_error_db,
 )
-from pipeline.builds.training import pretrain_256
+from pipeline.presets.training import pretrain_256
 from pipeline.renders.noise_floor import clamped_radiance, secant_slope
 from pipeline.renders.settings import USUAL_FLOOR_DB, RenderSettings
 from storage.conventions import log10_radiance

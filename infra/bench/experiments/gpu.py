@@ -17,7 +17,7 @@ from infra.bench.experiment import (
 from infra.bench.workloads.reading import time_reading
 from infra.bench_options import BenchOptions
 from storage.errors import TrilightError
-from train.runs import RUNS, named_run
+from train.presets import TRAINING_PRESETS, training_preset
 
 if TYPE_CHECKING:
     import torch
@@ -59,14 +59,18 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
 
 
 def _runs(scale: BenchScale, options: BenchOptions) -> Sequence[str]:
-    if unknown := [name for name in options.run if name not in RUNS]:
+    if unknown := [name for name in options.run if name not in TRAINING_PRESETS]:
         raise TrilightError(
             f"bench gpu: --run {unknown[0]!r} is no training preset; expected some of "
-            f"{', '.join(sorted(RUNS))}."
+            f"{', '.join(sorted(TRAINING_PRESETS))}."
         )
     if options.run:
         return options.run
-    return _QUICK_RUNS if scale.name == "quick" else [name for name in RUNS if RUNS.is_ours(name)]
+    return (
+        _QUICK_RUNS
+        if scale.name == "quick"
+        else [name for name in TRAINING_PRESETS if TRAINING_PRESETS.is_ours(name)]
+    )
 
 
 def _measure(name: str, part: Measured, context: BenchContext, trial: str) -> Figures:
@@ -119,10 +123,10 @@ def _step(run: str, context: BenchContext, device: "torch.device") -> Figures:
 
 def _reading(threads: int, context: BenchContext, device: "torch.device") -> Figures:
     """Decode and augment samples as a training preset does."""
-    from train.data.stream import StreamSettings
+    from train.data.loader import LoaderSettings
 
-    run = named_run(READ_AS)
-    settings = StreamSettings(
+    run = training_preset(READ_AS)
+    settings = LoaderSettings(
         seed=0,
         window=run.shuffle_shards,
         batch_size=_BATCH,

@@ -59,9 +59,9 @@ def _read(threads: int, context: BenchContext, trial: str) -> Figures:
 
 def read_figures(data: TrainingData, count: int, threads: int) -> Figures:
     """Read samples as training does, without the network."""
-    from train.data.stream import StreamSettings
+    from train.data.loader import LoaderSettings
 
-    settings = StreamSettings(
+    settings = LoaderSettings(
         seed=0,
         window=2,
         batch_size=BATCH,

@@ -9,7 +9,7 @@ from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
 from infra.bench.workloads.judged_pictures import load_or_render_reference
 from infra.bench_options import BenchOptions
-from infra.render.held_out_scenes import TRIANGLES, held_out_build, held_out_scene
+from infra.render.held_out_scenes import TRIANGLES, held_out_scene, held_out_settings
 from infra.render.methods import (
     BUILTIN_NETWORKS,
     DIRECT_LIGHT,
@@ -91,7 +91,7 @@ def _set_up(
     renderers = {
         (px, each.name): each for px in WIDTHS for each in compared_renderers(px, networks, child)
     }
-    return renderers, context.render_child(held_out_build(), BENCHMARK, threads=1)
+    return renderers, context.render_child(held_out_settings(), BENCHMARK, threads=1)
 
 
 def judged_figures(renderer: Renderer, scene: Scene, reference: RawReference) -> Figures:

@@ -30,7 +30,7 @@ def settings_of(side: str, seed: int, scale: BenchScale, options: BenchOptions) 
     Raises:
         TrilightError: several presets are named, or a change names no setting.
     """
-    from train.runs import changed_run
+    from train.presets import override_training_preset
 
     if len(options.run) > 1:
         raise TrilightError(
@@ -40,7 +40,7 @@ def settings_of(side: str, seed: int, scale: BenchScale, options: BenchOptions) 
     side_changes = options.set_a if side == SIDE_A else options.set_b
     changes = {"seed": seed, **options.changes, **side_changes}
     steps = changes.pop("num_steps", scale.steps)  # warm-up and decay are in proportion
-    return changed_run((options.run or (PRESET,))[0], changes, steps=steps)
+    return override_training_preset((options.run or (PRESET,))[0], changes, steps=steps)
 
 
 def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:

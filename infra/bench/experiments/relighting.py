@@ -22,7 +22,7 @@ from infra.render.raw_references import (
     light_references,
     true_error_db,
 )
-from pipeline.builds.training import olat
+from pipeline.presets.training import olat
 from storage.conventions import log10_radiance
 from storage.seeds import rng_for
 

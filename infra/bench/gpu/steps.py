@@ -31,7 +31,7 @@ from train.loop.state import new_state
 from train.loop.step import Stepper
 from train.loss.lpips import BLOCKS, Lpips
 from train.loss.objective import TrainingLoss
-from train.runs import named_run
+from train.presets import training_preset
 from train.settings import TrainSettings
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ def _kernel_us(event: Any) -> float:
 
 def step_settings(run: str, device: torch.device) -> TrainSettings:
     """Return a preset with random initial weights; without a GPU a small one of its form."""
-    settings = dataclasses.replace(named_run(run), from_weights=False)
+    settings = dataclasses.replace(training_preset(run), from_weights=False)
     if device.type == "cuda":
         return settings
     return dataclasses.replace(

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from infra.render.held_out_scenes import first_composed
-from pipeline.builds.training import object_views, olat, smoke, textured_256
 from pipeline.exchange.gltf.read import SUFFIXES as GLTF_SUFFIXES
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.isolation import IsolatedChild
+from pipeline.presets.training import object_views, olat, smoke, textured_256
 from scene_templates.settings import SceneSettings
 from storage.errors import TrilightError
 from storage.records.scene import Scene
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 
 SKIES = ("sun_and_sky", "clouds", "softboxes", "night")
 """Families of skies; the first has a sharp sun."""
@@ -78,7 +78,7 @@ def mapped_scene(child: IsolatedChild, name: str) -> Scene:
     """
     kind, _, which = name.partition(" ")
     number = int(which) if kind == "surfaces" else 10 + SKIES.index(which)
-    settings: SceneSettings = changed(textured_256().scenes, _CALM)
+    settings: SceneSettings = apply_overrides(textured_256().scenes, _CALM)
     if kind == "sky":
         sky = {
             "skies.share": 1.0,
@@ -87,7 +87,7 @@ def mapped_scene(child: IsolatedChild, name: str) -> Scene:
             "skies.maps.families": (which,),
             "skies.maps.height": _SKY_ROWS,
         }
-        settings = changed(settings, sky)
+        settings = apply_overrides(settings, sky)
     return first_composed(child, settings, number, seed=_MAPPED_SEED)
 
 

@@ -12,9 +12,9 @@ import h5py
 import numpy as np
 
 from infra.planning import measure_scenes
-from pipeline.builds.named import named_build
 from pipeline.exchange.renderformer_h5 import TextureType, write_renderformer_h5
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
+from pipeline.presets.registry import preset_settings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, index_shard, write_manifest
 from storage.dataset.shard import write_shard
@@ -26,7 +26,7 @@ from storage.records.sample import Sample, decode_sample, encode_sample, sample_
 from storage.records.scene import ARRAY_FIELDS
 
 if TYPE_CHECKING:
-    from train.data.stream import StreamSettings
+    from train.data.loader import LoaderSettings
 
 BUILD = "smoke"
 SCENES = 3
@@ -44,8 +44,8 @@ def render_scenes(px: int, place: Path) -> tuple[dict[str, float], list[Members]
     Returns:
         Wall-clock milliseconds and CPU seconds of a view; and the files of each scene.
     """
-    splits = named_build(BUILD).splits
-    order = DatasetOrder(build=BUILD, resolution=px, scenes=splits.scenes_per_shard)
+    splits = preset_settings(BUILD).splits
+    order = GenerateOptions(build=BUILD, resolution=px, scenes=splits.scenes_per_shard)
     marks: list[float] = []
     measured = measure_scenes(order, SCENES, place, lambda: marks.append(time.monotonic()))
     staged = DatasetFolder(place).staged_shard(shard_name(0, splits))
@@ -80,7 +80,7 @@ def write_copies(
 
 def time_reading(
     data: TrainingData,
-    settings: "StreamSettings",
+    settings: "LoaderSettings",
     threads: int,
     *,
     least_count: int = 1,
@@ -96,10 +96,10 @@ def time_reading(
         TrilightError: the data cannot be read at this width.
     """
     from train.data.bad_samples import BadSampleCounter
+    from train.data.loader import load_batches
     from train.data.order import RankSlice
-    from train.data.stream import stream_batches
 
-    stream = stream_batches(
+    stream = load_batches(
         data.split("train"), settings, 0, rank_slice=RankSlice(),
         workers=threads, unusable=BadSampleCounter(0),
     )  # fmt: skip

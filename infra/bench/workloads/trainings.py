@@ -15,7 +15,7 @@ from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.buckets import bucket_scenes
-from train.data.stream import stream_batches
+from train.data.loader import load_batches
 from train.evaluation.judge import Judge
 from train.loop.distributed import DistributedContext
 from train.loop.muon import choose_muon_precision
@@ -24,7 +24,7 @@ from train.loop.state import new_state
 from train.loop.step import Stepper
 from train.loop.trainer import scene_flops
 from train.loss.objective import TrainingLoss
-from train.run import stream_settings
+from train.run import loader_settings
 from train.settings import TrainSettings
 
 
@@ -90,9 +90,9 @@ def _trained_network(
     state = new_state(settings, device, muon_precision=choose_muon_precision(crew))
     stepper = Stepper(state, settings, TrainingLoss(settings.loss, None), crew)
     cost = partial(scene_flops, settings)
-    stream = stream_batches(
+    stream = load_batches(
         shards,
-        stream_settings(settings),
+        loader_settings(settings),
         0,
         rank_slice=crew.rank_slice,
         workers=1,

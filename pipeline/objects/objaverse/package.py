@@ -14,8 +14,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
-from storage.claims import hold_claim
 from storage.errors import TrilightError
+from storage.file_locks import hold_lock
 from storage.remote.tries import TransferFailed, with_tries
 
 Result = TypeVar("Result")
@@ -123,7 +123,7 @@ class ObjaversePackage:
             replaced["_load_object_paths"] = lambda: self._paths
         missing = object()
         originals = {name: self._package.__dict__.get(name, missing) for name in replaced}
-        with hold_claim(self._root / ".trilight.lock", wait=True):
+        with hold_lock(self._root / ".trilight.lock", wait=True):
             socket.setdefaulttimeout(_SILENCE_S)
             self._package.__dict__.update(replaced)
             try:

@@ -107,7 +107,7 @@ def picture_passes(
 def passes_in_file(scene: Scene, names: Sequence[str]) -> list[str]:
     """Return the passes that a file has where `names` are asked for.
 
-    `coverage` is among them; `uv` only where the scene has texture coordinates, so that of a build
+    `coverage` is among them; `uv` only where the scene has texture coordinates, so that of a preset
     which mixes textured and plain scenes no file holds NaN where a surface is met.
     """
     known = [name for name in names if name != UV or scene.uv is not None]

@@ -37,7 +37,7 @@ from storage.records.sample import encode_sample
 from tests.for_each import case
 from tests.infra.bench.test_harness import TINY, measured_rows
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
-from train.runs import RUNS, named_run
+from train.presets import TRAINING_PRESETS, training_preset
 
 PX = 64
 
@@ -114,9 +114,9 @@ CPU = torch.device("cpu")
 
 
 def test_every_preset_has_its_own_size_on_a_gpu_and_a_small_one_here() -> None:
-    for run in RUNS:
+    for run in TRAINING_PRESETS:
         with case(run):
-            settings = named_run(run)
+            settings = training_preset(run)
             on_gpu = step_settings(run, torch.device("cuda"))
             assert on_gpu == dataclasses.replace(settings, from_weights=False)
             small = step_settings(run, CPU)

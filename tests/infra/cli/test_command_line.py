@@ -21,13 +21,13 @@ from infra.cli.options import kind_of as kind_of_field
 from infra.setup.command_line_page import every_command
 from infra.setup.generated_pages import PAGES
 from model.config import SIZES
-from pipeline.builds.named import BUILDS
+from pipeline.presets.registry import DATASET_PRESETS
 from pipeline.shards.expression import TEXTS, condition, kind_of
 from storage.records.quantities import QUANTITIES
 from storage.settings.fields import option_of
 from tests.command_line import run_program, trilight
 from tests.for_each import case
-from train.runs import RUNS
+from train.presets import TRAINING_PRESETS
 
 ALL = {found.name: found for found in every_command()}
 TYPED = "pre"
@@ -100,7 +100,13 @@ def test_the_first_page_has_five_sections_and_a_first_command() -> None:
 
 def test_presets_lists_what_there_is_by_its_name_for_people() -> None:
     shown = trilight(["presets"], env={"COLUMNS": "120"}).stdout
-    for name in (*BUILDS, *RUNS, *SIZES, "tiny (stored: smoke)", "default (stored: builtin:)"):
+    for name in (
+        *DATASET_PRESETS,
+        *TRAINING_PRESETS,
+        *SIZES,
+        "tiny (stored: smoke)",
+        "default (stored: builtin:)",
+    ):
         assert name in shown
     assert json.loads(trilight(["presets", "--json"]).stdout)["datasets"][0]["scenes"] == 24
 
@@ -185,7 +191,7 @@ def test_too_little_memory_is_one_sentence(tmp_path: Path) -> None:
 
 
 def test_completion_installs_and_completes(tmp_path: Path) -> None:
-    """In a home of its own; the shell itself asks for the names of builds."""
+    """In a home of its own; the shell itself asks for the names of presets."""
     path = f"{_bin(tmp_path)}:{os.environ['PATH']}"
     for shell, typed in COMPLETED.items():
         script = tmp_path / f"completion of {shell}"

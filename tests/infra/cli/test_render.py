@@ -39,7 +39,7 @@ from storage.records.profiles import Profile
 from storage.records.sample import Sample, encode_sample
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene, scene_digest
-from storage.settings.changes import option_words
+from storage.settings.overrides import option_words
 from tests.command_line import trilight
 from tests.crash import CrashingRenderer
 from tests.for_each import case
@@ -191,6 +191,7 @@ def test_a_picture_says_how_it_was_made(source: Path, network: Path, tmp_path: P
     assert set(json.loads(traced["settings"])) == {
         "resolution", "noise_floor_db", "min_spp", "max_spp", "reject_at_cap", "max_depth",
         "rr_depth", "aux_spp", "denoiser", "min_mean_radiance", "per_light", "arithmetic",
+        "stated_error", "min_spp_px", "picture_within_db",
     }  # fmt: skip
     assert "mitsuba_variant" in json.loads(traced["environment"])
     assert (drawn["engine"], drawn["checkpoint"]) == ("neural", "model.safetensors")
@@ -324,16 +325,15 @@ def test_a_target_governs_and_is_the_floor_that_is_said(source: Path, tmp_path: 
 
 
 def test_a_promise_and_what_is_probable_are_said(source: Path, tmp_path: Path) -> None:
-    """Where they are asked for, at a width that is calibrated; elsewhere the bound is named."""
+    """At a width that is calibrated; elsewhere the bound is named."""
     out = tmp_path / "x.exr"
     words = (source, "--out", out, "--noise-floor", "5", "--max-spp", "128")
-    assert "probably" not in printed(*words, "--resolution", "64")
-    calibrated = (*words, "--stated-error", "calibrated")
-    said = printed(*calibrated, "--resolution", "64")
+    assert "probably" not in printed(*words, "--resolution", "64", "--stated-error", "bound")
+    said = printed(*words, "--resolution", "64")
     assert re.search(r"noise floor +-?\d+\.\d dB, probably -?\d+\.\d \(psnr_log_db; ", said)
     assert re.search(r"Of a hundred pictures .* \d+ are at most 1 dB worse, and half are", said)
     assert header(out)["expected_error_db"] > header(out)["noise_floor_db"]
-    said = printed(*calibrated, "--resolution", "16")
+    said = printed(*words, "--resolution", "16")
     assert "a bound: pictures like this one are not calibrated" in said
 
 

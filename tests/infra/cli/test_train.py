@@ -14,16 +14,21 @@ from typing import Any, NoReturn
 
 import pytest
 
-from infra.cli.changes import BaseSettings, all_changes, read_settings_file, with_base_settings
 from infra.cli.console import progress_bars
+from infra.cli.overrides import (
+    BaseSettings,
+    merge_overrides,
+    read_settings_file,
+    with_base_settings,
+)
 from infra.cli.train import _BarProgress, _QuietProgress, _report, _validation_rows
 from model.checkpoint_format import saved_steps
-from pipeline.builds.named import BUILDS, named_build
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
-from storage.settings.changes import changed
 from storage.settings.described import settings_record
+from storage.settings.overrides import apply_overrides
 from tests.command_line import run_program, trilight
 from tests.conftest import ROOT
 from tests.for_each import case
@@ -32,7 +37,7 @@ from tests.train.toy import write_toy_dataset
 from train.evaluation.metrics import Lead
 from train.folder import RunFolder
 from train.loop.interrupts import SAVED_STATUS
-from train.runs import RUNS, named_run
+from train.presets import TRAINING_PRESETS, training_preset
 
 TINY = {
     "resolution": 16,
@@ -68,7 +73,7 @@ def test_mistakes_and_the_first_words_come_before_torch(tmp_path: Path) -> None:
     ended = dict(zip(asked, map(json.loads, done.stdout.splitlines()), strict=True))
     assert {name: status for name, (status, *_) in ended.items()} == dict.fromkeys(asked, 1)
     said = {name: mistake for name, (_, _, mistake) in ended.items()}
-    assert "run 'smok': no such run; did you mean smoke?" in said["smok"]
+    assert "training preset 'smok' is unknown; did you mean smoke?" in said["smok"]
     assert "setting 'widht' does not exist" in said["widht"]
     assert "expected begin_with" in said["finetune"]
     assert "it has not begun, so --change seed changes nothing" in said["change"]
@@ -207,14 +212,14 @@ def _file(folder: Path, text: str) -> str:
 
 
 def test_a_preset_like_another_is_that_other() -> None:
-    builds = [(named_build("smoke"), named_build(name)) for name in BUILDS]
-    runs = [(named_run("smoke"), named_run(name)) for name in RUNS]
+    builds = [(preset_settings("smoke"), preset_settings(name)) for name in DATASET_PRESETS]
+    runs = [(training_preset("smoke"), training_preset(name)) for name in TRAINING_PRESETS]
     for smoke, other in [*builds, *runs]:
         with case(other):
             record = settings_record(other)
-            changes = all_changes(smoke, BaseSettings(), record, {})
-            assert settings_record(changed(smoke, changes)) == record
-            assert all_changes(other, BaseSettings(), record, {}) == {}
+            changes = merge_overrides(smoke, BaseSettings(), record, {})
+            assert settings_record(apply_overrides(smoke, changes)) == record
+            assert merge_overrides(other, BaseSettings(), record, {}) == {}
 
 
 def test_a_dataset_is_followed_and_options_count_more(tmp_path: Path) -> None:
@@ -224,12 +229,12 @@ def test_a_dataset_is_followed_and_options_count_more(tmp_path: Path) -> None:
         like=str(tmp_path / "set"),
         settings=_file(tmp_path, "renders: {resolution: 96, max_spp: 64}\nseed: 1\n"),
     )
-    alike = with_base_settings(DatasetOrder(build=FAR), BaseSettings(like=shared.like))
-    found = named_build(FAR, changes=alike.changes).as_json()
+    alike = with_base_settings(GenerateOptions(build=FAR), BaseSettings(like=shared.like))
+    found = preset_settings(FAR, changes=alike.changes).as_json()
     assert found == {**record, "build": FAR}
-    order = DatasetOrder(build=FAR, resolution=32, changes={"renders.max_spp": 128})
+    order = GenerateOptions(build=FAR, resolution=32, changes={"renders.max_spp": 128})
     changes = with_base_settings(order, shared).changes
-    settings = named_build(FAR, changes=changes)
+    settings = preset_settings(FAR, changes=changes)
     assert (settings.seed, settings.renders.resolution, settings.renders.max_spp) == (1, 32, 128)
     assert settings.scenes.num_views == record["scenes"]["num_views"]
 
@@ -237,13 +242,13 @@ def test_a_dataset_is_followed_and_options_count_more(tmp_path: Path) -> None:
 def test_a_floor_that_is_asked_for_replaces_those_of_a_file(tmp_path: Path) -> None:
     file = _file(tmp_path, "renders: {noise_floor_db: 44, noise_floor_objects_db: 43}\n")
     order = with_base_settings(
-        DatasetOrder(noise_floor_linear_db=36.0), BaseSettings(settings=file)
+        GenerateOptions(noise_floor_linear_db=36.0), BaseSettings(settings=file)
     )
-    assert named_build("smoke", changes=order.changes).renders.targets_db == {
+    assert preset_settings("smoke", changes=order.changes).renders.targets_db == {
         "psnr_linear_db": 36.0
     }
-    as_filed = with_base_settings(DatasetOrder(), BaseSettings(settings=file)).changes
-    assert named_build("smoke", changes=as_filed).renders.targets_db == {
+    as_filed = with_base_settings(GenerateOptions(), BaseSettings(settings=file)).changes
+    assert preset_settings("smoke", changes=as_filed).renders.targets_db == {
         "psnr_log_db": 44.0,
         "object_psnr_log_db": 43.0,
     }
@@ -266,7 +271,7 @@ def test_a_file_says_what_set_would(tmp_path: Path) -> None:
     }
     # a preset takes the place of single settings
     base = BaseSettings(settings=_file(tmp_path, "model: {width: 60}\nloss.perceptual: none\n"))
-    changes = all_changes(named_run("smoke"), base, {}, {"model": "tiny"})
+    changes = merge_overrides(training_preset("smoke"), base, {}, {"model": "tiny"})
     assert changes == {"loss.perceptual": "none", "model": "tiny"}
 
 
@@ -304,24 +309,26 @@ def test_what_is_wrong_in_a_file_is_named_with_its_line(tmp_path: Path) -> None:
 
 def test_a_run_is_followed_on_the_command_line(tmp_path: Path) -> None:
     """As far as the data, which are not there: the settings were checked before."""
-    record: dict[str, Any] = settings_record(named_run("smoke")) | {"num_steps": 7}
+    record: dict[str, Any] = settings_record(training_preset("smoke")) | {"num_steps": 7}
     (tmp_path / "settings.json").write_text(json.dumps({"settings": record}))
     words = ["train", "smoke", "--like", str(tmp_path), "--data", str(tmp_path / "no")]
     with pytest.raises(TrilightError, match="warmup_steps is 50"):
-        changed(named_run("smoke"), {"num_steps": 7})
+        apply_overrides(training_preset("smoke"), {"num_steps": 7})
     assert "warmup_steps is 50" in trilight(words).mistake
     ended = trilight([*words, "--set", "warmup_steps=2"])
     assert "Run smoke: 7 steps" in ended.stdout
 
 
 def test_licences_are_allowed_beside_those_of_a_file(tmp_path: Path) -> None:
-    order = DatasetOrder(allow_licences=("CC-BY-NC-4.0",))
+    order = GenerateOptions(allow_licences=("CC-BY-NC-4.0",))
     for text, others in (
-        ("seed: 1\n", named_build("smoke").allowed_licences),
+        ("seed: 1\n", preset_settings("smoke").allowed_licences),
         ("allowed_licences: [MIT]\n", ("MIT",)),
     ):
         found = with_base_settings(order, BaseSettings(settings=_file(tmp_path, text)))
-        settings = named_build("smoke", allow_licences=found.allow_licences, changes=found.changes)
+        settings = preset_settings(
+            "smoke", allow_licences=found.allow_licences, changes=found.changes
+        )
         assert settings.allowed_licences == tuple(sorted({*others, "CC-BY-NC-4.0"}))
 
 

@@ -32,7 +32,7 @@ from storage.settings.fields import describe_fields
 from tests.command_line import run_program, trilight
 from tests.conftest import ROOT
 from tests.for_each import case
-from train.runs import RUNS, named_run
+from train.presets import TRAINING_PRESETS, training_preset
 from train.settings import TrainSettings
 
 SLEEP = [sys.executable, "-c", "import time; time.sleep(120)"]
@@ -272,7 +272,7 @@ def test_the_password_is_no_argument_and_is_not_said(
     assert said.splitlines()[0].startswith("starting Prefect's server at http://my-host:4200")
 
 
-SECOND_STAGES = sorted(name for name in RUNS if named_run(name).from_weights)
+SECOND_STAGES = sorted(name for name in TRAINING_PRESETS if training_preset(name).from_weights)
 
 
 def _parameters(**given: Any) -> dict[str, Any]:
@@ -292,7 +292,7 @@ def test_training_is_launched_by_torchrun_where_there_are_several_processes() ->
 
 def test_the_form_has_every_run_and_every_setting() -> None:
     schema = train_model.parameters.model_dump()
-    assert schema["properties"]["run"]["enum"] == list(RUNS)
+    assert schema["properties"]["run"]["enum"] == list(TRAINING_PRESETS)
     groups = schema["definitions"]
     settings = groups["TrainSettingsChanges"]["properties"]
     assert set(settings) == {field.name for field in dataclasses.fields(TrainSettings)}

@@ -115,7 +115,7 @@ scene = SceneBuilder().add_floor().add_lamp(at=(0, 0, 2)).add_camera(at=(0, -2, 
 trilight.write_scene(scene, "it.safetensors")
 scene = trilight.read_scene("it.safetensors")
 assert trilight.first_hits(scene, resolution=8).met.any()
-assert trilight.named_run("smoke").run == "smoke"
+assert trilight.training_preset("smoke").run == "smoke"
 assert [module.WHOSE for module in (model, train, storage.errors)] == ["the user's"] * 3
 ours = {"scene_templates", "pipeline", "infra"} & set(sys.modules)
 assert not ours, ours

@@ -21,12 +21,12 @@ from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.quality.distance import Surface
 from pipeline.assets.recipe import RECIPE, methods_of
 from pipeline.assets.settings import AssetSettings, GateSettings
-from pipeline.builds.named import named_build
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.generation.environment import vector_extension
 from pipeline.generation.prepare_isolated import prepare_isolated
 from pipeline.objects.generated import generate_objects
 from pipeline.objects.sources import find_objects
+from pipeline.presets.registry import preset_settings
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.asset import Asset, encode_asset
@@ -333,7 +333,7 @@ def test_faithful_works_without_pymeshlab_and_uniform_says_what_to_do(shared: Pa
     assert re.search("profile uniform.*pymeshlab is not installed.*faithful", told["refusal"])
     assert told["recipe"] == "assets-3 libigl" != RECIPE
     assert methods_of("faithful")[0] == "pymeshlab_collapse"
-    assert methods_of("faithful", named_build("pretrain-256").assets.decimator) == tuple(
+    assert methods_of("faithful", preset_settings("pretrain-256").assets.decimator) == tuple(
         told["methods"]
     )
 

@@ -12,12 +12,12 @@ import pytest
 import trimesh
 
 from infra.bench.workloads.cost_scene import cost_scene
-from pipeline.builds.named import named_build
 from pipeline.exchange import formats
 from pipeline.exchange.convert import convert_scene, write_scene
 from pipeline.exchange.formats import list_lost_members
 from pipeline.exchange.open_scene import SceneSource, load_source, scene_source
 from pipeline.isolation import ChildLimits, IsolatedChild
+from pipeline.presets.registry import preset_settings
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.sample_layout import scene_plan
 from scene_templates.settings import SceneSettings
@@ -46,7 +46,7 @@ def test_sampled_scenes_come_back(pool: list[PooledAsset], tmp_path: Path) -> No
     """Rooms with a colour a triangle, smooth objects, emitters that reflect, all four templates."""
     suffixes = itertools.cycle((".usdc", ".usdz", ".usda"))
     for build, templates in (("renderformer-v1-256", TEMPLATES), ("benchmark-v1", {"open_box"})):
-        for template, scene in _of_each(named_build(build).scenes, pool, templates).items():
+        for template, scene in _of_each(preset_settings(build).scenes, pool, templates).items():
             folder = tmp_path / build / template
             folder.mkdir(parents=True)
             assert_usd_keeps_all(scene, folder, next(suffixes))

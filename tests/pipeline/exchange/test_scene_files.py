@@ -11,8 +11,6 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from pipeline.builds.named import named_build
-from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles, find_scene_files
 from pipeline.generation import render_children
 from pipeline.generation.accept_scene_files import (
@@ -20,8 +18,10 @@ from pipeline.generation.accept_scene_files import (
     build_once,
     settings_for_files,
 )
-from pipeline.generation.begin_dataset import begin_dataset
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
+from pipeline.generation.generate_options import GenerateOptions
+from pipeline.presets.registry import preset_settings
+from pipeline.presets.settings import DatasetSettings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
 from storage.errors import Rejected, TrilightError
@@ -71,22 +71,24 @@ def _build(folder: Path, name: str = "a.json") -> Scene:
 
 
 def _digests(folder: Path, name: str) -> dict[str, str]:
-    assets = named_build("smoke").assets
+    assets = preset_settings("smoke").assets
     return dict(build_once(folder.resolve(), name, assets, 1, "scale").sha256)
 
 
-def _settings(folder: Path, views: int | None = None) -> BuildSettings:
-    return settings_for_files(named_build("smoke"), find_scene_files(str(folder)), views)
+def _settings(folder: Path, views: int | None = None) -> DatasetSettings:
+    return settings_for_files(preset_settings("smoke"), find_scene_files(str(folder)), views)
 
 
-def _scene(files: SceneFiles, scene_index: int, settings: BuildSettings) -> Scene:
+def _scene(files: SceneFiles, scene_index: int, settings: DatasetSettings) -> Scene:
     views = settings.scenes.num_views
     return files.scene(scene_index, settings.assets, num_views=views, seed=settings.seed)
 
 
 def _accept(folder: Path, out: Path, licence: str | None = None) -> None:
     found, settings = find_scene_files(str(folder)), _settings(folder)
-    publication = begin_dataset(DatasetFolder(out), settings, {}, 1, accept_environment=False)
+    publication = begin_or_resume_dataset(
+        DatasetFolder(out), settings, {}, 1, accept_environment=False
+    )
     accept_scene_files(found, licence, settings, publication)
 
 
@@ -167,7 +169,7 @@ def test_without_wish_there_are_as_many_views_as_every_file_has(folder: Path) ->
     with pytest.raises(TrilightError, match="--views is 0"):
         _settings(folder, views=0)
     with pytest.raises(TrilightError, match="only with --scenes-from"):
-        DatasetOrder(views=1)
+        GenerateOptions(views=1)
 
 
 @pytest.mark.usefixtures("no_child")
@@ -272,7 +274,7 @@ def test_a_bad_file_keeps_its_number_and_stops_nobody(folder: Path, tmp_path: Pa
     found, settings = find_scene_files(str(folder)), _settings(folder)
     assert found.names == ("a.json", "aa.json", "b.json", "c.json")
     assert settings.splits.listed_scenes == 4
-    publication = begin_dataset(
+    publication = begin_or_resume_dataset(
         DatasetFolder(tmp_path / "set"), settings, {}, 1, accept_environment=False
     )
     files = accept_scene_files(found, None, settings, publication).origin

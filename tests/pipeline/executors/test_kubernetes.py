@@ -11,7 +11,7 @@ from pipeline.executors.array_job import ArrayJob
 from pipeline.executors.kubernetes import PLACE, shards_of_place
 from pipeline.executors.kubernetes_array import KubernetesOptions, job_manifest
 from pipeline.executors.registry import find_executor
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.pipeline.generation.tiny_scenes_kit import tiny_order
@@ -60,7 +60,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Made:
     def make(missing: list[int] = MISSING, **options: Any) -> dict[str, Any]:
         monkeypatch.setattr(arrays, "_is_begun", lambda place: True)
         monkeypatch.setattr(arrays, "unfinished_shards", lambda place, scenes: missing)
-        order = DatasetOrder(
+        order = GenerateOptions(
             build="smoke", scenes=64, out="s3://sets/mine", objects="builtin:", seed=7
         )
         job = arrays.array_job(order, per_task=2, at_once=None, on="kubernetes")
@@ -136,7 +136,7 @@ def test_an_image_is_needed(made: Made, monkeypatch: pytest.MonkeyPatch) -> None
 )
 def test_files_of_this_machine_are_refused(asked: dict[str, str], message: str) -> None:
     given: dict[str, Any] = {"scenes": 8, "out": "gs://sets/mine", **asked}
-    order = DatasetOrder(**given | {"build": "smoke"})
+    order = GenerateOptions(**given | {"build": "smoke"})
     object.__setattr__(order, "build", asked.get("build", "smoke"))  # --extend has loaded it
     job = ArrayJob(order=order, tasks=[0], per_task=1, at_once=1)
     with pytest.raises(TrilightError, match=f"submit kubernetes: .*{message}"):

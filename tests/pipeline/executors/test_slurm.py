@@ -17,9 +17,9 @@ from pipeline.executors.array_job import MAX_TASKS, ArrayJob, array_job
 from pipeline.executors.registry import EXECUTORS, find_executor
 from pipeline.executors.slurm import shards_of_task
 from pipeline.executors.slurm_array import sbatch_command, sbatch_environment
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from storage.dataset.dataset import open_dataset
-from storage.dataset.progress import unfinished_shards
+from storage.dataset.progress import missing_shards
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges, numbers_of
@@ -126,7 +126,7 @@ def test_ranges(numbers: tuple[int, ...], text: str) -> None:
 
 
 def test_an_array_fits_the_cluster_and_covers_every_shard(cluster: Path) -> None:
-    order = DatasetOrder(build="pretrain-256", scenes=2_000_000)
+    order = GenerateOptions(build="pretrain-256", scenes=2_000_000)
     job = array_job(order, per_task=None, at_once=None)
     shards = -(-2_000_000 // 256)
     assert len(job.tasks) <= MAX_TASKS
@@ -137,7 +137,7 @@ def test_an_array_fits_the_cluster_and_covers_every_shard(cluster: Path) -> None
 
 def test_settings_that_divide_the_dataset_count(cluster: Path) -> None:
     changes = {"splits.scenes_per_shard": 8}
-    order = DatasetOrder(build="smoke", scenes=64, changes=changes, objects="my objects")
+    order = GenerateOptions(build="smoke", scenes=64, changes=changes, objects="my objects")
     job = array_job(order, per_task=2, at_once=3)
     assert job.tasks == [0, 1, 2, 3]
     words = sbatch_command(job)
@@ -145,7 +145,7 @@ def test_settings_that_divide_the_dataset_count(cluster: Path) -> None:
     assert words[4:] == ["--changes", "splits.scenes_per_shard=8"]
     given = sbatch_environment(job)
     assert given["OBJECTS"] == "my objects" and given["SCENES"] == "64"
-    for refused in (DatasetOrder(shards="0:1"), DatasetOrder(scenes_from="folder")):
+    for refused in (GenerateOptions(shards="0:1"), GenerateOptions(scenes_from="folder")):
         with pytest.raises(TrilightError, match="submit slurm: expected no"):
             array_job(refused, per_task=None, at_once=None)
 
@@ -185,7 +185,7 @@ def test_tasks_that_died_are_all_that_is_submitted_again(
     first = array_job(order, per_task=2, at_once=None)
     assert first.tasks == [0, 1, 2]
     run(first)
-    left = unfinished_shards(order.place)
+    left = missing_shards(order.place)
     assert left and set(left) <= {2, 3}
     said = trilight(["status", order.place, "--missing", "--shards-per-task", "2"])
     assert said.stdout.strip() == "1"
@@ -195,14 +195,14 @@ def test_tasks_that_died_are_all_that_is_submitted_again(
     run(again)
     assert verify_dataset(order.place).problems == []
     # what is left are the documents, which these tasks do not write
-    assert unfinished_shards(order.place) == [0]
+    assert missing_shards(order.place) == [0]
     (tmp_path / "set" / "README.md").write_text("# A set")
     assert array_job(order, per_task=2, at_once=None).tasks == []
     assert trilight(["status", order.place, "--missing"]).stdout == ""
 
 
 def test_passwords_do_not_reach_the_queue() -> None:
-    order = DatasetOrder(build="smoke", objects="http://ada:secret@host/objects/")
+    order = GenerateOptions(build="smoke", objects="http://ada:secret@host/objects/")
     with pytest.raises(TrilightError, match="holds a password") as refused:
         array_job(order, per_task=None, at_once=None)
     assert "secret" not in str(refused.value)

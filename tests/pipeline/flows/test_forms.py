@@ -7,12 +7,12 @@ import pytest
 from prefect.exceptions import ParameterTypeError
 
 from infra.serving.train_model import train_model
-from pipeline.builds.settings import BuildSettings
 from pipeline.flows.array_flow import make_by_array
 from pipeline.flows.dataset_flows import build_dataset, generate_scenes, prepare_assets
-from pipeline.flows.forms import BuildChanges, changed_values, order_of
+from pipeline.flows.forms import DatasetOverrides, changed_values, options_of_form
 from pipeline.flows.prefect_runner import is_retryable
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
+from pipeline.presets.settings import DatasetSettings
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.for_each import for_each
 
@@ -27,7 +27,7 @@ FLOWS = {
 
 
 def _defaults(**given: Any) -> dict[str, Any]:
-    plain = {field.name: field.default for field in dataclasses.fields(DatasetOrder)}
+    plain = {field.name: field.default for field in dataclasses.fields(GenerateOptions)}
     return {**plain, "changes": None, **given}
 
 
@@ -48,8 +48,8 @@ def test_the_forms_within_have_every_setting_of_a_build_and_its_range() -> None:
     renders = groups["RenderSettingsChanges"]["properties"]
     assert renders["max_spp"]["description"].startswith("The cap")
     assert renders["denoiser"]["anyOf"][0]["enum"] == ["high", "fast", "off"]
-    assert set(groups["BuildSettingsChanges"]["properties"]) == set(
-        BuildSettings.__dataclass_fields__
+    assert set(groups["DatasetSettingsChanges"]["properties"]) == set(
+        DatasetSettings.__dataclass_fields__
     )
     # As declared at the fields, but for what no form can hold exactly.
     shown = schema["properties"]
@@ -64,12 +64,12 @@ def test_the_forms_within_have_every_setting_of_a_build_and_its_range() -> None:
 
 
 def test_changes_become_dotted_names() -> None:
-    form = BuildChanges(**{"renders": {"max_spp": 64}, "storage": {"profile": "lossless"}})
+    form = DatasetOverrides(**{"renders": {"max_spp": 64}, "storage": {"profile": "lossless"}})
     expected = {"renders.max_spp": 64, "storage.profile": "lossless"}
     assert changed_values(form) == expected
-    order = order_of(_defaults(scenes=3, changes=form), DatasetOrder)
-    assert order == DatasetOrder(scenes=3, changes=expected)
-    assert order_of(_defaults(), DatasetOrder) == DatasetOrder()
+    order = options_of_form(_defaults(scenes=3, changes=form), GenerateOptions)
+    assert order == GenerateOptions(scenes=3, changes=expected)
+    assert options_of_form(_defaults(), GenerateOptions) == GenerateOptions()
 
 
 @for_each(
@@ -126,7 +126,7 @@ def test_a_place_that_cannot_be_written_is_refused_by_name() -> None:
     """Before anything is begun: a flow makes its order first."""
     for out in ("https://host/set", "hf://datasets/ada/set", "ftp://host/set"):
         with pytest.raises(TrilightError, match=f"^out '{out}'"):
-            order_of(_defaults(out=out), DatasetOrder)
+            options_of_form(_defaults(out=out), GenerateOptions)
 
 
 def test_only_what_can_pass_is_tried_again() -> None:

@@ -20,8 +20,8 @@ from pipeline.flows import array_flow, run_artifacts
 from pipeline.flows.array_flow import make_by_array
 from pipeline.flows.prefect_runner import PrefectRunner
 from pipeline.flows.run_artifacts import RunArtifacts, report_url, small_picture, usd_per_core_hour
-from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetProgress
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.run import TaskResult
 from storage.errors import TrilightError
 from tests.for_each import for_each
@@ -90,7 +90,7 @@ def test_a_page_that_cannot_be_shown_does_not_end_the_run(
     tables: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     _cannot_show(monkeypatch)
-    watched = RunArtifacts(DatasetOrder(out=str(tmp_path)))
+    watched = RunArtifacts(GenerateOptions(out=str(tmp_path)))
     watched.record_task(None, _task(1, 1.0))  # type: ignore[arg-type]
     watched.show_failure(ValueError("x"))
     assert [record.levelname for record in caplog.records] == ["WARNING"]
@@ -102,7 +102,7 @@ def test_the_rate_begins_with_the_first_scene(
     """An hour of preparing objects, then 4 scenes in 20 s."""
     now = 0.0
     monkeypatch.setattr(run_artifacts.time, "monotonic", lambda: now)
-    watched = RunArtifacts(DatasetOrder(out=str(tmp_path)))
+    watched = RunArtifacts(GenerateOptions(out=str(tmp_path)))
     assert watched.scenes_per_s() == 0
     now = 3620.0
     watched.record_task(None, _task(4, 20.0))  # type: ignore[arg-type]
@@ -124,7 +124,7 @@ def test_a_page_shows_the_scenes_and_where_their_report_is(
     outcome: Any = SimpleNamespace(
         num_shards=1, num_shards_planned=1, digest="d", statistics=statistics
     )
-    RunArtifacts(DatasetOrder(out=str(out))).show_result(outcome)
+    RunArtifacts(GenerateOptions(out=str(out))).show_result(outcome)
     ((_, rows),) = tables
     assert (rows["report"], rows["views"]) == (f"{out}/report.html", "16")
     (url,) = pictures
@@ -140,7 +140,7 @@ def test_the_page_ends_with_how_far_everything_is(
     tables: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_artifacts.time, "monotonic", lambda: 0.0)
-    watched = RunArtifacts(DatasetOrder(out=str(tmp_path)))
+    watched = RunArtifacts(GenerateOptions(out=str(tmp_path)))
     done = DatasetProgress(shards=1, scenes=4, shards_requested=2, scenes_requested=8)
     publication = SimpleNamespace(progress=done, manifest=SimpleNamespace(num_views=2))
     run: Any = SimpleNamespace(publication=publication)
@@ -164,7 +164,7 @@ def test_a_run_that_fails_says_so_in_its_summary(
 
     monkeypatch.setattr(run_artifacts, "make_dataset", full)
     with pytest.raises(TrilightError):
-        run_artifacts.make_with_artifacts(DatasetOrder(out=str(tmp_path)), PrefectRunner())
+        run_artifacts.make_with_artifacts(GenerateOptions(out=str(tmp_path)), PrefectRunner())
     ((key, rows),) = tables
     assert key == "summary"
     assert rows["failed"].startswith("TrilightError: the disk is full")
@@ -180,7 +180,7 @@ def test_a_price_that_is_none_is_named_at_the_start(
     assert usd_per_core_hour() == 0.5
     monkeypatch.setenv("TRILIGHT_USD_PER_CORE_HOUR", text)
     with pytest.raises(TrilightError, match=rf"TRILIGHT_USD_PER_CORE_HOUR is '{text}'; expected"):
-        RunArtifacts(DatasetOrder())
+        RunArtifacts(GenerateOptions())
 
 
 @pytest.fixture
@@ -208,7 +208,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
 
 def run(**given: Any) -> None:
     plain = {
-        each.name: getattr(tiny_order(), each.name) for each in dataclasses.fields(DatasetOrder)
+        each.name: getattr(tiny_order(), each.name) for each in dataclasses.fields(GenerateOptions)
     }
     own = {name: DatasetByArray.__dataclass_fields__[name].default for name in _OWN}
     flow: Any = make_by_array
@@ -218,7 +218,7 @@ def run(**given: Any) -> None:
     flow.fn(**checked)
 
 
-_OWN = set(DatasetByArray.__dataclass_fields__) - set(DatasetOrder.__dataclass_fields__)
+_OWN = set(DatasetByArray.__dataclass_fields__) - set(GenerateOptions.__dataclass_fields__)
 
 
 def test_what_is_missing_is_asked_for_and_shown_to_the_end(

@@ -13,10 +13,10 @@ import pytest
 from pipeline.flows import dataset_flows as building
 from pipeline.flows import on_dask
 from pipeline.flows import prefect_runner as runner
-from pipeline.flows.forms import DatasetInRuns, order_of
+from pipeline.flows.forms import DatasetInRuns, options_of_form
 from pipeline.flows.limits import GPU_LIMIT
 from pipeline.flows.process import run_to_end
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.tasks import shard_ranges
 from storage.errors import TrilightError
 from tests.for_each import for_each
@@ -68,7 +68,7 @@ def test_there_are_no_more_ranges_than_shards() -> None:
 )
 def test_wrong_numbers_of_runs_are_named(given: dict[str, Any], message: str) -> None:
     with pytest.raises(TrilightError, match=message):
-        order_of(_parameters(**given), DatasetInRuns)
+        options_of_form(_parameters(**given), DatasetInRuns)
 
 
 @for_each(("device", "held"), [("gpu", [1]), ("cpu", [])])
@@ -102,7 +102,7 @@ def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_pat
         def run(self, function: Any, *arguments: Any) -> dict[str, bool]:
             return {"tcp://a:1": function(*arguments), "tcp://b:1": False}
 
-    order = DatasetOrder(out=str(tmp_path / "set"))
+    order = GenerateOptions(out=str(tmp_path / "set"))
     with pytest.raises(TrilightError, match="1 of 2 Dask workers do not see.*such as tcp://b:1"):
         on_dask._require_shared(cast(Any, Client()), order)
     assert list((tmp_path / "set" / ".staging").iterdir()) == []

@@ -30,7 +30,7 @@ from pipeline.flows.prefect_server import (
     wait_until_healthy,
 )
 from pipeline.flows.submission import parameters, poll_run, server, submit, workers_online
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from storage.cache import open_private, private_folder
 from storage.errors import TrilightError
 from tests.for_each import case, for_each
@@ -98,7 +98,7 @@ def test_a_deployment_that_cannot_be_found(
 
 def test_parameters_are_what_the_flow_takes() -> None:
     """Prefect's own check of the flow's form accepts them, and nothing at its default is sent."""
-    order = DatasetOrder(
+    order = GenerateOptions(
         build="smoke",
         scenes=5,
         allow_licences=("CC-BY-4.0",),

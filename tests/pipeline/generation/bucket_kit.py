@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.builds.named import named_build
 from pipeline.generation import dataset_writer
-from pipeline.generation.begin_dataset import begin_dataset, hold_membership
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
 from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.presets.registry import preset_settings
 from pipeline.shards.pack import pack_shard
 from storage.dataset.layout import dataset_folder
 from storage.dataset.staging import stage_scene
@@ -90,9 +90,11 @@ class Machines:
         """Take part from a machine, as a run does."""
         self.use(name)
         folder = dataset_folder(OUT)
-        build = named_build("smoke", changes=changes) if changes else _build()
-        with hold_membership(folder):
-            yield begin_dataset(folder, build, ENVIRONMENT, scenes, accept_environment=False)
+        build = preset_settings("smoke", changes=changes) if changes else _build()
+        with hold_dataset_lock(folder):
+            yield begin_or_resume_dataset(
+                folder, build, ENVIRONMENT, scenes, accept_environment=False
+            )
 
 
 def other_shard(writer: DatasetWriter) -> Any:

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from pipeline.assets.stage import PreparedObject
-from pipeline.builds.named import named_build
-from pipeline.builds.settings import BuildSettings
 from pipeline.generation import object_batches
-from pipeline.generation.begin_dataset import begin_dataset
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects, ObjectLock
 from pipeline.generation.prepare_isolated import asset_store
+from pipeline.presets.registry import preset_settings
+from pipeline.presets.settings import DatasetSettings
 from storage.dataset.layout import DatasetFolder
 from storage.digests import sha256_hex
 from storage.records.asset import encode_asset
@@ -28,9 +28,9 @@ LICENCES = ("CC0-1.0", "CC-BY-SA-4.0", "CC-BY-4.0", "CC-BY-SA-3.0")
 SOURCE = "objects-by-hand"
 
 
-def build() -> BuildSettings:
-    """Return a small build."""
-    return named_build("smoke", resolution=16)
+def build() -> DatasetSettings:
+    """Return a small preset."""
+    return preset_settings("smoke", resolution=16)
 
 
 _pool = functools.cache(small_pool)
@@ -62,7 +62,9 @@ def prepared(number: int) -> PreparedObject:
 
 def begun(root: Path) -> DatasetWriter:
     """Begin a dataset of four scenes."""
-    return begin_dataset(DatasetFolder(root), build(), ENVIRONMENT, 4, accept_environment=False)
+    return begin_or_resume_dataset(
+        DatasetFolder(root), build(), ENVIRONMENT, 4, accept_environment=False
+    )
 
 
 def asked(writer: DatasetWriter, source: str = SOURCE, licence: str | None = None) -> ObjectLock:

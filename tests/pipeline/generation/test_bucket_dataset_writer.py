@@ -13,9 +13,9 @@ import pytest
 
 from pipeline.executors.array_job import array_job
 from pipeline.generation import dataset_writer
-from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import prepare_dataset
 from pipeline.generation.prepare_isolated import asset_store
 from pipeline.shards import published
@@ -59,7 +59,7 @@ def names(bucket: Any) -> set[str]:
 def test_an_array_is_of_what_a_bucket_lacks(bucket: Any, machines: Machines) -> None:
     machines.use("a")
     splits = {f"splits.{name}": value for name, value in vars(_build().splits).items()}
-    order = DatasetOrder(build="smoke", out=OUT, scenes=8, changes=splits)
+    order = GenerateOptions(build="smoke", out=OUT, scenes=8, changes=splits)
     assert array_job(order, per_task=None, at_once=None).tasks == [0, 1]
     with machines.maker("a") as writer:
         make(writer, 0)

@@ -5,15 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.builds.named import named_build
-from pipeline.builds.settings import BuildSettings
 from pipeline.generation import dataset_writer
-from pipeline.generation.begin_dataset import begin_dataset
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.environment import environment
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.run import choose_dataset_variant
 from pipeline.objects.generated import generate_objects
+from pipeline.presets.registry import preset_settings
+from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.variant import Device, Variant, _ProbeResult, device_of
 from pipeline.shards.pack import pack_shard
 from storage.dataset import layout
@@ -37,13 +37,15 @@ from tests.scenes_by_hand import tiny_sample, tiny_scene
 ENVIRONMENT = {"mitsuba_variant": "llvm_ad_rgb", "libraries": {"mitsuba": "3.9.1"}}
 
 
-def _build() -> BuildSettings:
-    build = named_build("smoke", resolution=16)
+def _build() -> DatasetSettings:
+    build = preset_settings("smoke", resolution=16)
     return dataclasses.replace(build, scenes=dataclasses.replace(build.scenes, num_views=2))
 
 
-def _begin(root: Path, build: BuildSettings, scenes: int = 4, **environment: str) -> DatasetWriter:
-    return begin_dataset(
+def _begin(
+    root: Path, build: DatasetSettings, scenes: int = 4, **environment: str
+) -> DatasetWriter:
+    return begin_or_resume_dataset(
         DatasetFolder(root), build, {**ENVIRONMENT, **environment}, scenes, accept_environment=False
     )
 
@@ -104,14 +106,16 @@ def test_as_many_scenes_are_planned_as_are_asked_for(tmp_path: Path) -> None:
 
 def test_other_settings_and_another_environment_are_refused_by_name(tmp_path: Path) -> None:
     _dataset(tmp_path)
-    other = named_build("smoke", resolution=32, seed=3)
+    other = preset_settings("smoke", resolution=32, seed=3)
     other = dataclasses.replace(other, scenes=_build().scenes)
     with pytest.raises(TrilightError, match=r"renders.resolution was 16, now 32 \(and 1 more\)"):
         _begin(tmp_path, other)
     with pytest.raises(TrilightError, match="mitsuba_variant was 'llvm_ad_rgb', now 'scalar_rgb'"):
         _begin(tmp_path, _build(), mitsuba_variant="scalar_rgb")
     elsewhere = {**ENVIRONMENT, "mitsuba_variant": "scalar_rgb"}
-    begin_dataset(DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True)
+    begin_or_resume_dataset(
+        DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True
+    )
 
 
 @for_each(
@@ -138,7 +142,7 @@ def test_a_dataset_stays_on_the_device_that_it_began_on(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """This machine has a GPU that renders well, and smoke and frozen builds have digests."""
+    """This machine has a GPU that renders well, and smoke and frozen presets have digests."""
     folder = DatasetFolder(tmp_path)
     if begun:
         _begin(tmp_path, _build(), mitsuba_variant=begun)
@@ -148,7 +152,7 @@ def test_a_dataset_stays_on_the_device_that_it_began_on(
     monkeypatch.setattr("pipeline.renders.variant._probe", lambda variant: _ProbeResult())
     on_cpu = Variant(name="llvm_ad_rgb", libllvm="", note="")
     monkeypatch.setattr("pipeline.renders.variant._on_processor", lambda: on_cpu)
-    order = DatasetOrder(build=build, device=device)
+    order = GenerateOptions(build=build, device=device)
     variant = choose_dataset_variant(order, folder)
     assert variant.device == device_of(environment(variant)) == chosen
 
@@ -163,7 +167,9 @@ def test_a_dataset_goes_on_with_another_device_only_where_that_is_accepted(
     with pytest.raises(TrilightError, match=f"{said} {first} or another --out, or .*--accept-env"):
         _begin(tmp_path, _build(), mitsuba_variant=now)
     elsewhere = {**ENVIRONMENT, "mitsuba_variant": now}
-    begin_dataset(DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True)
+    begin_or_resume_dataset(
+        DatasetFolder(tmp_path), _build(), elsewhere, 4, accept_environment=True
+    )
 
 
 def test_a_shard_that_missed_the_manifest_is_found(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.generation.begin_dataset import begin_dataset
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
 from pipeline.generation.derive_dataset import derive_dataset
 from pipeline.shards.derive import DeriveOptions, derive_shards
 from pipeline.shards.finished_dataset import open_finished
@@ -307,7 +307,7 @@ def test_rejections_follow_their_scenes(tmp_path: Path) -> None:
 
 
 def test_objects_that_two_sources_prepared_otherwise_are_both_named(tmp_path: Path) -> None:
-    """Two builds cut the same object to other budgets: one uid, two assets, one split."""
+    """Two presets cut the same object to other budgets: one uid, two assets, one split."""
     a = finished(tmp_path / "a", scenes(0))
     rows = [
         dataclasses.replace(entry, asset_sha256=f"{number}" * 64)
@@ -496,7 +496,9 @@ def test_nothing_is_overwritten_and_nothing_grows(tmp_path: Path) -> None:
     with pytest.raises(TrilightError, match="is there already"):
         derive_dataset([str(a)], reshard, out)
     with pytest.raises(TrilightError, match=r"made by `trilight shards reshard`.*cannot grow"):
-        begin_dataset(DatasetFolder(out), _build(), ENVIRONMENT, 4, accept_environment=False)
+        begin_or_resume_dataset(
+            DatasetFolder(out), _build(), ENVIRONMENT, 4, accept_environment=False
+        )
 
 
 KILLED = """

@@ -9,13 +9,13 @@ import pytest
 from prefect.exceptions import ParameterTypeError
 
 from infra.repair import repair
-from pipeline.builds.named import BUILDS, named_build, typed_build
 from pipeline.exchange.reader import file_child
 from pipeline.executors.threads import ThreadRunner
-from pipeline.generation.begin_dataset import begin_dataset, hold_membership
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, make_task, prepare_dataset
 from pipeline.isolation import call_with_retries
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings, resolve_dataset_preset
 from pipeline.shards.derive import _extensions
 from scene_templates.families import FAMILIES
 from storage.dataset.asked import read_asked, write_asked
@@ -43,8 +43,8 @@ TRAP = "from pathlib import Path\nPath(__file__).with_suffix('.ran').touch()\n"
 
 
 def _begin(root: Path) -> None:
-    build = named_build("smoke")
-    begin_dataset(DatasetFolder(root), build, ENVIRONMENT, 4, accept_environment=False)
+    build = preset_settings("smoke")
+    begin_or_resume_dataset(DatasetFolder(root), build, ENVIRONMENT, 4, accept_environment=False)
 
 
 def test_the_manifest_records_what_had_part_in_a_dataset(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_a_template_is_checked_when_it_is_made(tmp_path: Path, changed: str, sai
 def test_a_dataset_never_causes_an_import(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, extended: dict[str, str]
 ) -> None:
-    """Its build may say FILE.py:FUNCTION, and its extensions may lie beside it."""
+    """Its preset may say FILE.py:FUNCTION, and its extensions may lie beside it."""
     folder = tmp_path / "set"
     monkeypatch.chdir(tmp_path)
     writer = begin_tiny(folder, 4)
@@ -181,23 +181,23 @@ def test_a_form_cannot_name_a_file(tmp_path: Path) -> None:
 def test_families_are_chosen_by_name() -> None:
     with loaded(EXAMPLES / "family.py"):
         for names in ("crowd", ["crowd", "plane-single"]):
-            families = named_build("smoke", changes={"scenes.families": names}).scenes.families
+            families = preset_settings("smoke", changes={"scenes.families": names}).scenes.families
             assert families[0] == FAMILIES["crowd"]()
             assert len(families) == (2 if isinstance(names, list) else 1)
         heavy = {"scenes.families": ["crowd"], "scenes.families.weight": 5.0}
-        assert named_build("smoke", changes=heavy).scenes.families[0].weight == 5.0
+        assert preset_settings("smoke", changes=heavy).scenes.families[0].weight == 5.0
     for wrong in ("crowd", ["plane-single", "crowd"], 3):
         with pytest.raises(
             TrilightError, match=r"setting 'scenes\.families' is .* of plane-single"
         ):
-            named_build("smoke", changes={"scenes.families": wrong})
+            preset_settings("smoke", changes={"scenes.families": wrong})
     with pytest.raises(TrilightError, match=r"families.* expected at least one"):
-        named_build("smoke", changes={"scenes.families": []})
+        preset_settings("smoke", changes={"scenes.families": []})
 
 
 def test_a_build_of_ones_own_has_a_name_of_its_own(tmp_path: Path) -> None:
     text = """
-from pipeline.builds.training import smoke
+from pipeline.presets.training import smoke
 import dataclasses
 
 def mine():
@@ -211,17 +211,17 @@ def nothing():
 """
     path = written(tmp_path, text)
     with room_for_extensions():
-        name = typed_build(f"{path}:mine")
-        assert (name, named_build(name).build, BUILDS[name].num_scenes) == (
+        name = resolve_dataset_preset(f"{path}:mine")
+        assert (name, preset_settings(name).build, DATASET_PRESETS[name].num_scenes) == (
             "own.py:mine",
             "mine",
             32,
         )
         with pytest.raises(TrilightError, match="build='smoke', which is one of Trilight's own"):
-            named_build(typed_build(f"{path}:posing"))
-        with pytest.raises(TrilightError, match=r"own\.py: it returned a NoneType; expected Build"):
-            typed_build(f"{path}:nothing")
-    assert name not in BUILDS
+            preset_settings(resolve_dataset_preset(f"{path}:posing"))
+        with pytest.raises(TrilightError, match=r"own\.py: it returned a NoneType; expected Data"):
+            resolve_dataset_preset(f"{path}:nothing")
+    assert name not in DATASET_PRESETS
 
 
 def test_derived_sets_name_the_extensions_of_their_sources(tmp_path: Path) -> None:
@@ -239,7 +239,7 @@ def test_a_mistyped_source_leaves_nothing_behind(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     with pytest.raises(TrilightError, match="objects"):
-        make_dataset(DatasetOrder(objects=source, out="set"), ThreadRunner())
+        make_dataset(GenerateOptions(objects=source, out="set"), ThreadRunner())
     assert [path.name for path in tmp_path.iterdir()] == ["empty"]
 
 
@@ -247,8 +247,10 @@ def test_what_was_only_begun_is_begun_anew(tmp_path: Path, monkeypatch: pytest.M
     """As a run leaves it that ended over its objects: other settings and fewer scenes are free."""
     without_rendering(monkeypatch)
     folder = DatasetFolder(tmp_path / "set")
-    with folder.hold_membership():
-        begin_dataset(folder, named_build("smoke", seed=5), {}, 24, accept_environment=False)
+    with folder.hold_shared_lock():
+        begin_or_resume_dataset(
+            folder, preset_settings("smoke", seed=5), {}, 24, accept_environment=False
+        )
     run = prepare_dataset(tiny_order(out=str(folder.root), scenes=4, seed=7))
     assert run.publication.manifest.settings["seed"] == 7
     assert run.publication.manifest.num_scenes == 4
@@ -268,19 +270,25 @@ def test_what_has_objects_or_scenes_is_not(tmp_path: Path, monkeypatch: pytest.M
 
 def test_nobody_forgets_while_another_is_at_work(tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path / "set")
-    with hold_membership(folder):
-        begin_dataset(folder, named_build("smoke", seed=5), {}, 4, accept_environment=False)
-        with hold_membership(folder):
+    with hold_dataset_lock(folder):
+        begin_or_resume_dataset(
+            folder, preset_settings("smoke", seed=5), {}, 4, accept_environment=False
+        )
+        with hold_dataset_lock(folder):
             assert read_manifest(folder.manifest).settings["seed"] == 5
 
 
 def test_who_was_replaced_all_the_same_stops(tmp_path: Path) -> None:
     """Locks do not reach every machine: a maker whose manifest has become another's says so."""
     folder = DatasetFolder(tmp_path / "set")
-    with folder.hold_membership():
-        mine = begin_dataset(folder, named_build("smoke", seed=5), {}, 4, accept_environment=False)
+    with folder.hold_shared_lock():
+        mine = begin_or_resume_dataset(
+            folder, preset_settings("smoke", seed=5), {}, 4, accept_environment=False
+        )
         folder.manifest.unlink()
-        begin_dataset(folder, named_build("smoke", seed=7), {}, 4, accept_environment=False)
+        begin_or_resume_dataset(
+            folder, preset_settings("smoke", seed=7), {}, 4, accept_environment=False
+        )
         with pytest.raises(TrilightError, match="another dataset has been begun here"):
             mine.lock_objects([])
 
@@ -300,4 +308,4 @@ def test_a_dataset_of_removed_settings_is_read_and_not_resumed(
     with pytest.raises(TrilightError, match=refusal):
         make_dataset(order, Undocumented())
     with pytest.raises(TrilightError, match=refusal):
-        named_build("smoke", changes={"splits.object_parts": 2})
+        preset_settings("smoke", changes={"splits.object_parts": 2})

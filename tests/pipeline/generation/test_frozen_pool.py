@@ -10,19 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.builds.named import named_build
-from pipeline.builds.settings import BuildSettings
 from pipeline.documents.attribution import encode_attribution
 from pipeline.generation import accept_maps as accepting
 from pipeline.generation import freeze_objects, frozen_pool, pipeline, restore_object
 from pipeline.generation.accept_maps import AcceptedMaps, MapFolders, accept_maps, map_folders
-from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.freeze_objects import AcceptedObjects, require_same
 from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, SplitPool, user_maps
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.scene_worker import SceneAttempt
 from pipeline.objects.maps.prepared import MapFiles, prepare_map
+from pipeline.presets.registry import preset_settings
+from pipeline.presets.settings import DatasetSettings
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.fitting import draw_rows
 from pipeline.scenes.pool import PooledAsset, fits_of
@@ -247,12 +247,12 @@ SHARES = {
 
 
 @pytest.fixture(scope="module")
-def settings() -> BuildSettings:
-    return named_build("smoke", changes=SHARES)
+def settings() -> DatasetSettings:
+    return preset_settings("smoke", changes=SHARES)
 
 
 @pytest.fixture(scope="module")
-def accepted(settings: BuildSettings, tmp_path_factory: pytest.TempPathFactory) -> AcceptedMaps:
+def accepted(settings: DatasetSettings, tmp_path_factory: pytest.TempPathFactory) -> AcceptedMaps:
     """Twelve of each, one in a second copy, and a map that is no map."""
     root = tmp_path_factory.mktemp("own")
     for number in range(12, 24):
@@ -283,7 +283,7 @@ def test_rows_have_splits_by_content_and_copies_stay_together(accepted: Accepted
 
 
 def test_no_texture_or_map_of_test_is_in_train(
-    accepted: AcceptedMaps, settings: BuildSettings
+    accepted: AcceptedMaps, settings: DatasetSettings
 ) -> None:
     """By their bytes: not only the uids differ, but what scenes show."""
     uids: dict[str, set[str]] = {}
@@ -319,11 +319,11 @@ def test_no_texture_or_map_of_test_is_in_train(
 
 
 def test_without_own_ones_a_scene_is_what_it_was(
-    accepted: AcceptedMaps, settings: BuildSettings
+    accepted: AcceptedMaps, settings: DatasetSettings
 ) -> None:
     """Folders change no draw while their shares are 0, and procedural ones stay where none is."""
     changes = {name: 0.0 for name in SHARES if name.endswith("own_share")}
-    plain = named_build("smoke", changes=SHARES | changes).scenes
+    plain = preset_settings("smoke", changes=SHARES | changes).scenes
     own = user_maps(accepted.rows, "train")
     first, second = (
         compose_scene(plain, small_pool(), SceneKey(0, 3), **given)
@@ -373,13 +373,13 @@ def test_share_alike_licences_never_meet() -> None:
 
 def test_folders_and_shares_belong_together() -> None:
     with pytest.raises(TrilightError, match="--skies is not given"):
-        map_folders(DatasetOrder(textures="t"), named_build("smoke", changes=SHARES))
+        map_folders(GenerateOptions(textures="t"), preset_settings("smoke", changes=SHARES))
     with pytest.raises(TrilightError, match=r"--textures is given, but .*own_share 0"):
-        map_folders(DatasetOrder(textures="t"), named_build("smoke"))
+        map_folders(GenerateOptions(textures="t"), preset_settings("smoke"))
     with pytest.raises(TrilightError, match="only where scenes are composed"):
-        DatasetOrder(textures="t", scenes_from="scenes")
+        GenerateOptions(textures="t", scenes_from="scenes")
     with pytest.raises(TrilightError, match="only with --textures or --skies"):
-        DatasetOrder(map_licence="MIT")
+        GenerateOptions(map_licence="MIT")
 
 
 def test_files_that_lie_are_refused_with_their_part(tmp_path: Path) -> None:

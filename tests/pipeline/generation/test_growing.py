@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.builds.named import BUILDS, named_build
 from pipeline.generation import pipeline
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, prepare_dataset
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.shards import pack
 from storage.dataset.dataset import open_dataset, open_listed
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
-from storage.dataset.progress import read_progress, read_status, unfinished_shards
+from storage.dataset.progress import missing_shards, read_progress, read_status
 from storage.dataset.settings import MOST_SCENES
 from storage.dataset.splits import (
     MOST_SHARDS,
@@ -36,7 +36,7 @@ from tests.for_each import case
 from tests.pipeline.generation.bucket_kit import OUT, Killed, Machines, Writes
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
-SMOKE = named_build("smoke").splits
+SMOKE = preset_settings("smoke").splits
 GIVEN_UP = (1, 6, 7)
 """Of shards of four: in the middle of one, and at the end of one."""
 
@@ -58,7 +58,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
     return count
 
 
-def order(root: Path | str, scenes: int, **changes: Any) -> DatasetOrder:
+def order(root: Path | str, scenes: int, **changes: Any) -> GenerateOptions:
     return tiny_order(out=str(root), scenes=scenes, failure_budget=1.0, **changes)
 
 
@@ -160,8 +160,8 @@ def test_a_shard_that_grows_is_missing_and_readable(tmp_path: Path, made: Counte
     root, whole = tmp_path / "set", make(tmp_path / "whole", 9)
     make(root, 3)
     (root / "README.md").touch()  # no documents are written here
-    assert unfinished_shards(str(root), 3) == []
-    assert unfinished_shards(str(root), 9) == [0, 1, 2]
+    assert missing_shards(str(root), 3) == []
+    assert missing_shards(str(root), 9) == [0, 1, 2]
     assert make(root, 9, shards="1:3") == ""
     status = read_status(str(root))
     assert (status.shards_done, status.shards_planned) == (2, 3)
@@ -169,7 +169,7 @@ def test_a_shard_that_grows_is_missing_and_readable(tmp_path: Path, made: Counte
     assert status.scenes_given_up == 3
     assert not verify_dataset(root).is_finished
     assert [shard.num_samples for shard in open_dataset(str(root)).manifest.shards] == [2, 2, 1]
-    assert unfinished_shards(str(root)) == [0]
+    assert missing_shards(str(root)) == [0]
     (root / "train-000000.tar").write_bytes(b"damaged")  # its scenes are made again
     shutil.rmtree(root / ".staging")
     assert make(root, 9, shards="0:1") == whole
@@ -243,8 +243,8 @@ def test_a_bucket_without_notes_grows(
 
 
 def test_every_preset_makes_one_scene() -> None:
-    for name in BUILDS:
-        splits = named_build(name).splits
+    for name in DATASET_PRESETS:
+        splits = preset_settings(name).splits
         assert planned_scenes(1, splits) == shards_for(1, splits) == 1, name
         assert scenes_of_shard(0, cut_splits(1, splits)) == range(1)
         most = min(MOST_SCENES, MOST_SHARDS * splits.scenes_per_shard)

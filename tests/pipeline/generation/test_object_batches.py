@@ -301,19 +301,19 @@ def test_a_claim_keeps_other_machines_off_until_it_ends(
     a, b = _machine(tmp_path, "a"), _machine(tmp_path, "b")
     for holder, other in ((a, b), (b, a)):
         with (
-            holder.hold_claim("x") as ours,
-            other.hold_claim("x") as theirs,
-            other.hold_claim("y") as free,
+            holder.hold_lock("x") as ours,
+            other.hold_lock("x") as theirs,
+            other.hold_lock("y") as free,
         ):
             assert (ours, theirs, free) == (True, False, True)
     with monkeypatch.context() as patch:
         patch.setattr(store.BucketStore, "put", lambda *given: None)  # it dies
-        with a.hold_claim("z") as ours:
+        with a.hold_lock("z") as ours:
             assert ours
-    with b.hold_claim("z") as theirs, _machine(tmp_path, "a").hold_claim("z") as again:
+    with b.hold_lock("z") as theirs, _machine(tmp_path, "a").hold_lock("z") as again:
         assert (theirs, again) == (False, True), "a machine that is started again has its claims"
     monkeypatch.setattr(store, "LEASE_S", 0.0)
-    with b.hold_claim("z") as theirs:
+    with b.hold_lock("z") as theirs:
         assert theirs
 
 

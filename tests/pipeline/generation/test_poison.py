@@ -13,7 +13,7 @@ import pytest
 
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation import pipeline
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, prepare_dataset
 from pipeline.generation.run import Outcome
 from pipeline.generation.scene_worker import SceneWorker
@@ -46,8 +46,8 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield folder
 
 
-def order(folder: Path, out: Path | str, **changes: object) -> DatasetOrder:
-    return DatasetOrder(
+def order(folder: Path, out: Path | str, **changes: object) -> GenerateOptions:
+    return GenerateOptions(
         objects=str(folder / "objects"),
         out=str(out),
         **{"scenes": 8, "resolution": 32, "noise_floor_db": 20.0, **changes},  # type: ignore[arg-type]

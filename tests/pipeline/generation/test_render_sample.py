@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.builds.named import named_build
-from pipeline.builds.settings import BuildSettings
 from pipeline.generation import render_sample as module
 from pipeline.generation import render_sample as rendering
 from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
+from pipeline.presets.registry import preset_settings
+from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.results import RenderedView
 from pipeline.renders.variant import activate, choose_variant
 from pipeline.scenes.compose import compose_scene
@@ -24,11 +24,11 @@ from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene
 from storage.renderer import Sampling
 from storage.seeds import SceneKey, seed_for
-from storage.settings.changes import json_or_word
+from storage.settings.overrides import json_or_word
 from tests.pipeline.scenes.small_pool import small_pool
 from tests.scenes_by_hand import tiny_scene
 
-BUILD = named_build("smoke", resolution=16)
+BUILD = preset_settings("smoke", resolution=16)
 KEY = "000000000"
 
 
@@ -74,7 +74,7 @@ def test_a_record_says_all_three_floors_and_the_target_that_was_missed(scene: Sc
     reached = {**missed, "renders.noise_floor_linear_db": 0.1}
     records = []
     for each in (missed, reached):
-        build = named_build("smoke", resolution=16, changes=each)
+        build = preset_settings("smoke", resolution=16, changes=each)
         sample = render_sample(KEY, RenderInput(scene=scene), build, [], ViewProgress(None, 0))
         records.append(decode_sample(KEY, encode_sample(sample)).views)
     assert [view.at_cap for view in records[0]] == [True] * scene.num_views
@@ -121,9 +121,9 @@ ASKED = {"storage.passes": json_or_word("[normal, depth,object]")}
 NAMES = ("object", "depth_axis_m", "shading_normal")
 
 
-def build(**changes: object) -> BuildSettings:
+def build(**changes: object) -> DatasetSettings:
     small = {"scenes.num_views": 2, "renders.min_spp": 8, "renders.max_spp": 8}
-    return named_build("smoke", resolution=16, changes={**small, **changes})
+    return preset_settings("smoke", resolution=16, changes={**small, **changes})
 
 
 def test_what_stores_some_says_so_in_the_order_of_the_table() -> None:

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from infra.cli.changes import BaseSettings, with_base_settings
+from infra.cli.overrides import BaseSettings, with_base_settings
 from infra.repair import repair
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation import render_children
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset
-from pipeline.generation.revisit_options import RevisitOptions, revisit_order
+from pipeline.generation.revisit_options import RevisitOptions, to_generate_options
 from pipeline.isolation import IsolatedChild
 from pipeline.renders.renderer import SceneRenderer
 from storage.dataset.dataset import Dataset, open_dataset
@@ -41,7 +41,7 @@ TINY = {
 
 
 def generated(out: Path, num_views: int, **changes: Any) -> Dataset:
-    order = DatasetOrder(
+    order = GenerateOptions(
         build="smoke",
         objects="builtin:12",
         out=str(out),
@@ -54,8 +54,8 @@ def generated(out: Path, num_views: int, **changes: Any) -> Dataset:
     return open_dataset(str(out))
 
 
-def order_of(source: Path, out: Path, **asked: Any) -> DatasetOrder:
-    order = revisit_order(RevisitOptions(dataset=str(source), out=str(out), **asked))
+def order_of(source: Path, out: Path, **asked: Any) -> GenerateOptions:
+    order = to_generate_options(RevisitOptions(dataset=str(source), out=str(out), **asked))
     return dataclasses.replace(with_base_settings(order, BaseSettings(like=str(source))), workers=1)
 
 

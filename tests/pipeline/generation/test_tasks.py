@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infra.cli.changes import parse_changes
 from infra.cli.options import SHOWN
-from pipeline.generation.dataset_order import DatasetOrder, generate_words
+from infra.cli.overrides import parse_overrides
+from pipeline.generation.generate_options import GenerateOptions, generate_words
 from pipeline.generation.run import TaskResult, children_of_gpu
 from pipeline.generation.runner import Runner
 from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece, TaskCutter
@@ -99,7 +99,7 @@ def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
 @for_each(
     ("changes", "message"),
     [
-        ({"build": "nonsense"}, "build 'nonsense'"),
+        ({"build": "nonsense"}, "preset 'nonsense'"),
         ({"scenes": 0}, "scenes is 0"),
         ({"failure_budget": 1.5}, "failure_budget is 1.5"),
         ({"shards": "4:4"}, "shards is '4:4'"),
@@ -109,11 +109,11 @@ def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
 )
 def test_wrong_orders_are_named(changes: dict[str, object], message: str) -> None:
     with pytest.raises(TrilightError, match=message):
-        dataclasses.replace(DatasetOrder(), **changes)  # type: ignore[arg-type]
-    assert DatasetOrder(shards="4:7").shard_range() == range(4, 7)
+        dataclasses.replace(GenerateOptions(), **changes)  # type: ignore[arg-type]
+    assert GenerateOptions(shards="4:7").shard_range() == range(4, 7)
 
 
-ASKED = DatasetOrder(
+ASKED = GenerateOptions(
     build="pretrain-256",
     objects="my objects",
     scenes=2_000_000,
@@ -151,7 +151,7 @@ def test_every_option_that_was_given_is_there() -> None:
     }
     assert "--accept-environment" in words
     changes = [words[i + 1] for i, word in enumerate(words) if word == "--changes"]
-    assert parse_changes(changes) == json.loads(json.dumps(dict(ASKED.changes)))
+    assert parse_overrides(changes) == json.loads(json.dumps(dict(ASKED.changes)))
     shown = trilight(["generate", "--help-all"], env={"COLUMNS": "200"}).output
     fields = [word[2:].replace("-", "_") for word in words if word.startswith("--")]
     for field in fields:  # a field's own name works beside the name that help shows
@@ -159,10 +159,13 @@ def test_every_option_that_was_given_is_there() -> None:
 
 
 def test_words_are_what_was_asked_for_and_no_more() -> None:
-    assert generate_words(DatasetOrder(workers=3, shards="0:2", out="x")) == ["generate", "smoke"]
+    assert generate_words(GenerateOptions(workers=3, shards="0:2", out="x")) == [
+        "generate",
+        "smoke",
+    ]
     changes = {"source": "12", "storage.profile": "true"}  # words that are JSON stay words
-    assert parse_changes(generate_words(DatasetOrder(changes=changes))[3::2]) == changes
-    with_password = DatasetOrder(objects="https://me:secret@host/objects?key=1")
+    assert parse_overrides(generate_words(GenerateOptions(changes=changes))[3::2]) == changes
+    with_password = GenerateOptions(objects="https://me:secret@host/objects?key=1")
     assert generate_words(with_password)[3] == "https://host/objects"
 
 

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from pipeline.generation import pipeline, render_children, tasks, unfinished_shard
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, make_piece
 from pipeline.generation.prepare_isolated import ChildPool
 from pipeline.generation.run import Run, ShardJob, TaskResult
@@ -25,8 +25,7 @@ from pipeline.generation.tasks import Piece
 from pipeline.generation.unfinished_shard import UnfinishedShard
 from pipeline.isolation import ChildFailed, IsolatedChild
 from pipeline.shards.pack import pack_shard
-from storage import claims
-from storage.claims import hold_claim
+from storage import file_locks
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry, index_shard
 from storage.dataset.progress import read_progress, read_status
@@ -35,6 +34,7 @@ from storage.dataset.shard_notes import ShardNote, note_shard, noted_shard
 from storage.dataset.staging import is_staged, read_staged_scene, stage_scene
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
+from storage.file_locks import hold_lock
 from storage.records.objects import Failure, read_failures
 from storage.records.sample import sample_key
 from tests.pipeline.generation.test_dataset_writer import (
@@ -114,7 +114,7 @@ def test_the_first_scene_can_be_looked_at_at_once(tmp_path: Path) -> None:
 def test_what_somebody_else_is_making_is_left_to_them(tmp_path: Path) -> None:
     made: Counter[int] = Counter()
     claim = DatasetFolder(tmp_path).staged_shard(NAME) / f"{sample_key(1)}.claim"
-    with hold_claim(claim):
+    with hold_lock(claim):
         assert _make(tmp_path, 0, 4, made) is None
     assert made == {0: 1, 2: 1, 3: 1}
     assert _make(tmp_path, 0, 4, made) is not None  # they died; now it is free
@@ -123,7 +123,7 @@ def test_what_somebody_else_is_making_is_left_to_them(tmp_path: Path) -> None:
 def test_who_waits_for_others_says_for_whom(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(claims, "_SILENT_S", 0.0)
+    monkeypatch.setattr(file_locks, "_SILENT_S", 0.0)
     folder, missing = DatasetFolder(tmp_path), [[0], [0], []]
     writer = SimpleNamespace(folder=folder)
     settings = SimpleNamespace(splits=_build().splits)
@@ -131,7 +131,7 @@ def test_who_waits_for_others_says_for_whom(
         publication=writer, settings=settings, unfinished_shards=lambda: missing.pop(0)
     )
     _make(tmp_path, 1, 4, Counter())
-    with hold_claim(folder.staged_shard(NAME) / f"{sample_key(0)}.claim"):
+    with hold_lock(folder.staged_shard(NAME) / f"{sample_key(0)}.claim"):
         tasks.wait_for_others(run, 0.0)
     assert f"{sample_key(0)}.claim: waiting for 0 s for process {os.getpid()} of" in caplog.text
 
@@ -161,12 +161,12 @@ def _somebody_quicker(
     @contextlib.contextmanager
     def claimed_late(claim: Path) -> Iterator[bool]:
         if claim.name == claim_name:
-            monkeypatch.setattr(unfinished_shard, "hold_claim", hold_claim)
+            monkeypatch.setattr(unfinished_shard, "hold_lock", hold_lock)
             work()
-        with hold_claim(claim) as ours:
+        with hold_lock(claim) as ours:
             yield ours
 
-    monkeypatch.setattr(unfinished_shard, "hold_claim", claimed_late)
+    monkeypatch.setattr(unfinished_shard, "hold_lock", claimed_late)
 
 
 def test_a_scene_that_somebody_made_before_the_claim_is_not_made_again(
@@ -236,7 +236,7 @@ class Idle(Runner[Any]):
 
 def _run(root: Path, scenes: int) -> Run:
     return Run(
-        order=DatasetOrder(out=str(root), scenes=scenes),
+        order=GenerateOptions(out=str(root), scenes=scenes),
         settings=_build(),
         scene_folder=None,
         publication=begin_tiny(root, scenes),
@@ -245,7 +245,7 @@ def _run(root: Path, scenes: int) -> Run:
 
 
 def _claim(folder: DatasetFolder, scene: int) -> Any:
-    return hold_claim(folder.staged_shard(NAME) / f"{sample_key(scene)}.claim")
+    return hold_lock(folder.staged_shard(NAME) / f"{sample_key(scene)}.claim")
 
 
 def test_waiting_for_others_takes_few_looks_and_no_tasks(
@@ -295,7 +295,7 @@ def test_what_is_free_is_what_nobody_is_at(tmp_path: Path) -> None:
     assert shard.is_free()
     stage_scene(folder.staged_shard(NAME), 3, _sample(3), [], "lossless")
     assert shard.is_free()  # to be packed
-    with hold_claim(folder.staged_shard(NAME) / "pack.claim"):
+    with hold_lock(folder.staged_shard(NAME) / "pack.claim"):
         assert not shard.is_free()
     pack_shard(folder, NAME, range(4))
     assert not shard.is_free()

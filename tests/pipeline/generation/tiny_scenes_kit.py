@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from pipeline.executors.threads import ThreadRunner
-from pipeline.generation.dataset_order import DatasetOrder
 from pipeline.generation.freeze_objects import AcceptedObjects, ObjectLock
 from pipeline.generation.frozen_pool import ComposedScenes, FrozenPool
+from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.run import ShardJob
 from pipeline.renders.variant import Variant
 from storage.dataset.layout import DatasetFolder
@@ -29,9 +29,9 @@ NO_OBJECTS = AcceptedObjects(
 )
 
 
-def tiny_order(**changes: Any) -> DatasetOrder:
+def tiny_order(**changes: Any) -> GenerateOptions:
     """Return an order that fits the scenes by hand: two views of 16 pixels, four to a shard."""
-    return DatasetOrder(**{"resolution": 16, "changes": {"scenes.num_views": 2}, **changes})
+    return GenerateOptions(**{"resolution": 16, "changes": {"scenes.num_views": 2}, **changes})
 
 
 def shard_job(root: Path, **changes: Any) -> ShardJob:

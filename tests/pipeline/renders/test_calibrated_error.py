@@ -14,6 +14,7 @@ from pipeline.renders.calibrated_error import (
     METRICS,
     CalibratedStatement,
     MetricStatement,
+    first_spp,
     load_statement,
     versions_of_pictures,
 )
@@ -113,6 +114,19 @@ def test_what_was_not_calibrated_has_the_bound(
     found, before = (render_view(lit_scene(), each, 3) for each in (settings, bound))
     assert found.expected_error is None and not measured
     assert found.noise_floor_db == before.noise_floor_db
+
+
+@pytest.mark.usefixtures("measured")
+def test_a_bound_in_its_place_is_measured_later() -> None:
+    cases: list[tuple[dict[str, Any], int]] = [
+        ({}, 32), ({"stated_error": "bound"}, 32), ({"per_light": True}, 64), ({"split": True}, 64),
+        ({"denoiser": "fast"}, 64), ({"resolution": 512}, 64), ({"resolution": 128}, 64),
+        ({"split": True, "max_spp": 32}, 32),
+    ]  # fmt: skip
+    for changes, spp in cases:
+        asked: dict[str, Any] = {"resolution": 256, "min_spp_px": 256, **changes}
+        settings = dataclasses.replace(SETTINGS, **asked)
+        assert first_spp(settings) == spp, changes
 
 
 @for_each("arithmetic", ["numpy", "device"])

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.builds.named import named_build
 from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
+from pipeline.presets.registry import preset_settings
 from pipeline.renders import kernel_scene
 from pipeline.renders.device_memory import read_back
 from pipeline.renders.device_pictures import DevicePictures
@@ -133,18 +133,18 @@ def test_guided_passes_have_one_more_set_of_kernels_for_every_scene() -> None:
 
 def test_all_views_and_lights_share_one_load(monkeypatch: pytest.MonkeyPatch) -> None:
     loads = list[Scene]()
-    load = kernel_scene.load_triangles
+    load = kernel_scene.build_mitsuba_scene
 
     def counted(scene: Scene, *rest: Any, **named: Any) -> Any:
         loads.append(scene)
         return load(scene, *rest, **named)
 
-    monkeypatch.setattr(kernel_scene, "load_triangles", counted)
+    monkeypatch.setattr(kernel_scene, "build_mitsuba_scene", counted)
     scene = sampled_like_scene(np.random.default_rng(3), num_views=2)
     scene = scene.with_provenance({"camera_attempts": [0] * 2})
     changes = {"renders.min_spp": 8, "renders.max_spp": 8, "renders.per_light": True}
     changes["scenes.num_views"] = 2
-    settings = named_build("smoke", resolution=16, changes=changes)
+    settings = preset_settings("smoke", resolution=16, changes=changes)
     sample = render_sample(
         "000000000", RenderInput(scene=scene), settings, [], ViewProgress(None, 0)
     )

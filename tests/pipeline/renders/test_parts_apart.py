@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.builds.named import named_build
 from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
+from pipeline.presets.registry import preset_settings
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
@@ -161,7 +161,9 @@ def test_a_build_with_the_setting_stores_what_verify_accepts() -> None:
     for kind, per_light in (({}, True), (KINDS[0], False), (KINDS[2], True)):
         asked = {**kind, "per_light": per_light, "min_spp": 8, "max_spp": 8}
         changes = {f"renders.{name}": value for name, value in asked.items()}
-        settings = named_build("smoke", resolution=16, changes={**changes, "scenes.num_views": 2})
+        settings = preset_settings(
+            "smoke", resolution=16, changes={**changes, "scenes.num_views": 2}
+        )
         scene = tiny_scene(provenance={"camera_attempts": [0, 0]})
         sample = render_sample(
             "000000007", RenderInput(scene=scene), settings, [], ViewProgress(None, 7)

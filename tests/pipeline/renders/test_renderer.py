@@ -27,7 +27,7 @@ from storage.records.lights import (
     sum_of_lights,
 )
 from storage.records.scene import Scene, SceneObject
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
 from tests.pipeline.renders.guided_scenes import mirrors
 from tests.pipeline.renders.sampling import (
@@ -155,10 +155,10 @@ def test_every_target_counts_at_the_cap() -> None:
         ("noise_floor_linear_db", "psnr_linear_db"),
         ("noise_floor_objects_db", "object_psnr_log_db"),
     ):
-        assert not render_view(simple_scene(), changed(easy, {name: 5.0})).at_cap
+        assert not render_view(simple_scene(), apply_overrides(easy, {name: 5.0})).at_cap
         with pytest.raises(Rejected, match=f"^floor_not_reached: {metric} is .* dB; expected 95$"):
-            render_view(simple_scene(), changed(easy, {name: 95.0}))
-    view = render_view(simple_scene(), changed(easy, {name: 95.0, "reject_at_cap": False}))
+            render_view(simple_scene(), apply_overrides(easy, {name: 95.0}))
+    view = render_view(simple_scene(), apply_overrides(easy, {name: 95.0, "reject_at_cap": False}))
     assert view.at_cap and view.noise_floor_db > 10
 
 

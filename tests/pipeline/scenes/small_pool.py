@@ -44,7 +44,7 @@ SOURCE = SourceFacts(
 
 
 STEP_ERROR = 0.02
-"""Error of each level beyond that of the next finer one: far above what any build calls enough, so
+"""Error of each level beyond that of the next finer one: far above what any preset calls enough, so
 that finer levels are wanted wherever they fit."""
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.builds.named import BUILDS, named_build
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.renders.load_tracer import choose_tracing_scale
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
@@ -25,7 +25,7 @@ from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
 from storage.seeds import SceneKey
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
 from tests.pipeline.scenes.scene_facts import counts_of, digest, planes_of, points_of, rows_of
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
@@ -54,9 +54,9 @@ def test_attempts_differ_but_keep_what_was_planned(pool: list[PooledAsset]) -> N
 
 
 def _require_within_budget(pool: list[PooledAsset], names: Iterable[str], scenes: int) -> None:
-    """Shell and lights included; and each build has scenes that come near its budget."""
+    """Shell and lights included; and each preset has scenes that come near its budget."""
     for name in names:
-        settings = named_build(name, changes={"scenes.num_views": 1}).scenes
+        settings = preset_settings(name, changes={"scenes.num_views": 1}).scenes
         fullest = 0.0
         for index in range(scenes):
             after = settings.of_scene(index)
@@ -82,7 +82,9 @@ def test_no_build_exceeds_its_budget(pool: list[PooledAsset]) -> None:
         *("textured-256", "sky-256", "olat", "out-of-range", "out-of-range-2")
     }
     # an object alone has as many triangles as it needs
-    plain = set(BUILDS) - with_maps_or_many_triangles - {"benchmark-v1-mini", "object-views"}
+    plain = (
+        set(DATASET_PRESETS) - with_maps_or_many_triangles - {"benchmark-v1-mini", "object-views"}
+    )
     _require_within_budget(pool, sorted(plain), scenes=40)
     _require_within_budget(pool, sorted(with_maps_or_many_triangles), scenes=16)
 
@@ -232,8 +234,8 @@ def test_a_mesh_without_usable_triangles_is_rejected(pool: list[PooledAsset], bu
     An overlapping scene never asks for collisions, and one that does not would hand FCL a mesh of
     nothing: both must end alike.
     """
-    settings = named_build(build, changes={"scenes.num_views": 1}).scenes
-    overlapping = changed(settings, {"placement.overlap_share": 1.0})
+    settings = preset_settings(build, changes={"scenes.num_views": 1}).scenes
+    overlapping = apply_overrides(settings, {"placement.overlap_share": 1.0})
     for damage, each, index in itertools.product(DAMAGES, (settings, overlapping), range(4)):
         try:
             scene = compose_scene(each, [_damaged(pool[1], damage)], SceneKey(0, index))
@@ -246,7 +248,7 @@ def test_a_mesh_without_usable_triangles_is_rejected(pool: list[PooledAsset], bu
 
 def test_what_a_scene_must_be_is_looked_at_last(scenes: list[Scene]) -> None:
     """Of a scene that is fine, each law by itself."""
-    settings = named_build("smoke").scenes
+    settings = preset_settings("smoke").scenes
     scene = next(scene for scene in scenes if scene.num_triangles > 1000)
     require_valid(scene, settings)
     require_valid(scene, dataclasses.replace(settings, max_triangles=scene.num_triangles))
@@ -265,7 +267,7 @@ def test_what_a_scene_must_be_is_looked_at_last(scenes: list[Scene]) -> None:
 def test_an_emitter_in_the_box_of_an_object_is_found_and_one_beside_it_is_not(
     scenes: list[Scene],
 ) -> None:
-    settings = named_build("smoke").scenes
+    settings = preset_settings("smoke").scenes
     scene = scenes[0]
     kinds = [entry.kind for entry in scene.objects]
     emitter, body = len(kinds) - 1, kinds.index("object")
@@ -298,7 +300,7 @@ SCENES = {
 
 def composed_digest(build: str, seed: int, index: int) -> str:
     """Compose one scene with the small pool; the work of one process."""
-    settings = named_build(build).scenes
+    settings = preset_settings(build).scenes
     return digest(first_scene(settings, small_pool(), seed=seed, scene_index=index))
 
 
@@ -337,7 +339,7 @@ def test_one_and_three_processes_make_the_same_scenes(monkeypatch: pytest.Monkey
             for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
                 monkeypatch.setenv(name, "1")
         assert _from_workers(workers) == here
-    # The comparison can fail: other scenes and other builds are other bytes.
+    # The comparison can fail: other scenes and other presets are other bytes.
     count = sum(len(indices) for indices in SCENES.values())
     assert len({sha for scenes in here.values() for sha in scenes.values()}) == count
 
@@ -352,7 +354,7 @@ def test_order_does_not_matter_and_seed_zero_is_a_seed() -> None:
 def test_what_is_planned_does_not_depend_on_the_pool(pool: list[PooledAsset]) -> None:
     """Which objects a scene holds may change with the pool, its kind may not."""
     for build, indices in SCENES.items():
-        settings = named_build(build).scenes
+        settings = preset_settings(build).scenes
         for index in indices[1:5]:
             few, many = (
                 first_scene(settings, entries, seed=0, scene_index=index)

@@ -15,8 +15,8 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
-from pipeline.builds.named import named_build
-from pipeline.builds.settings import differences
+from pipeline.presets.registry import preset_settings
+from pipeline.presets.settings import differences
 from pipeline.scenes.pieces import object_piece, shell_piece
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.shapes import MeshShape
@@ -61,7 +61,7 @@ def _composed_table(
 def test_composed_scenes_are_as_planned(scenes: list[Scene], pool: list[PooledAsset]) -> None:
     """Views of the published recipe are hardly judged: even its cameras keep their distribution."""
     require_plausible(_composed_table(scenes, pool, DEFAULT))
-    settings = named_build("renderformer-v1-256", changes={"scenes.num_views": 2}).scenes
+    settings = preset_settings("renderformer-v1-256", changes={"scenes.num_views": 2}).scenes
     published = [first_scene(settings, pool, seed=0, scene_index=index) for index in range(200)]
     table = _composed_table(published, pool, STAGE_1)
     table["fov"] = uniform([fov for scene in published for fov in scene.fov_deg.tolist()], 30, 60)
@@ -80,7 +80,7 @@ def test_how_far_meshes_shift_sizes(pool: list[PooledAsset]) -> None:
     objects of a pool without walls of triangles (measured: 0.07 and 0.10), and a single object
     that fits hardly deviates (0.08; measured 0.05). For solid balls see tests/scene_templates.
     """
-    settings = named_build("pretrain-256").scenes
+    settings = preset_settings("pretrain-256").scenes
     coarse = [MeshShape(entry.locked.uid, entry.asset.levels[-1], "box") for entry in pool]
     sizes: dict[int, list[float]] = {1: [], 2: [], 3: []}
     for index in range(200):
@@ -135,7 +135,7 @@ def test_colours_go_by_triangle_by_group_or_are_one() -> None:
             assert sorted(np.bincount(piece.material_index)) == [64, 64, 128]
 
 
-SETTINGS = named_build("out-of-range").scenes
+SETTINGS = preset_settings("out-of-range").scenes
 
 SEED = 20261121
 
@@ -348,7 +348,7 @@ def test_axes_of_maps_have_the_value_that_they_name(
     pool: list[PooledAsset], mapped: Sequence[int]
 ) -> None:
     """All else, and whether a scene has any map, is as without them."""
-    settings = named_build("out-of-range-2").scenes
+    settings = preset_settings("out-of-range-2").scenes
     found = {}
     for index in mapped:
         scene = first_scene(settings, pool, seed=SEED, scene_index=index)

@@ -24,7 +24,7 @@ from scene_templates.rotations import rotation_xyz, uniform_rotation
 from scene_templates.sample_layout import scene_plan
 from scene_templates.settings import SceneSettings
 from storage.records.scene import Scene
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 from tests.pipeline.scenes.scene_facts import ray_distances, rows_of, triangles_of
 from tests.pipeline.scenes.small_pool import first_scene, level, small_pool
 
@@ -198,7 +198,7 @@ def test_meshes_meet_only_where_the_plan_lets_them(
             pairs += len(rows_of(scene, "object")) // 2
     assert pairs > 25
     changes = {"families.num_objects": [3, 3], "placement.overlap_share": 1.0, "num_views": 1}
-    settings = changed(SETTINGS, changes)
+    settings = apply_overrides(SETTINGS, changes)
     may = [first_scene(settings, pool, seed=0, scene_index=index) for index in range(12)]
     assert sum(_meeting(scene) > 0 for scene in may) > 3
 

@@ -45,7 +45,7 @@ from storage.records.scene_file import scene_digest
 from storage.records.skin import LevelSkin, SkinQuality
 from storage.records.texture import Texture
 from storage.seeds import SceneKey
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
 from tests.pipeline.scenes.small_pool import LOOK, first_scene, pooled, small_pool
 from tests.scene_templates.balls import STILL
@@ -55,8 +55,8 @@ from tests.textured_by_hand import bumps
 SMALL = SurfaceMapSettings(size=8)
 PLAIN = SceneSettings(families=DEFAULT_FAMILIES, num_views=1)
 TEXTURED = dataclasses.replace(PLAIN, textures=TextureSettings(share=0.5, surfaces=SMALL))
-OWN = changed(PLAIN, {"materials.source": "object"})
-GLOWS = changed(OWN, {"materials.own_emission": 0.5})
+OWN = apply_overrides(PLAIN, {"materials.source": "object"})
+GLOWS = apply_overrides(OWN, {"materials.own_emission": 0.5})
 QUALITY = SkinQuality(
     colour_error=0.0,
     colour_error_p95=0.0,
@@ -128,7 +128,7 @@ def test_as_many_surfaces_and_objects_are_textured_as_stated() -> None:
                     scene.material_textures,
                 )
                 drawn.append(textures is not None and bool((textures[mine] >= 0).any()))
-    some = changed(OWN, {"materials.own_share": 0.3})
+    some = apply_overrides(OWN, {"materials.own_share": 0.3})
     entries = _pool()[1:]
     levels = [entry.asset.levels[0] for entry in entries]
     own = []
@@ -152,7 +152,7 @@ def test_the_sides_of_a_cube_show_a_texture_upright_and_unmirrored(side: int) ->
 
 def test_floors_are_one_flat_chart_of_the_stated_width() -> None:
     """Texture coordinates go with the place on the floor as one similarity: no seam, no stretch."""
-    settings = changed(TEXTURED, {"textures.share": 1.0})
+    settings = apply_overrides(TEXTURED, {"textures.share": 1.0})
     for index in range(4):
         scene = _scene(settings, index)
         assert scene.uv is not None
@@ -193,7 +193,7 @@ def test_an_objects_texture_turns_with_it() -> None:
 
 
 def test_an_objects_texture_is_never_mirrored_and_hardly_stretched() -> None:
-    scene = _scene(changed(TEXTURED, {"textures.share": 1.0}), 1)
+    scene = _scene(apply_overrides(TEXTURED, {"textures.share": 1.0}), 1)
     assert scene.uv is not None and scene.material_textures is not None
     row = next(row for row, entry in enumerate(scene.objects) if entry.kind == "object")
     mine = scene.object_index == row
@@ -387,7 +387,7 @@ def test_textures_have_the_rights_and_the_means_of_their_objects() -> None:
             owner.attribution,
             owner.source_url,
         )
-    both = changed(OWN, {"textures.share": 1.0, "textures.surfaces.size": 8})
+    both = apply_overrides(OWN, {"textures.share": 1.0, "textures.surfaces.size": 8})
     drawn = _scene(both, 1, _pool())
     assert {texture.source.name.startswith("made/") for texture in drawn.textures} == {True, False}
     assert {texture.sha256 for texture in scene.textures} <= {t.sha256 for t in drawn.textures}

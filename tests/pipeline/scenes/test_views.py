@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.builds.named import named_build
+from pipeline.presets.registry import preset_settings
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
 from pipeline.scenes.scene_checks import require_valid
 from pipeline.scenes.views import (
@@ -165,7 +165,7 @@ def test_cameras_of_a_view_need_nothing_but_the_stored_scene_until_they_are_used
     np.testing.assert_array_equal(seen.fov_deg, [other.fov_deg, own.fov_deg])
 
 
-SMOKE = named_build("smoke").scenes
+SMOKE = preset_settings("smoke").scenes
 KEY = SceneKey(7, 3)
 
 

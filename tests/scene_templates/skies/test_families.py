@@ -13,7 +13,7 @@ from scene_templates.skies.draws import SkyDraws
 from scene_templates.skies.families import OUR_SKIES, SKIES
 from scene_templates.skies.texels import SkyTexels
 from storage.seeds import rng_for
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
 from tests.scene_templates.skies.test_skies import uv_of
 from tests.scene_templates.statistics import merged, require_plausible, stated_table
@@ -22,7 +22,7 @@ MANY = 60
 
 
 def _sky(family: str, seed: int, **changes: Any) -> SkyMap:
-    settings = changed(SkyMapSettings(families=(family,), height=32), changes)
+    settings = apply_overrides(SkyMapSettings(families=(family,), height=32), changes)
     return draw_sky(rng_for(seed, "sky"), settings)
 
 

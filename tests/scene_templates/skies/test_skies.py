@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from pipeline.builds.named import named_build
+from pipeline.presets.registry import preset_settings
 from scene_templates.skies.draw import SkyMapSettings, draw_sky
 from scene_templates.skies.drawn_scene import SceneSky, lamp_irradiance, scene_sky
 from scene_templates.skies.draws import COOLEST_MIRED, WARMEST_MIRED, planckian_rgb
@@ -245,9 +245,9 @@ def test_a_sky_sends_what_was_drawn_over_what_lamps_send() -> None:
 
 
 def test_only_the_sky_is_new() -> None:
-    """Objects, materials, lights and cameras are those of the build without skies."""
-    plain = named_build("pretrain-256").scenes
-    skies = named_build("sky-256").scenes
+    """Objects, materials, lights and cameras are those of the preset without skies."""
+    plain = preset_settings("pretrain-256").scenes
+    skies = preset_settings("sky-256").scenes
     assert dataclasses.replace(skies, skies=SkySettings()) == plain
     always = dataclasses.replace(
         skies, skies=dataclasses.replace(skies.skies, share=1.0, maps=SMALL)

@@ -14,7 +14,7 @@ from scene_templates.surfaces.families import OUR_SURFACES, SURFACES
 from scene_templates.surfaces.maps import Finish, SurfaceMaps
 from scene_templates.surfaces.texels import Texels
 from storage.seeds import rng_for
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
 from tests.scene_templates.statistics import merged, require_plausible, stated_table
 
@@ -23,7 +23,7 @@ ALBEDO = (0.02, 0.9)
 
 
 def _surface(family: str, seed: int, **changes: Any) -> SurfaceMaps:
-    settings = changed(SurfaceMapSettings(families=(family,), size=64), changes)
+    settings = apply_overrides(SurfaceMapSettings(families=(family,), size=64), changes)
     return draw_surface(rng_for(seed, "surface"), settings)
 
 

@@ -39,10 +39,10 @@ from storage.dataset.progress import (
     announce_objects,
     count_object,
     forget_views,
+    missing_shards,
     read_progress,
     read_status,
     tell_views,
-    unfinished_shards,
 )
 from storage.dataset.scene_logs import SceneLog, log_scene, sample_logs
 from storage.dataset.settings import SplitSettings
@@ -223,7 +223,7 @@ def test_a_billion_planned_shards_cost_nothing(tmp_path: Path) -> None:
     settings = {"splits": {"scenes_per_shard": 1}}
     edit_manifest(dataset, settings=settings, num_scenes=10**9)
     with pytest.raises(TrilightError, match="1000000000 shards; expected at most 1000000"):
-        unfinished_shards(str(tmp_path))
+        missing_shards(str(tmp_path))
 
 
 SETTINGS = SplitSettings(scenes_per_shard=4)
@@ -404,7 +404,7 @@ def test_only_a_bucket_is_asked_what_it_holds(
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     begin_tiny(tmp_path, 8)
     with serve(tmp_path) as site:
-        assert unfinished_shards(site.url) == [0, 1]
+        assert missing_shards(site.url) == [0, 1]
     assert not asked
 
 

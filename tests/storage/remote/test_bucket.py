@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from pipeline.generation.begin_dataset import begin_dataset, hold_membership
-from pipeline.generation.dataset_order import DatasetOrder
+from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
+from pipeline.generation.generate_options import GenerateOptions
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import dataset_folder
 from storage.dataset.training_data import open_training_data
@@ -166,7 +166,7 @@ def create_once(made: Store, folder: Path) -> None:
     assert made.list() == {"small"}
     assert made.list("part-0001/") == {"part-0001/large"}
     assert made.list("elsewhere") == set()
-    with made.hold_claim("small") as ours:
+    with made.hold_lock("small") as ours:
         assert ours
     made.require_create()
     made.require_create()  # what is left of the first time says nothing
@@ -198,9 +198,9 @@ def test_a_server_that_ignores_the_condition_is_refused_before_anything_is_begun
     folder = dataset_folder("gs://shards/made")
     with (
         pytest.raises(TrilightError, match="^out 'gs://shards/made': .*conditional writes"),
-        hold_membership(folder),
+        hold_dataset_lock(folder),
     ):
-        begin_dataset(folder, _build(), ENVIRONMENT, 8, accept_environment=False)
+        begin_or_resume_dataset(folder, _build(), ENVIRONMENT, 8, accept_environment=False)
     assert BucketStore(place("gs://shards/made")).list_all() == {".staging/once"}
     assert not folder.manifest.exists()
 
@@ -218,7 +218,7 @@ def test_a_server_that_ignores_the_condition_is_refused_before_anything_is_begun
 )
 def test_places_that_cannot_be_written_are_refused_by_name(out: str, message: str) -> None:
     with pytest.raises(TrilightError, match="^out ") as caught:
-        DatasetOrder(out=out)
+        GenerateOptions(out=out)
     assert message in str(caught.value)
     assert "hunter2" not in str(caught.value)
 

@@ -41,8 +41,8 @@ from train.data.augment import (
     scale_light,
 )
 from train.data.bad_samples import BadSampleCounter
+from train.data.loader import LoaderSettings, _SceneMaker
 from train.data.scenes import TrainingScene, training_scene
-from train.data.stream import StreamSettings, _SceneMaker
 from train.settings import AugmentationSettings
 
 RESOLUTION = 32
@@ -278,7 +278,7 @@ def _below_a_sky() -> StoredSample:
     ],
 )
 def test_training_takes_skies_that_its_network_knows(config: object, is_known: bool) -> None:
-    settings = StreamSettings(
+    settings = LoaderSettings(
         seed=0, window=1, batch_size=1, resolution=16, views_per_scene=1, network=config  # type: ignore[arg-type]
     )  # fmt: skip
     rng = np.random.default_rng(0)

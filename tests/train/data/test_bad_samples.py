@@ -23,9 +23,9 @@ from tests.for_each import for_each
 from tests.train.kit import flip_a_bit, keys_of, take
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.bad_samples import BadSampleCounter
-from train.data.stream import StreamSettings
+from train.data.loader import LoaderSettings
 
-SETTINGS = StreamSettings(seed=0, window=2, batch_size=4, resolution=8, views_per_scene=1)
+SETTINGS = LoaderSettings(seed=0, window=2, batch_size=4, resolution=8, views_per_scene=1)
 BAD_KEY = "000000002"
 
 
@@ -128,7 +128,7 @@ def test_all_unusable_ends_the_run(dataset: Dataset) -> None:
         keys(dataset, BadSampleCounter(10**9))
 
 
-BOTH_VIEWS = StreamSettings(seed=0, window=2, batch_size=2, resolution=8, views_per_scene=2)
+BOTH_VIEWS = LoaderSettings(seed=0, window=2, batch_size=2, resolution=8, views_per_scene=2)
 BAD, GOOD = "bad-000000.tar", "good-000000.tar"
 Members = dict[str, bytes]
 

@@ -25,16 +25,16 @@ from storage.dataset.mixed_data import open_mixture
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
 from tests.for_each import for_each
-from tests.train.data.test_stream import by_key, identity, same_batches
+from tests.train.data.test_loader import by_key, identity, same_batches
 from tests.train.fake_card import CARD, fake_card
 from tests.train.kit import CPU, keys_of, require_resumed_to_the_bit, take, tiny_run
 from tests.train.toy import write_toy_dataset
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.buckets import CopyStream, StepScenes, decodes_on_device, step_scenes
+from train.data.loader import LoaderSettings, load_batches
 from train.data.mixture import RECORD, Mixture, plan_mixture
 from train.data.order import RankSlice
 from train.data.scenes import TrainingScene, stored_levels
-from train.data.stream import StreamSettings, stream_batches
 from train.data.workers import MAX_THREADS, Machine, choose_workers, detect_machine
 from train.loop.checkpoints import read_checkpoint
 from train.resume import StartOptions
@@ -42,7 +42,7 @@ from train.run import train_run
 from train.settings import AugmentationSettings
 
 BATCH = 4
-SETTINGS = StreamSettings(seed=1, window=2, batch_size=BATCH, resolution=16, views_per_scene=1)
+SETTINGS = LoaderSettings(seed=1, window=2, batch_size=BATCH, resolution=16, views_per_scene=1)
 
 
 @pytest.fixture(scope="module")
@@ -277,7 +277,7 @@ def test_threads_are_what_is_spare(
 
 
 LIT = AugmentationSettings(mirror=True, channels=True, light_scale=3.0)
-LIT_SETTINGS = StreamSettings(
+LIT_SETTINGS = LoaderSettings(
     seed=2, window=2, batch_size=6, resolution=16, views_per_scene=2, augmentation=LIT
 )
 
@@ -293,7 +293,7 @@ def steps(
     dataset: Dataset, device: torch.device = CPU, **changes: Any
 ) -> Iterator[Iterator[StepScenes]]:
     settings = dataclasses.replace(LIT_SETTINGS, **changes)
-    batches = stream_batches(
+    batches = load_batches(
         open_training_data([str(dataset.folder.root)]).split("train"),
         settings,
         0,

@@ -14,7 +14,7 @@ from PIL import Image
 from infra import judging
 from model.light_groups import light_groups
 from model.weights import encode_weights
-from pipeline.builds.judging import JUDGING_BUILDS
+from pipeline.presets.judging import PRESETS_FOR_JUDGING
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
@@ -211,7 +211,7 @@ def test_the_page_prints_na_escapes_text_and_puts_the_benchmark_beside_the_paper
     assert "| n/a |" in line and "`lpips` (lower is better)" in page
     assert record([row(0)], {"build": "smoke"})["published"] is None
     page = evaluation_page(record([row(0)], {"build": BENCHMARK}))
-    assert BENCHMARK in JUDGING_BUILDS
+    assert BENCHMARK in PRESETS_FOR_JUDGING
     assert "| 29.77 | 0.9526 | 0.0551 | 0.1751 |" in page
     assert "| here: network | 30.00 | 30.0000 | n/a | 30.0000 |" in page
     assert "400 scenes" in page and "256 x 256" in page

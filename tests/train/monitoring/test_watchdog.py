@@ -32,7 +32,7 @@ from storage.seeds import rng_for
 from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.train.kit import ALONE, CPU, Heard, Killed, stepper, tiny_run, toy_batch, trained
-from train.data import stream
+from train.data import loader
 from train.data.scenes import TrainingScene
 from train.folder import RunFolder
 from train.loop.distributed import DistributedContext, join_processes
@@ -190,23 +190,23 @@ class Said(TrainProgress):
 
 def slow_from(crew: DistributedContext) -> None:
     """Let the second process's loader sleep a little at each scene, and once for long."""
-    made, count = stream._SceneMaker.scene, 0
+    made, count = loader._SceneMaker.scene, 0
 
-    def sleeping(maker: stream._SceneMaker, place: stream.Visit) -> TrainingScene:
+    def sleeping(maker: loader._SceneMaker, place: loader.Visit) -> TrainingScene:
         nonlocal count
         count += 1
         time.sleep(SLEEP_S if count == 12 else 0.2)
         return made(maker, place)
 
     if not crew.is_first:
-        setattr(stream._SceneMaker, "scene", sleeping)  # noqa: B010
+        setattr(loader._SceneMaker, "scene", sleeping)  # noqa: B010
 
 
 def main(data: str, out: Path) -> None:
     settings = tiny_run(
         scenes_per_step=2, num_steps=16, log_every=4, validate_every=16, checkpoint_every=16
     )
-    stream.PREFETCHED_SCENES = 1
+    loader.PREFETCHED_SCENES = 1
     with join_processes("cpu") as crew:
         slow_from(crew)
         watched = WatchSettings(hang_after_s=1.0, hang_factor=2.0)

@@ -21,7 +21,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.builds.named import named_build
+from pipeline.presets.registry import preset_settings
 from scene_templates.sample_layout import scene_plan
 from storage.dataset.dataset import open_dataset
 from storage.records.sample import sample_key
@@ -219,7 +219,7 @@ def test_layouts_are_as_frequent_as_in_renderformer_studio(build: str) -> None:
     assert (
         len(weights) == len(rows) == {"renderformer-v1-256": 21, "renderformer-v1-512": 14}[build]
     )
-    scenes, seed = named_build(build).scenes, 7
+    scenes, seed = preset_settings(build).scenes, 7
     drawn = 250 * sum(weights.values())
     counts = Counter(
         scene_plan(scenes, seed=seed, scene_index=index).family.name for index in range(drawn)

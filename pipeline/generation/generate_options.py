@@ -1,12 +1,12 @@
-"""`DatasetOrder`: the options of `trilight generate`, also for a scheduler's form."""
+"""`GenerateOptions`: the options of `trilight generate`, also for a scheduler's form."""
 
 import re
 from collections.abc import Mapping
 from dataclasses import field
 from typing import Annotated, Any
 
-from pipeline.builds.named import BUILDS
 from pipeline.exchange.from_description import AlbedoOverOne
+from pipeline.presets.registry import DATASET_PRESETS
 from pipeline.renders.settings import NoiseFloor, NoiseTargets, Resolution
 from pipeline.renders.variant import Device
 from storage.dataset.layout import dataset_folder
@@ -14,8 +14,8 @@ from storage.dataset.settings import MOST_SCENES
 from storage.errors import TrilightError
 from storage.extensions import function_name
 from storage.remote.safe_url import safe_url
-from storage.settings.changes import option_words
 from storage.settings.described import checked
+from storage.settings.overrides import option_words
 from storage.settings.ranges import Seed, Share, Within
 
 _RANGE = re.compile(r"(\d+):(\d+)")
@@ -24,7 +24,7 @@ _PER_MACHINE = ("build", "out", "shards", "workers")
 
 
 @checked()
-class DatasetOrder:
+class GenerateOptions:
     """The dataset to make, the range of its shards, and how."""
 
     build: str = "smoke"
@@ -34,7 +34,7 @@ class DatasetOrder:
     the variable of a worker that holds the source; by default the preset's, or procedural:."""
     out: str | None = None
     """Folder or bucket (s3://bucket/folder) for the dataset, on the machine that makes it; by
-    default data/BUILD."""
+    default data/PRESET."""
     scenes: Annotated[int | None, Within(1, MOST_SCENES, unit="scenes")] = None
     """Number of scenes; a larger one lets a dataset grow; by default the preset's."""
     seed: Seed | None = None
@@ -51,17 +51,17 @@ class DatasetOrder:
     """The same as object_psnr_log_db, which leaves out empty background; by default the preset's,
     unless another target is given."""
     allow_licences: tuple[str, ...] = ()
-    """Licences to allow in addition to the preset's; by default there are none."""
+    """Licenses to allow in addition to the preset's; by default there are none."""
     licence: str | None = None
-    """Licence of object files that state none; by default such files count as your own work."""
+    """License of object files that state none; by default such files count as your own work."""
     textures: str | None = None
-    """Folder of your own textures: base colours, with their maps beside them; by default all
+    """Folder of your own textures: base colors, with their maps beside them; by default all
     textures are procedural. The settings scenes.textures say how many are used."""
     skies: str | None = None
     """Folder of your own environment maps, .hdr or .exr; by default all skies are procedural. The
     settings scenes.skies say how many are used."""
     map_licence: str | None = None
-    """Licence of textures and maps of folders without a catalogue; by default such files count as
+    """License of textures and maps of folders without a catalog; by default such files count as
     your own work."""
     workers: Annotated[int | None, Within(1, 1024, unit="processes")] = None
     """Number of render processes, which share the cores; by default one, or up to four a GPU."""
@@ -74,7 +74,7 @@ class DatasetOrder:
     """Continue a dataset that was started with other library versions or on another device."""
     scenes_from: str | None = None
     """Folder of scene files (RenderFormer JSON) to render; by default scenes are composed of
-    objects. Scene k is the k-th *.json, all scenes belong to the split test, and the build's limits
+    objects. Scene k is the k-th *.json. All scenes belong to the test split. The preset's limits
     on scenes do not apply."""
     views: Annotated[int | None, Within(1, 1000, unit="cameras")] = None
     """Number of cameras to use of each scene file, from its first; by default the smallest number
@@ -83,8 +83,8 @@ class DatasetOrder:
     """How to treat a material of a scene file whose diffuse and specular albedos add up to more
     than 1: scale multiplies both by one factor, refuse leaves the file out."""
     revisits: str | None = None
-    """Folder of a finished dataset whose scenes to render again, with what the settings `revisit`
-    say is new (`trilight revisit` writes them); by default scenes are composed of objects."""
+    """Folder of a finished dataset to render again by the settings `revisit`, which `trilight
+    revisit` writes; by default scenes are composed of objects."""
     shards: str | None = None
     """Range A:B of the shards to make, from A up to but not including B; by default all. The run
     that makes the last missing shard finishes the dataset."""
@@ -93,7 +93,7 @@ class DatasetOrder:
     (values are JSON); by default there are none."""
 
     def __post_init__(self) -> None:
-        BUILDS.find(self.build)
+        DATASET_PRESETS.find(self.build)
         if self.scenes_from is not None and (self.objects, self.scenes) != (None, None):
             raise TrilightError(
                 f"--scenes-from {self.scenes_from} was given with --objects or --scenes; expected "
@@ -144,7 +144,7 @@ class DatasetOrder:
         return range(int(match[1]), int(match[2]))
 
 
-def _refuse_maps(order: DatasetOrder) -> None:
+def _refuse_maps(order: GenerateOptions) -> None:
     """Raise if map folders are given for scenes that are not composed, or a licence without any."""
     for name, value in (("--textures", order.textures), ("--skies", order.skies)):
         if value is not None and (order.scenes_from or order.revisits):
@@ -158,7 +158,7 @@ def _refuse_maps(order: DatasetOrder) -> None:
         )
 
 
-def generate_words(order: DatasetOrder) -> list[str]:
+def generate_words(order: GenerateOptions) -> list[str]:
     """Return the arguments of `generate` that repeat these options, without `--out`.
 
     Options of this machine alone (the range of shards, the number of processes) are left out; so

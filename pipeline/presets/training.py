@@ -1,4 +1,4 @@
-"""Builds for the training of networks: `smoke`, `pretrain-256`, `finetune-512` and others.
+"""Dataset presets for the training of networks: `smoke`, `pretrain-256`, `finetune-512` and others.
 
 They keep the published ranges of sizes, materials, lights and cameras, and deviate where the
 published scenes have defects (reference: renderformer.md, G):
@@ -23,8 +23,8 @@ published scenes have defects (reference: renderformer.md, G):
 import dataclasses
 
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
-from pipeline.builds.settings import BuildSettings, NamedBuild
 from pipeline.objects.licences import DEFAULT_ALLOWED
+from pipeline.presets.settings import DatasetPreset, DatasetSettings
 from pipeline.renders.settings import RenderSettings
 from scene_templates.cameras import CameraSettings
 from scene_templates.families import DEFAULT_FAMILIES, alone
@@ -38,68 +38,76 @@ from scene_templates.textures import TextureSettings
 from storage.dataset.settings import SplitSettings
 
 
-def smoke() -> BuildSettings:
+def smoke() -> DatasetSettings:
     """A set of minutes on a laptop: small shards, 256 pixels, pictures to 38 dB or 256 samples."""
-    return BuildSettings(
+    return DatasetSettings(
         build="smoke",
         seed=0,
         allowed_licences=DEFAULT_ALLOWED,
         assets=AssetSettings(budgets=(1400, 1000, 700, 500, 340, 240)),
         scenes=SceneSettings(families=DEFAULT_FAMILIES, max_triangles=1536, num_views=4),
         renders=RenderSettings(
-            resolution=256, noise_floor_db=38.0, min_spp=64, max_spp=256, arithmetic="device"
+            resolution=256,
+            noise_floor_db=38.0,
+            min_spp=32,
+            min_spp_px=256,
+            max_spp=256,
+            light_paths="scene",
+            arithmetic="device",
+            stated_error="calibrated",
+            picture_within_db=2.0,
         ),
         splits=SplitSettings(scenes_per_shard=4),
     )
 
 
-def pretrain_256() -> BuildSettings:
+def pretrain_256() -> DatasetSettings:
     """The first training stage: 256 pixels, up to 1536 triangles, pictures to 46 dB."""
-    build = smoke()
+    base = smoke()
     return dataclasses.replace(
-        build,
+        base,
         build="pretrain-256",
-        assets=dataclasses.replace(build.assets, decimator="libigl"),
-        renders=dataclasses.replace(build.renders, noise_floor_db=46.0, max_spp=4096, aux_spp=64),
+        assets=dataclasses.replace(base.assets, decimator="libigl"),
+        renders=dataclasses.replace(base.renders, noise_floor_db=46.0, max_spp=4096, aux_spp=64),
         splits=SplitSettings(scenes_per_shard=256, shards_per_cycle=64, held_out_objects=0.02),
     )
 
 
-def finetune_512() -> BuildSettings:
+def finetune_512() -> DatasetSettings:
     """The second training stage: 512 pixels, up to 4096 triangles, pictures to 46 dB."""
-    build = pretrain_256()
+    base = pretrain_256()
     return dataclasses.replace(
-        build,
+        base,
         build="finetune-512",
-        assets=dataclasses.replace(build.assets, budgets=(3900, 2600, 1700, 1100, 700, 400)),
-        scenes=dataclasses.replace(build.scenes, max_triangles=4096, enough_error=0.0025),
-        renders=dataclasses.replace(build.renders, resolution=512),
-        splits=dataclasses.replace(build.splits, scenes_per_shard=64),
+        assets=dataclasses.replace(base.assets, budgets=(3900, 2600, 1700, 1100, 700, 400)),
+        scenes=dataclasses.replace(base.scenes, max_triangles=4096, enough_error=0.0025),
+        renders=dataclasses.replace(base.renders, resolution=512),
+        splits=dataclasses.replace(base.splits, scenes_per_shard=64),
     )
 
 
-def textured_256() -> BuildSettings:
+def textured_256() -> DatasetSettings:
     """`pretrain-256` with procedural textures on half of the objects, floors and walls."""
-    build = pretrain_256()
+    base = pretrain_256()
     return dataclasses.replace(
-        build,
+        base,
         build="textured-256",
-        scenes=dataclasses.replace(build.scenes, textures=TextureSettings(share=0.5)),
+        scenes=dataclasses.replace(base.scenes, textures=TextureSettings(share=0.5)),
     )
 
 
-def sky_256() -> BuildSettings:
+def sky_256() -> DatasetSettings:
     """Scenes of `pretrain-256`, three in four below a sky as well."""
-    build = pretrain_256()
-    scenes = dataclasses.replace(build.scenes, skies=SkySettings(share=0.75))
-    return dataclasses.replace(build, build="sky-256", scenes=scenes)
+    base = pretrain_256()
+    scenes = dataclasses.replace(base.scenes, skies=SkySettings(share=0.75))
+    return dataclasses.replace(base, build="sky-256", scenes=scenes)
 
 
-def object_views() -> BuildSettings:
+def object_views() -> DatasetSettings:
     """One object with its own materials and normal maps, alone below a sky: 24 views, 38 dB."""
-    build = smoke()
+    base = smoke()
     return dataclasses.replace(
-        build,
+        base,
         build="object-views",
         assets=AssetSettings(
             budgets=(16_384, 8_192, 4_096, 2_048, 1_024, 512),
@@ -128,7 +136,7 @@ def object_views() -> BuildSettings:
             ),
         ),
         renders=dataclasses.replace(
-            build.renders,
+            base.renders,
             resolution=512,
             noise_floor_db=None,
             noise_floor_objects_db=38.0,
@@ -139,31 +147,31 @@ def object_views() -> BuildSettings:
     )
 
 
-def olat() -> BuildSettings:
+def olat() -> DatasetSettings:
     """One light at a time: rooms with 2 to 6 lamps, half of them below a sky too, each light alone.
 
     Lamps are white, so that a reader colors them.
     """
-    build = pretrain_256()
+    base = pretrain_256()
     return dataclasses.replace(
-        build,
+        base,
         build="olat",
         scenes=dataclasses.replace(
-            build.scenes, lights=LightSettings(count=(2, 6)), skies=SkySettings(share=0.5)
+            base.scenes, lights=LightSettings(count=(2, 6)), skies=SkySettings(share=0.5)
         ),
         renders=dataclasses.replace(
-            build.renders, noise_floor_db=42.0, max_spp=1024, per_light=True
+            base.renders, noise_floor_db=42.0, max_spp=1024, per_light=True
         ),
-        splits=dataclasses.replace(build.splits, scenes_per_shard=64),
+        splits=dataclasses.replace(base.splits, scenes_per_shard=64),
     )
 
 
-TRAINING_BUILDS = {
-    "smoke": NamedBuild(settings=smoke, num_scenes=24, device="cpu"),
-    "pretrain-256": NamedBuild(settings=pretrain_256, num_scenes=65_536),
-    "finetune-512": NamedBuild(settings=finetune_512, num_scenes=16_384),
-    "textured-256": NamedBuild(settings=textured_256, num_scenes=16_384),
-    "sky-256": NamedBuild(settings=sky_256, num_scenes=65_536),
-    "olat": NamedBuild(settings=olat, num_scenes=2_048),
-    "object-views": NamedBuild(settings=object_views, num_scenes=1_024),
+PRESETS_FOR_TRAINING = {
+    "smoke": DatasetPreset(settings=smoke, num_scenes=24, device="cpu"),
+    "pretrain-256": DatasetPreset(settings=pretrain_256, num_scenes=65_536),
+    "finetune-512": DatasetPreset(settings=finetune_512, num_scenes=16_384),
+    "textured-256": DatasetPreset(settings=textured_256, num_scenes=16_384),
+    "sky-256": DatasetPreset(settings=sky_256, num_scenes=65_536),
+    "olat": DatasetPreset(settings=olat, num_scenes=2_048),
+    "object-views": DatasetPreset(settings=object_views, num_scenes=1_024),
 }

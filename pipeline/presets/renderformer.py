@@ -1,4 +1,4 @@
-"""RenderFormer V1's own distribution, as far as it is known and agrees with itself.
+"""Dataset presets: RenderFormer V1's distribution, as far as known and in accord with itself.
 
 Every number of the published recipes that is known stands in the settings (reference:
 renderformer.md, A.1 to A.9), and so in the manifest of every dataset. What is not known, or cannot
@@ -20,40 +20,40 @@ be meant, with what is done here:
 - **Pictures.** Cycles at 4096 samples with a denoiser; here Mitsuba, until the measured floor
   is reached or at the same number of samples.
 
-The `-original` builds have the background policy from before the authors' repair: squares hardly
+The `-original` presets have the background policy from before the authors' repair: squares hardly
 turn in their plane, so that the diagonals of floor and walls run one way.
 """
 
 import dataclasses
 import functools
 
-from pipeline.builds.frozen_v1 import BUILD_V1
-from pipeline.builds.settings import BuildSettings, NamedBuild
+from pipeline.presets.frozen_v1 import SETTINGS_V1
+from pipeline.presets.settings import DatasetPreset, DatasetSettings
 from scene_templates.families import Family
 from scene_templates.frozen_v1 import SCENES_V1
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
 from scene_templates.settings import SceneSettings
 
 
-def renderformer_v1_256(policy: Policy = "de-biased") -> BuildSettings:
+def renderformer_v1_256(policy: Policy = "de-biased") -> DatasetSettings:
     """The published first stage: 21 families, 256 pixels, at most 1572 triangles."""
     return dataclasses.replace(
-        BUILD_V1,
+        SETTINGS_V1,
         build="renderformer-v1-256" + _suffix(policy),
-        assets=dataclasses.replace(BUILD_V1.assets, budgets=(1188, 840, 594, 396, 297, 198)),
+        assets=dataclasses.replace(SETTINGS_V1.assets, budgets=(1188, 840, 594, 396, 297, 198)),
         scenes=_published_scenes(stage_1_families(policy), max_triangles=1572),
     )
 
 
-def renderformer_v1_512(policy: Policy = "de-biased") -> BuildSettings:
+def renderformer_v1_512(policy: Policy = "de-biased") -> DatasetSettings:
     """The published second stage: 14 families, 512 pixels, at most 4192 triangles."""
     return dataclasses.replace(
-        BUILD_V1,
+        SETTINGS_V1,
         build="renderformer-v1-512" + _suffix(policy),
-        assets=dataclasses.replace(BUILD_V1.assets, budgets=(3968, 2380, 1188, 840, 594, 396)),
+        assets=dataclasses.replace(SETTINGS_V1.assets, budgets=(3968, 2380, 1188, 840, 594, 396)),
         scenes=_published_scenes(stage_2_families(policy), max_triangles=4192),
-        renders=dataclasses.replace(BUILD_V1.renders, resolution=512),
-        splits=dataclasses.replace(BUILD_V1.splits, scenes_per_shard=64),
+        renders=dataclasses.replace(SETTINGS_V1.renders, resolution=512),
+        splits=dataclasses.replace(SETTINGS_V1.splits, scenes_per_shard=64),
     )
 
 
@@ -85,17 +85,17 @@ def _suffix(policy: Policy) -> str:
     return "-original" if policy == "original" else ""
 
 
-RENDERFORMER_BUILDS = {
-    "renderformer-v1-256": NamedBuild(
+RENDERFORMER_PRESETS = {
+    "renderformer-v1-256": DatasetPreset(
         settings=renderformer_v1_256, num_scenes=65_536, device="cpu"
     ),
-    "renderformer-v1-512": NamedBuild(
+    "renderformer-v1-512": DatasetPreset(
         settings=renderformer_v1_512, num_scenes=16_384, device="cpu"
     ),
-    "renderformer-v1-256-original": NamedBuild(
+    "renderformer-v1-256-original": DatasetPreset(
         settings=functools.partial(renderformer_v1_256, "original"), num_scenes=65_536, device="cpu"
     ),
-    "renderformer-v1-512-original": NamedBuild(
+    "renderformer-v1-512-original": DatasetPreset(
         settings=functools.partial(renderformer_v1_512, "original"), num_scenes=16_384, device="cpu"
     ),
 }

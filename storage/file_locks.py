@@ -1,4 +1,4 @@
-"""Claims: locks that tell processes in a shared folder which work is taken.
+"""File locks, called claims: they tell processes in a shared folder which work is taken.
 
 A claim is a lock on a small file. It ends with the process that holds it, however that ends, so
 nothing has to be cleaned up after a kill. The file says who holds it, for those who wait. Claims
@@ -21,7 +21,7 @@ from pathlib import Path
 from storage.atomic import write_error
 from storage.remote.safe_url import printable
 
-log = logging.getLogger("trilight.claims")
+log = logging.getLogger("trilight.file_locks")
 
 _MOST_TRIES = 100
 """To create a lock in a folder that others delete."""
@@ -37,8 +37,8 @@ _unlocked = itertools.count()
 
 
 @contextlib.contextmanager
-def hold_claim(path: Path, *, wait: bool = False) -> Iterator[bool]:
-    """Hold a claim for the block; yield whether it is ours.
+def hold_lock(path: Path, *, wait: bool = False) -> Iterator[bool]:
+    """Hold the lock of a file, a claim, for the block; yield whether it is ours.
 
     Args:
         path: the file of the claim; it is created here, and its holder may delete it.
@@ -103,7 +103,7 @@ def take_lock(descriptor: int, *, shared: bool = False, wait: bool = False) -> b
     return True
 
 
-def is_claimed(path: Path) -> bool:
+def is_locked(path: Path) -> bool:
     """Return whether another holds a claim; to look, this takes a free one for a moment."""
     try:
         descriptor = os.open(path, os.O_RDWR)

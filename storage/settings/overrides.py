@@ -1,4 +1,4 @@
-"""Settings with some values changed, by dotted names such as `lights.count`.
+"""Settings overrides: some values replaced, by dotted names such as `lights.count`.
 
 A name leads through groups of settings, and through a list of them by the number of an entry, as in
 `families.0.weight`; without a number each entry is changed. Values come as JSON has them, lists and
@@ -23,7 +23,7 @@ Settings = TypeVar("Settings")
 
 _LIST_OF_WORDS = re.compile(r"\[(\s*[A-Za-z]\w*\s*(?:,\s*[A-Za-z]\w*\s*)*)\]")
 
-Change = tuple[Sequence[str], Any, str]
+Override = tuple[Sequence[str], Any, str]
 """The way that is left to a value, the value, and the whole name."""
 
 
@@ -75,8 +75,8 @@ def _write_value(value: Any) -> str:
     return value if is_word else json.dumps(value)
 
 
-def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:
-    """Return settings, a frozen dataclass, with the named values replaced, all at once.
+def apply_overrides(settings: Settings, overrides: Mapping[str, Any]) -> Settings:
+    """Return settings, a frozen dataclass, with the values of overrides, all at once.
 
     Values that only fit each other may therefore come in any order.
 
@@ -84,7 +84,9 @@ def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:
         TrilightError: a name that does not exist, a value of another kind, or one that the
             settings themselves refuse; a name that is nearly right is asked back.
     """
-    result: Settings = _replace_fields(settings, [(n.split("."), v, n) for n, v in changes.items()])
+    result: Settings = _replace_fields(
+        settings, [(n.split("."), v, n) for n, v in overrides.items()]
+    )
     return result
 
 
@@ -107,11 +109,11 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, 
     return differing
 
 
-def _replace_fields(group: Any, changes: Sequence[Change]) -> Any:
+def _replace_fields(group: Any, overrides: Sequence[Override]) -> Any:
     kind: Any = type(group)
     fields = {field.name: field for field in describe_fields(kind)}
-    by_field: dict[str, list[Change]] = {}
-    for path, value, name in changes:
+    by_field: dict[str, list[Override]] = {}
+    for path, value, name in overrides:
         first, *rest = path
         if first in getattr(kind, "REMOVED", ()):
             raise TrilightError(removal_message(f"setting {name!r}"))
@@ -128,11 +130,11 @@ def _replace_fields(group: Any, changes: Sequence[Change]) -> Any:
             if not path:  # first as a whole, then single settings within it
                 record = _without_presets(new, value, name)
                 value = field_value(kind, fields[field], record, name)
-        values[field] = _change_within(value, [change for change in inner if change[0]])
+        values[field] = _override_within(value, [override for override in inner if override[0]])
     try:
         return dataclasses.replace(group, **values)
     except TrilightError as error:
-        names = [name for _, _, name in changes]
+        names = [name for _, _, name in overrides]
         if any(name in str(error) for name in names):
             raise
         quoted = ", ".join(map(repr, names))
@@ -165,21 +167,21 @@ def _no_group(new: Any, name: str, group: Any, choices: str = "expected") -> Tri
     )
 
 
-def _change_within(value: Any, changes: Sequence[Change]) -> Any:
+def _override_within(value: Any, overrides: Sequence[Override]) -> Any:
     """Return a group, or a list of groups, with single settings of it changed."""
-    if not changes:
+    if not overrides:
         return value
     if dataclasses.is_dataclass(value):
-        for path, new, name in changes:
+        for path, new, name in overrides:
             if not path:
                 raise _no_group(new, name, value)
-        return _replace_fields(value, changes)
+        return _replace_fields(value, overrides)
     if not isinstance(value, tuple) or not all(map(dataclasses.is_dataclass, value)):
-        path, _, name = changes[0]
+        path, _, name = overrides[0]
         plain = ".".join(name.split(".")[: -len(path)])
         raise TrilightError(f"setting {name!r} does not exist: {plain!r} has no settings within.")
-    by_entry: list[list[Change]] = [[] for _ in value]
-    for path, new, name in changes:
+    by_entry: list[list[Override]] = [[] for _ in value]
+    for path, new, name in overrides:
         if not path[0].isdigit():  # all entries are meant
             for entry in by_entry:
                 entry.append((path, new, name))
@@ -190,4 +192,4 @@ def _change_within(value: Any, changes: Sequence[Change]) -> Any:
                 f"setting {name!r} does not exist: the list has {len(value)} entries; expected a "
                 f"number from 0 to {len(value) - 1}."
             )
-    return tuple(map(_change_within, value, by_entry))
+    return tuple(map(_override_within, value, by_entry))

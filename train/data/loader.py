@@ -1,4 +1,4 @@
-"""Data loader: an endless stream of batches of scenes, fetched and decoded ahead in threads.
+"""DataLoader of training datasets: endless batches of scenes, decoded ahead in threads.
 
 Batch i holds the same scenes with the same augmentation wherever the stream starts, for any number
 of ranks and threads: a run resumes by the number of its step.
@@ -53,8 +53,8 @@ Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, kw_only=True)
-class StreamSettings:
-    """Settings that determine the stream."""
+class LoaderSettings:
+    """Settings that determine the batches of the data loader."""
 
     seed: int
     """Seed of the order, and of the views and augmentation of each visit."""
@@ -80,9 +80,9 @@ class StreamSettings:
         return OrderSettings(seed=self.seed, window=self.window)
 
 
-def stream_batches(
+def load_batches(
     shards: ShardSet,
-    settings: StreamSettings,
+    settings: LoaderSettings,
     first: int,
     *,
     rank_slice: RankSlice,
@@ -224,7 +224,7 @@ class _SampleCounts:
 
 def _plan_batches(
     counted: _SampleCounts,
-    settings: StreamSettings,
+    settings: LoaderSettings,
     mixture: Mixture | None,
     first: int,
     rank_slice: RankSlice,
@@ -247,7 +247,7 @@ def _plan_batches(
         yield mine
 
 
-def _plan_ahead(counted: _SampleCounts, settings: StreamSettings, mixture: Mixture | None) -> int:
+def _plan_ahead(counted: _SampleCounts, settings: LoaderSettings, mixture: Mixture | None) -> int:
     """Return the number of batches to plan ahead: about a window, to open its shards in time.
 
     With several datasets it is the window that ends first.
@@ -268,7 +268,7 @@ class _SceneMaker:
         self,
         shards: ShardSet,
         opened: OpenShards,
-        settings: StreamSettings,
+        settings: LoaderSettings,
         unusable: BadSampleCounter,
     ) -> None:
         self._shards = shards

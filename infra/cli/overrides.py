@@ -1,4 +1,4 @@
-"""Base settings: changes to a preset from a dataset, a run, a YAML file, or `--set`."""
+"""Overrides of a preset's settings: from a dataset, a run, a YAML file, or `--set`."""
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from storage.errors import TrilightError
 from storage.records.safe_read import open_plain, read_plain
-from storage.settings.changes import changed, differences, json_or_word
 from storage.settings.described import checked, settings_record
+from storage.settings.overrides import apply_overrides, differences, json_or_word
 from storage.typed_json import read_json
 
 if TYPE_CHECKING:
-    from pipeline.generation.dataset_order import DatasetOrder
+    from pipeline.generation.generate_options import GenerateOptions
 
-Order = TypeVar("Order", bound="DatasetOrder")
+Options = TypeVar("Options", bound="GenerateOptions")
 
 _LICENCES = "allowed_licences"
 _OF_SOURCES = ("build", "derived", "revisit")
@@ -43,8 +43,8 @@ class BaseSettings:
         return (self.like, self.settings) != (None, None)
 
 
-def parse_changes(texts: Iterable[str]) -> dict[str, Any]:
-    """Return the values by name; a value is JSON, or a plain word that stands for itself.
+def parse_overrides(texts: Iterable[str]) -> dict[str, Any]:
+    """Return the overrides by name; a value is JSON, or a plain word that stands for itself.
 
     Raises:
         TrilightError: a text without `=`, or a name given twice.
@@ -61,18 +61,18 @@ def parse_changes(texts: Iterable[str]) -> dict[str, Any]:
     return changes
 
 
-def with_base_settings(order: Order, base: BaseSettings) -> Order:
+def with_base_settings(order: Options, base: BaseSettings) -> Options:
     """Return dataset options whose `changes` hold all differences from the preset.
 
     Raises:
         TrilightError: settings cannot be read, or the preset refuses a value, also one that the
             options state.
     """
-    from pipeline.builds.named import named_build, option_changes  # train does without
+    from pipeline.presets.registry import option_overrides, preset_settings  # train does without
 
-    options = option_changes(order.seed, order.resolution, order.noise_targets)
+    options = option_overrides(order.seed, order.resolution, order.noise_targets)
     stated = {**options, **order.changes}
-    changes = all_changes(named_build(order.build), base, _dataset_record(base), stated)
+    changes = merge_overrides(preset_settings(order.build), base, _dataset_record(base), stated)
     if not base.is_given:
         return order
     if _LICENCES in changes:  # the option adds licences to those of any source of settings
@@ -80,10 +80,10 @@ def with_base_settings(order: Order, base: BaseSettings) -> Order:
     return dataclasses.replace(order, changes=changes)
 
 
-def all_changes(
+def merge_overrides(
     settings: Any, base: BaseSettings, liked: Mapping[str, Any], stated: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return all changes to a preset's settings by dotted name, and check the changed settings.
+    """Return all overrides of a preset's settings by dotted name, and check the result.
 
     Args:
         base: names a settings file, which overrides `liked`.
@@ -102,7 +102,7 @@ def all_changes(
             unchanged = [old for old in merged if not f"{old}.".startswith(f"{name}.")]
             merged = {old: merged[old] for old in unchanged} | {name: value}
     try:
-        changed(settings, merged)
+        apply_overrides(settings, merged)
     except TrilightError as error:
         lines = [line for name, (_, line) in filed.items() if f"'{name}'" in str(error)]
         if not lines:

@@ -1,6 +1,6 @@
-"""A training run of your own: a function that returns everything that decides the weights.
+"""A training preset of your own: a function that returns everything that decides the weights.
 
-    trilight train run.py:quick_lights --data data/smoke --out runs/lights
+    trilight train training_preset.py:quick_lights --data data/smoke --out runs/lights
 
 settings.json and every checkpoint keep the settings in full and the sha256 of this file: --resume
 after the file has changed is refused. The trained network opens anywhere, without the file.
@@ -8,12 +8,12 @@ after the file has changed is refused. The trained network opens anywhere, witho
 
 import dataclasses
 
-from trilight.extend import TrainSettings, named_run
+from trilight.extend import TrainSettings, training_preset
 
 
 def quick_lights() -> TrainSettings:
     """Return a short run that is shown every scene under lights of many strengths."""
-    base = named_run("smoke")
+    base = training_preset("smoke")
     return dataclasses.replace(
         base,
         run="quick-lights",

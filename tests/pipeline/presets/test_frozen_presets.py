@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.builds.judging import JUDGING_BUILDS
-from pipeline.builds.named import BUILDS, named_build
-from pipeline.builds.renderformer import RENDERFORMER_BUILDS
+from pipeline.presets.judging import PRESETS_FOR_JUDGING
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings
+from pipeline.presets.renderformer import RENDERFORMER_PRESETS
 from scene_templates import lights, placement
 from scene_templates.cameras import sample_camera
 from scene_templates.rooms import PATCH_FACES, QUADS, SIDES
@@ -50,12 +50,12 @@ LAYOUTS = {
 
 
 def test_the_settings_of_a_frozen_set_stay_what_they_are() -> None:
-    assert {name: named_build(name).digest for name in FROZEN} == FROZEN
-    assert set(FROZEN) == {*JUDGING_BUILDS, *RENDERFORMER_BUILDS}
+    assert {name: preset_settings(name).digest for name in FROZEN} == FROZEN
+    assert set(FROZEN) == {*PRESETS_FOR_JUDGING, *RENDERFORMER_PRESETS}
 
 
 def test_the_layouts_of_a_frozen_set_stay_what_they_are() -> None:
-    used = {family.template for name in FROZEN for family in named_build(name).scenes.families}
+    used = {family.template for name in FROZEN for family in preset_settings(name).scenes.families}
     assert used == set(LAYOUTS)
     for name, (parts, *sectors) in LAYOUTS.items():
         template = TEMPLATES[name]
@@ -97,7 +97,7 @@ DRAWN = {
 def test_what_is_drawn_from_them_stays_what_it_is() -> None:
     """So that the code, too, which draws a layout from its data, changes no published set."""
     for name, digest in DRAWN.items():
-        build = named_build(name)
+        build = preset_settings(name)
         numbers = [_numbers(build.scenes, build.seed, index) for index in range(12)]
         # to a millionth: exp, sin and cos differ between processors in their sixteenth digit
         rounded = np.round(np.concatenate(numbers) * 1e6).astype(np.int64)
@@ -127,23 +127,23 @@ def test_a_layout_that_is_registered_later_changes_no_build() -> None:
             load_extension(f"examples/{name}.py")
         from scene_templates.families import TEMPLATES, Family
         assert "corridor" in TEMPLATES and "crowd" in Family.PRESETS
-        from pipeline.builds.named import BUILDS
+        from pipeline.presets.registry import DATASET_PRESETS
         """)
-    assert found == {name: build.settings().digest for name, build in BUILDS.items()}
+    assert found == {name: build.settings().digest for name, build in DATASET_PRESETS.items()}
 
 
 def test_a_default_that_is_changed_later_changes_no_frozen_set() -> None:
     """They are made where no field of any group of settings has a default to fall back on."""
     found = _digests_after("""
         from pipeline.assets import settings as assets
-        from pipeline.builds import settings as builds
+        from pipeline.presets import settings as presets
         from pipeline.renders import settings as renders
         from scene_templates import settings as scenes
         from scene_templates import families
         from scene_templates import rooms
         from scene_templates import separate_sides
         from storage.dataset import settings as dataset_settings
-        modules = (assets, builds, renders, scenes, families, rooms, separate_sides)
+        modules = (assets, presets, renders, scenes, families, rooms, separate_sides)
         kinds = {kind for module in (*modules, dataset_settings) for kind in vars(module).values()
                  if hasattr(kind, "__pydantic_fields__")}
         assert len(kinds) > 14
@@ -162,17 +162,18 @@ def test_a_default_that_is_changed_later_changes_no_frozen_set() -> None:
             pass
         else:
             raise AssertionError("a default is still there")
-        from pipeline.builds.judging import JUDGING_BUILDS
-        from pipeline.builds.renderformer import RENDERFORMER_BUILDS
-        BUILDS = JUDGING_BUILDS | RENDERFORMER_BUILDS
+        from pipeline.presets.judging import PRESETS_FOR_JUDGING
+        from pipeline.presets.renderformer import RENDERFORMER_PRESETS
+        DATASET_PRESETS = PRESETS_FOR_JUDGING | RENDERFORMER_PRESETS
         """)
-    assert found == {name: BUILDS[name].settings().digest for name in FROZEN}
+    assert found == {name: DATASET_PRESETS[name].settings().digest for name in FROZEN}
 
 
 def _digests_after(code: str) -> dict[str, str]:
-    """Return the digests of `BUILDS`, which the code imports, in a process of its own."""
+    """Return the digests of `DATASET_PRESETS`, which the code imports, in a process of its own."""
     lines = "\n".join(line.removeprefix(" " * 8) for line in code.splitlines())
-    tail = "import json\nprint(json.dumps({n: b.settings().digest for n, b in BUILDS.items()}))"
+    digests = "{n: b.settings().digest for n, b in DATASET_PRESETS.items()}"
+    tail = f"import json\nprint(json.dumps({digests}))"
     ran = subprocess.run(
         [sys.executable, "-c", f"{lines}\n{tail}"], capture_output=True, text=True, check=False
     )

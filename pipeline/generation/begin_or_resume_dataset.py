@@ -1,4 +1,4 @@
-"""Begins a dataset in a folder or a bucket; resumes the one there if its settings are the same."""
+"""Begins a dataset in a folder or a bucket, or resumes the one there with the same settings."""
 
 import contextlib
 import dataclasses
@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from pipeline.builds.settings import BuildSettings, differences
 from pipeline.generation.dataset_writer import (
     PLANNED,
     DatasetWriter,
@@ -15,6 +14,7 @@ from pipeline.generation.dataset_writer import (
     merge_failures,
     published_head,
 )
+from pipeline.presets.settings import DatasetSettings, differences
 from pipeline.renders.variant import device_of
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder, place_of_part
@@ -26,8 +26,8 @@ from storage.remote.store import Store
 from storage.settings.described import from_record
 
 
-def hold_membership(folder: DatasetFolder) -> contextlib.AbstractContextManager[None]:
-    """Hold the membership of a dataset's workers; who is alone brings the folder up to date.
+def hold_dataset_lock(folder: DatasetFolder) -> contextlib.AbstractContextManager[None]:
+    """Hold the lock that a dataset's workers share; one that is alone updates the folder.
 
     Before a bucket it gets the bucket's state. Elsewhere, the manifest of a dataset without any
     object, scene or shard is deleted: it begins again.
@@ -36,7 +36,7 @@ def hold_membership(folder: DatasetFolder) -> contextlib.AbstractContextManager[
         TrilightError: the folder cannot be written, or the bucket not be read.
     """
     store = folder.store()
-    return folder.hold_membership(
+    return folder.hold_shared_lock(
         partial(_forget_unused, folder) if store.is_here else partial(_adopt, folder, store)
     )
 
@@ -87,9 +87,9 @@ def _publish_plan(store: Store, num_scenes: int) -> None:
         store.put(f"{PLANNED}{num_scenes:012d}", b"\n")
 
 
-def begin_dataset(
+def begin_or_resume_dataset(
     folder: DatasetFolder,
-    settings: BuildSettings,
+    settings: DatasetSettings,
     environment: Mapping[str, Any],
     num_scenes: int,
     *,
@@ -97,7 +97,7 @@ def begin_dataset(
 ) -> DatasetWriter:
     """Begin a dataset in a folder or a bucket, or resume the one that is there.
 
-    The number of scenes never falls. Call while holding the folder's membership.
+    The number of scenes never falls. Call while holding the dataset's lock.
 
     Raises:
         TrilightError: the dataset was begun with other settings, or in another environment and
@@ -139,7 +139,7 @@ def begin_dataset(
 def _require_same_dataset(
     folder: DatasetFolder,
     manifest: Manifest,
-    settings: BuildSettings,
+    settings: DatasetSettings,
     environment: Mapping[str, Any],
     accept_environment: bool,
 ) -> None:
@@ -150,7 +150,7 @@ def _require_same_dataset(
             "and cannot grow; extend its sources and make it again, or choose another --out."
         )
     require_same_extensions(folder.display_name, manifest.extensions, extension_digests("data"))
-    stored = from_record(BuildSettings, manifest.settings).as_json()  # fields may come later
+    stored = from_record(DatasetSettings, manifest.settings).as_json()  # fields may come later
     _require_same(folder, "setting", stored, settings.as_json(), "choose another --out")
     if not accept_environment:
         before = device_of(manifest.environment)

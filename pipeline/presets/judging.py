@@ -1,48 +1,48 @@
-"""Builds for the evaluation of networks, never for training: all scenes belong to `test`.
+"""Dataset presets for the evaluation of networks, never training: all scenes belong to `test`.
 
 Their pictures are stored without loss: there are few, and all figures are measured against them.
 """
 
 import dataclasses
 
-from pipeline.builds.frozen_v1 import BUILD_V1, JUDGING_SPLITS
-from pipeline.builds.settings import BuildSettings, NamedBuild
 from pipeline.objects.generated import BENCHMARK
+from pipeline.presets.frozen_v1 import JUDGING_SPLITS, SETTINGS_V1
+from pipeline.presets.settings import DatasetPreset, DatasetSettings
 from scene_templates.out_of_range import out_of_range_2_settings, out_of_range_settings
 from storage.dataset.settings import StorageSettings
 
 _EXACT = StorageSettings(profile="lossless", passes=())
 
 
-def out_of_range() -> BuildSettings:
+def out_of_range() -> DatasetSettings:
     """Scenes with one axis beyond the trained range: 37 values of nine axes in four layouts."""
     return dataclasses.replace(
-        BUILD_V1,
+        SETTINGS_V1,
         build="out-of-range",
-        assets=dataclasses.replace(BUILD_V1.assets, budgets=(3900, 2600, 1700, 1100, 700, 400)),
+        assets=dataclasses.replace(SETTINGS_V1.assets, budgets=(3900, 2600, 1700, 1100, 700, 400)),
         scenes=out_of_range_settings(max_triangles=4096),
         # Lights of a hundredth of the area: a view is black where it is a thousand times darker.
-        renders=dataclasses.replace(BUILD_V1.renders, max_spp=2048, min_mean_radiance=1e-5),
+        renders=dataclasses.replace(SETTINGS_V1.renders, max_spp=2048, min_mean_radiance=1e-5),
         splits=dataclasses.replace(JUDGING_SPLITS, scenes_per_shard=37),
         storage=_EXACT,
     )
 
 
-def out_of_range_2() -> BuildSettings:
+def out_of_range_2() -> DatasetSettings:
     """`out-of-range` with twelve more values: five axes of textures and skies.
 
     It is another set: the first nine axes have the same distribution, and different scenes.
     """
-    build = out_of_range()
+    base = out_of_range()
     return dataclasses.replace(
-        build,
+        base,
         build="out-of-range-2",
         scenes=out_of_range_2_settings(max_triangles=4096),
-        splits=dataclasses.replace(build.splits, scenes_per_shard=49),
+        splits=dataclasses.replace(base.splits, scenes_per_shard=49),
     )
 
 
-def benchmark_v1() -> BuildSettings:
+def benchmark_v1() -> DatasetSettings:
     """200 frozen scenes, 50 of each layout, one view each, to 48 dB or 2048 samples.
 
     The settings, the seed and the built-in objects are frozen: every run gives the same scenes
@@ -50,26 +50,26 @@ def benchmark_v1() -> BuildSettings:
     `--resolution 512`.
     """
     return dataclasses.replace(
-        BUILD_V1,
+        SETTINGS_V1,
         build="benchmark-v1",
         seed=20261121,
         source=BENCHMARK,
-        renders=dataclasses.replace(BUILD_V1.renders, noise_floor_db=48.0, max_spp=2048),
+        renders=dataclasses.replace(SETTINGS_V1.renders, noise_floor_db=48.0, max_spp=2048),
         splits=JUDGING_SPLITS,
         storage=_EXACT,
     )
 
 
-JUDGING_BUILDS = {
-    "out-of-range": NamedBuild(settings=out_of_range, num_scenes=148, device="cpu"),
-    "out-of-range-2": NamedBuild(settings=out_of_range_2, num_scenes=196, device="cpu"),
-    "benchmark-v1": NamedBuild(
+PRESETS_FOR_JUDGING = {
+    "out-of-range": DatasetPreset(settings=out_of_range, num_scenes=148, device="cpu"),
+    "out-of-range-2": DatasetPreset(settings=out_of_range_2, num_scenes=196, device="cpu"),
+    "benchmark-v1": DatasetPreset(
         settings=benchmark_v1,
         num_scenes=200,
         device="cpu",
         scene_digest="5c77fcc0c9a5cb2859a0433befce8ae15d7cd4ad6fd26b8775494fde4fd8c14f",
     ),
-    "benchmark-v1-mini": NamedBuild(
+    "benchmark-v1-mini": DatasetPreset(
         settings=benchmark_v1,
         num_scenes=20,
         device="cpu",

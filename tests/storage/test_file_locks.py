@@ -18,11 +18,11 @@ import pytest
 import torch
 
 from pipeline.assets.store import AssetStore
-from storage import claims
+from storage import file_locks
 from storage.atomic import atomic_writer, write_error
-from storage.claims import describe_holder, hold_claim, is_claimed
 from storage.dataset.layout import DatasetFolder
 from storage.errors import EnvironmentFailure, TrilightError
+from storage.file_locks import describe_holder, hold_lock, is_locked
 from storage.remote.cache import ShardCache
 from storage.remote.url import RemoteUrl, parse_url
 from tests.conftest import ROOT
@@ -33,8 +33,8 @@ from train.loop.distributed import DistributedContext
 HOLD = """
 import sys, time
 from pathlib import Path
-from storage.claims import hold_claim
-with hold_claim(Path(sys.argv[1])) as ours:
+from storage.file_locks import hold_lock
+with hold_lock(Path(sys.argv[1])) as ours:
     print(ours, flush=True)
     time.sleep(60)
 """
@@ -42,10 +42,10 @@ with hold_claim(Path(sys.argv[1])) as ours:
 
 def test_a_claim_has_one_holder(tmp_path: Path) -> None:
     path = tmp_path / "folder" / "a.claim"
-    with hold_claim(path) as first, hold_claim(path) as second:
+    with hold_lock(path) as first, hold_lock(path) as second:
         assert first
         assert not second
-    with hold_claim(path) as third:
+    with hold_lock(path) as third:
         assert third
 
 
@@ -55,10 +55,10 @@ def test_a_claim_ends_with_its_process(tmp_path: Path) -> None:
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "True\n"
-        with hold_claim(path) as ours:
+        with hold_lock(path) as ours:
             assert not ours
         holder.send_signal(signal.SIGKILL)
-    with hold_claim(path, wait=True) as ours:
+    with hold_lock(path, wait=True) as ours:
         assert ours
 
 
@@ -68,11 +68,11 @@ def test_a_claim_that_its_holder_deleted_is_not_shared(tmp_path: Path) -> None:
     held_together: list[bool] = []
 
     def wait() -> None:
-        with hold_claim(path, wait=True), hold_claim(path) as again:
+        with hold_lock(path, wait=True), hold_lock(path) as again:
             held_together.append(again)
         waited.set()
 
-    with hold_claim(path):
+    with hold_lock(path):
         waiter = threading.Thread(target=wait)
         waiter.start()
         shutil.rmtree(path.parent)
@@ -92,18 +92,18 @@ def test_the_first_writer_wins_where_asked(tmp_path: Path) -> None:
 
 def test_leftovers_are_cleared_only_where_nobody_works(tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path)
-    with folder.hold_membership():
+    with folder.hold_shared_lock():
         leftover, young = tmp_path / "a.tar.1-00.part", tmp_path / "b.tar.1-00.part"
         for path in (leftover, young):
             path.write_bytes(b"")
         hours_ago = time.time() - 7200
         os.utime(leftover, (hours_ago, hours_ago))
-        with folder.hold_membership():
+        with folder.hold_shared_lock():
             assert leftover.exists()
-    with folder.hold_membership():
+    with folder.hold_shared_lock():
         assert leftover.exists(), "somebody has looked within the hour"
     os.utime(folder.staging / "cleaned", (hours_ago, hours_ago))
-    with folder.hold_membership():
+    with folder.hold_shared_lock():
         assert not leftover.exists()
         assert young.exists()  # of another machine, perhaps, that our locks do not reach
 
@@ -128,7 +128,7 @@ def test_a_folder_that_can_never_be_made_is_said_at_once() -> None:
     """Where /proc says of a folder that it does not exist, as a deleted one would, waiting ends."""
     with (
         pytest.raises(TrilightError, match="/proc/nowhere"),
-        hold_claim(Path("/proc/nowhere/lock")),
+        hold_lock(Path("/proc/nowhere/lock")),
     ):
         pass
 
@@ -145,11 +145,11 @@ def test_without_locks_everything_goes_on_after_one_warning(
 
     caplog.clear()
     monkeypatch.setattr(fcntl, "flock", refuse)
-    monkeypatch.setattr(claims, "_unlocked", itertools.count())
+    monkeypatch.setattr(file_locks, "_unlocked", itertools.count())
     folder, cache = DatasetFolder(tmp_path / "set"), ShardCache(tmp_path / "cache", 1 << 20)
-    with folder.hold_membership(), folder.mutex("manifest") as ours, folder.hold_exclusively():
-        with hold_claim(tmp_path / "a") as first, hold_claim(tmp_path / "a", wait=True) as second:
-            assert ours and first and second and not is_claimed(tmp_path / "a")
+    with folder.hold_shared_lock(), folder.mutex("manifest") as ours, folder.hold_exclusive_lock():
+        with hold_lock(tmp_path / "a") as first, hold_lock(tmp_path / "a", wait=True) as second:
+            assert ours and first and second and not is_locked(tmp_path / "a")
     with AssetStore(tmp_path / "store").lock("abc"):
         pass
     with claim_run(RunFolder(tmp_path / "run"), DistributedContext(device=torch.device("cpu"))):
@@ -171,21 +171,21 @@ def test_one_function_takes_every_lock() -> None:
     packages = ("infra", "model", "pipeline", "scene_templates", "storage", "train", "trilight")
     files = [path for name in packages for path in (ROOT / name).rglob("*.py")]
     takers = [path for path in files if re.search(r"\b(flock|lockf|F_SETLKW?)\(", path.read_text())]
-    assert takers == [ROOT / "storage" / "claims.py"]
+    assert takers == [ROOT / "storage" / "file_locks.py"]
 
 
 def test_who_waits_says_for_whom_and_since_when(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Once, and again after ever longer times; of a thread of the same process never."""
-    monkeypatch.setattr(claims, "_SILENT_S", 0.1)
+    monkeypatch.setattr(file_locks, "_SILENT_S", 0.1)
     path = tmp_path / "a\x1b]0;b.claim"
     command = [sys.executable, "-c", HOLD.replace("sleep(60)", "sleep(1.5)"), str(path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as holder:
         assert holder.stdout is not None and holder.stdout.readline()
-        assert is_claimed(path)
-        with hold_claim(path, wait=True):
-            waiter = threading.Thread(target=lambda: hold_claim(path, wait=True).__enter__())
+        assert is_locked(path)
+        with hold_lock(path, wait=True):
+            waiter = threading.Thread(target=lambda: hold_lock(path, wait=True).__enter__())
             waiter.start()
             said = len(caplog.messages)
             time.sleep(0.5)

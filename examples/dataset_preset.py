@@ -1,6 +1,6 @@
-"""A build of your own: a function that returns the full settings of a dataset.
+"""A dataset preset of your own: a function that returns the full settings of a dataset.
 
-    trilight generate build.py:sunsets --out data/sunsets
+    trilight generate dataset_preset.py:sunsets --out data/sunsets
 
 The manifest keeps the settings in full and the sha256 of this file: going on with a dataset after
 the file has changed is refused, since its other scenes would not be of the same kind.
@@ -8,12 +8,12 @@ the file has changed is refused, since its other scenes would not be of the same
 
 import dataclasses
 
-from trilight.extend import BuildSettings, LightSettings, NamedBuild, named_build
+from trilight.extend import DatasetPreset, DatasetSettings, LightSettings, preset_settings
 
 
-def sunsets() -> NamedBuild:
-    """Return the smoke build with one or two coloured lights, far apart from each other."""
-    base: BuildSettings = named_build("smoke")
+def sunsets() -> DatasetPreset:
+    """Return the smoke preset with one or two coloured lights, far apart from each other."""
+    base: DatasetSettings = preset_settings("smoke")
     lights: LightSettings = dataclasses.replace(
         base.scenes.lights, count=(1, 2), coloured_share=1.0
     )
@@ -24,4 +24,4 @@ def sunsets() -> NamedBuild:
         renders=dataclasses.replace(base.renders, resolution=128, noise_floor_db=38.0),
     )
     # a function may return the settings alone; this says how many scenes there are by default
-    return NamedBuild(settings=lambda: settings, num_scenes=32)
+    return DatasetPreset(settings=lambda: settings, num_scenes=32)

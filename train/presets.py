@@ -18,10 +18,10 @@ from model.config import base as base_model
 from model.config import hits_base, hits_smoke
 from model.config import large as large_model
 from model.config import smoke as smoke_model
-from storage.aliases import PRESETS
-from storage.errors import TrilightError, expected_one_of
+from storage.aliases import PRESET_ALIASES
+from storage.errors import TrilightError
 from storage.registry import Registry
-from storage.settings.changes import changed
+from storage.settings.overrides import apply_overrides
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
 
 
@@ -254,8 +254,8 @@ def finetune() -> TrainSettings:
     )
 
 
-RUNS: Registry[Callable[[], TrainSettings]] = Registry(
-    "run",
+TRAINING_PRESETS: Registry[Callable[[], TrainSettings]] = Registry(
+    "training preset",
     Callable,
     {
         "smoke": smoke,
@@ -272,7 +272,7 @@ RUNS: Registry[Callable[[], TrainSettings]] = Registry(
         "paper-finetune-large": paper_finetune_large,
     },
     decides=("weights",),
-    aliases=PRESETS,
+    aliases=PRESET_ALIASES,
 )
 """Training presets by name."""
 
@@ -280,8 +280,8 @@ _INTERVALS = ("log_every", "validate_every", "checkpoint_every", "keep_every")
 """Settings that are numbers of steps between two events."""
 
 
-def typed_run(typed: str) -> str:
-    """Return the name of a run that was typed on a command line.
+def resolve_training_preset(typed: str) -> str:
+    """Return the name of a training preset that was typed on a command line.
 
     For FILE.py:FUNCTION it registers the TrainSettings that the user's function returns. Names from
     other sources must not be passed, since the file is executed.
@@ -289,57 +289,56 @@ def typed_run(typed: str) -> str:
     Raises:
         TrilightError: as `Registry.resolve`, or the function returns something else.
     """
-    return RUNS.resolve(typed, _as_run)
+    return TRAINING_PRESETS.resolve(typed, _as_preset)
 
 
-def _as_run(settings: Any) -> Callable[[], TrainSettings]:
+def _as_preset(settings: Any) -> Callable[[], TrainSettings]:
     if not isinstance(settings, TrainSettings):
         raise TrilightError(f"it returned a {type(settings).__name__}; expected TrainSettings.")
     return lambda: settings
 
 
-def named_run(name: str) -> TrainSettings:
-    """Return the settings of a run.
+def training_preset(name: str) -> TrainSettings:
+    """Return the settings of a training preset.
 
     Raises:
-        TrilightError: the name is unknown, or a user's run has the name of one of ours.
+        TrilightError: the name is unknown, or a user's preset has the name of one of ours.
     """
-    if name not in RUNS:
-        raise TrilightError(f"run {name!r}: no such run; {expected_one_of(name, sorted(RUNS))}.")
-    run = RUNS[name]()
-    if not RUNS.is_ours(name) and RUNS.is_ours(run.run):
+    preset = TRAINING_PRESETS.find(name)()
+    if not TRAINING_PRESETS.is_ours(name) and TRAINING_PRESETS.is_ours(preset.run):
         raise TrilightError(
-            f"run {name!r}: its settings say run={run.run!r}, which is one of Trilight's own; "
-            f"expected another name, such as dataclasses.replace(..., run='my-{run.run}')."
+            f"training preset {name!r}: its settings say run={preset.run!r}, which is one of "
+            f"Trilight's own; expected another name, such as dataclasses.replace(..., "
+            f"run='my-{preset.run}')."
         )
-    return run
+    return preset
 
 
-def changed_run(
+def override_training_preset(
     name: str,
     changes: Mapping[str, Any],
     *,
     steps: int | None = None,
     most_unusable: int | None = None,
 ) -> TrainSettings:
-    """Return the settings of a named run with some values replaced.
+    """Return the settings of a training preset with some values replaced.
 
     Args:
-        changes: values by dotted name, as `storage.settings.changes` takes them.
+        changes: values by dotted name, as `storage.settings.overrides` takes them.
         steps: replaces the number of steps; if it is smaller, the warm-up and the intervals that
             `changes` does not name shrink in proportion.
         most_unusable: replaces that setting, after the changes.
 
     Raises:
-        TrilightError: no such run or setting, or an invalid value; the message names it.
+        TrilightError: no such preset or setting, or an invalid value; the message names it.
     """
-    run = named_run(name)
+    run = training_preset(name)
     every = dict(changes)
     if steps is not None:
         every |= {**scale_intervals(run, steps, changes), "num_steps": steps}
     if most_unusable is not None:
         every["most_unusable"] = most_unusable
-    return changed(run, every)
+    return apply_overrides(run, every)
 
 
 def scale_intervals(run: TrainSettings, steps: int, stated: Mapping[str, Any]) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Laws of the stream: batch i is the same scenes for ever, and errors arrive where they belong.
+"""Laws of the data loader: batch i is the same scenes always, and errors arrive where they belong.
 
 Laws of targets: block means are measurements, and bad values never reach the weights. Laws of the
 order: each sample once an epoch, the same batches for any number of ranks; and the shards that are
@@ -39,6 +39,7 @@ from tests.train.kit import take
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.augment import augment_scene
 from train.data.buckets import MOST_WASTE, bucket_scenes
+from train.data.loader import LoaderSettings, OpenShards, prefetch
 from train.data.order import (
     OrderSettings,
     RankSlice,
@@ -49,10 +50,9 @@ from train.data.order import (
     windows_from,
 )
 from train.data.scenes import TrainingScene, block_mean, scene_of_views, training_scene, with_target
-from train.data.stream import OpenShards, StreamSettings, prefetch
 from train.settings import AugmentationSettings
 
-SETTINGS = StreamSettings(
+SETTINGS = LoaderSettings(
     seed=1,
     window=2,
     batch_size=6,
@@ -172,7 +172,7 @@ def test_epochs_show_every_scene_and_differ(whole: list[list[TrainingScene]]) ->
 def test_views_are_drawn_without_repetition_and_equal_shares(data: Dataset) -> None:
     with pytest.raises(TrilightError, match="not divisible by 4 ranks"):
         take(data, SETTINGS, 1, world_size=4)
-    settings = StreamSettings(seed=0, window=1, batch_size=7, resolution=8, views_per_scene=2)
+    settings = LoaderSettings(seed=0, window=1, batch_size=7, resolution=8, views_per_scene=2)
     for scene in take(data, settings, 1)[0]:
         poses = scene.tensors.c2w_V44.numpy()
         assert poses.shape[0] == 2
@@ -488,11 +488,11 @@ import itertools, json, resource, sys
 from contextlib import closing
 from storage.dataset.training_data import open_training_data
 from train.data.order import RankSlice
-from train.data.stream import StreamSettings, stream_batches
+from train.data.loader import LoaderSettings, load_batches
 from train.data.bad_samples import BadSampleCounter
-settings = StreamSettings(seed=0, window=2, batch_size=8, resolution=16, views_per_scene=2)
+settings = LoaderSettings(seed=0, window=2, batch_size=8, resolution=16, views_per_scene=2)
 data = open_training_data([sys.argv[1]]).split("train")
-batches = stream_batches(
+batches = load_batches(
     data, settings, 0, rank_slice=RankSlice(), workers=2, unusable=BadSampleCounter(0)
 )
 count = peak = 0

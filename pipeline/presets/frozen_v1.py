@@ -1,11 +1,11 @@
-"""Frozen settings of the published sets, with every number stated: no default may change them.
+"""Frozen preset settings of the published sets, all numbers stated: no default may change them.
 
-See scene_templates.frozen_v1. A build for training may change in later versions; these may not, so
+See scene_templates.frozen_v1. A preset for training may change in later versions; these may not, so
 they use no settings that do.
 """
 
 from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSettings
-from pipeline.builds.settings import BuildSettings
+from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.settings import RenderSettings
 from scene_templates.frozen_v1 import SCENES_V1
 from storage.dataset.settings import SplitSettings, StorageSettings
@@ -30,7 +30,7 @@ _LICENCES = (
     "LicenseRef-user-provided",
 )
 
-BUILD_V1 = BuildSettings(
+SETTINGS_V1 = DatasetSettings(
     build="v1",
     seed=0,
     source=None,

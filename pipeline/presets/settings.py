@@ -1,4 +1,4 @@
-"""`BuildSettings`: all settings that decide the contents of a dataset, except its size."""
+"""`DatasetSettings`: all settings that decide the contents of a dataset, except its size."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
@@ -8,7 +8,7 @@ from typing import Any
 import pydantic
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.builds.revisit import RevisitSettings
+from pipeline.presets.revisit import RevisitSettings
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Device
 from scene_templates.settings import SceneSettings
@@ -20,11 +20,11 @@ from storage.settings.ranges import Seed
 
 
 @checked()
-class BuildSettings:
+class DatasetSettings:
     """The settings of one dataset. They are stored in its manifest and never change."""
 
     build: str
-    """Name of the build that the settings come from."""
+    """Name of the preset that the settings come from."""
     seed: Seed
     """Seed of objects, scenes, cameras and samples."""
     source: str | None = None
@@ -46,7 +46,7 @@ class BuildSettings:
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit `revisit` if there is none, so that digests of earlier builds stay.
+        """Omit `revisit` if there is none, so that digests of earlier presets stay.
 
         The settings of the mesh stage are recorded with the changes that scenes require.
         """
@@ -83,10 +83,10 @@ class BuildSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class NamedBuild:
-    """A build that the command line knows by name."""
+class DatasetPreset:
+    """A dataset preset that the command line knows by name."""
 
-    settings: Callable[[], BuildSettings]
+    settings: Callable[[], DatasetSettings]
     """Function that returns the settings of the dataset."""
     num_scenes: int
     """Number of scenes to make unless the user asks for another."""

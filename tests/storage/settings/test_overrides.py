@@ -17,9 +17,9 @@ from typing_extensions import TypeAliasType
 from storage import array_hints
 from storage.array_hints import array_scalar
 from storage.errors import TrilightError
-from storage.settings.changes import changed
 from storage.settings.described import checked
 from storage.settings.fields import describe_fields
+from storage.settings.overrides import apply_overrides
 from storage.settings.ranges import EXECUTION, Within
 from tests.for_each import for_each
 
@@ -93,7 +93,7 @@ def test_the_named_settings_change_and_no_others(
     place: str, name: str, data: st.DataObject
 ) -> None:
     value = data.draw(VALUES[name])
-    before, after = _flat(TREE), _flat(changed(TREE, {f"{place}.{name}": value}))
+    before, after = _flat(TREE), _flat(apply_overrides(TREE, {f"{place}.{name}": value}))
     assert list(before) == list(after)
     expected = tuple(value) if isinstance(value, list) else value
     hits = 0
@@ -116,28 +116,33 @@ def test_the_named_settings_change_and_no_others(
 def test_several_changes_are_one_after_the_other(changes: dict[str, int]) -> None:
     step = TREE
     for name, value in changes.items():
-        step = changed(step, {name: value})
-    assert changed(TREE, changes) == step
-    assert changed(step, changes) == step
+        step = apply_overrides(step, {name: value})
+    assert apply_overrides(TREE, changes) == step
+    assert apply_overrides(step, changes) == step
     assert Tree() == TREE
 
 
 def test_values_come_as_json_has_them() -> None:
     """A whole number for a float becomes one, so that the manifest says 2.0 whoever writes it."""
     text = '{"branch.height": 2, "branch.leaf.pair": [0, 1], "branch.leaf.whole": [9]}'
-    after = changed(TREE, json.loads(text))
+    after = apply_overrides(TREE, json.loads(text))
     assert repr(after.branch.height) == "2.0"
     assert repr(after.branch.leaf.pair) == "(0.0, 1.0)"
     assert after.branch.leaf.whole == (9,)
-    assert changed(TREE, {"branch.leaf.maybe": 7}).branch.leaf.maybe == 7
+    assert apply_overrides(TREE, {"branch.leaf.maybe": 7}).branch.leaf.maybe == 7
 
 
 def test_one_entry_of_a_list_and_whole_groups_may_be_named() -> None:
-    assert [b.height for b in changed(TREE, {"branches.1.height": 3}).branches] == [2.0, 3.0]
-    assert changed(TREE, {"branches.0.leaves.1.pair": [0, 2]}).branches[0].leaves[1].pair == (0, 2)
-    after = changed(TREE, {"branches": [{"height": 9}], "branches.0.leaf.count": 4})
+    assert [b.height for b in apply_overrides(TREE, {"branches.1.height": 3}).branches] == [
+        2.0,
+        3.0,
+    ]
+    assert apply_overrides(TREE, {"branches.0.leaves.1.pair": [0, 2]}).branches[0].leaves[
+        1
+    ].pair == (0, 2)
+    after = apply_overrides(TREE, {"branches": [{"height": 9}], "branches.0.leaf.count": 4})
     assert after.branches == (Branch(height=9.0, leaf=Leaf(count=4)),)
-    assert changed(TREE, {"branch": {"height": 1}}).branch == Branch(height=1.0)
+    assert apply_overrides(TREE, {"branch": {"height": 1}}).branch == Branch(height=1.0)
 
 
 WRONG: list[tuple[str, Any, str]] = [
@@ -172,7 +177,7 @@ WRONG: list[tuple[str, Any, str]] = [
 @for_each(("name", "value", "message"), WRONG)
 def test_a_mistake_is_one_line_that_says_what_to_do(name: str, value: Any, message: str) -> None:
     with pytest.raises(TrilightError) as caught:
-        changed(TREE, {name: value})
+        apply_overrides(TREE, {name: value})
     text = str(caught.value)
     assert message in text
     assert "\n" not in text
@@ -183,7 +188,7 @@ def test_a_mistake_is_one_line_that_says_what_to_do(name: str, value: Any, messa
 @given(st.text(st.characters(codec="ascii"), max_size=12), st.integers() | st.text() | st.none())
 def test_any_name_and_value_give_settings_or_a_clear_refusal(name: str, value: Any) -> None:
     try:
-        assert isinstance(changed(TREE, {name: value}), Tree)
+        assert isinstance(apply_overrides(TREE, {name: value}), Tree)
     except TrilightError as error:
         assert "\n" not in str(error)
 
@@ -208,13 +213,13 @@ class Spans:
 def test_values_that_only_fit_each_other_come_in_any_order(names: tuple[str, str]) -> None:
     numbers = {"low": 8, "high": 16}
     for group in ("one", "many"):
-        found = changed(Spans(), {f"{group}.{name}": numbers[name] for name in names})
+        found = apply_overrides(Spans(), {f"{group}.{name}": numbers[name] for name in names})
         new = found.one if group == "one" else found.many[1]
         assert (new.low, new.high) == (8, 16)
     with pytest.raises(TrilightError, match=r"settings 'one\.(low|high)', .*: 9 to 8; expected"):
-        changed(Spans(), {f"one.{name}": {"low": 9, "high": 8}[name] for name in names})
+        apply_overrides(Spans(), {f"one.{name}": {"low": 9, "high": 8}[name] for name in names})
     with pytest.raises(TrilightError, match=r"^setting 'many\.high': 32 to 8; expected"):
-        changed(Spans(), {"many.high": 8})
+        apply_overrides(Spans(), {"many.high": 8})
 
 
 @checked()
@@ -238,8 +243,8 @@ class Car:
 def test_a_group_with_presets_may_be_named_and_then_changed(backwards: bool) -> None:
     changes = {"engine": "large", "engine.power": 8, "wheels": 3}
     ordered = dict(reversed(changes.items())) if backwards else changes
-    assert changed(Car(), ordered) == Car(engine=Engine(power=8, fuel="coal"), wheels=3)
-    assert changed(Car(), {"engine": "small"}) == Car(engine=Engine(power=2))
+    assert apply_overrides(Car(), ordered) == Car(engine=Engine(power=8, fuel="coal"), wheels=3)
+    assert apply_overrides(Car(), {"engine": "small"}) == Car(engine=Engine(power=2))
 
 
 @for_each(
@@ -255,7 +260,7 @@ def test_a_group_with_presets_may_be_named_and_then_changed(backwards: bool) -> 
 )
 def test_a_wrong_preset_or_name_is_asked_back(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(TrilightError, match=message):
-        changed(Car(), changes)
+        apply_overrides(Car(), changes)
 
 
 Count = Annotated[int, Within(1, 9)]

@@ -1,1 +1,0 @@
-"""The named builds as data; frozen ones are spelled out in full."""

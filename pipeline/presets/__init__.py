@@ -1,0 +1,1 @@
+"""Dataset presets as data; frozen ones are spelled out in full."""
