@@ -188,7 +188,7 @@ def _calibrate(
         if not at:
             continue
         some = [mine[row] for row in at]
-        shift, _ = largest_shift(metric, some, center[at], ALLOWED[metric][group])
+        shift = largest_shift(metric, some, center[at], ALLOWED[metric][group])
         stated = stated + shift * np.array([group_of(look.px) == group for look in judging])
     return list(judging), stated
 

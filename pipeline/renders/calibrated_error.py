@@ -51,8 +51,8 @@ LEAST_ERROR = 1e-10
 """Squared errors below this count as this: 100 dB."""
 
 _LEAST_HITS = 1e-3
-_NARROW_PX = 128
-"""Narrower pictures have shifts of their own."""
+_NARROW_PX, _WIDE_PX = 128, 256
+"""Narrower pictures, and those from the second width on, have shifts of their own."""
 
 Number = Annotated[float, Within(-1e3, 1e3)]
 
@@ -80,7 +80,7 @@ class MetricStatement:
     """Weights of MEASURES in dB, of `hits` (10 log10 of the share), and of `samples` and `width`
     (log2 of their ratios to 64 samples and 128 pixels)."""
     bound: Mapping[str, Number]
-    """Shifts of the bound by group of widths, `narrow` (below 128 pixels) and `wide`."""
+    """Shifts of the bound by group of widths (`group_of`)."""
     expected: Mapping[str, Number]
     """Shifts of the expected error by group of widths."""
     judged: Mapping[str, JudgedShare]
@@ -178,8 +178,8 @@ def terms_of(measures: ErrorMeasures, resolution: int, spp: float) -> dict[str, 
 
 
 def group_of(resolution: int) -> str:
-    """Return the group of widths whose shifts a picture takes."""
-    return "narrow" if resolution < _NARROW_PX else "wide"
+    """Return the group of widths whose shifts a picture takes: those below 128, 256, and others."""
+    return "narrow" if resolution < _NARROW_PX else "medium" if resolution < _WIDE_PX else "wide"
 
 
 def statement_for(settings: RenderSettings, samples: DualBuffer) -> CalibratedStatement | None:

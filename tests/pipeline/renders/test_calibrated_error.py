@@ -30,8 +30,8 @@ WEIGHTS = dict.fromkeys((*MEASURES, "hits", "samples", "width"), 0.2)
 METRIC = MetricStatement(
     intercept=1.0,
     weights=WEIGHTS,
-    bound={"narrow": -3.0, "wide": -2.0},
-    expected={"narrow": 0.5, "wide": 0.25},
+    bound={"narrow": -3.0, "medium": -2.5, "wide": -2.0},
+    expected={"narrow": 0.5, "medium": 0.4, "wide": 0.25},
     judged={},
 )
 STATEMENT = CalibratedStatement(
