@@ -51,8 +51,10 @@ LEAST_ERROR = 1e-10
 """Squared errors below this count as this: 100 dB."""
 
 _LEAST_HITS = 1e-3
-_NARROW_PX, _WIDE_PX = 128, 256
-"""Narrower pictures, and those from the second width on, have shifts of their own."""
+_NARROW_PX = 128
+"""Narrower pictures have shifts of their own."""
+_WIDE_PX = 256
+"""Pictures from this width on have shifts of their own."""
 
 Number = Annotated[float, Within(-1e3, 1e3)]
 
