@@ -193,7 +193,7 @@ def test_refusals(tools: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_status_prints_what_any_scheduler_needs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("infra.cli.status.unfinished_shards", lambda dataset: [0, 1, 5, 8])
+    monkeypatch.setattr("infra.cli.status.missing_shards", lambda dataset: [0, 1, 5, 8])
     words = ["status", "set", "--missing", "--shards-per-task", "2"]
     assert trilight(words).stdout == "0,2,4\n"
     assert trilight([*words, "--lines"]).stdout == "0:2\n4:6\n8:10\n"

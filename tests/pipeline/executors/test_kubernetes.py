@@ -59,7 +59,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Made:
 
     def make(missing: list[int] = MISSING, **options: Any) -> dict[str, Any]:
         monkeypatch.setattr(arrays, "_is_begun", lambda place: True)
-        monkeypatch.setattr(arrays, "unfinished_shards", lambda place, scenes: missing)
+        monkeypatch.setattr(arrays, "missing_shards", lambda place, scenes: missing)
         order = GenerateOptions(
             build="smoke", scenes=64, out="s3://sets/mine", objects="builtin:", seed=7
         )
