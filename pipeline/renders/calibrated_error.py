@@ -150,10 +150,10 @@ def promise_sentence(resolution: int, metric: str = "log") -> str:
     widths = sorted(map(int, judged))
     width = max((px for px in widths if px <= resolution), default=widths[0])
     record = judged[str(width)]
-    good = 100 - 100 * record.over_1
+    good = min(99, math.floor(100 - 100 * record.over_1))
     return (
-        f"Of a hundred pictures of scenes like those that calibrated it, {good:.0f} are at most "
-        f"1 dB worse, and half are {record.caution_db:.1f} dB better "
+        f"Of a hundred pictures of scenes like those that calibrated it, {good} or more are at "
+        f"most 1 dB worse, and half are {record.caution_db:.1f} dB better "
         f"({record.pictures} pictures of {record.layouts} layouts at {width} px)."
     )
 
