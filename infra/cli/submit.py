@@ -26,7 +26,7 @@ from pipeline.executors.kubernetes_array import (
     submit_job,
     write_job_file,
 )
-from pipeline.executors.slurm_array import sbatch_command, sbatch_environment, submit_array
+from pipeline.executors.slurm_array import sbatch_command, sbatch_environment, submit_slurm_array
 from pipeline.flows.prefect_server import load_prefect
 from pipeline.generation.generate_options import GenerateOptions
 from storage.errors import TrilightError
@@ -181,7 +181,7 @@ def submit_to_array(
     numbers = number_ranges(job.tasks)
     record: dict[str, Any] = {"array": numbers, "shards_per_task": job.per_task}
     if isinstance(options, SlurmOptions):
-        name = None if array.dry_run else submit_array(job, options.sbatch)
+        name = None if array.dry_run else submit_slurm_array(job, options.sbatch)
         line = _slurm_line(job, options.sbatch)
     else:
         manifest = (write_job_file if array.dry_run else submit_job)(job, options)

@@ -43,7 +43,7 @@ def sbatch_environment(job: ArrayJob) -> Mapping[str, str]:
     }
 
 
-def submit_array(job: ArrayJob, options: Sequence[str] = ()) -> str:
+def submit_slurm_array(job: ArrayJob, options: Sequence[str] = ()) -> str:
     """Submit an array from the folder of this process and return its number.
 
     Raises:

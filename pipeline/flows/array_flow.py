@@ -15,7 +15,7 @@ from prefect.logging import get_run_logger
 
 from pipeline.executors.array_job import DatasetByArray, array_job
 from pipeline.executors.kubernetes_array import options_from_environment, submit_job
-from pipeline.executors.slurm_array import submit_array
+from pipeline.executors.slurm_array import submit_slurm_array
 from pipeline.flows.forms import DATASET_FORMS, options_of_form, parameters_of, run_name
 from pipeline.flows.run_artifacts import ArtifactPage
 from storage.dataset.progress import DatasetStatus, missing_shards, read_status
@@ -45,7 +45,7 @@ def _submit(order: DatasetByArray) -> None:
     job = array_job(order.dataset, per_task=order.shards_per_task, at_once=order.at_once, on=on)
     if job.tasks:
         name = (
-            submit_array(job)
+            submit_slurm_array(job)
             if on == "slurm"
             else submit_job(job, options_from_environment()).parent.name
         )

@@ -247,7 +247,7 @@ class DatasetWriter:
         self.refresh_plan()
         every = range(self.num_shards)
         selected = every if requested is None else every[requested.start : requested.stop]
-        missing = self._missing(selected)
+        missing = self._missing_shards(selected)
         self.progress = dataclasses.replace(
             self.progress,
             shards=len(selected) - len(missing),
@@ -257,7 +257,7 @@ class DatasetWriter:
         )
         return missing
 
-    def _missing(self, shards: range) -> list[int]:
+    def _missing_shards(self, shards: range) -> list[int]:
         finished = self._finished_shards(shards)
         return [index for index in shards if shard_name(index, self._splits) not in finished]
 
@@ -286,7 +286,7 @@ class DatasetWriter:
         parts = list(in_parts(range(self.num_shards)))
         if any(len(self._finished_shards(part)) < len(part) for part in parts):  # names cost more
             return False
-        return not any(map(self._missing, parts))
+        return not any(map(self._missing_shards, parts))
 
     def finish(self) -> Manifest | None:
         """List all shards in the manifest if all are finished, and return it; else None.

@@ -101,10 +101,10 @@ class LocalFiles(_Files):
         except OSError as error:
             raise _open_error(path, error) from error
         if checked:
-            self._check(path, stream, shard)
+            self._check_shard_digest(path, stream, shard)
         return stream
 
-    def _check(self, path: Path, stream: BinaryIO, shard: ShardEntry) -> None:
+    def _check_shard_digest(self, path: Path, stream: BinaryIO, shard: ShardEntry) -> None:
         facts = os.fstat(stream.fileno())
         seen = (facts.st_ino, facts.st_size, facts.st_mtime_ns)
         if self._checked.get(shard.name) == seen:

@@ -143,7 +143,7 @@ class LocalStore(Store):
 
 
 class BucketStore(Store):
-    """A folder in a bucket."""
+    """A folder in a bucket, by fsspec."""
 
     is_here = False
 

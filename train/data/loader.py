@@ -31,7 +31,7 @@ from train.data.order import (
     RankSlice,
     Visit,
     batch_visits,
-    shard_order,
+    shuffled_shards,
     visits_from,
     windows_from,
 )
@@ -255,7 +255,7 @@ def _plan_ahead(counted: _SampleCounts, settings: LoaderSettings, mixture: Mixtu
     weights = (1.0,) if mixture is None else mixture.weights
     ahead = []
     for part, weight in zip(counted.parts, weights, strict=True):
-        some = shard_order(len(part), settings.order, 0)[0]
+        some = shuffled_shards(len(part), settings.order, 0)[0]
         window = counted.in_part(part)(some) * settings.window
         ahead.append(int(window * sum(weights) / weight) // settings.batch_size)
     return max(min(ahead), 1)

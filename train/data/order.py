@@ -1,6 +1,6 @@
 """Order of a run's scenes: a pure function of seed, epoch and sizes of the shards.
 
-Shards are permuted; then the samples of each window of a few consecutive shards are permuted.
+Shards are shuffled; then the samples of each window of a few consecutive shards are shuffled.
 Epochs follow one another without a gap, and global batch i is the samples at positions i B to
 (i + 1) B - 1 of that endless order, for any number of ranks and workers. A resume needs only the
 number of the batch.
@@ -84,7 +84,7 @@ class RankSlice:
         return sorted(mine, key=lambda visit: visit.position)
 
 
-def shard_order(num_shards: int, settings: OrderSettings, epoch: int) -> list[int]:
+def shuffled_shards(num_shards: int, settings: OrderSettings, epoch: int) -> list[int]:
     """Return the shard numbers in the order of an epoch."""
     rng = rng_for(settings.seed, "shards", epoch)
     return [int(shard) for shard in rng.permutation(num_shards)]
@@ -105,7 +105,7 @@ def windows_from(
     epoch, start = (first // total, first // total * total) if total else (0, 0)
     while True:
         epoch_start = start
-        order = shard_order(num_shards, settings, epoch)
+        order = shuffled_shards(num_shards, settings, epoch)
         for number, at in enumerate(range(0, num_shards, settings.window)):
             shards = order[at : at + settings.window]
             sizes = [num_samples(shard) for shard in shards]

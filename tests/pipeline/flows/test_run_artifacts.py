@@ -202,7 +202,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
         threading.Thread(target=work).start()
         return "4711"
 
-    monkeypatch.setattr(array_flow, "submit_array", submit)
+    monkeypatch.setattr(array_flow, "submit_slurm_array", submit)
     return arrays
 
 
