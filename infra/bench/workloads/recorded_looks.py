@@ -233,6 +233,10 @@ def unreachable(settings: RenderSettings, resolution: int, max_spp: int) -> Rend
         resolution=resolution,
         noise_floor_db=99.0,
         min_spp=32,
+        min_spp_px=128,
         max_spp=max_spp,
+        light_paths="view",
         arithmetic="numpy",
+        stated_error="bound",
+        picture_within_db=None,
     )
