@@ -231,7 +231,7 @@ def image_of(picture: GrowingPicture | RenderedView | Preview) -> Image:
     remark = ""
     if error_db is None:
         remark = "a preview: its error is not measured"
-    elif picture.spp < FIRST_SPP:
+    elif picture.spp < FIRST_SPP and "expected_error_db" not in facts:
         remark = f"below {FIRST_SPP} samples the stated error may flatter"
     return Image(
         radiance_rgb=picture.radiance_rgb,

@@ -191,6 +191,8 @@ def _caveats(renderer: Renderer, finished: Sequence[FinishedShot]) -> list[str]:
             "the error of a preview is not measured, so that its noise floor is unknown: "
             "--noise-floor 40 measures it and samples on to it"
         )
-    elif any(int(facts["spp"]) < FIRST_SPP for facts in sampled):
+    elif any(
+        int(facts["spp"]) < FIRST_SPP and "expected_error_db" not in facts for facts in sampled
+    ):
         notes.append(f"below {FIRST_SPP} samples the measured noise floor may flatter")
     return [*notes, *renderer.notes]

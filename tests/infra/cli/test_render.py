@@ -333,6 +333,8 @@ def test_a_promise_and_what_is_probable_are_said(source: Path, tmp_path: Path) -
     assert re.search(r"noise floor +-?\d+\.\d dB, probably -?\d+\.\d \(psnr_log_db; ", said)
     assert re.search(r"hundred pictures .* \d\d or more are at most 1 dB worse, and half are", said)
     assert header(out)["expected_error_db"] > header(out)["noise_floor_db"]
+    said = printed(*words, "--resolution", "256")
+    assert header(out)["spp"] == 32 and "may flatter" not in said, "calibrated from 32 samples on"
     said = printed(*words, "--resolution", "16")
     assert "a bound: pictures like this one are not calibrated" in said
 
