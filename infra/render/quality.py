@@ -1,9 +1,12 @@
 """Quality of a picture: a measured error, a number of samples, or a budget that chooses them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.settings import (
+    CALIBRATED_LOOKS,
     FIRST_SPP,
     USUAL_FLOOR_DB,
     Filtered,
@@ -40,22 +43,20 @@ class ToStatedError:
             TrilightError: a value is invalid; the message names it.
         """
         targets = self.targets if self.targets.overrides else USUAL_TARGETS
-        is_calibrated = self.stated_error == "calibrated"
+        is_bound = self.stated_error == "bound"
+        looks: Mapping[str, Any] = {"min_spp": FIRST_SPP} if is_bound else CALIBRATED_LOOKS
         return RenderSettings(
             resolution=resolution,
             noise_floor_db=targets.log_db,
             noise_floor_linear_db=targets.linear_db,
             noise_floor_objects_db=targets.objects_db,
-            min_spp=min(FIRST_SPP // 2 if is_calibrated else FIRST_SPP, self.max_spp),
-            min_spp_px=256 if is_calibrated else 128,
             max_spp=self.max_spp,
             max_depth=self.max_depth,
             min_mean_radiance=0.0,
             split=self.split,
             split_lobes=self.split_lobes,
             arithmetic="device",
-            stated_error=self.stated_error,
-            picture_within_db=2.0 if is_calibrated else None,
+            **dict(looks) | {"min_spp": min(looks["min_spp"], self.max_spp)},
         )
 
 

@@ -25,7 +25,7 @@ import dataclasses
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.presets.settings import DatasetPreset, DatasetSettings
-from pipeline.renders.settings import RenderSettings
+from pipeline.renders.settings import CALIBRATED_LOOKS, RenderSettings
 from scene_templates.cameras import CameraSettings
 from scene_templates.families import DEFAULT_FAMILIES, alone
 from scene_templates.lights import LightSettings
@@ -49,13 +49,10 @@ def smoke() -> DatasetSettings:
         renders=RenderSettings(
             resolution=256,
             noise_floor_db=38.0,
-            min_spp=32,
-            min_spp_px=256,
             max_spp=256,
             light_paths="scene",
             arithmetic="device",
-            stated_error="calibrated",
-            picture_within_db=2.0,
+            **CALIBRATED_LOOKS,
         ),
         splits=SplitSettings(scenes_per_shard=4),
     )

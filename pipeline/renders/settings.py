@@ -1,6 +1,7 @@
 """`RenderSettings`: how good a picture must be, and how much it may cost."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -70,6 +71,14 @@ _LATER = {
     "picture_within_db": None,
 }
 """Settings that no record holds at these values, so that digests of earlier presets stay."""
+
+CALIBRATED_LOOKS: Mapping[str, Any] = {
+    "stated_error": "calibrated",
+    "min_spp": FIRST_SPP // 2,
+    "min_spp_px": 256,
+    "picture_within_db": 2.0,
+}
+"""Settings of a calibrated stated error, whose first look needs half the samples of a bound's."""
 
 Samples = Annotated[int, Within(2 * PASS_SPP[-1], MAX_SPP, unit="samples")]
 """Of both halves of a picture together, per pixel."""
