@@ -18,8 +18,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from model.config import HitStage
+from model.config import HitStage, hit_stage
 from model.encoded_scene import EncodedScene
+from model.hits.denoised import denoise_traced
+from model.hits.traced import Traced
 from model.light_groups import LightGroup, light_groups
 from model.open import find_network
 from model.precision import set_precision
@@ -180,16 +182,11 @@ class NeuralRenderer:
         angle = torch.tensor(fov_deg, dtype=torch.float32, device=self.device)
         views = prepared.views
         if resolution not in views:
-            decode = functools.partial(_predict_picture, self._model, prepared.groups, resolution)
-            stage = self._model.config.stage
-            # a graph cannot hold the denoiser, which runs on the CPU
-            is_recorded = (
-                self.device.type == "cuda"
-                and isinstance(stage, HitStage)
-                and not stage.denoises(resolution)
-                and any(scene.lit.place for each, _ in prepared.groups for scene in each.traced)
-            )
-            views[resolution] = Replayed(decode) if is_recorded else decode
+            predict = functools.partial(_predict_picture, self._model, prepared.groups, resolution)
+            if isinstance(self._model.config.stage, HitStage):
+                ((encoded, _),) = prepared.groups
+                predict = _TracedView(self._model, encoded, resolution)
+            views[resolution] = predict
         picture: NDArray[np.float32] = views[resolution](c2w_44, angle).cpu().numpy()
         return picture
 
@@ -280,6 +277,36 @@ def _decode(
     """Return log10(1 + radiance) [R, R, 3] from one camera."""
     camera = Cameras(c2w_BV44=c2w_44[None, None], fov_deg_BV=fov_deg[None, None])
     return model.decode(encoded, camera, resolution)[0, 0]
+
+
+class _TracedView:
+    """Pictures of one scene by a network of hits; a GPU repeats its rays and the network as graphs.
+
+    Between them is the denoiser, which no graph holds.
+    """
+
+    def __init__(self, model: RenderFormer, encoded: EncodedScene, resolution: int) -> None:
+        self._model = model
+        self._encoded = encoded
+        self._resolution = resolution
+        is_recorded = any(scene.lit.place is not None for scene in encoded.traced)
+        self._trace = Replayed(self._tensors) if is_recorded else self._tensors
+        self._decode = Replayed(self._picture) if is_recorded else self._picture
+
+    def __call__(self, c2w_44: Tensor, fov_deg: Tensor) -> Tensor:
+        """Return linear radiance [R, R, 3] of at least 0."""
+        traced = Traced(*self._trace(c2w_44, fov_deg))
+        denoised = denoise_traced(traced, hit_stage(self._model.config))
+        (picture_RR3,) = self._decode(*denoised.tensors())
+        return picture_RR3
+
+    def _tensors(self, c2w_44: Tensor, fov_deg: Tensor) -> tuple[Tensor, ...]:
+        camera = Cameras(c2w_BV44=c2w_44[None, None], fov_deg_BV=fov_deg[None, None])
+        return self._model.trace(self._encoded, camera, self._resolution).tensors()
+
+    def _picture(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        log10_RR3 = self._model.decode_traced(self._encoded, Traced(*tensors))[0, 0]
+        return (radiance(log10_RR3.double()).clamp(min=0).float(),)
 
 
 def _free_bytes(device: torch.device) -> int | None:

@@ -6,11 +6,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from model.config import BundleStage, HitStage, ModelConfig
+from model.config import BundleStage, HitStage, ModelConfig, hit_stage
 from model.demodulated import albedo_of_cameras, compose_radiance
 from model.encoded_scene import EncodedScene, KeysValues
 from model.hits.decoder import HitDecoder
+from model.hits.denoised import denoise_traced
 from model.hits.lit_scene import LitScene
+from model.hits.traced import Traced
 from model.hits.tracing import (
     TracedScene,
     like,
@@ -72,10 +74,9 @@ class RenderFormer(nn.Module):
         if traced is None:
             scenes = traced_batch(batch)
             traced = traced_cameras(scenes, batch.cameras, resolution, stage)
+            traced = denoise_traced(traced, stage)
         encoded = self._encode_scenes(batch, scenes, traced.sides_T12, traced.unit_3)
-        with tf32(self.tf32):
-            pictures: Tensor = self.decoder(encoded, traced)
-        return pictures
+        return self.decode_traced(encoded, traced)
 
     def encode(self, batch: SceneBatch) -> EncodedScene:
         """Return the encoded scenes of a batch; its cameras are ignored."""
@@ -144,14 +145,23 @@ class RenderFormer(nn.Module):
         self._require_resolution(resolution)
         stage = self.config.stage
         if isinstance(stage, HitStage):
-            with tf32(self.tf32):
-                traced = traced_cameras(scene.traced, cameras, resolution, stage)
-                picture: Tensor = self.decoder(scene, traced)
-            return picture
+            traced = self.trace(scene, cameras, resolution)
+            return self.decode_traced(scene, denoise_traced(traced, stage))
         albedo_BVRR6 = None
         if rays := stage.albedo_rays:
             albedo_BVRR6 = albedo_of_cameras(scene.surfaces, cameras, resolution, rays)
         return self._bundles(scene, cameras, resolution, albedo_BVRR6)
+
+    def trace(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Traced:
+        """Return the traced inputs of views, for `hits`; arguments are as of `decode`."""
+        with tf32(self.tf32):
+            return traced_cameras(scene.traced, cameras, resolution, hit_stage(self.config))
+
+    def decode_traced(self, scene: EncodedScene, traced: Traced) -> Tensor:
+        """Return the pictures [B, V, R, R, 3] of traced views, denoised where the stage asks."""
+        with tf32(self.tf32):
+            pictures: Tensor = self.decoder(scene, traced)
+        return pictures
 
     def _bundles(
         self,

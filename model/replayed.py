@@ -17,14 +17,14 @@ class Replayed:
     GPU. What it returns is overwritten by the next call.
     """
 
-    def __init__(self, function: Callable[..., Tensor]) -> None:
+    def __init__(self, function: Callable[..., tuple[Tensor, ...]]) -> None:
         self._function = function
         self._calls = 0
         self._inputs: tuple[Tensor, ...] = ()
         self._graph: torch.cuda.CUDAGraph | None = None
 
-    def __call__(self, *inputs: Tensor) -> Tensor:
-        """Return what the function does of tensors of always the same shapes, on one GPU."""
+    def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the function's tensors, for tensors of always the same shapes on one GPU."""
         self._calls += 1
         if self._calls == 1:
             return self._function(*inputs)

@@ -71,6 +71,7 @@ def denoise(
     features: Features,
     quality: Quality,
     threads: int | None = None,
+    device: DenoiserDevice | None = None,
 ) -> NDArray[np.float32]:
     """Return the picture without noise, exactly black where no ray hit anything.
 
@@ -80,11 +81,12 @@ def denoise(
         features: albedo and normal, [R, R, 3] each, free of noise themselves.
         quality: of the network.
         threads: of the processor; None is what `set_denoiser_threads` says.
+        device: of the filter; None is what `set_denoiser_device` says.
     """
     if not radiance_rgb.any():
         return np.zeros_like(radiance_rgb)  # the filter would paint the albedo, up to 0.003 bright
     inputs = (radiance_rgb, features.albedo, features.normal)
-    opened = open_filter(radiance_rgb.shape[0], quality, threads)
+    opened = open_filter(radiance_rgb.shape[0], quality, threads, device)
     picture = opened.run(dict(zip(INPUTS, inputs, strict=True)))
     covered = np.any(features.normal != 0, axis=-1) | np.any(radiance_rgb != 0, axis=-1)
     return np.where(covered[..., None], np.maximum(picture, 0), np.float32(0))
@@ -174,10 +176,15 @@ def _check(device: Any) -> None:
         raise RuntimeError(f"Open Image Denoise: {message}")
 
 
-def open_filter(resolution: int, quality: Quality, threads: int | None = None) -> Filter:
+def open_filter(
+    resolution: int,
+    quality: Quality,
+    threads: int | None = None,
+    device: DenoiserDevice | None = None,
+) -> Filter:
     """Return this thread's filter; arguments are as of `denoise`."""
     threads = _threads if threads is None else threads
-    return _filter(resolution, quality, _device, threads, threading.get_ident())
+    return _filter(resolution, quality, device or _device, threads, threading.get_ident())
 
 
 @functools.lru_cache(maxsize=16)

@@ -20,7 +20,7 @@ CHANNELS = {
 """Channels of the inputs that pixels have."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Traced:
     """Traced inputs of a scene and of V of its views; in a batch, B comes first everywhere."""
 
@@ -37,9 +37,13 @@ class Traced:
     given_VI: Tensor
     """1, or 0 where a view has to do without one of INPUTS."""
 
+    def tensors(self) -> tuple[Tensor, ...]:
+        """Return the tensors in the order of the fields."""
+        return tuple(getattr(self, each.name) for each in fields(self))
+
     def convert_tensors(self, convert: Callable[[Tensor], Tensor]) -> "Traced":
         """Return the same with each tensor converted, such as moved to a device."""
-        return Traced(**{each.name: convert(getattr(self, each.name)) for each in fields(self)})
+        return Traced(*map(convert, self.tensors()))
 
     def without(self, kept_VI: Tensor) -> "Traced":
         """Return the same for views that lack the inputs whose number in `kept_VI` is 0."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from model.config import HitStage, ModelConfig, hit_stage
-from model.hits.denoised import denoise_light
+from model.hits.denoised import denoise_traced
 from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import DeviceTriangles, compiled_kernel
 from model.hits.lit_scene import LitScene
@@ -145,8 +145,10 @@ def with_traced(
     if device is not None:
         ready = ready.on(device)
     cameras = [each.to(ready.unit_3.device) for each in (scene.c2w_V44, scene.fov_deg_V)]
-    traced = traced_views(ready, cameras[0], cameras[1], resolution, hit_stage(config), seed)
-    traced = traced.convert_tensors(lambda each: each.to(scene.c2w_V44.device))
+    stage = hit_stage(config)
+    traced = traced_views(ready, cameras[0], cameras[1], resolution, stage, seed)
+    place = scene.c2w_V44.device
+    traced = denoise_traced(traced, stage).convert_tensors(lambda each: each.to(place))
     return dataclasses.replace(scene, traced=traced)
 
 
@@ -187,13 +189,10 @@ def traced_views(
         scene.view(c2w_44, fov_deg, resolution, stage, seed)
         for c2w_44, fov_deg in zip(c2w_V44, fov_deg_V, strict=True)
     ]
-    pixels_VRRC = _stack([view.pixels for view in views])
-    if stage.denoises(resolution):
-        pixels_VRRC = denoise_light(pixels_VRRC, scene.unit_3)
     return Traced(
         sides_T12=scene.sides_T12,
         unit_3=scene.unit_3,
-        pixels_VRRC=pixels_VRRC,
+        pixels_VRRC=_stack([view.pixels for view in views]),
         anchor_VA=_stack([view.anchor for view in views]),
         gathered_VA3=_stack([view.gathered for view in views]),
         given_VI=torch.ones(len(views), len(INPUTS), device=scene.unit_3.device),

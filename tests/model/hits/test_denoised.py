@@ -6,7 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.hits.denoised import denoise_light
+from model.config import hit_stage
+from model.hits.denoised import denoise_traced
+from model.hits.traced import Traced
 from model.hits.tracing import with_traced
 from model.hits.view_inputs import Channel
 from model.neural_renderer import NeuralRenderer
@@ -25,13 +27,19 @@ def _traced(**changes: int) -> Tensor:
     return torch.from_numpy(traced(corner(), PX, **changes).pixels[None])
 
 
+def _denoise(pixels_VRRC: Tensor, unit_3: Tensor) -> Tensor:
+    empty = torch.zeros(0)
+    views = Traced(empty, unit_3, pixels_VRRC, empty, empty, empty)
+    return denoise_traced(views, hit_stage(hits_config(denoise_from_px=PX))).pixels_VRRC
+
+
 def _light(pixels: Tensor) -> Tensor:
     return sum((pixels[0, ..., channel] for channel in LIGHTS), torch.zeros(PX, PX, 3))
 
 
 def test_noise_goes_and_light_and_surfaces_stay() -> None:
     noisy = _traced()
-    clean = denoise_light(noisy.clone(), UNIT)
+    clean = _denoise(noisy, UNIT)
     truth = torch.stack([_traced(seed=seed) for seed in range(1, 17)]).mean(dim=0)
     assert pepper(_light(clean), _light(truth)) < 0.5 * pepper(_light(noisy), _light(truth))
     torch.testing.assert_close(_light(clean).mean(), _light(noisy).mean(), rtol=0.05, atol=0)
@@ -50,7 +58,7 @@ def test_it_scales_with_the_lamps_and_is_the_same_in_every_thread() -> None:
     for channel in LIGHTS:
         brighter[..., channel] *= scale
     with ThreadPoolExecutor(2) as pool:
-        one, other = pool.map(denoise_light, (noisy, brighter), (UNIT, UNIT * scale))
+        one, other = pool.map(_denoise, (noisy, brighter), (UNIT, UNIT * scale))
     assert torch.equal(_light(other), _light(one) * scale)
 
 
@@ -66,7 +74,7 @@ def test_wide_pictures_are_denoised_wherever_their_light_is_traced() -> None:
     assert small is not None and plain is not None and wide is not None
     below = inputs[PX // 2, 0]
     assert below is not None and torch.equal(small.pixels_VRRC, below.pixels_VRRC)
-    expected = denoise_light(plain.pixels_VRRC.clone(), plain.unit_3)
+    expected = _denoise(plain.pixels_VRRC, plain.unit_3)
     assert torch.equal(wide.pixels_VRRC, expected)
     model = awake(config, torch.float32)
     with torch.no_grad():
