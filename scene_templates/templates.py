@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scene_templates.cameras import CameraSettings, Sector, sample_camera
 from scene_templates.checks import require
 from scene_templates.layout import CameraPose
 from scene_templates.rooms import PATCH_FACES, SIDES
+from scene_templates.sample_camera import CameraSettings, Sector, sample_camera
 from storage.registry import Registry
 
 

@@ -39,11 +39,11 @@ if TYPE_CHECKING:
     from pipeline.presets.settings import DatasetPreset as DatasetPreset
     from pipeline.presets.settings import DatasetSettings as DatasetSettings
     from pipeline.renders.settings import RenderSettings as RenderSettings
-    from scene_templates.cameras import Sector as Sector
     from scene_templates.families import FAMILIES as FAMILIES
     from scene_templates.families import Family as Family
-    from scene_templates.lights import LightSettings as LightSettings
     from scene_templates.rooms import SharedRoom as SharedRoom
+    from scene_templates.sample_camera import Sector as Sector
+    from scene_templates.sample_emitters import LightSettings as LightSettings
     from scene_templates.separate_sides import SeparateSides as SeparateSides
     from scene_templates.separate_sides import SideRanges as SideRanges
     from scene_templates.settings import SceneSettings as SceneSettings

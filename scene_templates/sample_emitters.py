@@ -1,4 +1,4 @@
-"""Emitters: a few small bright triangles outside the room, on its open side."""
+"""Samples emitters (lights): a few small bright triangles outside the room, on its open side."""
 
 from collections.abc import Sequence
 from typing import Annotated
@@ -6,10 +6,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.cameras import Sector
 from scene_templates.checks import OFFSET, SIZE, Counts, Range
 from scene_templates.layout import Emitter
 from scene_templates.rotations import Orientation, rotate_points, sample_rotation
+from scene_templates.sample_camera import Sector
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
 

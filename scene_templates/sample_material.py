@@ -1,4 +1,4 @@
-"""Surfaces: the published sampling, in linear colour throughout.
+"""Samples GGX materials of surfaces: the published distribution, in linear colour throughout.
 
 The published pipeline passes colours through 8-bit vertex colours whose transfer curve differs
 between its renderer and its tokens (reference: renderformer.md, G.3); a number here means the same

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scene_templates.cameras import CameraPath, CameraSettings, path_position, sample_camera
 from scene_templates.families import Family, alone
+from scene_templates.sample_camera import CameraPath, CameraSettings, path_position, sample_camera
 from scene_templates.settings import SceneSettings
 from scene_templates.skies.settings import SkySettings
 from scene_templates.templates import ALONE, CORNER

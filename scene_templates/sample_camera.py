@@ -1,4 +1,4 @@
-"""Cameras, which look near the origin from a sector of directions: the open side of a layout."""
+"""Samples cameras, which look near the origin from a sector of directions: a layout's open side."""
 
 import dataclasses
 import math
