@@ -60,12 +60,12 @@ CHOSEN = (
     "tests/storage/dataset/test_shard.py",
     "tests/train/data/test_augment.py",
     "tests/train/data/test_loader.py",
-    "tests/train/evaluation/test_judge.py",
-    "tests/train/loop/test_optim.py",
+    "tests/train/evaluation/test_validation.py",
+    "tests/train/loop/test_optimizer.py",
     "tests/train/loop/test_step.py",
-    "tests/train/loss/test_objective.py",
+    "tests/train/loss/test_training_loss.py",
     "tests/train/loop/test_processes.py",
-    "tests/train/test_run.py",
+    "tests/train/test_run_training.py",
 )
 """Where bytes, digests, stored numbers and close tolerances are compared, cheaply."""
 

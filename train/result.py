@@ -8,11 +8,11 @@ from model.renderformer import count_parameters
 from model.weights import TrainedRange, encode_weights
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData
-from train.evaluation.judge import Judge
 from train.evaluation.metrics import Lead
 from train.evaluation.sheet import draw_validation_sheet, write_picture
+from train.evaluation.validation import Judge
 from train.folder import RunFolder
-from train.loop.state import TrainState
+from train.loop.train_state import TrainState
 from train.monitoring.rows import read_rows
 from train.resume import Event
 from train.settings import TrainSettings

@@ -132,11 +132,11 @@ def _launch(order: TrainOptions, watched: WatchSettings, output: OutputOptions) 
 def _run_training(
     order: TrainOptions, settings: TrainSettings, watched: WatchSettings, *, quiet: bool
 ) -> "TrainResult | None":
-    """Train by `train.run.train_run`; imports torch, which takes seconds."""
+    """Train by `train.run_training.train_run`; imports torch, which takes seconds."""
     require_torch("train")
     from train.loop.distributed import join_processes
     from train.loop.interrupts import Stopped
-    from train.run import train_run
+    from train.run_training import train_run
 
     with join_processes(order.device) as crew, progress_bars() as bars:
         progress = _QuietProgress() if quiet else _BarProgress(bars)

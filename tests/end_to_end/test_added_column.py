@@ -41,8 +41,8 @@ from train.data.bad_samples import BadSampleCounter
 from train.data.loader import load_batches
 from train.data.order import RankSlice
 from train.data.scenes import training_scene
-from train.loop.state import new_state
-from train.run import loader_settings
+from train.loop.train_state import new_state
+from train.run_training import loader_settings
 from train.settings import TrainSettings
 
 SETTINGS = SceneSettings(families=DEFAULT_FAMILIES, num_views=2, max_triangles=600)

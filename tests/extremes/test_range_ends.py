@@ -54,8 +54,8 @@ from train.data.augment import augment_scene
 from train.data.buckets import TrainingBatch, collate_batch
 from train.data.scenes import training_scene
 from train.loop.schedule import learning_rate
-from train.loop.state import new_state
-from train.loss.objective import TrainingLoss
+from train.loop.train_state import new_state
+from train.loss.training_loss import TrainingLoss
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
 
 GROUPS: dict[type, str] = {

@@ -35,7 +35,7 @@ from tests.for_each import for_each
 from tests.http_server import Fault, Site, serve
 from tests.train.kit import TINY_MODEL, Heard, Killed, flip_a_bit, tiny_run, trained
 from tests.train.toy import write_toy_dataset
-from train.evaluation import judge
+from train.evaluation import validation
 from train.loop import trainer
 from train.loop.checkpoints import read_checkpoint
 from train.loop.interrupts import Stopped
@@ -138,11 +138,11 @@ def test_a_signal_in_a_validation_or_while_saving_loses_nothing(
     for number, (module, name, call, step) in enumerate((
         (trainer, "save_checkpoint", 1, 4),
         # one call for the median picture, and one for each of two scenes
-        (judge, "score_pictures", 2, 8),
+        (validation, "score_pictures", 2, 8),
         # two scenes of step 8 that are made up for, and the first of the last step
-        (judge, "predict", 3, 12),
+        (validation, "predict", 3, 12),
         # the last scene of the last step, which is made up for
-        (judge, "predict", 2, 12),
+        (validation, "predict", 2, 12),
     )):  # fmt: skip
         with monkeypatch.context() as patch:
             asked = SignalIn(patch, module, name, call)

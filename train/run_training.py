@@ -20,16 +20,16 @@ from train.data.buckets import decodes_on_device, step_scenes
 from train.data.loader import LoaderSettings, load_batches
 from train.data.scenes import TrainingScene, training_scene
 from train.data.workers import choose_workers, detect_machine
-from train.evaluation.judge import Judge
 from train.evaluation.stored_pictures import median_picture
+from train.evaluation.validation import Judge
 from train.folder import RunFolder, claim_run
 from train.initial_state import init_or_resume_state, plan_start
 from train.loop.distributed import DistributedContext
 from train.loop.recorder import Recorder
-from train.loop.state import TrainState
+from train.loop.train_state import TrainState
 from train.loop.trainer import Trainer, scene_flops
 from train.loss.lpips import load_lpips
-from train.loss.objective import TrainingLoss
+from train.loss.training_loss import TrainingLoss
 from train.monitoring.boards import require_wandb
 from train.monitoring.rows import add_note
 from train.monitoring.settings import WatchSettings

@@ -18,7 +18,7 @@ from storage.seeds import seed_for
 from train.data.bad_samples import BadSampleCounter
 from train.data.mixture import Mixture
 from train.loop.decision import Decision, Updates, move_towards
-from train.loop.optim import Updater
+from train.loop.optimizer import Updater
 from train.resume import Event
 from train.settings import Precision, TrainSettings
 

@@ -33,9 +33,9 @@ from train.data.scenes import TrainingScene, training_scene
 from train.loop import muon as muon_file
 from train.loop.distributed import DistributedContext
 from train.loop.muon import choose_muon_precision, muon, orthogonal, split_over_ranks
-from train.loop.optim import Updater
+from train.loop.optimizer import Updater
 from train.loop.schedule import decay_start_step, learning_rate
-from train.loop.state import new_state
+from train.loop.train_state import new_state
 from train.settings import Precision, TrainSettings
 
 RATE = 1e-3

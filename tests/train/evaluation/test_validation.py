@@ -23,7 +23,7 @@ from storage.renderer import Image as Rendered
 from storage.seeds import rng_for
 from tests.for_each import case, for_each
 from tests.train.kit import eval_config
-from tests.train.loss.test_objective import small_weights
+from tests.train.loss.test_training_loss import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
 from train.evaluation.equal_time import (
@@ -41,7 +41,6 @@ from train.evaluation.equal_time import (
 )
 from train.evaluation.error_colors import ERROR_WHITE, error_picture
 from train.evaluation.evaluate import EvalConfig, judge_views, sheet_views
-from train.evaluation.judge import hit_masks
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.metrics import (
     METRICS,
@@ -64,6 +63,7 @@ from train.evaluation.sheet import (
 )
 from train.evaluation.stored_pictures import median_picture
 from train.evaluation.timing import Price, time_scene
+from train.evaluation.validation import hit_masks
 from train.loss.lpips import Lpips
 
 

@@ -31,7 +31,7 @@ from train.loss.lpips import (
     load_lpips,
 )
 from train.loss.ms_ssim import SCALE_WEIGHTS, ms_ssim, ssim
-from train.loss.objective import TrainingLoss, tone_map
+from train.loss.training_loss import TrainingLoss, tone_map
 from train.settings import LossSettings
 
 WIDTHS = (4, 5, 6, 7, 8)
