@@ -28,7 +28,7 @@ from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.preview import preview
 from pipeline.assets.settings import AssetSettings
 from pipeline.executors.threads import ThreadRunner
-from pipeline.foreign.load import load_mesh
+from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
 from pipeline.generation.generate_options import GenerateOptions

@@ -18,7 +18,7 @@ from model.neural_renderer import NeuralRenderer
 from model.open import BUILTIN, BUILTIN_NETWORKS
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
-from pipeline.exchange.usd.write import write_usd
+from pipeline.exchange.usd.write_usd import write_usd
 from pipeline.generation.environment import vector_extension
 from pipeline.generation.prepare_isolated import asset_store, prepare_isolated
 from pipeline.generation.scene_worker import MAX_ATTEMPTS

@@ -13,8 +13,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.exchange.convert import convert_scene, write_scene
-from pipeline.exchange.gltf.read import read_gltf
-from pipeline.exchange.gltf.write import encode_mesh_glb, encode_scene_glb
+from pipeline.exchange.gltf.read_gltf import read_gltf
+from pipeline.exchange.gltf.write_gltf import encode_mesh_glb, encode_scene_glb
 from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.open_scene import load_source, scene_source
 from storage.conventions import linear_from_srgb8

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
-from pipeline.exchange.usd.read import read_usd, usd_keys
-from pipeline.exchange.usd.write import SUFFIXES, write_usd, write_usd_shard
+from pipeline.exchange.usd.read_usd import read_usd, usd_keys
+from pipeline.exchange.usd.write_usd import SUFFIXES, write_usd, write_usd_shard
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.records.scene import Scene, SceneObject
