@@ -1,4 +1,4 @@
-"""Flow `train-model`: a training run as a process, or as several by torchrun.
+"""Prefect flow `train-model`: a training run as a process, or as several by torchrun.
 
 It is in `infra`, which may import both `pipeline` and `train`: the form has every setting of
 `train.settings`, and wrong settings are refused before the training process exists, without torch.

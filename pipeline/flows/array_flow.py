@@ -1,4 +1,4 @@
-"""The flow `make-by-array`: submits a dataset to a scheduler's array and shows its progress.
+"""Prefect flow `make-by-array`: submits a dataset to a scheduler's array and shows its progress.
 
 Slurm or Kubernetes runs the tasks. The worker of this flow runs on a machine where `trilight submit
 slurm` works; it renders nothing, reads the same files as `trilight status`, and may be killed:

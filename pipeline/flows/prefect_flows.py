@@ -1,4 +1,4 @@
-"""The flows `prepare-assets`, `generate-scenes` and `build-dataset`, which combines both."""
+"""Prefect flows `prepare-assets`, `generate-scenes` and `build-dataset`, which combines both."""
 
 import dataclasses
 from typing import Any
