@@ -28,7 +28,7 @@ from storage.records.objects import count_by_reason, read_failures, read_objects
 from storage.settings.described import checked
 
 if TYPE_CHECKING:
-    from pipeline.generation.run import Outcome
+    from pipeline.generation.generation_run import Outcome
 
 _POLL_S = 0.5
 _MAX_NOTES = 20
@@ -64,7 +64,7 @@ def make(order: GenerateOptions, runner: ExecutorOptions, output: OutputOptions)
     first_words(f"Making {folder.display_name} with the preset {order.build}", silent=output.json)
     executor = find_executor(runner.runner, runner.address, order.workers)
     from infra.planning import describe_run  # slow: every stage
-    from pipeline.generation.run import choose_dataset_variant
+    from pipeline.generation.generation_run import choose_dataset_variant
 
     if not output.json and (text := describe_run(order, folder)):
         first_words(text)

@@ -8,9 +8,9 @@ import dataclasses
 from pathlib import Path
 
 from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
-from pipeline.generation.environment import environment
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
+from pipeline.generation.software_environment import environment
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.settings import DatasetSettings
 from pipeline.presets.training import smoke

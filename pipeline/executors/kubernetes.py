@@ -13,7 +13,7 @@ from collections.abc import Mapping
 
 from pipeline.executors.threads import make_part, number, variable
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.run import Outcome
+from pipeline.generation.generation_run import Outcome
 from storage.errors import TrilightError
 from storage.number_ranges import MOST_NUMBERS, numbers_of
 

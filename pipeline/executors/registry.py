@@ -16,7 +16,7 @@ from storage.installation import module_name
 from storage.registry import Registry
 
 if TYPE_CHECKING:
-    from pipeline.generation.run import Outcome
+    from pipeline.generation.generation_run import Outcome
 
 Make = Callable[[GenerateOptions, str | None], "Outcome"]
 

@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 
 from pipeline.executors.threads import make_part, number
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generation_run import Outcome
 from pipeline.generation.pipeline import prepare_dataset
-from pipeline.generation.run import Outcome
 from pipeline.generation.tasks import shard_ranges
 from storage.errors import TrilightError
 

@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generation_run import Outcome, ShardJob, TaskResult
 from pipeline.generation.pipeline import make_dataset, make_task
-from pipeline.generation.run import Outcome, ShardJob, TaskResult
 from pipeline.generation.runner import Runner
 from pipeline.generation.tasks import Piece
 from storage.errors import TrilightError

@@ -10,7 +10,7 @@ from pipeline.generation.generate_options import GenerateOptions
 
 if TYPE_CHECKING:
     from pipeline.flows.prefect_runner import PrefectRunner
-    from pipeline.generation.run import Outcome
+    from pipeline.generation.generation_run import Outcome
 
 
 def make(order: GenerateOptions, address: str | None) -> "Outcome":

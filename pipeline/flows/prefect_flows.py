@@ -17,8 +17,8 @@ from pipeline.flows.forms import (
 from pipeline.flows.prefect_runner import PrefectRunner
 from pipeline.flows.run_artifacts import make_with_artifacts
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generation_run import Outcome
 from pipeline.generation.pipeline import prepare_dataset
-from pipeline.generation.run import Outcome
 from pipeline.generation.tasks import shard_ranges
 from storage.dataset.progress import read_status
 

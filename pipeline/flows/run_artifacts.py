@@ -25,9 +25,9 @@ from prefect.artifacts import (
 from prefect.logging import get_run_logger
 
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generation_run import Outcome, Run, TaskResult
 from pipeline.generation.pipeline import make_dataset
 from pipeline.generation.price import PRICES, USD_PER_CORE_HOUR
-from pipeline.generation.run import Outcome, Run, TaskResult
 from pipeline.generation.runner import Runner
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError

@@ -11,8 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.prepare_isolated import ChildPool
-from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, call_with_retries, reach
+from pipeline.isolation import (
+    ChildFailed,
+    ChildLimits,
+    ChildPool,
+    IsolatedChild,
+    call_with_retries,
+    reach,
+)
 from pipeline.objects.maps.listing import PLURALS, FoundMap, find_maps
 from pipeline.objects.maps.prepared import MapFiles, decode_prepared, map_cache_key, prepare_map
 from pipeline.presets.settings import DatasetSettings

@@ -1,4 +1,7 @@
-"""Begins a dataset in a folder or a bucket, or resumes the one there with the same settings."""
+"""Begins a dataset in a folder or a bucket, or resumes the one there with the same settings.
+
+`DatasetWriter.unfinished_shards` says which shards are left: finished ones are skipped.
+"""
 
 import contextlib
 import dataclasses

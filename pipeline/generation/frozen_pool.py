@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.store import AssetStore
+from pipeline.assets.asset_store import AssetStore
 from pipeline.objects.maps.prepared import decode_prepared
 from pipeline.scenes.fitting import FitTable, least_triangles
 from pipeline.scenes.pool import IndexedPool, PooledAsset

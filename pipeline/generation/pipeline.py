@@ -37,17 +37,9 @@ from pipeline.generation.accept_revisited import accept_revisited
 from pipeline.generation.accept_scene_files import accept_scene_files
 from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.environment import environment
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions, generate_words
-from pipeline.generation.render_children import (
-    close_children,
-    cores_of_child,
-    render_child,
-    scene_reader,
-)
-from pipeline.generation.restore_object import restore_object
-from pipeline.generation.run import (
+from pipeline.generation.generation_run import (
     Outcome,
     Run,
     ShardJob,
@@ -56,8 +48,16 @@ from pipeline.generation.run import (
     choose_dataset_variant,
     resolve_settings,
 )
+from pipeline.generation.render_children import (
+    close_children,
+    cores_of_child,
+    render_child,
+    scene_reader,
+)
+from pipeline.generation.restore_object import restore_object
 from pipeline.generation.runner import Runner
 from pipeline.generation.scene_worker import MAX_ATTEMPTS, SceneAttempt, SceneWorker
+from pipeline.generation.software_environment import environment
 from pipeline.generation.tasks import FIRST_PAUSE_S, Piece, TaskCutter, wait_for_others
 from pipeline.generation.unfinished_shard import UnfinishedShard
 from pipeline.isolation import ChildFailed, IsolatedChild, with_retries

@@ -1,11 +1,11 @@
-"""`SceneWorker`: composes scenes and renders their views, inside a render child."""
+"""`SceneWorker`: composes scenes and renders their views, inside a worker process."""
 
 import contextlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from pipeline.assets.store import AssetStore
+from pipeline.assets.asset_store import AssetStore
 from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, user_maps
 from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample

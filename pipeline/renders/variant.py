@@ -78,7 +78,7 @@ class Variant:
 
 
 def device_of(environment: Mapping[str, Any]) -> Device:
-    """Return the device of a dataset by its environment (pipeline.generation.environment)."""
+    """Return the device in a dataset's environment (pipeline.generation.software_environment)."""
     return _DEVICES.get(str(environment.get("mitsuba_variant")), "cpu")
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pipeline.assets.store import AssetStore
+from pipeline.assets.asset_store import AssetStore
 from storage import file_locks
 from storage.atomic import atomic_writer, write_error
 from storage.dataset.layout import DatasetFolder

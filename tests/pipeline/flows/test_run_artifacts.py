@@ -22,7 +22,7 @@ from pipeline.flows.prefect_runner import PrefectRunner
 from pipeline.flows.run_artifacts import RunArtifacts, report_url, small_picture, usd_per_core_hour
 from pipeline.generation.dataset_writer import DatasetProgress
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.run import TaskResult
+from pipeline.generation.generation_run import TaskResult
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering

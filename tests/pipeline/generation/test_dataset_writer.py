@@ -8,9 +8,9 @@ import pytest
 from pipeline.generation import dataset_writer
 from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.environment import environment
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.run import choose_dataset_variant
+from pipeline.generation.generation_run import choose_dataset_variant
+from pipeline.generation.software_environment import environment
 from pipeline.objects.generated import generate_objects
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings

@@ -16,14 +16,13 @@ from PIL import Image
 
 from pipeline.generation import pipeline, render_children, tasks, unfinished_shard
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generation_run import Run, ShardJob, TaskResult
 from pipeline.generation.pipeline import make_dataset, make_piece
-from pipeline.generation.prepare_isolated import ChildPool
-from pipeline.generation.run import Run, ShardJob, TaskResult
 from pipeline.generation.runner import Runner
 from pipeline.generation.scene_worker import SceneAttempt
 from pipeline.generation.tasks import Piece
 from pipeline.generation.unfinished_shard import UnfinishedShard
-from pipeline.isolation import ChildFailed, IsolatedChild
+from pipeline.isolation import ChildFailed, ChildPool, IsolatedChild
 from pipeline.shards.pack import pack_shard
 from storage import file_locks
 from storage.dataset.layout import DatasetFolder

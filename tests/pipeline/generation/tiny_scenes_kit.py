@@ -11,7 +11,7 @@ from pipeline.executors.threads import ThreadRunner
 from pipeline.generation.freeze_objects import AcceptedObjects, ObjectLock
 from pipeline.generation.frozen_pool import ComposedScenes, FrozenPool
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.run import ShardJob
+from pipeline.generation.generation_run import ShardJob
 from pipeline.renders.variant import Variant
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.statistics import Statistics

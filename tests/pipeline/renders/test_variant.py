@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from pipeline.generation.environment import environment
+from pipeline.generation.software_environment import environment
 from pipeline.renders import variant as variant_module
 from pipeline.renders import variant_probe, vector_tracer
 from pipeline.renders.facts import render_facts

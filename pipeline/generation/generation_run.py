@@ -1,4 +1,4 @@
-"""Records that the steps of `pipeline.generation.pipeline` pass to each other."""
+"""`Run` and other records that the steps of `pipeline.generation.pipeline` pass to each other."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

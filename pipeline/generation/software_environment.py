@@ -1,4 +1,4 @@
-"""The environment that decides a dataset's bytes beside its settings: processor, libraries."""
+"""Software environment that decides a dataset's bytes beside its settings: processor, libraries."""
 
 import platform
 import zlib

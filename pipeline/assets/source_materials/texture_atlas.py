@@ -1,4 +1,4 @@
-"""A texture atlas with a tile for every triangle, whatever their number and neighbors.
+"""A texture atlas by UV tiles, one for every triangle, whatever their number and neighbors.
 
 A triangle of n cells a side takes one half of a square of n + 3 texels: its corners lie in the
 centers of texels, and every texel that a bilinear lookup within it can read belongs to it alone.

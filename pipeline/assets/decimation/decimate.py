@@ -1,4 +1,4 @@
-"""Decimation methods by name, and the check for meshes that may hang pymeshlab."""
+"""Decimation of meshes by named methods, and the check for meshes that may hang pymeshlab."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
