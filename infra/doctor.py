@@ -18,7 +18,7 @@ from pipeline.isolation.confinement import VARIABLE, confinement_mode, missing_f
 from pipeline.isolation.landlock import landlock_version
 from pipeline.isolation.seccomp import seccomp_works
 from pipeline.renders.facts import VIEW_PX, VIEW_SPP, render_facts
-from pipeline.renders.variant import choose_variant
+from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.visible_gpus import query_gpus
 from storage.cache import cache_folder
 from storage.errors import EnvironmentFailure, TrilightError

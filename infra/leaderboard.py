@@ -24,7 +24,7 @@ from infra.render.path_tracer import RenderChild
 from model.neural_renderer import NeuralRenderer
 from pipeline.exchange.exports.scenes import picture_name
 from pipeline.exchange.pictures import MAX_BYTES, decode_pixels
-from pipeline.renders.variant import choose_variant
+from pipeline.renders.mitsuba_variant import choose_variant
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.digests import sha256_hex

@@ -33,9 +33,9 @@ from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset
+from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import NoiseTargets
-from pipeline.renders.variant import choose_variant
 from storage.conventions import preview_gain, preview_srgb8
 from storage.dataset.dataset import open_dataset
 from storage.metrics import psnr_log_db

@@ -48,11 +48,11 @@ if TYPE_CHECKING:
     from scene_templates.separate_sides import SideRanges as SideRanges
     from scene_templates.settings import SceneSettings as SceneSettings
     from scene_templates.skies.draws import SkyDraws as SkyDraws
-    from scene_templates.skies.families import SKIES as SKIES
+    from scene_templates.skies.procedural_skies import SKIES as SKIES
     from scene_templates.skies.texels import SkyTexels as SkyTexels
     from scene_templates.surfaces.draws import SurfaceDraws as SurfaceDraws
-    from scene_templates.surfaces.families import SURFACES as SURFACES
     from scene_templates.surfaces.maps import Finish as Finish
+    from scene_templates.surfaces.procedural_textures import SURFACES as SURFACES
     from scene_templates.surfaces.texels import Texels as Texels
     from scene_templates.templates import TEMPLATES as TEMPLATES
     from scene_templates.templates import Template as Template

@@ -14,7 +14,7 @@ from pipeline.generation.software_environment import environment
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.settings import DatasetSettings
 from pipeline.presets.training import smoke
-from pipeline.renders.variant import Variant, choose_variant
+from pipeline.renders.mitsuba_variant import Variant, choose_variant
 from scene_templates.settings import SceneSettings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.splits import JUDGED_SPLIT

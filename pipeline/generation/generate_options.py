@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.presets.registry import DATASET_PRESETS
+from pipeline.renders.mitsuba_variant import Device
 from pipeline.renders.settings import NoiseFloor, NoiseTargets, Resolution
-from pipeline.renders.variant import Device
 from storage.dataset.layout import dataset_folder
 from storage.dataset.settings import MOST_SCENES
 from storage.errors import TrilightError

@@ -13,7 +13,7 @@ from pipeline.generation.generate_options import GenerateOptions
 from pipeline.objects.sources import check_source
 from pipeline.presets.registry import DATASET_PRESETS, frozen_note, object_source, preset_settings
 from pipeline.presets.settings import DatasetSettings
-from pipeline.renders.variant import Device, Variant, choose_variant, device_of
+from pipeline.renders.mitsuba_variant import Device, Variant, choose_variant, device_of
 from pipeline.renders.visible_gpus import gpu_memory_bytes, visible_gpus
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, read_head

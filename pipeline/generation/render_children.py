@@ -18,7 +18,7 @@ from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
 from pipeline.generation.software_environment import environment
 from pipeline.isolation import ChildLimits, ChildPool, IsolatedChild, call_with_retries, reach
 from pipeline.presets.settings import differences
-from pipeline.renders.variant import choose_variant
+from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.visible_gpus import visible_gpus
 from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions

@@ -11,8 +11,8 @@ from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
 from pipeline.generation.revisited_scenes import RevisitedScenes, SceneOrigin
 from pipeline.presets.settings import DatasetSettings
+from pipeline.renders.mitsuba_variant import Variant, activate
 from pipeline.renders.renderer import set_threads
-from pipeline.renders.variant import Variant, activate
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.settings import SceneSettings

@@ -6,7 +6,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from pipeline.renders.variant import Variant
+from pipeline.renders.mitsuba_variant import Variant
 
 _LIBRARIES = (
     "trilight",

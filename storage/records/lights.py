@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.exr import to_half
-from storage.records.layers import decode_layers, encode_layers
+from storage.records.exr_layers import decode_layers, encode_layers
 from storage.records.scene import Scene
 
 MAX_LIGHTS = 64

@@ -27,7 +27,7 @@ from storage.atomic import atomic_writer, write_atomically
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.file_locks import hold_lock
 from storage.remote.fetch import fetch_if_there
-from storage.remote.tries import TransferFailed, is_missing, is_taken, may_pass, with_tries
+from storage.remote.retries import TransferFailed, is_missing, is_taken, may_pass, with_tries
 from storage.remote.url import RemoteUrl, shared_driver
 
 WRITABLE = ("s3", "gs")

@@ -39,7 +39,7 @@ from pipeline.foreign.usd.polygons import (
 )
 from pipeline.foreign.usd.shaders import StatedMaterial, read_material
 from pipeline.foreign.usd.stage_materials import read_stage_materials
-from pipeline.scenes.shading import smooth_shaded
+from pipeline.scenes.shading_normals import smooth_shaded
 from storage.records.material import laid_out
 from storage.records.texture import MapSource, Texture
 

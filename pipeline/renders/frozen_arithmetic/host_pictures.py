@@ -7,6 +7,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from pipeline.renders.adaptive_sampling import tile_means
 from pipeline.renders.calibrated_error import is_far, statement_for
 from pipeline.renders.camera import PixelCamera
 from pipeline.renders.denoise_corrections import (
@@ -21,7 +22,6 @@ from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error, meas
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered, RenderSettings
-from pipeline.renders.tiles import tile_means
 from pipeline.renders.tracer import Tracer
 from pipeline.renders.view_pictures import (
     MeasuredLook,
@@ -207,7 +207,8 @@ class HostMeans:
         """Return the mean of both halves, [P, R, R, 3].
 
         They weigh the same even where one has more samples: what one half is given goes by the
-        other's, and weights by it would make the sum depend on itself (pipeline.renders.tiles).
+        other's, and weights by it would make the sum depend on itself
+        (pipeline.renders.adaptive_sampling).
         """
         first, second = self._means()
         return ((first + second) / 2).astype(np.float32)

@@ -62,7 +62,7 @@ TILED = dataclasses.replace(CHEAP, noise_floor_db=90.0, max_spp=512)
 """Tiles are chosen, and where a mirror lights a floor, paths are guided."""
 
 _IN_ANOTHER_PROCESS = """
-from pipeline.renders.variant import activate, choose_variant
+from pipeline.renders.mitsuba_variant import activate, choose_variant
 activate(choose_variant())
 from tests.pipeline.renders import test_renderer as t
 t.set_threads(1)

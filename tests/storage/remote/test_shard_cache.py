@@ -20,10 +20,10 @@ from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.shard_places import listed_shards
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.remote import tries
-from storage.remote.cache import ShardCache, shard_cache
+from storage.remote import retries
+from storage.remote.retries import TRIES, Pace, Patience, TransferFailed, with_tries
 from storage.remote.safe_url import public_text, safe_text, safe_url
-from storage.remote.tries import TRIES, Pace, Patience, TransferFailed, with_tries
+from storage.remote.shard_cache import ShardCache, shard_cache
 from storage.remote.url import RemoteUrl
 from tests.for_each import for_each
 from tests.http_server import Fault, Site
@@ -217,7 +217,7 @@ def test_what_passes_by_itself_is_outlived(
 ) -> None:
     if len(faults) > 4 and not ranges:
         pytest.skip("without ranges, a line that always breaks gets nowhere")
-    monkeypatch.setattr(tries, "PATIENCE", Patience(least_bytes_per_s=0.0))  # of a busy machine
+    monkeypatch.setattr(retries, "PATIENCE", Patience(least_bytes_per_s=0.0))  # of a busy machine
     server.faults[PATH], server.ranges = list(faults), ranges
     assert read(server.url) == expected(local)
     assert not server.faults[PATH]
@@ -326,7 +326,7 @@ def test_a_cache_that_cannot_be_written_is_named(
 
 
 def patience(monkeypatch: pytest.MonkeyPatch, **limits: float) -> None:
-    monkeypatch.setattr(tries, "PATIENCE", Patience(**limits))
+    monkeypatch.setattr(retries, "PATIENCE", Patience(**limits))
 
 
 def test_a_server_that_trickles_is_left(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from pipeline.documents.sums import SUMS, UNPUBLISHED, published_files, stale_sums
+from pipeline.documents.checksums import SUMS, UNPUBLISHED, published_files, stale_sums
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError

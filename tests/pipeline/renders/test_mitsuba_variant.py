@@ -13,11 +13,10 @@ import mitsuba as mi
 import pytest
 
 from pipeline.generation.software_environment import environment
-from pipeline.renders import variant as variant_module
+from pipeline.renders import mitsuba_variant as variant_module
 from pipeline.renders import variant_probe, vector_tracer
 from pipeline.renders.facts import render_facts
-from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
-from pipeline.renders.variant import (
+from pipeline.renders.mitsuba_variant import (
     Device,
     Variant,
     _ProbeResult,
@@ -25,6 +24,7 @@ from pipeline.renders.variant import (
     choose_variant,
     llvm_libraries,
 )
+from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
 from pipeline.renders.variant_probe import BLOCK, probe_scene, wrong_picture
 from storage import denoiser
 from storage.errors import EnvironmentFailure, TrilightError
@@ -255,7 +255,7 @@ def test_a_process_denoises_where_its_variant_says(variant: Variant) -> None:
 
 def test_asking_does_not_import_mitsuba_nor_the_denoiser_torch() -> None:
     code = (
-        "import sys; from pipeline.renders.variant import choose_variant; choose_variant(); "
+        "import sys; from pipeline.renders import mitsuba_variant as it; it.choose_variant(); "
         "import pipeline.renders.renderer, pipeline.renders.facts; "
         "print(sorted({'mitsuba', 'drjit', 'pyoidn'} & set(sys.modules))); "
         "from storage.denoiser import load_oidn; load_oidn(); "

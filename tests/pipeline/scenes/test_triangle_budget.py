@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from pipeline.scenes import fitting
-from pipeline.scenes.fitting import FitTable, draw_rows, least_triangles, levels_within
+from pipeline.scenes import triangle_budget
 from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.triangle_budget import FitTable, draw_rows, least_triangles, levels_within
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
@@ -176,7 +176,7 @@ def _slow_twin(
 
 
 def test_parts_change_no_draw(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitting, "_CHUNK", 7)
+    monkeypatch.setattr(triangle_budget, "_CHUNK", 7)
     rejected = several = 0
     for trial in range(300):
         rng = np.random.default_rng(trial)

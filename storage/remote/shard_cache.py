@@ -17,7 +17,7 @@ from storage.digests import canonical_json, sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.file_locks import hold_lock, take_lock
 from storage.remote.fetch import download, facts_of, unreadable
-from storage.remote.tries import TransferFailed
+from storage.remote.retries import TransferFailed
 from storage.remote.url import RemoteUrl
 
 LIMIT_VARIABLE = "TRILIGHT_SHARD_CACHE_GB"

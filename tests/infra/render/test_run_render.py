@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from PIL import Image as Picture
 
-from infra.render import look as look_module
-from infra.render.look import Look, enlarge, enlargement, tone_mapped
+from infra.render import tone_mapping as look_module
 from infra.render.networks import RendererHere, SceneHere
 from infra.render.output_paths import OutputPaths, output_paths, write_video
 from infra.render.plan import RenderPlan, shots
-from infra.render.run import FinishedShot, run_plan
+from infra.render.run_render import FinishedShot, run_plan
 from infra.render.sources import orbit, own_camera, pair_cameras
+from infra.render.tone_mapping import Look, enlarge, enlargement, tone_mapped
 from pipeline.exchange.open_scene import SceneSource
 from storage.conventions import preview_srgb8
 from storage.errors import TrilightError

@@ -9,7 +9,6 @@ from typing import Protocol
 
 from infra.render.budget import Choice
 from infra.render.comparison import Flicker, Frame, comparison_sheet, flicker, log_error
-from infra.render.look import Look, display_pixels
 from infra.render.output_paths import write_video
 from infra.render.picture_file import (
     PictureFile,
@@ -20,6 +19,7 @@ from infra.render.picture_file import (
 )
 from infra.render.plan import RenderPlan, Shot
 from infra.render.sources import own_camera
+from infra.render.tone_mapping import Look, display_pixels
 from pipeline.documents.png import encode_png
 from pipeline.exchange.formats import SceneSource
 from pipeline.exchange.reader import SceneReader
