@@ -248,7 +248,7 @@ class Pictures:
         self, name: str, changes: Mapping[str, Any], build: str = "tiny"
     ) -> Iterator[Sample]:
         """Make one of the datasets, unless it is there, and yield its training scenes."""
-        order = GenerateOptions(
+        options = GenerateOptions(
             build=build,
             objects=str(self._objects),
             out=str(self._data / name),
@@ -257,7 +257,7 @@ class Pictures:
             licence="CC0-1.0",
             changes=changes,
         )
-        make_dataset(order, ThreadRunner())
+        make_dataset(options, ThreadRunner())
         yield from open_dataset(str(self._data / name)).samples("train")
 
     def _meshes(self, scene: Scene) -> tuple[TriangleMesh, TriangleMesh]:

@@ -21,13 +21,13 @@ PLACE = "JOB_COMPLETION_INDEX"
 """Variable with the index of a task in the Job, from 0."""
 
 
-def make(order: GenerateOptions, address: str | None) -> Outcome:
+def make(options: GenerateOptions, address: str | None) -> Outcome:
     """Make the shards of this task.
 
     Raises:
         TrilightError: this is no task of an indexed Job, or as `make_part`.
     """
-    return make_part(order, "kubernetes", lambda: shards_of_place(os.environ))
+    return make_part(options, "kubernetes", lambda: shards_of_place(os.environ))
 
 
 def shards_of_place(environment: Mapping[str, str]) -> str:

@@ -39,8 +39,8 @@ def _load_on_use(module: str) -> Make:
     The import loads every stage, and for some executors packages that may not be installed.
     """
 
-    def make(order: GenerateOptions, address: str | None) -> "Outcome":
-        outcome: Outcome = import_module(module_name(module)).make(order, address)
+    def make(options: GenerateOptions, address: str | None) -> "Outcome":
+        outcome: Outcome = import_module(module_name(module)).make(options, address)
         return outcome
 
     return make

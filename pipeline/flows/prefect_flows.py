@@ -49,14 +49,14 @@ def build_dataset(**parameters: Any) -> None:
     the first. Then it makes all remaining shards that no worker has claimed, so that it ends even
     if no other worker ever starts.
     """
-    order = options_of_form(parameters, DatasetInRuns)
+    options = options_of_form(parameters, DatasetInRuns)
     values = {field.name: parameters[field.name] for field in dataclasses.fields(GenerateOptions)}
     prepare_assets(**values)
-    if order.flow_runs > 1:
-        first, *rest = shard_ranges(read_status(order.place).shards_planned, order.flow_runs)
+    if options.flow_runs > 1:
+        first, *rest = shard_ranges(read_status(options.place).shards_planned, options.flow_runs)
         for shards in rest:
             ranged = {name: _json(value) for name, value in values.items()} | {"shards": shards}
-            run_deployment(order.deployment, parameters=ranged, timeout=0, as_subflow=False)
+            run_deployment(options.deployment, parameters=ranged, timeout=0, as_subflow=False)
         generate_scenes(**{**values, "shards": first})
     generate_scenes(**values)
 

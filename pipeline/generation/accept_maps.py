@@ -63,7 +63,7 @@ class MapFolders:
 NO_FOLDERS = MapFolders()
 
 
-def map_folders(order: GenerateOptions, settings: DatasetSettings) -> MapFolders:
+def map_folders(options: GenerateOptions, settings: DatasetSettings) -> MapFolders:
     """Return the folders of textures and maps that the options name.
 
     Raises:
@@ -72,8 +72,8 @@ def map_folders(order: GenerateOptions, settings: DatasetSettings) -> MapFolders
     """
     scenes = settings.scenes
     shares = {
-        TEXTURE: (order.textures, "textures", scenes.textures.share, scenes.textures.own_share),
-        SKY: (order.skies, "skies", scenes.skies.share, scenes.skies.own_share),
+        TEXTURE: (options.textures, "textures", scenes.textures.share, scenes.textures.own_share),
+        SKY: (options.skies, "skies", scenes.skies.share, scenes.skies.own_share),
     }
     for folder, name, share, own_share in shares.values():
         used = bool(share and own_share)
@@ -90,7 +90,7 @@ def map_folders(order: GenerateOptions, settings: DatasetSettings) -> MapFolders
             )
     return MapFolders(
         folders=tuple((kind, entry[0]) for kind, entry in shares.items() if entry[0] is not None),
-        licence=order.map_licence,
+        licence=options.map_licence,
     )
 
 

@@ -40,7 +40,7 @@ _USED = 0.9
 class Run:
     """A dataset that has begun, with its objects frozen: the input of every later step."""
 
-    order: GenerateOptions
+    options: GenerateOptions
     """The command's options."""
     settings: DatasetSettings
     """The preset with the options' changes."""
@@ -55,12 +55,12 @@ class Run:
 
     def unfinished_shards(self) -> list[int]:
         """Return the numbers of the requested shards that are not finished."""
-        return self.publication.unfinished_shards(self.order.shard_range())
+        return self.publication.unfinished_shards(self.options.shard_range())
 
     def num_workers(self) -> int:
         """Return the number of parallel tasks of one process; an executor may set another."""
-        if self.order.workers is not None:
-            return self.order.workers
+        if self.options.workers is not None:
+            return self.options.workers
         if self.device == "cpu":
             return 1
         num_gpus = max(1, len(visible_gpus()))
@@ -72,7 +72,7 @@ class Run:
         return ShardJob(
             folder=self.publication.folder,
             settings=self.settings,
-            environment={} if self.order.accept_environment else manifest.environment,
+            environment={} if self.options.accept_environment else manifest.environment,
             accepted=self.accepted,
             lock_sha256=manifest.objects_lock_sha256,
             num_at_once=num_at_once,
@@ -88,8 +88,8 @@ class Run:
         origin = self.accepted.origin
         if listed and isinstance(origin, SceneFiles):
             notes = (*origin.notes, *listed.notes(self.settings.scenes.num_views))
-        elif statistics and self.order.revisits is None:
-            notes = frozen_note(self.order.build, statistics)
+        elif statistics and self.options.revisits is None:
+            notes = frozen_note(self.options.build, statistics)
             splits = self.settings.splits
             num_scenes = writer.manifest.num_scenes
             if lacking := lacks_validation(num_scenes, splits):
@@ -115,7 +115,7 @@ class Run:
         origin = self.accepted.origin
         num_unusable = len(origin.unusable) if isinstance(origin, SceneFiles) else 0
         num_scenes = writer.manifest.num_scenes
-        budget = self.order.failure_budget
+        budget = self.options.failure_budget
         given_up = writer.progress.given_up
         if given_up > budget * num_scenes + num_unusable:
             writer.add_failures(writer.failures)
@@ -205,7 +205,7 @@ Watcher = Callable[[Run, TaskResult], None]
 
 
 def resolve_settings(
-    order: GenerateOptions, folder: DatasetFolder
+    options: GenerateOptions, folder: DatasetFolder
 ) -> tuple[DatasetSettings, SceneFolder | None]:
     """Return the dataset's settings, and the scene files if scenes come from files.
 
@@ -213,31 +213,31 @@ def resolve_settings(
         TrilightError: the settings contradict each other, or the source or files are unusable.
     """
     settings = preset_settings(
-        order.build,
-        seed=order.seed,
-        resolution=order.resolution,
-        noise_targets=order.noise_targets,
-        allow_licences=order.allow_licences,
-        changes=order.changes,
+        options.build,
+        seed=options.seed,
+        resolution=options.resolution,
+        noise_targets=options.noise_targets,
+        allow_licences=options.allow_licences,
+        changes=options.changes,
     )
-    if order.revisits is not None or settings.revisit is not None:
-        return settings_for_revisit(settings, order.revisits), None
-    source = object_source(settings, order.objects)
-    files = order.scenes_from
-    listed = None if files is None else find_scene_files(files, order.albedo_over_one)
+    if options.revisits is not None or settings.revisit is not None:
+        return settings_for_revisit(settings, options.revisits), None
+    source = object_source(settings, options.objects)
+    files = options.scenes_from
+    listed = None if files is None else find_scene_files(files, options.albedo_over_one)
     if listed is None and not folder.manifest.exists():
-        check_source(source, allowed_licences=settings.allowed_licences, licence=order.licence)
-    return settings_for_files(settings, listed, order.views), listed
+        check_source(source, allowed_licences=settings.allowed_licences, licence=options.licence)
+    return settings_for_files(settings, listed, options.views), listed
 
 
-def choose_dataset_variant(order: GenerateOptions, folder: DatasetFolder) -> Variant:
+def choose_dataset_variant(options: GenerateOptions, folder: DatasetFolder) -> Variant:
     """Return the variant that renders a dataset.
 
     It is that of the device which the dataset was begun on, unless the options or TRILIGHT_VARIANT
     name another one. A new dataset takes its preset's device. Raises as `choose_variant`.
     """
-    default = DATASET_PRESETS[order.build].device
-    device = order.device
+    default = DATASET_PRESETS[options.build].device
+    device = options.device
     if folder.manifest.exists():
         default = device_of(read_head(folder.manifest).environment)
         device = default if device == "auto" else device

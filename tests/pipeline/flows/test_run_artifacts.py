@@ -195,8 +195,8 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
             for task in job.tasks:
                 monkeypatch.setenv("SHARDS_PER_TASK", str(job.per_task))
                 monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(task))
-                find_executor("slurm", None, None).make(job.order, None)
-            Path(job.order.place, "README.md").write_text("# A set")  # the last document
+                find_executor("slurm", None, None).make(job.options, None)
+            Path(job.options.place, "README.md").write_text("# A set")  # the last document
 
         arrays.append(list(job.tasks))
         threading.Thread(target=work).start()
