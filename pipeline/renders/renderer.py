@@ -24,9 +24,9 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.renders.adaptive_sampling import TileChoice
 from pipeline.renders.calibrated_error import first_spp
 from pipeline.renders.camera import PixelCamera
-from pipeline.renders.frozen_arithmetic.host_pictures import HostPictures
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import MeasuredFloor
+from pipeline.renders.numpy_arithmetic.host_pictures import HostPictures
 from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered, RenderSettings

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from pipeline.renders import variant_probe
 from pipeline.renders.adaptive_sampling import TileChoice
 from pipeline.renders.denoise_corrections import LEAST_PASSES
-from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error
-from pipeline.renders.frozen_arithmetic.host_pictures import (
+from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.numpy_arithmetic.host_pictures import (
     HostMeans,
     Pictures,
     keep_converged,
     keep_in_halves,
     with_mean_of,
 )
-from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.numpy_arithmetic.noise_floor import Half, estimate_error
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import RenderSettings
 from storage import denoiser

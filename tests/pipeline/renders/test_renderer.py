@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.renders.frozen_arithmetic import host_pictures
-from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans, with_mean_of
 from pipeline.renders.load_tracer import choose_tracing_scale, load_tracer
+from pipeline.renders.numpy_arithmetic import host_pictures
+from pipeline.renders.numpy_arithmetic.host_pictures import HostMeans, with_mean_of
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import RenderedView
 from pipeline.renders.samples import DualBuffer

@@ -18,8 +18,8 @@ from pipeline.renders.denoise_corrections import (
     STANDARD_ERRORS,
     STANDS_OUT,
 )
-from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error, measure_errors
 from pipeline.renders.noise_floor import clamped_radiance
+from pipeline.renders.numpy_arithmetic.noise_floor import Half, estimate_error, measure_errors
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tracer import Tracer
