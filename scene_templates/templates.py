@@ -1,4 +1,4 @@
-"""Layouts as data: which walls they have, and from where they are seen and lit.
+"""Layout templates as data: which walls they have, and from where they are seen and lit.
 
 `sample_layout` in the file of that name draws one.
 """

@@ -1,4 +1,4 @@
-"""Runs one experiment: every point once in each trial, stored as soon as it is measured.
+"""Runs one benchmark (experiment): every point once in each trial, stored as soon as measured.
 
 Machines drift. The points of an experiment are therefore measured alternately (A B A B ...), and
 only ratios within one run are meaningful.

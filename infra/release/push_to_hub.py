@@ -1,4 +1,4 @@
-"""Upload of a folder to a repository of the Hugging Face hub, by the package huggingface_hub.
+"""Upload of a folder to the Hugging Face hub, by the package huggingface_hub.
 
 The hub's limits are from https://huggingface.co/docs/hub/storage-limits, "Repository limitations"
 (2026-11).

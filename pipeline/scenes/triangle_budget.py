@@ -1,4 +1,4 @@
-"""The triangle budget: draws objects that still fit, and chooses a level of detail for each.
+"""The triangle budget: draws objects that still fit, and chooses a level of detail (LOD) for each.
 
 A limit per object would either waste most of a scene's triangles or overflow it (the published
 recipes do both). Here objects are drawn among those that still fit; each begins with its coarsest

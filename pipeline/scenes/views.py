@@ -1,4 +1,4 @@
-"""Chooses cameras: tries up to sixteen proposals per view until one sees enough.
+"""Chooses camera views: tries up to sixteen proposals per view until one sees enough.
 
 Proposals are numbered, and each is a pure function of (seed, scene, attempt, view, number). A view
 whose picture turns out black can therefore continue with the next one, long after composition and

@@ -1,4 +1,4 @@
-"""`draw_sky`: the light from all around a scene, from a generator."""
+"""`draw_sky`: a procedural environment map, the light from all around a scene."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

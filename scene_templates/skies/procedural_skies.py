@@ -1,4 +1,4 @@
-"""The families of skies, by name; extensions may add to them.
+"""Procedural environment maps (skies), by name of their family; extensions may add to them.
 
 A family is a function of the draws of one sky and its texels; it returns the radiance [H, 2H, 3] up
 to a factor, which `draw_sky` chooses. All that it draws has a name and a stated range, and its

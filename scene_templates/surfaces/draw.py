@@ -1,4 +1,4 @@
-"""`draw_surface`: a textured surface from a generator."""
+"""`draw_surface`: a procedural texture from a generator."""
 
 from typing import Annotated
 

@@ -1,4 +1,4 @@
-"""The families of surfaces, by name; extensions may add to them.
+"""Procedural textures of surfaces, by name of their family; extensions may add to them.
 
 A family is a function of the draws of one surface and its texels; it returns what the surface is
 made of. All that it draws has a name and a stated range, and noises and patterns take a stream of

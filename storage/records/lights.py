@@ -1,4 +1,4 @@
-"""Pictures by light: what each emitter adds, and the rule that their sum is the picture.
+"""Pictures by light (OLAT): what each emitter adds, and the rule that their sum is the picture.
 
 Light i is the i-th object of kind `emitter`, in the order of `Scene.objects`; a sky that shines is
 one more light, the last one. The member

@@ -1,4 +1,4 @@
-"""Bytes of one file on a server: facts about it, or all of it to a file.
+"""Downloads one file of a server or bucket: facts about it, or all of it to a file.
 
 A transfer that breaks off goes on where it stopped, where the server can do that, and ends only
 when all announced bytes are there.

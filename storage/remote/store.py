@@ -1,4 +1,4 @@
-"""`Store`: the place where a dataset is published, a folder or a bucket (s3://, gs://).
+"""`Store`: where a dataset is published, a folder or a bucket (s3://, gs://) by fsspec.
 
 Files have names relative to it. A file appears whole or not at all, and once if asked. A bucket
 shows one when all of it has come, however large it is, so a kill leaves nothing half written; parts

@@ -1,4 +1,4 @@
-"""URLs of files and folders on servers: which are admitted, and the driver that reads each."""
+"""URLs of files and folders on servers: which are admitted, and the fsspec driver of each."""
 
 import base64
 import dataclasses

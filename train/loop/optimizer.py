@@ -1,4 +1,7 @@
-"""Optimizers of a run: AdamW, and Muon for the matrices."""
+"""Optimizers of a run: AdamW, and Muon for the matrices.
+
+The learning rate and its warm-up (warmup) are in train.loop.schedule.
+"""
 
 import itertools
 from collections import defaultdict

@@ -1,4 +1,4 @@
-"""One update of the weights, or none: a step that is not finite changes nothing.
+"""Training step: one update of the weights, or none if it is not finite.
 
 `Stepper.launch` enqueues a step and returns its statistics on the device; `Stepper.sync` waits for
 them. On a CPU a step is synced at once, on a GPU once per window (loop.trainer), so that the host

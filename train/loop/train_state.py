@@ -1,4 +1,4 @@
-"""Mutable state of a run: weights, their mean, optimizer state, counters and history.
+"""Mutable state of a run: weights, their mean (EMA), optimizer state, counters and history.
 
 Everything else (order, augmentation, learning rate) is a function of the settings and the step, so
 that no state of a random generator has to be saved.

@@ -1,4 +1,4 @@
-"""Loss of a run: L1 on log10(1 + radiance), a perceptual term, and the weight of each view."""
+"""Training loss: L1 on log10(1 + radiance), a perceptual term, and the weight of each view."""
 
 import math
 from collections.abc import Callable

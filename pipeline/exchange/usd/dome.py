@@ -1,4 +1,4 @@
-"""Writes and reads the environment of a scene as a USD DomeLight with a map file.
+"""Writes and reads the environment map of a scene as a USD DomeLight with a map file.
 
 A dome has the middle of its picture towards +Z, a quarter from the left towards +X and the top
 towards +Y, whatever the axis of the stage; the axes of an `Environment` are a cyclic permutation of

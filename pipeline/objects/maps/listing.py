@@ -1,4 +1,4 @@
-"""The textures or environment maps of a folder, with their rights.
+"""Textures or environment maps (HDRIs) of a folder, with their rights.
 
 A folder has a catalogue, as a folder of objects may have one, or else all of its pictures count.
 Nothing is decoded here. The uid of a texture or map begins with its kind, so that it differs from
