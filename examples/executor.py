@@ -26,10 +26,10 @@ from trilight.extend import (
 TRILIGHT = (sys.executable, "-m", "trilight")
 
 
-def by_commands(order: GenerateOptions, address: str | None) -> Outcome:
+def by_commands(options: GenerateOptions, address: str | None) -> Outcome:
     """Make every missing shard in a process of its own, then finish what is left here."""
-    missing = prepare_dataset(order).publication.unfinished_shards()
-    words = (*TRILIGHT, *generate_words(order), "--out", order.place)
+    missing = prepare_dataset(options).publication.unfinished_shards()
+    words = (*TRILIGHT, *generate_words(options), "--out", options.place)
 
     def make(shard: int) -> None:
         command = [*words, "--shards", f"{shard}:{shard + 1}"]
@@ -38,9 +38,9 @@ def by_commands(order: GenerateOptions, address: str | None) -> Outcome:
             said = ran.stderr.strip().splitlines() or ["it said nothing"]
             raise TrilightError(f"shard {shard} could not be made: {said[-1]}")
 
-    with ThreadPoolExecutor(order.workers or 2) as starters:
+    with ThreadPoolExecutor(options.workers or 2) as starters:
         list(starters.map(make, missing))
-    return make_dataset(order, ThreadRunner())
+    return make_dataset(options, ThreadRunner())
 
 
 EXECUTORS.register("commands", Executor(make=by_commands))

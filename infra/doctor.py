@@ -18,7 +18,7 @@ from pipeline.isolation.confinement import VARIABLE, confinement_mode, missing_f
 from pipeline.isolation.landlock import landlock_version
 from pipeline.isolation.seccomp import seccomp_works
 from pipeline.renders.facts import VIEW_PX, VIEW_SPP, render_facts
-from pipeline.renders.variant import choose_variant
+from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.visible_gpus import query_gpus
 from storage.cache import cache_folder
 from storage.errors import EnvironmentFailure, TrilightError
@@ -158,7 +158,7 @@ def _mesh_filters() -> Finding:
         problem = "libigl decimates: other meshes, other digests, and no profile uniform"
         return Finding("slower", "no pymeshlab (GPL)", problem, "make setup")
     code = (
-        f"from {module_name('pipeline.assets.environment')} import missing_filters; "
+        f"from {module_name('pipeline.assets.check_pymeshlab')} import missing_filters; "
         "m = missing_filters(); "
         "raise SystemExit(', '.join(m) if m else 0)"
     )

@@ -18,8 +18,8 @@ from infra.render.quality import FixedSamples
 from model.neural_renderer import NeuralRenderer
 from model.open import find_network
 from model.weights import network_digest
+from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.preview import MOST_SPP
-from pipeline.renders.variant import choose_variant
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError

@@ -24,7 +24,7 @@ from infra.render.path_tracer import RenderChild
 from model.neural_renderer import NeuralRenderer
 from pipeline.exchange.exports.scenes import picture_name
 from pipeline.exchange.pictures import MAX_BYTES, decode_pixels
-from pipeline.renders.variant import choose_variant
+from pipeline.renders.mitsuba_variant import choose_variant
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.digests import sha256_hex
@@ -77,31 +77,31 @@ class Leaderboard:
     out: Path
 
 
-def make_leaderboard(order: LeaderboardOptions, on_progress: OnProgress) -> Leaderboard:
+def make_leaderboard(options: LeaderboardOptions, on_progress: OnProgress) -> Leaderboard:
     """Evaluate the missing views; write leaderboard.md, leaderboard.csv, pairs.csv and a chart.
 
     Raises:
         TrilightError: the dataset, a network or a folder of pictures is unusable, the folder's rows
             are of another dataset, or no view could be evaluated.
     """
-    with _open_board(order) as (board, opened, most_triangles):
+    with _open_board(options) as (board, opened, most_triangles):
         judge_all(board, on_progress)
-        return _write_leaderboard(order, opened, board, most_triangles)
+        return _write_leaderboard(options, opened, board, most_triangles)
 
 
-def check_leaderboard(order: LeaderboardOptions) -> None:
+def check_leaderboard(options: LeaderboardOptions) -> None:
     """Raise TrilightError for wrong options or pictures of a leaderboard that is made later."""
-    with _open_board(order):
+    with _open_board(options):
         pass
 
 
 @contextlib.contextmanager
 def _open_board(
-    order: LeaderboardOptions,
+    options: LeaderboardOptions,
 ) -> Iterator[tuple[Board, TrainingData, dict[str, int]]]:
     """Yield board, dataset, and the most triangles that each network was trained on."""
-    opened = open_training_data([order.source])
-    shards = opened.split(order.split)
+    opened = open_training_data([options.source])
+    shards = opened.split(options.split)
     if opened.num_views is None:
         raise TrilightError(
             f"{opened.display_name} is a list of shards; expected a dataset with its manifest."
@@ -109,18 +109,18 @@ def _open_board(
     board = Board(
         shards=shards,
         set_digest=opened.digest,
-        keys=first_keys(shards, order.scenes),
+        keys=first_keys(shards, options.scenes),
         num_views=opened.num_views,
-        timed_scenes=order.timed_scenes,
+        timed_scenes=options.timed_scenes,
         machine=processor() or "an unnamed processor",
-        widths=widths_of(order.width, stored_resolution(shards)),
-        lpips=load_lpips(order.lpips),
-        folder=order.out,
+        widths=widths_of(options.width, stored_resolution(shards)),
+        lpips=load_lpips(options.lpips),
+        folder=options.out,
     )
-    _add_folders(board, order.pictures)
-    _add_nearest(board, order, opened)
+    _add_folders(board, options.pictures)
+    _add_nearest(board, options, opened)
     with contextlib.closing(RenderChild(choose_variant(), threads=1)) as child:
-        yield board, opened, _add_renderers(board, order.checkpoint, child)
+        yield board, opened, _add_renderers(board, options.checkpoint, child)
 
 
 def widths_of(requested: Sequence[int], stored: int) -> list[int]:
@@ -144,15 +144,15 @@ def _add_folders(board: Board, folders: Sequence[Path]) -> None:
         )
 
 
-def _add_nearest(board: Board, order: LeaderboardOptions, opened: TrainingData) -> None:
+def _add_nearest(board: Board, options: LeaderboardOptions, opened: TrainingData) -> None:
     """Add the lookup among pictures of the training split, or of the other scenes.
 
     There is none if the only scene to look up is the only evaluated one.
     """
-    pool = open_training_data(order.train_data) if order.train_data else opened
+    pool = open_training_data(options.train_data) if options.train_data else opened
     trained = "train" in pool.splits
-    split = "train" if trained else order.split
-    if order.train_data and not trained:
+    split = "train" if trained else options.split
+    if options.train_data and not trained:
         raise TrilightError(
             f"--train-data {pool.display_name}: it has no training split; expected one. Leave it "
             "out to look up the other scenes of the set."
@@ -219,12 +219,12 @@ def _names(places: Sequence[str]) -> list[str]:
 
 
 def _write_leaderboard(
-    order: LeaderboardOptions,
+    options: LeaderboardOptions,
     opened: TrainingData,
     board: Board,
     most_triangles: dict[str, int],
 ) -> Leaderboard:
-    rival = _names(order.checkpoint or BUILTIN_NETWORKS[:1])[0]
+    rival = _names(options.checkpoint or BUILTIN_NETWORKS[:1])[0]
     standings = [standings_of(board, width, rival) for width in board.widths]
     tables = tuple(one for one in standings if one is not None)
     if not tables:
@@ -232,19 +232,19 @@ def _write_leaderboard(
         raise TrilightError(f"leaderboard: no scene could be rendered by all entries ({why}).")
     about = {
         "set": f"{opened.build or 'a set of unknown build'}, digest {opened.digest[:12]}",
-        "split": order.split,
+        "split": options.split,
         "scenes": str(len(board.keys)),
         "processor": board.machine,
     }
     every_note = [*board.notes, *_notes(board, tables), *_beyond(most_triangles, tables)]
     notes = tuple(dict.fromkeys(every_note))
     page = leaderboard_page(about, tables, notes, rival)
-    write_atomically(order.out / "leaderboard.md", page.encode())
-    write_atomically(order.out / "leaderboard.csv", standings_csv(tables, board.machine))
-    write_atomically(order.out / "pairs.csv", pairs_csv(tables))
+    write_atomically(options.out / "leaderboard.md", page.encode())
+    write_atomically(options.out / "leaderboard.csv", standings_csv(tables, board.machine))
+    write_atomically(options.out / "pairs.csv", pairs_csv(tables))
     title = f"{opened.build or 'leaderboard'}: what core-seconds buy"
-    plot_leaderboard(tables, title, order.out / "leaderboard.png")
-    return Leaderboard(widths=tables, notes=notes, rival=rival, out=order.out)
+    plot_leaderboard(tables, title, options.out / "leaderboard.png")
+    return Leaderboard(widths=tables, notes=notes, rival=rival, out=options.out)
 
 
 def _notes(board: Board, tables: Sequence[WidthStandings]) -> Iterator[str]:

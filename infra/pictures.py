@@ -28,14 +28,14 @@ from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.preview import preview
 from pipeline.assets.settings import AssetSettings
 from pipeline.executors.threads import ThreadRunner
-from pipeline.foreign.load import load_mesh
+from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset
+from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import NoiseTargets
-from pipeline.renders.variant import choose_variant
 from storage.conventions import preview_gain, preview_srgb8
 from storage.dataset.dataset import open_dataset
 from storage.metrics import psnr_log_db
@@ -248,7 +248,7 @@ class Pictures:
         self, name: str, changes: Mapping[str, Any], build: str = "tiny"
     ) -> Iterator[Sample]:
         """Make one of the datasets, unless it is there, and yield its training scenes."""
-        order = GenerateOptions(
+        options = GenerateOptions(
             build=build,
             objects=str(self._objects),
             out=str(self._data / name),
@@ -257,7 +257,7 @@ class Pictures:
             licence="CC0-1.0",
             changes=changes,
         )
-        make_dataset(order, ThreadRunner())
+        make_dataset(options, ThreadRunner())
         yield from open_dataset(str(self._data / name)).samples("train")
 
     def _meshes(self, scene: Scene) -> tuple[TriangleMesh, TriangleMesh]:

@@ -96,20 +96,20 @@ class Prediction:
 
 
 def measure_scenes(
-    order: GenerateOptions, count: int, place: Path, scene_done: Callable[[], None]
+    options: GenerateOptions, count: int, place: Path, scene_done: Callable[[], None]
 ) -> MeasuredScenes:
     """Make the first scenes of a dataset in another folder.
 
     Args:
-        order: options of the dataset, whose folder is not touched.
+        options: options of the dataset, whose folder is not touched.
         place: empty folder, which may be deleted afterwards.
 
     Raises:
         TrilightError: as `prepare_dataset`.
     """
     # prepared at its full size, so that a lack of objects is reported now and not by `generate`
-    scenes = max(count, _num_scenes(order))
-    run = prepare_dataset(dataclasses.replace(order, out=str(place), scenes=scenes))
+    scenes = max(count, _num_scenes(options))
+    run = prepare_dataset(dataclasses.replace(options, out=str(place), scenes=scenes))
     job = run.job(1)
     splits = run.settings.splits
     core_s = []
@@ -129,7 +129,7 @@ def measure_scenes(
 
 
 def predict_cost(
-    measured: MeasuredScenes, order: GenerateOptions, *, cores: int, usd_per_core_hour: float
+    measured: MeasuredScenes, options: GenerateOptions, *, cores: int, usd_per_core_hour: float
 ) -> Prediction:
     """Return the predicted cost of the whole dataset from the means of measured scenes.
 
@@ -137,8 +137,8 @@ def predict_cost(
     it is left out if there are others. Means are resampled 2000 times (Efron's bootstrap), which is
     too narrow for very few scenes and cannot predict costs that none of them shows.
     """
-    splits = _settings(order).splits
-    num_scenes = planned_scenes(_num_scenes(order), splits)
+    splits = _settings(options).splits
+    num_scenes = planned_scenes(_num_scenes(options), splits)
     num_shards = shards_for(num_scenes, splits)
     core_hours = _total(measured.core_s[1:] or measured.core_s, num_scenes / 3600)
     scene_s = core_hours.value * 3600 / num_scenes / available_cores()
@@ -161,15 +161,15 @@ def predict_cost(
     return dataclasses.replace(prediction, notes=tuple(_notes(prediction)))
 
 
-def describe_run(order: GenerateOptions, folder: DatasetFolder) -> str:
+def describe_run(options: GenerateOptions, folder: DatasetFolder) -> str:
     """Return a line on the scenes that a run will make, and its time by earlier scenes.
 
     It is empty if files or another dataset define the scenes.
     """
-    settings = _settings(order)
-    if order.scenes_from or order.revisits or settings.revisit:
+    settings = _settings(options)
+    if options.scenes_from or options.revisits or settings.revisit:
         return ""
-    scenes = _num_scenes(order)
+    scenes = _num_scenes(options)
     remaining = scenes
     core_s: list[float] = []
     size = ""
@@ -186,7 +186,7 @@ def describe_run(order: GenerateOptions, folder: DatasetFolder) -> str:
     shards = shards_for(scenes, settings.splits)
     lacking = lacks_validation(scenes, settings.splits)
     lacking = f" ({lacking})" if lacking else ""
-    part = f", of which this run makes {order.shards}" if order.shards else ""
+    part = f", of which this run makes {options.shards}" if options.shards else ""
     views = f"{settings.scenes.num_views} views each"
     counts = f"{_count_text(scenes, 'scene')} of {views} in {_count_text(shards, 'shard')}"
     return f"{counts}{lacking}{part}{size}; {_expected_time(settings, remaining, core_s)}"
@@ -227,16 +227,16 @@ def _notes(prediction: Prediction) -> Iterator[str]:
         )
 
 
-def _num_scenes(order: GenerateOptions) -> int:
-    return DATASET_PRESETS[order.build].num_scenes if order.scenes is None else order.scenes
+def _num_scenes(options: GenerateOptions) -> int:
+    return DATASET_PRESETS[options.build].num_scenes if options.scenes is None else options.scenes
 
 
-def _settings(order: GenerateOptions) -> DatasetSettings:
+def _settings(options: GenerateOptions) -> DatasetSettings:
     return preset_settings(
-        order.build,
-        resolution=order.resolution,
-        noise_targets=order.noise_targets,
-        changes=order.changes,
+        options.build,
+        resolution=options.resolution,
+        noise_targets=options.noise_targets,
+        changes=options.changes,
     )
 
 

@@ -58,7 +58,7 @@ def repair(
     command = read_asked(opened) or ()
     revisits = _revisit_source(opened, command)
     maps = _user_maps(opened, command)
-    order = GenerateOptions(
+    options = GenerateOptions(
         build=manifest.build,
         objects=None if scenes_from or revisits else objects,
         out=str(root),
@@ -76,7 +76,7 @@ def repair(
     for name in bad_shards:
         if (root / name).exists():
             (root / name).replace(root / f"{name}{ASIDE}")
-    outcome = make_dataset(order, ThreadRunner())
+    outcome = make_dataset(options, ThreadRunner())
     if outcome.digest != manifest.dataset_digest:
         raise TrilightError(
             f"{root}: the shards were made again, but the dataset digest is {outcome.digest}; "

@@ -1,4 +1,4 @@
-"""Base widths of the maximal update parametrization. Imports no torch.
+"""Base widths of the maximal update parametrization (muP). Imports no torch.
 
 Learning rates and initial weights are stated at these widths; at other widths they follow the rules
 of model.width_scales. With a width of 0 they are the same at every width, as in the paper's recipe.

@@ -1,4 +1,4 @@
-"""Pictures of scenes by a trained network.
+"""Inference: pictures of scenes by a trained network.
 
 renderer = NeuralRenderer.load("runs/smoke/model.safetensors")
 picture = renderer.render(read_scene_file("scene.safetensors"), resolution=512)

@@ -1,4 +1,4 @@
-"""Loads a network from any source, without pickle.
+"""Loads a pretrained network from any source, without pickle.
 
 ours, shipped      builtin:hits (builtin: or default for short), builtin:tokens
 our own            model.safetensors of `trilight train`, or the folder that holds one

@@ -1,4 +1,4 @@
-"""Precision of the network's matrix products, chosen at run time and not stored in checkpoints.
+"""Mixed precision of the network's matrix products, chosen at run time, absent from checkpoints.
 
 The layers of both stages and the head may be rounded. Always float32 are positions and rotary
 angles with their sines, the rotation itself, ray directions and their layer, normals and their

@@ -1,4 +1,4 @@
-"""`Replayed`: a function of tensors that a GPU repeats as one recorded graph.
+"""`Replayed`: a function of tensors that a GPU repeats as one recorded CUDA graph.
 
 A view of `hits` is four thousand small kernels; submitting them one by one takes longer than they.
 """

@@ -1,4 +1,4 @@
-"""Rounding of all weights of a layer in one kernel, for training in reduced precision.
+"""Rounding of a layer's weights in one kernel, for training in mixed precision (bfloat16).
 
 Autocast rounds every matrix in a separate kernel, and its gradient in another one: hundreds of
 launches with little work. Here a layer's weights are rounded together. Every number is exactly that

@@ -1,4 +1,4 @@
-"""View-independent stage: light transport between triangles, once per scene.
+"""View-independent stage (encoder): light transport between triangles, once per scene.
 
 Every triangle is one token: the sum of a learned vector, its material and its normals. Its position
 enters only through rotary encodings. Registers are at the mean of all vertices.

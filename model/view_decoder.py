@@ -1,4 +1,4 @@
-"""View stage: ray bundles of a camera attend to the tokens of the scene.
+"""View stage (decoder): ray bundles of a camera attend to the tokens of the scene.
 
 It runs in camera space: rotating the keys transforms the context to each camera's space, and the
 bundles are at the origin. The scene's tokens themselves are the same for every view.

@@ -1,4 +1,4 @@
-"""Maximal update parametrization: scaling of rates and initial weights with the width.
+"""Maximal update parametrization (muP): scaling of rates and initial weights with the width.
 
 One learning rate is best at every width if a step changes the output of each layer by an equal
 fraction at every width (Yang et al. 2021). For a matrix from n inputs to m outputs this needs

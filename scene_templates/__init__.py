@@ -1,1 +1,1 @@
-"""Layouts of scenes, drawn from a generator without meshes, rendering or files."""
+"""Scene layouts (templates), drawn from a generator without meshes, rendering or files."""

@@ -1,4 +1,4 @@
-"""Functions of numbers that give the same bytes on every processor.
+"""Deterministic functions of numbers: the same bytes on every processor.
 
 IEEE arithmetic rounds + - * / and square roots the same everywhere, while libraries compute sin,
 exp and powers by whatever the processor offers, and the last bit differs. Maps are known by the

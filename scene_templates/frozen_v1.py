@@ -5,12 +5,12 @@ that networks are compared on may not. Test: tests/pipeline/presets/test_frozen_
 layouts that are named here are frozen with it; another `plane` is registered under another name.
 """
 
-from scene_templates.cameras import CameraSettings
 from scene_templates.families import Family
-from scene_templates.lights import LightSettings
-from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom
+from scene_templates.sample_camera import CameraSettings
+from scene_templates.sample_emitters import LightSettings
+from scene_templates.sample_material import MaterialSettings
 from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.skies.draw import SkyMapSettings
 from scene_templates.skies.settings import SkySettings

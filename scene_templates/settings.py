@@ -13,12 +13,12 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import pydantic
 
-from scene_templates.cameras import CameraSettings
 from scene_templates.checks import OFFSET, require
 from scene_templates.families import Family
-from scene_templates.lights import LightSettings
-from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
+from scene_templates.sample_camera import CameraSettings
+from scene_templates.sample_emitters import LightSettings
+from scene_templates.sample_material import MaterialSettings
 from scene_templates.skies.settings import SkySettings
 from scene_templates.textures import TextureSettings
 from storage.settings.described import checked

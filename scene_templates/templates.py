@@ -1,4 +1,4 @@
-"""Layouts as data: which walls they have, and from where they are seen and lit.
+"""Layout templates as data: which walls they have, and from where they are seen and lit.
 
 `sample_layout` in the file of that name draws one.
 """
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scene_templates.cameras import CameraSettings, Sector, sample_camera
 from scene_templates.checks import require
 from scene_templates.layout import CameraPose
 from scene_templates.rooms import PATCH_FACES, SIDES
+from scene_templates.sample_camera import CameraSettings, Sector, sample_camera
 from storage.registry import Registry
 
 

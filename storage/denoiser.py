@@ -1,4 +1,4 @@
-"""Open Image Denoise with clean auxiliary pictures, one filter per thread.
+"""Denoising by Open Image Denoise (OIDN) with clean auxiliary pictures, one filter per thread.
 
 The denoiser is deterministic for any number of threads (tested). `high` and `balanced` are not the
 same here: with clean auxiliary pictures `high` is 1.6 dB better on sampled scenes (study S4).

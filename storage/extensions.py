@@ -1,4 +1,4 @@
-"""Files of a user's own that add to Trilight: loaded once in a process, and known by their bytes.
+"""Extensions (plugins), files of a user: loaded once in a process, and known by their bytes.
 
 `--extend FILE.py` and `FILE.py:FUNCTION` name such files on a command line; nothing else may.
 Processes that are started from there load the same files, since the variable TRILIGHT_EXTEND names

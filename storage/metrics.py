@@ -1,4 +1,4 @@
-"""Distances between two pictures: the only definitions.
+"""Image metrics (PSNR and others) of two pictures: the only definitions.
 
 Values in dB never stand alone: report the median, the 5th percentile and the share over a target.
 """

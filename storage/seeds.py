@@ -1,4 +1,4 @@
-"""Randomness by name: every draw depends on its purpose, never on earlier draws.
+"""Random seeds by name: every draw depends on its purpose, never on earlier draws.
 
 A stage asks for the generator of (seed, purpose, index, attempt, ...). Scene 7 is therefore the
 same scene whether it is made first, last, alone, or on another machine. Seed 0 is an ordinary seed.

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from pipeline.renders.variant import llvm_libraries
+from pipeline.renders.mitsuba_variant import llvm_libraries
 
 # No test asserts a time: a crowded machine must not fail what is right.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])

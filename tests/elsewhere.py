@@ -53,19 +53,19 @@ CHOSEN = (
     "tests/pipeline/objects/builtin/test_builtin.py",
     "tests/pipeline/renders/test_stored_pictures.py",
     "tests/pipeline/scenes/test_compose.py",
-    "tests/pipeline/scenes/test_shapes.py",
-    "tests/scene_templates/skies/test_families.py",
-    "tests/scene_templates/surfaces/test_families.py",
+    "tests/pipeline/scenes/test_mesh_collision.py",
+    "tests/scene_templates/skies/test_procedural_skies.py",
+    "tests/scene_templates/surfaces/test_procedural_textures.py",
     "tests/storage/test_metrics.py",
     "tests/storage/dataset/test_shard.py",
     "tests/train/data/test_augment.py",
     "tests/train/data/test_loader.py",
-    "tests/train/evaluation/test_judge.py",
-    "tests/train/loop/test_optim.py",
+    "tests/train/evaluation/test_validation.py",
+    "tests/train/loop/test_optimizer.py",
     "tests/train/loop/test_step.py",
-    "tests/train/loss/test_objective.py",
+    "tests/train/loss/test_training_loss.py",
     "tests/train/loop/test_processes.py",
-    "tests/train/test_run.py",
+    "tests/train/test_run_training.py",
 )
 """Where bytes, digests, stored numbers and close tolerances are compared, cheaply."""
 
@@ -74,7 +74,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Have Dr.Jit compile for the other processor, once Mitsuba is there; see that numpy obeys."""
     import numpy as np
 
-    from pipeline.renders import variant as variants
+    from pipeline.renders import mitsuba_variant as variants
 
     found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", ())
     left = set(found) & set(PROCESSORS[os.environ[ASKED]]["NPY_DISABLE_CPU_FEATURES"].split())

@@ -31,7 +31,7 @@ from train.loop.checkpoints import (
 from train.loop.distributed import DistributedContext
 from train.loop.muon import choose_muon_precision
 from train.loop.recorder import MetricsLog
-from train.loop.state import TrainState, new_state
+from train.loop.train_state import TrainState, new_state
 from train.monitoring.rows import read_rows
 from train.progress import TrainProgress
 from train.result import pretty_json

@@ -8,11 +8,11 @@ from model.renderformer import count_parameters
 from model.weights import TrainedRange, encode_weights
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData
-from train.evaluation.judge import Judge
 from train.evaluation.metrics import Lead
 from train.evaluation.sheet import draw_validation_sheet, write_picture
+from train.evaluation.validation import Judge
 from train.folder import RunFolder
-from train.loop.state import TrainState
+from train.loop.train_state import TrainState
 from train.monitoring.rows import read_rows
 from train.resume import Event
 from train.settings import TrainSettings
@@ -38,7 +38,7 @@ class TrainResult:
     loss_at_end: float
     """The same over the last twentieth."""
     scores: dict[str, float] | None
-    """The network on the validation split (evaluation.judge); None where the data has none."""
+    """The network on the validation split (evaluation.validation); None where the data has none."""
     median_scores: dict[str, float] | None
     """The median picture of the training views on the same split."""
     lead: Lead | None

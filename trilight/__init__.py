@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from infra.judging import write_judgement as write_judgement
     from model.neural_renderer import NeuralRenderer as NeuralRenderer
     from pipeline.generation.generate_options import GenerateOptions as GenerateOptions
-    from pipeline.generation.run import Outcome as Outcome
+    from pipeline.generation.generation_run import Outcome as Outcome
     from pipeline.renders.results import RenderedView as RenderedView
     from storage.conventions import preview_srgb8 as preview_srgb8
     from storage.dataset.dataset import Dataset as Dataset

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from pipeline.generation.generate_options import GenerateOptions
 
 if TYPE_CHECKING:
-    from pipeline.generation.run import Outcome
+    from pipeline.generation.generation_run import Outcome
 
 
 def generate(options: GenerateOptions) -> "Outcome":

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from pipeline.executors.threads import ThreadRunner as ThreadRunner
     from pipeline.generation.generate_options import GenerateOptions as GenerateOptions
     from pipeline.generation.generate_options import generate_words as generate_words
+    from pipeline.generation.generation_run import Outcome as Outcome
     from pipeline.generation.pipeline import make_dataset as make_dataset
     from pipeline.generation.pipeline import prepare_dataset as prepare_dataset
-    from pipeline.generation.run import Outcome as Outcome
     from pipeline.generation.runner import Runner as Runner
     from pipeline.objects.listing import Listing as Listing
     from pipeline.objects.ply import encode_ply as encode_ply
@@ -39,20 +39,20 @@ if TYPE_CHECKING:
     from pipeline.presets.settings import DatasetPreset as DatasetPreset
     from pipeline.presets.settings import DatasetSettings as DatasetSettings
     from pipeline.renders.settings import RenderSettings as RenderSettings
-    from scene_templates.cameras import Sector as Sector
     from scene_templates.families import FAMILIES as FAMILIES
     from scene_templates.families import Family as Family
-    from scene_templates.lights import LightSettings as LightSettings
     from scene_templates.rooms import SharedRoom as SharedRoom
+    from scene_templates.sample_camera import Sector as Sector
+    from scene_templates.sample_emitters import LightSettings as LightSettings
     from scene_templates.separate_sides import SeparateSides as SeparateSides
     from scene_templates.separate_sides import SideRanges as SideRanges
     from scene_templates.settings import SceneSettings as SceneSettings
     from scene_templates.skies.draws import SkyDraws as SkyDraws
-    from scene_templates.skies.families import SKIES as SKIES
+    from scene_templates.skies.procedural_skies import SKIES as SKIES
     from scene_templates.skies.texels import SkyTexels as SkyTexels
     from scene_templates.surfaces.draws import SurfaceDraws as SurfaceDraws
-    from scene_templates.surfaces.families import SURFACES as SURFACES
     from scene_templates.surfaces.maps import Finish as Finish
+    from scene_templates.surfaces.procedural_textures import SURFACES as SURFACES
     from scene_templates.surfaces.texels import Texels as Texels
     from scene_templates.templates import TEMPLATES as TEMPLATES
     from scene_templates.templates import Template as Template

@@ -86,9 +86,9 @@ def _train_alone(
     device: str | None,
     **options: Any,
 ) -> "TrainResult":
-    """Run `train.run.train_run` in this process as the only rank."""
+    """Run `train.run_training.train_run` in this process as the only rank."""
     from train.loop.distributed import DistributedContext, choose_device
-    from train.run import train_run
+    from train.run_training import train_run
 
     data = [os.fspath(root) for root in roots]
     dist_context = DistributedContext(device=choose_device(device))

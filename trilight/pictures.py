@@ -109,7 +109,7 @@ def render_views(
             and errors.
     """
     from infra.render.path_tracer import PathTracer, RenderChild
-    from pipeline.renders.variant import choose_variant
+    from pipeline.renders.mitsuba_variant import choose_variant
 
     rows = range(scene.num_views) if views is None else views
     cameras = [own_camera(scene, row, named="view") for row in rows]

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from infra.bench.experiments.calibration import use_of
-from infra.bench.run import ROOT
+from infra.bench.run_benchmark import ROOT
 from infra.bench.store import Store
 from infra.bench.workloads.fitted_statement import (
     ALLOWED,

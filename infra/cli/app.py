@@ -1,4 +1,4 @@
-"""Entry point of the command `trilight`: handles mistakes, missing memory and Ctrl-C."""
+"""Entry point of the command line `trilight`: handles mistakes, missing memory and Ctrl-C."""
 
 import logging
 import os

@@ -41,7 +41,7 @@ _COLUMNS = 8
 def bench(run_options: BenchRunOptions, options: BenchOptions) -> None:
     try:
         from infra.bench.experiment import FULL, QUICK, experiment_of
-        from infra.bench.run import results_path, run
+        from infra.bench.run_benchmark import results_path, run
         from infra.bench.store import Store
     except ModuleNotFoundError as error:
         if ".bench" not in (error.name or ""):

@@ -1,4 +1,4 @@
-"""Table of the commands; the module of a command is imported when the command runs."""
+"""Subcommands of `trilight`; the module of a command is imported when the command runs."""
 
 import sys
 from collections.abc import Collection

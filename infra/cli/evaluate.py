@@ -15,15 +15,15 @@ from train.evaluation.options import EvaluationOptions
 
 
 @command("checkpoint")
-def evaluate(order: EvaluationOptions, output: OutputOptions) -> None:
+def evaluate(options: EvaluationOptions, output: OutputOptions) -> None:
     record: dict[str, Any] = {}
-    board = order.leaderboard()
-    if order.checkpoint:
+    board = options.leaderboard()
+    if options.checkpoint:
         if board:
             from infra.leaderboard import check_leaderboard
 
             check_leaderboard(board)  # the evaluation before it may take hours
-        record, out = _judge_network(order, order.checkpoint, silent=output.json)
+        record, out = _judge_network(options, options.checkpoint, silent=output.json)
         board = board and dataclasses.replace(board, out=out)
     if board:
         standings = judge_methods(board, silent=output.json)
@@ -33,10 +33,10 @@ def evaluate(order: EvaluationOptions, output: OutputOptions) -> None:
 
 
 def _judge_network(
-    order: EvaluationOptions, checkpoint: str, *, silent: bool
+    options: EvaluationOptions, checkpoint: str, *, silent: bool
 ) -> tuple[dict[str, Any], Path]:
     """Evaluate a network, and print the figures unless `silent`; return figures and folder."""
-    first_words(f"Judging {checkpoint} on the split {order.split}", silent=silent)
+    first_words(f"Judging {checkpoint} on the split {options.split}", silent=silent)
     require_torch("evaluate")
     from infra.judging import judge_network, write_judgement
 
@@ -44,19 +44,19 @@ def _judge_network(
         task = bars.add_task("scenes", total=None, note="", visible=not silent)
         judgement = judge_network(
             checkpoint,
-            data=order.data,
-            split=order.split,
-            train_data=order.train_data or None,
-            resolution=order.resolution,
-            most_scenes=order.most_scenes,
-            tracer_views=order.tracer_views,
-            lpips=order.lpips,
-            device=order.device,
+            data=options.data,
+            split=options.split,
+            train_data=options.train_data or None,
+            resolution=options.resolution,
+            most_scenes=options.most_scenes,
+            tracer_views=options.tracer_views,
+            lpips=options.lpips,
+            device=options.device,
             done=lambda now, total: bars.update(task, completed=now, total=total),
         )
     first_words("Drawing the sheets", silent=silent)
     record = judgement.record
-    out = write_judgement(judgement, order.report_folder)
+    out = write_judgement(judgement, options.report_folder)
     if not silent:
         _report(record, out)
     return {name: record[name] for name in ("about", "contestants", "path tracer")}, out

@@ -28,7 +28,7 @@ from storage.records.objects import count_by_reason, read_failures, read_objects
 from storage.settings.described import checked
 
 if TYPE_CHECKING:
-    from pipeline.generation.run import Outcome
+    from pipeline.generation.generation_run import Outcome
 
 _POLL_S = 0.5
 _MAX_NOTES = 20
@@ -52,26 +52,26 @@ class ExecutorOptions:
 
 @command("build")
 def generate(
-    order: GenerateOptions, base: BaseSettings, runner: ExecutorOptions, output: OutputOptions
+    options: GenerateOptions, base: BaseSettings, runner: ExecutorOptions, output: OutputOptions
 ) -> None:
-    make(with_base_settings(order, base), runner, output)
+    make(with_base_settings(options, base), runner, output)
 
 
-def make(order: GenerateOptions, runner: ExecutorOptions, output: OutputOptions) -> None:
+def make(options: GenerateOptions, runner: ExecutorOptions, output: OutputOptions) -> None:
     """Make a dataset and print the result; raises TrilightError."""
-    folder = dataset_folder(order.place)
+    folder = dataset_folder(options.place)
     started = time.monotonic()
-    first_words(f"Making {folder.display_name} with the preset {order.build}", silent=output.json)
-    executor = find_executor(runner.runner, runner.address, order.workers)
+    first_words(f"Making {folder.display_name} with the preset {options.build}", silent=output.json)
+    executor = find_executor(runner.runner, runner.address, options.workers)
     from infra.planning import describe_run  # slow: every stage
-    from pipeline.generation.run import choose_dataset_variant
+    from pipeline.generation.generation_run import choose_dataset_variant
 
-    if not output.json and (text := describe_run(order, folder)):
+    if not output.json and (text := describe_run(options, folder)):
         first_words(text)
-    if (text := choose_dataset_variant(order, folder).note) and not output.json:
+    if (text := choose_dataset_variant(options, folder).note) and not output.json:
         note(f"{text}; see trilight doctor")
     with show_progress(folder, silent=output.json):
-        outcome = executor.make(order, runner.address)
+        outcome = executor.make(options, runner.address)
     report(folder, outcome, time.monotonic() - started, as_json=output.json)
 
 

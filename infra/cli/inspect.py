@@ -132,9 +132,9 @@ def _write(
     folder: DatasetFolder,
     options: InspectOptions,
 ) -> None:
+    from pipeline.documents.checksums import renew_sums
     from pipeline.documents.report import write_report
     from pipeline.documents.sheets import write_contact_sheet, write_template_sheet
-    from pipeline.documents.sums import renew_sums
 
     write_contact_sheet(opened, statistics, max_scenes=options.scenes, out=folder)
     write_report(opened, distributions, out=folder)

@@ -18,22 +18,22 @@ from train.evaluation.options import LeaderboardOptions
 
 
 @command("source")
-def leaderboard(order: LeaderboardOptions, output: OutputOptions) -> None:
-    record = judge_methods(order, silent=output.json)
+def leaderboard(options: LeaderboardOptions, output: OutputOptions) -> None:
+    record = judge_methods(options, silent=output.json)
     if output.json:
         print_json(record)
 
 
-def judge_methods(order: LeaderboardOptions, *, silent: bool) -> dict[str, Any]:
+def judge_methods(options: LeaderboardOptions, *, silent: bool) -> dict[str, Any]:
     """Make a leaderboard and print it unless `silent`; return it as JSON values."""
-    first_words(f"Judging on {safe_url(order.source)}, into {order.out}", silent=silent)
+    first_words(f"Judging on {safe_url(options.source)}, into {options.out}", silent=silent)
     require_torch("leaderboard")
     from infra.leaderboard import make_leaderboard
 
     with progress_bars() as bars:
         task = bars.add_task("scenes", total=None, note="", visible=not silent)
         board = make_leaderboard(
-            order,
+            options,
             lambda now, total, what: bars.update(task, completed=now, total=total, note=what),
         )
     if not silent:

@@ -61,7 +61,7 @@ def parse_overrides(texts: Iterable[str]) -> dict[str, Any]:
     return changes
 
 
-def with_base_settings(order: Options, base: BaseSettings) -> Options:
+def with_base_settings(options: Options, base: BaseSettings) -> Options:
     """Return dataset options whose `changes` hold all differences from the preset.
 
     Raises:
@@ -70,14 +70,14 @@ def with_base_settings(order: Options, base: BaseSettings) -> Options:
     """
     from pipeline.presets.registry import option_overrides, preset_settings  # train does without
 
-    options = option_overrides(order.seed, order.resolution, order.noise_targets)
-    stated = {**options, **order.changes}
-    changes = merge_overrides(preset_settings(order.build), base, _dataset_record(base), stated)
+    from_options = option_overrides(options.seed, options.resolution, options.noise_targets)
+    stated = {**from_options, **options.changes}
+    changes = merge_overrides(preset_settings(options.build), base, _dataset_record(base), stated)
     if not base.is_given:
-        return order
+        return options
     if _LICENCES in changes:  # the option adds licences to those of any source of settings
-        changes[_LICENCES] = sorted({*changes[_LICENCES], *order.allow_licences})
-    return dataclasses.replace(order, changes=changes)
+        changes[_LICENCES] = sorted({*changes[_LICENCES], *options.allow_licences})
+    return dataclasses.replace(options, changes=changes)
 
 
 def merge_overrides(

@@ -39,28 +39,28 @@ class PlanOptions:
 
 @command("build")
 def plan(
-    order: GenerateOptions,
+    options: GenerateOptions,
     base: BaseSettings,
-    options: PlanOptions,
+    plan_options: PlanOptions,
     core: CorePrice,
     output: OutputOptions,
 ) -> None:
-    if (order.scenes_from, order.revisits, order.shards) != (None,) * 3:
+    if (options.scenes_from, options.revisits, options.shards) != (None,) * 3:
         raise TrilightError(
             "plan: --scenes-from, --revisits or --shards was given; expected none of them, since a "
             "whole dataset of new scenes is predicted."
         )
-    order = with_base_settings(order, base)
-    build = order.build
-    samples = options.samples
-    cores = options.cores
+    options = with_base_settings(options, base)
+    build = options.build
+    samples = plan_options.samples
+    cores = plan_options.cores
     first_words(f"Measuring {samples} scenes of {build}", silent=output.json)
     from infra.planning import measure_scenes, predict_cost  # slow: every stage
 
     with progress_bars() as bars, temporary_folder("trilight-plan-") as place:
         task = bars.add_task("scenes", total=samples, note="", visible=not output.json)
-        measured = measure_scenes(order, samples, place, lambda: bars.advance(task))
-    prediction = predict_cost(measured, order, cores=cores, usd_per_core_hour=core.price)
+        measured = measure_scenes(options, samples, place, lambda: bars.advance(task))
+    prediction = predict_cost(measured, options, cores=cores, usd_per_core_hour=core.price)
     title = f"{build}, {prediction.num_scenes} scenes, predicted from {samples} (90 % intervals)"
     record = dataclasses.asdict(prediction)
     print_result(title, _rows(prediction, cores), record, as_json=output.json)
@@ -68,7 +68,7 @@ def plan(
         return
     for text in prediction.notes:
         note(text)
-    next_step((*generate_words(order), "--out", _free(order.place)))
+    next_step((*generate_words(options), "--out", _free(options.place)))
 
 
 def _rows(prediction: "Prediction", cores: int) -> list[tuple[str, str]]:

@@ -24,8 +24,8 @@ class PushOptions:
 @command("folder", "repository")
 def push(options: PushOptions, output: OutputOptions) -> None:
     first_words(f"Looking through {options.folder}", silent=output.json)
-    from infra.release.push import planned_upload
-    from infra.release.push import push as upload_all
+    from infra.release.push_to_hub import planned_upload
+    from infra.release.push_to_hub import push as upload_all
 
     upload = planned_upload(options.folder, options.repository)
     facts: dict[str, str | int] = {

@@ -15,7 +15,7 @@ from storage.renderer import Image, Sampling
 def render(options: RenderOptions, output: OutputOptions) -> None:
     from infra.cli.rendered import print_outcome
     from infra.render.plan import plan_render
-    from infra.render.run import run_plan
+    from infra.render.run_render import run_plan
     from pipeline.exchange.reader import SceneReader
 
     started = time.monotonic()

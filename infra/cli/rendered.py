@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from infra.cli.console import console, note, print_json, print_rows
-from infra.render.look import enlargement
 from infra.render.networks import NetworkRenderer
 from infra.render.path_tracer import PathTracer
 from infra.render.plan import RenderPlan
-from infra.render.run import FinishedShot, RenderResult
+from infra.render.run_render import FinishedShot, RenderResult
+from infra.render.tone_mapping import enlargement
 from pipeline.renders.calibrated_error import OUTSIDE, promise_sentence
 from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.settings import RenderSettings

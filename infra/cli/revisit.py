@@ -10,5 +10,5 @@ from pipeline.generation.revisit_options import RevisitOptions, to_generate_opti
 @command("dataset")
 def revisit(options: RevisitOptions, runner: ExecutorOptions, output: OutputOptions) -> None:
     first_words(f"Reading {options.dataset}", silent=output.json)
-    order = with_base_settings(to_generate_options(options), BaseSettings(like=options.dataset))
-    make(order, runner, output)
+    made = with_base_settings(to_generate_options(options), BaseSettings(like=options.dataset))
+    make(made, runner, output)

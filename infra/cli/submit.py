@@ -101,90 +101,90 @@ class SlurmOptions:
 def submit(
     submission: SubmitOptions,
     runs: FlowRunOptions,
-    order: GenerateOptions,
+    options: GenerateOptions,
     base: BaseSettings,
     output: OutputOptions,
 ) -> None:
-    _submit_flow(submission.flow, order, base, runs, output)
+    _submit_flow(submission.flow, options, base, runs, output)
 
 
 @app.command(name=SLURM, help="Submit the missing shards to Slurm, as an array of tasks.")
 @command("build")
 def submit_to_slurm(
-    order: GenerateOptions,
+    options: GenerateOptions,
     base: BaseSettings,
     array: ArrayOptions,
     batch: SlurmOptions,
     output: OutputOptions,
 ) -> None:
-    order = with_base_settings(order, base)
-    submit_to_array(order, array, batch, as_json=output.json)
+    options = with_base_settings(options, base)
+    submit_to_array(options, array, batch, as_json=output.json)
 
 
 @app.command(name=KUBERNETES, help="Submit the missing shards to Kubernetes, as an indexed job.")
 @command("build")
 def submit_to_kubernetes(
-    order: GenerateOptions,
+    options: GenerateOptions,
     base: BaseSettings,
     array: ArrayOptions,
     machines: KubernetesOptions,
     output: OutputOptions,
 ) -> None:
-    order = with_base_settings(order, base)
-    submit_to_array(order, array, machines, as_json=output.json)
+    options = with_base_settings(options, base)
+    submit_to_array(options, array, machines, as_json=output.json)
 
 
 @app.command(name=BY_ARRAY, help="Have a Prefect worker submit the missing shards as an array.")
 @command("build")
 def submit_by_array(
-    order: DatasetByArray, base: BaseSettings, runs: FlowRunOptions, output: OutputOptions
+    options: DatasetByArray, base: BaseSettings, runs: FlowRunOptions, output: OutputOptions
 ) -> None:
-    _submit_flow(BY_ARRAY, order, base, runs, output)
+    _submit_flow(BY_ARRAY, options, base, runs, output)
 
 
 def _submit_flow(
     flow: str,
-    order: GenerateOptions,
+    options: GenerateOptions,
     base: BaseSettings,
     runs: FlowRunOptions,
     output: OutputOptions,
 ) -> None:
     """Submit a flow run and report it; once it has ended, name the next commands."""
-    first_words(f"Submitting {flow} with the preset {order.build}", silent=output.json)
+    first_words(f"Submitting {flow} with the preset {options.build}", silent=output.json)
     load_prefect()
     from pipeline.flows.submission import parameters
 
-    values = parameters(with_base_settings(order, base))
-    ended = run_flow(flow, values, runs, where=order.place, as_json=output.json)
-    if ended and not output.json and Path(order.place).is_dir():
-        next_step(["verify", order.place], ["inspect", order.place])
+    values = parameters(with_base_settings(options, base))
+    ended = run_flow(flow, values, runs, where=options.place, as_json=output.json)
+    if ended and not output.json and Path(options.place).is_dir():
+        next_step(["verify", options.place], ["inspect", options.place])
 
 
 def submit_to_array(
-    order: GenerateOptions,
+    options: GenerateOptions,
     array: ArrayOptions,
-    options: SlurmOptions | KubernetesOptions,
+    scheduler: SlurmOptions | KubernetesOptions,
     *,
     as_json: bool,
 ) -> None:
     """Submit the missing shards of a dataset and print the job; raises TrilightError."""
-    on = SLURM if isinstance(options, SlurmOptions) else KUBERNETES
-    first_words(f"Looking for what is missing of {order.place}", silent=as_json)
-    job = array_job(order, per_task=array.shards_per_task, at_once=array.at_once, on=on)
+    on = SLURM if isinstance(scheduler, SlurmOptions) else KUBERNETES
+    first_words(f"Looking for what is missing of {options.place}", silent=as_json)
+    job = array_job(options, per_task=array.shards_per_task, at_once=array.at_once, on=on)
     if not job.tasks:
         if as_json:
             print_json({"job": None, "array": "", "shards_per_task": None})
             return
-        print_rows("Nothing is missing", [("dataset", order.place)])
-        next_step(["verify", order.place])
+        print_rows("Nothing is missing", [("dataset", options.place)])
+        next_step(["verify", options.place])
         return
     numbers = number_ranges(job.tasks)
     record: dict[str, Any] = {"array": numbers, "shards_per_task": job.per_task}
-    if isinstance(options, SlurmOptions):
-        name = None if array.dry_run else submit_slurm_array(job, options.sbatch)
-        line = _slurm_line(job, options.sbatch)
+    if isinstance(scheduler, SlurmOptions):
+        name = None if array.dry_run else submit_slurm_array(job, scheduler.sbatch)
+        line = _slurm_line(job, scheduler.sbatch)
     else:
-        manifest = (write_job_file if array.dry_run else submit_job)(job, options)
+        manifest = (write_job_file if array.dry_run else submit_job)(job, scheduler)
         name = manifest.parent.name
         words = create_command(manifest)
         line = shlex.join(words)
@@ -199,7 +199,7 @@ def submit_to_array(
         console.print(line, soft_wrap=True)
         return
     note("the same command submits again what is missing then, once no task is left in the queue")
-    next_step(["status", order.place])
+    next_step(["status", options.place])
 
 
 def _slurm_line(job: ArrayJob, options: Sequence[str]) -> str:

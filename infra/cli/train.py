@@ -100,53 +100,55 @@ def _end(text: str, status: int) -> NoReturn:
 
 @command("run")
 def train(
-    order: TrainOptions, watched: WatchSettings, base: BaseSettings, output: OutputOptions
+    options: TrainOptions, watched: WatchSettings, base: BaseSettings, output: OutputOptions
 ) -> None:
     if base.is_given:
-        changes = merge_overrides(training_preset(order.run), base, run_record(base), order.changes)
-        order = dataclasses.replace(order, changes=changes)
-    settings = order.settings()  # without torch, so that mistakes are named at once
-    if order.processes > 1:
-        _launch(order, watched, output)
+        changes = merge_overrides(
+            training_preset(options.run), base, run_record(base), options.changes
+        )
+        options = dataclasses.replace(options, changes=changes)
+    settings = options.settings()  # without torch, so that mistakes are named at once
+    if options.processes > 1:
+        _launch(options, watched, output)
     if os.environ.get("RANK", "0") == "0" and not output.json:
-        _announce(order, settings)
-    result = _run_training(order, settings, watched, quiet=output.json)
+        _announce(options, settings)
+    result = _run_training(options, settings, watched, quiet=output.json)
     if result is None:
         return
     if output.json:
         sys.stdout.write(result.folder.summary.read_text())
     else:
-        _report(result, order.data)
+        _report(result, options.data)
 
 
-def _launch(order: TrainOptions, watched: WatchSettings, output: OutputOptions) -> NoReturn:
+def _launch(options: TrainOptions, watched: WatchSettings, output: OutputOptions) -> NoReturn:
     """Become torchrun, which starts this command once for each process."""
     if "RANK" in os.environ:
         raise TrilightError(
-            f"--processes is {order.processes} under torchrun, which sets their number; omit it."
+            f"--processes is {options.processes} under torchrun, which sets their number; omit it."
         )
-    words = [*order.command(), *option_words(watched), *option_words(output)]
+    words = [*options.command(), *option_words(watched), *option_words(output)]
     os.execve(words[0], words, child_environment())
 
 
 def _run_training(
-    order: TrainOptions, settings: TrainSettings, watched: WatchSettings, *, quiet: bool
+    options: TrainOptions, settings: TrainSettings, watched: WatchSettings, *, quiet: bool
 ) -> "TrainResult | None":
-    """Train by `train.run.train_run`; imports torch, which takes seconds."""
+    """Train by `train.run_training.train_run`; imports torch, which takes seconds."""
     require_torch("train")
     from train.loop.distributed import join_processes
     from train.loop.interrupts import Stopped
-    from train.run import train_run
+    from train.run_training import train_run
 
-    with join_processes(order.device) as crew, progress_bars() as bars:
+    with join_processes(options.device) as crew, progress_bars() as bars:
         progress = _QuietProgress() if quiet else _BarProgress(bars)
         try:
             return train_run(
                 settings,
-                data=list(order.data),
-                out=Path(order.place),
-                start=order.start(),
-                workers=order.workers,
+                data=list(options.data),
+                out=Path(options.place),
+                start=options.start(),
+                workers=options.workers,
                 watched=watched,
                 dist_context=crew,
                 progress=progress,
@@ -155,18 +157,18 @@ def _run_training(
             if crew.world_size > 1:  # torchrun's own arguments are not known here
                 raise
             typed = [part for part in sys.argv[1:] if part != "--resume"]
-            resume = [] if order.restartable else ["--resume"]
+            resume = [] if options.restartable else ["--resume"]
             command = shlex.join(["trilight", *typed, *resume])
             raise Stopped(stopped.step, command) from stopped
 
 
-def _announce(order: TrainOptions, settings: TrainSettings) -> None:
+def _announce(options: TrainOptions, settings: TrainSettings) -> None:
     """Print the start or the continuation of a run, before torch is imported."""
-    if order.start().continues_run:  # how, the checkpoint says
+    if options.start().continues_run:  # how, the checkpoint says
         console.print(f"Run {settings.run} goes on. Loading torch and the checkpoint ...")
         return
-    if (steps := order.steps) is not None:
-        shorter = scale_intervals(training_preset(order.run), steps, order.changes)
+    if (steps := options.steps) is not None:
+        shorter = scale_intervals(training_preset(options.run), steps, options.changes)
         if shorter:
             text = ", ".join(f"{name}={value}" for name, value in shorter.items())
             console.print(f"In proportion to {steps} steps: {text}")

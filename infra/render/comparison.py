@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from infra.render.look import Look, display_pixels, enlarge
+from infra.render.tone_mapping import Look, display_pixels, enlarge
 from pipeline.exchange.formats import FORMATS, SceneSource
 from storage.conventions import log10_radiance
 from storage.metrics import flicker_log_db, psnr_log_db

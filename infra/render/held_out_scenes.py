@@ -8,13 +8,13 @@ import dataclasses
 from pathlib import Path
 
 from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
-from pipeline.generation.environment import environment
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
+from pipeline.generation.software_environment import environment
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.settings import DatasetSettings
 from pipeline.presets.training import smoke
-from pipeline.renders.variant import Variant, choose_variant
+from pipeline.renders.mitsuba_variant import Variant, choose_variant
 from scene_templates.settings import SceneSettings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.splits import JUDGED_SPLIT

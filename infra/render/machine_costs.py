@@ -26,9 +26,9 @@ from infra.render.preview_table import (
     machine_name,
 )
 from pipeline.objects.generated import BENCHMARK
+from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.preview import timed_parts
 from pipeline.renders.renderer import set_threads
-from pipeline.renders.variant import choose_variant
 from storage.machine import available_cores
 from storage.records.scene import Scene
 from storage.renderer import Camera

@@ -1,4 +1,4 @@
-"""Networks and traced light without a network, which render in this process."""
+"""Inference by networks, and traced light without a network, in this process."""
 
 import functools
 import time

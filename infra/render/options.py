@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from infra.render.look import ToneMap
 from infra.render.quality import (
     MOST_TRACED_SPP,
     ErrorBudget,
@@ -12,6 +11,7 @@ from infra.render.quality import (
     TimeBudget,
     ToStatedError,
 )
+from infra.render.tone_mapping import ToneMap
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.renders.preview import MOST_SPP, usual_filter
 from pipeline.renders.settings import (

@@ -14,13 +14,13 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 from infra.render.quality import FixedSamples, ToStatedError
-from pipeline.generation.environment import environment
+from pipeline.generation.software_environment import environment
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
+from pipeline.renders.mitsuba_variant import Variant, activate
 from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings, ProgressiveRenderer
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import GrowingPicture, RenderedView
 from pipeline.renders.settings import FIRST_SPP, RenderSettings
-from pipeline.renders.variant import Variant, activate
 from storage.errors import Rejected, Unrenderable
 from storage.machine import available_cores
 from storage.records.material import PUBLISHED_COLUMNS, unread_columns

@@ -12,7 +12,7 @@ from storage.atomic import write_atomically
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.exr import read_header
-from storage.records.layers import decode_picture, encode_picture
+from storage.records.exr_layers import decode_picture, encode_picture
 from storage.records.lights import rounded_to_half
 from storage.records.safe_read import read_plain
 from storage.renderer import Camera, Fact, Facts, Image, Renderer

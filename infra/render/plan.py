@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from infra.render.budget import Choice, choose, price_all
-from infra.render.look import Look
 from infra.render.networks import NetworkRenderer
 from infra.render.options import EngineChoice, RenderOptions
 from infra.render.output_paths import OutputPaths, output_paths
@@ -15,10 +14,11 @@ from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.preview_table import known_costs, shipped_table
 from infra.render.quality import Budget, FixedSamples, Traced
 from infra.render.sources import camera_path, orbit, own_camera, pair_cameras, scene_sources
+from infra.render.tone_mapping import Look
 from infra.torch_library import require_torch
 from pipeline.exchange.open_scene import SceneSource, scene_source
 from pipeline.exchange.reader import SceneReader
-from pipeline.renders.variant import choose_variant
+from pipeline.renders.mitsuba_variant import choose_variant
 from storage.errors import TrilightError
 from storage.machine import available_cores
 from storage.renderer import Camera, Renderer

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from infra.processor import processor
+from pipeline.renders.mitsuba_variant import Variant
 from pipeline.renders.preview import MOST_SPP
 from pipeline.renders.settings import Filtered, Resolution
-from pipeline.renders.variant import Variant
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.digests import canonical_json

@@ -1,4 +1,4 @@
-"""Raw references without denoising, and the true errors of pictures against them.
+"""Reference pictures (ground truth) without denoising, and the true errors of pictures.
 
 A reference is two independent halves of raw samples, A and B. For smaller pictures, blocks of its
 pixels are averaged, which adds their samples. The squared error of a picture P is the mean of

@@ -1,4 +1,4 @@
-"""Flow `train-model`: a training run as a process, or as several by torchrun.
+"""Prefect flow `train-model`: a training run as a process, or as several by torchrun.
 
 It is in `infra`, which may import both `pipeline` and `train`: the form has every setting of
 `train.settings`, and wrong settings are refused before the training process exists, without torch.
@@ -38,16 +38,16 @@ TRAIN_FORMS: Mapping[str, Any] = {
 """Types of parameters that are narrower in the form than on the command line."""
 
 
-def train_order(parameters: Mapping[str, Any]) -> TrainOptions:
+def train_options(parameters: Mapping[str, Any]) -> TrainOptions:
     """Return the training options of the flow's parameters.
 
     Raises:
         TrilightError: a value that no schema can refuse, such as one that contradicts another
             setting; the message names it.
     """
-    order = options_of_form(parameters, TrainOptions)
-    order.settings()
-    return order
+    options = options_of_form(parameters, TrainOptions)
+    options.settings()
+    return options
 
 
 def _run_name() -> str:
@@ -65,15 +65,15 @@ def train_model(**parameters: Any) -> None:
 
     Prefect waits for half a minute then; `resume` goes on from there.
     """
-    order = train_order(parameters)
+    options = train_options(parameters)
     log = get_run_logger()
     cards = len(visible_gpus())
     limit = (
-        concurrency(GPU_LIMIT, occupy=min(order.processes, cards), strict=False)
+        concurrency(GPU_LIMIT, occupy=min(options.processes, cards), strict=False)
         if cards
         else contextlib.nullcontext()
     )
     with limit:
-        status, last = run_to_end(order.command(), lambda line: log.info("%s", line))
+        status, last = run_to_end(options.command(), lambda line: log.info("%s", line))
     if status:
-        raise TrilightError(f"train {order.run} ended with status {status}: {last}")
+        raise TrilightError(f"train {options.run} ended with status {status}: {last}")

@@ -40,9 +40,9 @@ from infra.render.raw_references import (
 )
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK
+from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.preview import SCENE, all_parts, timed_parts
 from pipeline.renders.settings import Filtered
-from pipeline.renders.variant import choose_variant
 from storage.atomic import write_atomically
 from storage.conventions import log10_radiance
 from storage.errors import Rejected

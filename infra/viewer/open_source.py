@@ -10,7 +10,7 @@ from infra.viewer.scene_handlers import handlers_of_scene
 from infra.viewer.scene_list import scene_list
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
-from pipeline.renders.variant import choose_variant
+from pipeline.renders.mitsuba_variant import choose_variant
 from storage.dataset.dataset import open_dataset
 
 

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.render.look import ToneMap, tone_mapped
 from infra.render.path_tracer import RenderChild
+from infra.render.tone_mapping import ToneMap, tone_mapped
 from infra.viewer.page_renderers import PageRenderer, PassImage, StoredPictures, page_renderers
 from infra.viewer.picture_options import parse_edits, parse_picture_options, short_digest
 from infra.viewer.render_queue import RenderJob, RenderQueue, agreement_db

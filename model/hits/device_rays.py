@@ -1,4 +1,4 @@
-"""Rays that a GPU traces: a tree of boxes, built by torch, and a kernel that walks through it.
+"""Ray tracing on a GPU: a tree of boxes (BVH) by torch, and a kernel that walks through it.
 
 A node has four children: its triangles are halved twice, each time where the surface of the halves'
 boxes, weighed by their triangles, is least (binned, Wald 2007). Whether a ray meets a triangle is

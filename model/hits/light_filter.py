@@ -1,4 +1,4 @@
-"""Mirrored light of many pixels, mixed: a filter whose weights are learned, never the light itself.
+"""Denoising of mirrored light: a filter whose weights are learned, never the light itself.
 
 One ray of a pixel says what its glossy surface shows, with much noise. Pixels that see like things
 may share what their rays found: each level mixes three by three pixels, as far apart as the level

@@ -1,4 +1,4 @@
-"""Light that triangles receive: direct, and by diffuse bounces between all of them.
+"""Radiosity: direct light of triangles, and diffuse bounces between all of them.
 
 One number a side of a triangle, which a scene's tokens and gathering rays read.
 """

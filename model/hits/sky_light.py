@@ -1,4 +1,4 @@
-"""Direct light from the sky at points: rays drawn by its map and rays drawn by the surface.
+"""Direct light from the sky at points: rays drawn by its map and by the surface (MIS).
 
 A smooth sky is found by directions that lie around the normal, a sun by those that its map draws,
 and what a glossy surface mirrors by rays that its lobe draws. Each direction counts by the density

@@ -10,7 +10,7 @@ from pipeline.assets.attempt import AssetAttempt
 from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalize
 from pipeline.assets.cleaning.guards import check_clean, check_raw
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.decimation.by_name import decimate, safe_method
+from pipeline.assets.decimation.decimate import decimate, safe_method
 from pipeline.assets.decimation.smallest import smallest_passing
 from pipeline.assets.quality.level_checks import check_level, require_watertight
 from pipeline.assets.quality.measure import MeasuredSource
@@ -19,7 +19,7 @@ from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.source_materials.skin import add_source_materials
 from pipeline.assets.watertight import LevelBase, make_watertight
-from pipeline.foreign.load import load_mesh
+from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected

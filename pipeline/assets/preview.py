@@ -10,7 +10,7 @@ from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.outside_rays import first_faces
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.source_materials.nearest import barycentric
-from pipeline.foreign.load import load_mesh
+from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
 from storage.conventions import srgb8

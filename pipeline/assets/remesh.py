@@ -3,7 +3,7 @@
 import numpy as np
 
 from pipeline.assets.cleaning.clean import clean, normalize
-from pipeline.assets.decimation.by_name import decimate, safe_method
+from pipeline.assets.decimation.decimate import decimate, safe_method
 from pipeline.assets.recipe import methods_of
 from pipeline.assets.settings import Profile
 from pipeline.foreign.mesh import TriangleMesh

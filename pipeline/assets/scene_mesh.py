@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipeline.assets.cleaning.guards import check_raw
 from pipeline.assets.remesh import remesh
 from pipeline.assets.settings import AssetSettings
-from pipeline.foreign.load import load_mesh
+from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected

@@ -8,10 +8,10 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.assets.asset_store import AssetStore
 from pipeline.assets.attempt import AssetAttempt
 from pipeline.assets.recipe import library_versions, methods_of
 from pipeline.assets.settings import AssetSettings
-from pipeline.assets.store import AssetStore
 from pipeline.foreign.source_file import needs_child, read_source
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
 from storage.digests import sha256_hex

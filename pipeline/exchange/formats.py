@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange import renderformer_h5, renderformer_json
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
-from pipeline.exchange.gltf import write as gltf
-from pipeline.exchange.gltf.read import read_gltf
+from pipeline.exchange.gltf import write_gltf as gltf
+from pipeline.exchange.gltf.read_gltf import read_gltf
 from pipeline.exchange.loaded_scene import LoadedScene as LoadedScene
 from pipeline.exchange.loaded_scene import Pictures as Pictures
 from pipeline.exchange.renderformer_cells import textured_triangles
@@ -32,9 +32,9 @@ from pipeline.exchange.renderformer_h5 import (
 )
 from pipeline.exchange.renderformer_json import describe_scene
 from pipeline.exchange.scene_files import build_scene, read_scene_cameras, read_scene_description
-from pipeline.exchange.usd import write as usd
-from pipeline.exchange.usd.read import read_usd, usd_keys
-from pipeline.exchange.usd.write import write_usd, write_usd_shard
+from pipeline.exchange.usd import write_usd as usd
+from pipeline.exchange.usd.read_usd import read_usd, usd_keys
+from pipeline.exchange.usd.write_usd import write_usd, write_usd_shard
 from pipeline.objects.licences import USER_PROVIDED
 from storage.atomic import write_atomically
 from storage.dataset.shard import iterate_samples, read_members

@@ -11,7 +11,7 @@ from pipeline.assets.remesh import remesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.posing import without_slivers
-from pipeline.scenes.shading import ShadedMesh, face_normals, flat_shaded, smooth_shaded
+from pipeline.scenes.shading_normals import ShadedMesh, face_normals, flat_shaded, smooth_shaded
 from storage.errors import Rejected, TrilightError
 from storage.records.retextured import without_maps
 from storage.records.scene import Scene

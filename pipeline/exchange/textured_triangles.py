@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.cameras import fit_camera
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
-from pipeline.scenes.shading import ShadedMesh, flat_shaded
+from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import (

@@ -52,7 +52,7 @@ class DatasetByArray(GenerateOptions):
 class ArrayJob:
     """One submission of an array."""
 
-    order: GenerateOptions
+    options: GenerateOptions
     """Options of the dataset, with its number of scenes."""
     tasks: Sequence[int]
     """Numbers of the tasks with missing shards; empty if nothing is missing."""
@@ -63,12 +63,12 @@ class ArrayJob:
 
 
 def array_job(
-    order: GenerateOptions, *, per_task: int | None, at_once: int | None, on: str = "slurm"
+    options: GenerateOptions, *, per_task: int | None, at_once: int | None, on: str = "slurm"
 ) -> ArrayJob:
     """Return the array that makes the missing shards of a dataset, which need not exist yet.
 
     Args:
-        order: options of the dataset.
+        options: options of the dataset.
         per_task: shards of a task; by default as few as MOST_TASKS tasks allow.
         at_once: most tasks that run at the same time.
         on: name of the scheduler, for messages.
@@ -77,22 +77,26 @@ def array_job(
         TrilightError: the options name scene files, a range of shards or a password, the dataset
             cannot be read, or the array would have too many tasks.
     """
-    if order.scenes_from or order.revisits or order.shards:
+    if options.scenes_from or options.revisits or options.shards:
         raise TrilightError(
             f"submit {on}: expected no --scenes-from, --revisits or --shards: the array divides "
             "scenes that are composed. Start such a dataset by trilight generate on each machine."
         )
-    if order.objects and safe_url(order.objects) != order.objects and "://" in order.objects:
+    if (
+        options.objects
+        and safe_url(options.objects) != options.objects
+        and "://" in options.objects
+    ):
         raise TrilightError(
-            f"submit {on}: --objects {safe_url(order.objects)} holds a password, which every user "
-            "of the cluster could read in the queue; expected env:TRILIGHT_SOURCE_NAME, with the "
-            "address in that variable of the tasks."
+            f"submit {on}: --objects {safe_url(options.objects)} holds a password, which every "
+            "user of the cluster could read in the queue; expected env:TRILIGHT_SOURCE_NAME, with "
+            "the address in that variable of the tasks."
         )
-    scenes = order.scenes or DATASET_PRESETS.find(order.build).num_scenes
-    splits = apply_overrides(preset_settings(order.build), order.changes).splits
+    scenes = options.scenes or DATASET_PRESETS.find(options.build).num_scenes
+    splits = apply_overrides(preset_settings(options.build), options.changes).splits
     planned = shards_for(scenes, splits)
-    is_begun = _is_begun(order.place)
-    missing = missing_shards(order.place, scenes) if is_begun else list(range(planned))
+    is_begun = _is_begun(options.place)
+    missing = missing_shards(options.place, scenes) if is_begun else list(range(planned))
     each = per_task or -(-planned // MAX_TASKS)
     tasks = sorted({shard // each for shard in missing})
     if tasks and tasks[-1] >= MAX_TASKS:
@@ -101,8 +105,8 @@ def array_job(
             f"most {MAX_TASKS - 1}, which schedulers allow by default. {-(-planned // MAX_TASKS)}"
             " shards a task fit."
         )
-    order = dataclasses.replace(order, scenes=scenes, out=order.place, workers=None)
-    return ArrayJob(order=order, tasks=tasks, per_task=each, at_once=at_once)
+    options = dataclasses.replace(options, scenes=scenes, out=options.place, workers=None)
+    return ArrayJob(options=options, tasks=tasks, per_task=each, at_once=at_once)
 
 
 def _is_begun(location: str) -> bool:

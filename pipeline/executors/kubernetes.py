@@ -13,7 +13,7 @@ from collections.abc import Mapping
 
 from pipeline.executors.threads import make_part, number, variable
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.run import Outcome
+from pipeline.generation.generation_run import Outcome
 from storage.errors import TrilightError
 from storage.number_ranges import MOST_NUMBERS, numbers_of
 
@@ -21,13 +21,13 @@ PLACE = "JOB_COMPLETION_INDEX"
 """Variable with the index of a task in the Job, from 0."""
 
 
-def make(order: GenerateOptions, address: str | None) -> Outcome:
+def make(options: GenerateOptions, address: str | None) -> Outcome:
     """Make the shards of this task.
 
     Raises:
         TrilightError: this is no task of an indexed Job, or as `make_part`.
     """
-    return make_part(order, "kubernetes", lambda: shards_of_place(os.environ))
+    return make_part(options, "kubernetes", lambda: shards_of_place(os.environ))
 
 
 def shards_of_place(environment: Mapping[str, str]) -> str:

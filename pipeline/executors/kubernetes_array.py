@@ -125,8 +125,8 @@ def job_manifest(job: ArrayJob, options: KubernetesOptions) -> dict[str, Any]:
     Raises:
         TrilightError: a task would need a file of this machine, or there is no image.
     """
-    _require_bucket_alone(job.order)
-    words = ["trilight", *generate_words(job.order), "--out", job.order.place]
+    _require_bucket_alone(job.options)
+    words = ["trilight", *generate_words(job.options), "--out", job.options.place]
     words += ["--runner", "kubernetes"]
     environment = {
         "SHARDS_PER_TASK": str(job.per_task),
@@ -218,24 +218,26 @@ def _image(options: KubernetesOptions) -> str:
     return image
 
 
-def _require_bucket_alone(order: GenerateOptions) -> None:
+def _require_bucket_alone(options: GenerateOptions) -> None:
     """Raise TrilightError if a task would need a file of this machine."""
-    if order.place.partition("://")[0] not in WRITABLE:
+    if options.place.partition("://")[0] not in WRITABLE:
         raise TrilightError(
-            f"submit kubernetes: --out is {order.place}; expected a bucket such as "
+            f"submit kubernetes: --out is {options.place}; expected a bucket such as "
             "s3://bucket/folder: the machines share nothing else."
         )
     for option, value in (
-        ("--objects", order.objects), ("--textures", order.textures), ("--skies", order.skies),
-    ):  # fmt: skip
+        ("--objects", options.objects),
+        ("--textures", options.textures),
+        ("--skies", options.skies),
+    ):
         if value is not None and (":" not in value or value.startswith("file:")):
             raise TrilightError(
                 f"submit kubernetes: {option} is {value}, a folder of this machine; expected a URL "
                 "or a named source, which every machine can read. Bring it to a bucket."
             )
-    if is_reference(order.build):
+    if is_reference(options.build):
         raise TrilightError(
-            f"submit kubernetes: the preset is {order.build}, a file of this machine; expected a "
+            f"submit kubernetes: the preset is {options.build}, a file of this machine; expected a "
             "name. Put the file into an image of your own, with TRILIGHT_EXTEND, and name its "
             "preset."
         )

@@ -16,7 +16,7 @@ from storage.installation import module_name
 from storage.registry import Registry
 
 if TYPE_CHECKING:
-    from pipeline.generation.run import Outcome
+    from pipeline.generation.generation_run import Outcome
 
 Make = Callable[[GenerateOptions, str | None], "Outcome"]
 
@@ -39,8 +39,8 @@ def _load_on_use(module: str) -> Make:
     The import loads every stage, and for some executors packages that may not be installed.
     """
 
-    def make(order: GenerateOptions, address: str | None) -> "Outcome":
-        outcome: Outcome = import_module(module_name(module)).make(order, address)
+    def make(options: GenerateOptions, address: str | None) -> "Outcome":
+        outcome: Outcome = import_module(module_name(module)).make(options, address)
         return outcome
 
     return make

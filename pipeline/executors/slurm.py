@@ -11,13 +11,13 @@ from collections.abc import Callable, Mapping
 
 from pipeline.executors.threads import make_part, number
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generation_run import Outcome
 from pipeline.generation.pipeline import prepare_dataset
-from pipeline.generation.run import Outcome
 from pipeline.generation.tasks import shard_ranges
 from storage.errors import TrilightError
 
 
-def make(order: GenerateOptions, address: str | None) -> Outcome:
+def make(options: GenerateOptions, address: str | None) -> Outcome:
     """Make the shards of this array task.
 
     Raises:
@@ -25,9 +25,9 @@ def make(order: GenerateOptions, address: str | None) -> Outcome:
     """
 
     def shards() -> str:
-        return shards_of_task(os.environ, lambda: prepare_dataset(order).publication.num_shards)
+        return shards_of_task(os.environ, lambda: prepare_dataset(options).publication.num_shards)
 
-    return make_part(order, "slurm", shards)
+    return make_part(options, "slurm", shards)
 
 
 def shards_of_task(environment: Mapping[str, str], num_shards: Callable[[], int]) -> str:

@@ -27,19 +27,19 @@ def sbatch_command(job: ArrayJob, options: Sequence[str] = ()) -> list[str]:
     """
     limit = f"%{job.at_once}" if job.at_once else ""
     array = f"--array={number_ranges(job.tasks)}{limit}"
-    words = _without(generate_words(job.order)[2:], _OF_THE_SCRIPT)
+    words = _without(generate_words(job.options)[2:], _OF_THE_SCRIPT)
     return ["sbatch", "--parsable", array, *options, str(SCRIPT), *words]
 
 
 def sbatch_environment(job: ArrayJob) -> Mapping[str, str]:
     """Return the environment variables that the script reads."""
     return {
-        "OUT": job.order.place,
-        "BUILD": job.order.build,
-        "SCENES": str(job.order.scenes),
+        "OUT": job.options.place,
+        "BUILD": job.options.build,
+        "SCENES": str(job.options.scenes),
         "SHARDS_PER_TASK": str(job.per_task),
         "TRILIGHT": str(Path(sys.executable).with_name("trilight")),
-        "OBJECTS": job.order.objects or "",  # also overrides a variable of this shell
+        "OBJECTS": job.options.objects or "",  # also overrides a variable of this shell
     }
 
 

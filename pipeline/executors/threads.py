@@ -9,35 +9,35 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generation_run import Outcome, ShardJob, TaskResult
 from pipeline.generation.pipeline import make_dataset, make_task
-from pipeline.generation.run import Outcome, ShardJob, TaskResult
 from pipeline.generation.runner import Runner
 from pipeline.generation.tasks import Piece
 from storage.errors import TrilightError
 
 
-def make(order: GenerateOptions, address: str | None) -> Outcome:
+def make(options: GenerateOptions, address: str | None) -> Outcome:
     """Make a dataset here; raises as `make_dataset`."""
-    return make_dataset(order, ThreadRunner())
+    return make_dataset(options, ThreadRunner())
 
 
-def make_part(order: GenerateOptions, runner: str, shards: Callable[[], str]) -> Outcome:
+def make_part(options: GenerateOptions, runner: str, shards: Callable[[], str]) -> Outcome:
     """Make the shards of one task of an array.
 
     Args:
-        order: options of the dataset.
+        options: options of the dataset.
         runner: name of the executor, for messages.
         shards: returns the range A:B of this task.
 
     Raises:
         TrilightError: the options have a range of shards; as `shards`, or as `make_dataset`.
     """
-    if order.shards is not None:
+    if options.shards is not None:
         raise TrilightError(
-            f"--shards is {order.shards}; expected none with --runner {runner}: the task's place "
+            f"--shards is {options.shards}; expected none with --runner {runner}: the task's place "
             "in the array says which shards are made. Omit one of the two."
         )
-    return make_dataset(dataclasses.replace(order, shards=shards()), ThreadRunner())
+    return make_dataset(dataclasses.replace(options, shards=shards()), ThreadRunner())
 
 
 def variable(environment: Mapping[str, str], name: str, runner: str) -> str:

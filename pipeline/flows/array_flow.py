@@ -1,4 +1,4 @@
-"""The flow `make-by-array`: submits a dataset to a scheduler's array and shows its progress.
+"""Prefect flow `make-by-array`: submits a dataset to a scheduler's array and shows its progress.
 
 Slurm or Kubernetes runs the tasks. The worker of this flow runs on a machine where `trilight submit
 slurm` works; it renders nothing, reads the same files as `trilight status`, and may be killed:
@@ -33,16 +33,18 @@ def make_by_array(**parameters: Any) -> None:
 
     Start it again when no task is left in the queue: it submits what is still missing.
     """
-    order = options_of_form(parameters, DatasetByArray)
-    artifacts = ArrayArtifacts(order.place)
-    if order.scheduler != "none":
-        _submit(order)
-    artifacts.show_result(_watch_until_finished(order, artifacts))
+    options = options_of_form(parameters, DatasetByArray)
+    artifacts = ArrayArtifacts(options.place)
+    if options.scheduler != "none":
+        _submit(options)
+    artifacts.show_result(_watch_until_finished(options, artifacts))
 
 
-def _submit(order: DatasetByArray) -> None:
-    on = order.scheduler
-    job = array_job(order.dataset, per_task=order.shards_per_task, at_once=order.at_once, on=on)
+def _submit(options: DatasetByArray) -> None:
+    on = options.scheduler
+    job = array_job(
+        options.dataset, per_task=options.shards_per_task, at_once=options.at_once, on=on
+    )
     if job.tasks:
         name = (
             submit_slurm_array(job)
@@ -54,13 +56,13 @@ def _submit(order: DatasetByArray) -> None:
         )
 
 
-def _watch_until_finished(order: DatasetByArray, artifacts: "ArrayArtifacts") -> DatasetStatus:
+def _watch_until_finished(options: DatasetByArray, artifacts: "ArrayArtifacts") -> DatasetStatus:
     """Show a dataset until it is finished; raises TrilightError after too long without scenes."""
     before = None
     changed_s = time.monotonic()
     while True:
-        status = _status(order.place)
-        if status and status.finished and not missing_shards(order.place, order.scenes or 0):
+        status = _status(options.place)
+        if status and status.finished and not missing_shards(options.place, options.scenes or 0):
             return status  # a lost shard of a finished dataset is made again
         progress = (status.shards_done, status.scenes_done) if status else None
         if progress != before:
@@ -68,10 +70,10 @@ def _watch_until_finished(order: DatasetByArray, artifacts: "ArrayArtifacts") ->
             changed_s = time.monotonic()
         if status is not None:
             artifacts.show_status(status)
-        if time.monotonic() - changed_s > 3600 * order.quiet_hours:
+        if time.monotonic() - changed_s > 3600 * options.quiet_hours:
             done = f"{status.scenes_done} of {status.scenes_planned}" if status else "none"
             raise TrilightError(
-                f"{order.place}: no new scene for {order.quiet_hours:g} hours ({done} made); "
+                f"{options.place}: no new scene for {options.quiet_hours:g} hours ({done} made); "
                 "expected tasks at work. Look at the queue, and run the flow again: it submits "
                 "what is missing."
             )

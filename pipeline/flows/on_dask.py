@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 from pipeline.flows.on_prefect import as_flow
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generation_run import Outcome
 from pipeline.generation.render_children import close_idle_children
-from pipeline.generation.run import Outcome
 from storage.atomic import write_atomically
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
@@ -27,7 +27,7 @@ _AHEAD = 2
 """Tasks submitted for each thread of the cluster, so that none waits for the next one."""
 
 
-def make(order: GenerateOptions, address: str | None) -> Outcome:
+def make(options: GenerateOptions, address: str | None) -> Outcome:
     """Make a dataset with the workers of a Dask cluster, as a flow run of this process.
 
     Raises:
@@ -37,10 +37,10 @@ def make(order: GenerateOptions, address: str | None) -> Outcome:
     assert address is not None, "the executor needs one"
     quiet_prefect()
     with prefect_server():
-        return _make(order, address)
+        return _make(options, address)
 
 
-def _make(order: GenerateOptions, address: str) -> Outcome:
+def _make(options: GenerateOptions, address: str) -> Outcome:
     try:
         from prefect_dask import DaskTaskRunner
     except ImportError as error:
@@ -52,10 +52,10 @@ def _make(order: GenerateOptions, address: str) -> Outcome:
 
     with _client(address) as client:
         threads = _threads(client, address)
-        _require_shared(client, order)
+        _require_shared(client, options)
     runner = PrefectRunner(window=_AHEAD * sum(threads), num_at_once=max(threads))
     try:
-        return as_flow(order, runner, task_runner=DaskTaskRunner(address=address))
+        return as_flow(options, runner, task_runner=DaskTaskRunner(address=address))
     finally:
         # the workers outlive the run; where the cluster is gone, so are its children
         with contextlib.suppress(TrilightError, OSError), _client(address) as client:
@@ -88,9 +88,9 @@ def _threads(client: "Client", address: str) -> list[int]:
     return [int(worker["nthreads"]) for worker in workers.values()]
 
 
-def _require_shared(client: "Client", order: GenerateOptions) -> None:
+def _require_shared(client: "Client", options: GenerateOptions) -> None:
     """Raise if a worker of the cluster cannot see the output folder."""
-    folder = dataset_folder(order.place)
+    folder = dataset_folder(options.place)
     seen_by_all = folder.staging.resolve() / f"met-{uuid.uuid4().hex}"
     write_atomically(seen_by_all, b"")
     try:

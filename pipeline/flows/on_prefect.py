@@ -10,10 +10,10 @@ from pipeline.generation.generate_options import GenerateOptions
 
 if TYPE_CHECKING:
     from pipeline.flows.prefect_runner import PrefectRunner
-    from pipeline.generation.run import Outcome
+    from pipeline.generation.generation_run import Outcome
 
 
-def make(order: GenerateOptions, address: str | None) -> "Outcome":
+def make(options: GenerateOptions, address: str | None) -> "Outcome":
     """Make a dataset; raises as `make_dataset`, or if the private server does not start."""
     quiet_prefect()
     with prefect_server():
@@ -21,16 +21,16 @@ def make(order: GenerateOptions, address: str | None) -> "Outcome":
             PrefectRunner,  # late: Prefect reads its settings on import
         )
 
-        return as_flow(order, PrefectRunner())
+        return as_flow(options, PrefectRunner())
 
 
-def as_flow(order: GenerateOptions, runner: "PrefectRunner", **options: Any) -> "Outcome":
-    """Make a dataset as a flow run, with its artifacts; `options` are Prefect's of a flow."""
+def as_flow(options: GenerateOptions, runner: "PrefectRunner", **flow_options: Any) -> "Outcome":
+    """Make a dataset as a flow run, with its artifacts; `flow_options` are Prefect's."""
     from prefect import flow
 
     from pipeline.flows.run_artifacts import make_with_artifacts
 
     def generate() -> "Outcome":
-        return make_with_artifacts(order, runner)
+        return make_with_artifacts(options, runner)
 
-    return flow(name="generate-scenes", persist_result=False, **options)(generate)()
+    return flow(name="generate-scenes", persist_result=False, **flow_options)(generate)()

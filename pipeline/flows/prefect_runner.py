@@ -16,8 +16,8 @@ from prefect.futures import PrefectFuture, as_completed
 from prefect.tasks import Task, exponential_backoff
 
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
+from pipeline.generation.generation_run import ShardJob, TaskResult
 from pipeline.generation.pipeline import make_task
-from pipeline.generation.run import ShardJob, TaskResult
 from pipeline.generation.runner import Runner
 from pipeline.generation.tasks import Piece
 from storage.dataset.statistics import Statistics

@@ -25,9 +25,9 @@ from prefect.artifacts import (
 from prefect.logging import get_run_logger
 
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generation_run import Outcome, Run, TaskResult
 from pipeline.generation.pipeline import make_dataset
 from pipeline.generation.price import PRICES, USD_PER_CORE_HOUR
-from pipeline.generation.run import Outcome, Run, TaskResult
 from pipeline.generation.runner import Runner
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
@@ -40,13 +40,13 @@ _SHEET_PX = 1024
 """Longest side of the contact sheet on the page: about 100 kB."""
 
 
-def make_with_artifacts(order: GenerateOptions, runner: Runner) -> Outcome:
+def make_with_artifacts(options: GenerateOptions, runner: Runner) -> Outcome:
     """Make a dataset within a flow run and show its artifacts; the summary includes failures."""
     # one line per scene; PREFECT_LOGGING_EXTRA_LOGGERS=trilight brings it to the server
     logging.getLogger("trilight").setLevel(logging.INFO)
-    watched = RunArtifacts(order)
+    watched = RunArtifacts(options)
     try:
-        outcome = make_dataset(order, runner, watched.record_task)
+        outcome = make_dataset(options, runner, watched.record_task)
     except Exception as error:
         watched.show_failure(error)
         raise
@@ -106,7 +106,7 @@ class ArtifactPage:
 class RunArtifacts(ArtifactPage):
     """The artifacts of one flow run."""
 
-    def __init__(self, order: GenerateOptions) -> None:
+    def __init__(self, options: GenerateOptions) -> None:
         """Create the first artifact of a run.
 
         Raises:
@@ -118,7 +118,7 @@ class RunArtifacts(ArtifactPage):
         self._scenes = 0
         self._core_s = 0.0
         self._run: Run | None = None
-        super().__init__(order.place)
+        super().__init__(options.place)
 
     def record_task(self, run: Run, outcome: TaskResult) -> None:
         """Record a finished task, and show a new table if the last one is old."""

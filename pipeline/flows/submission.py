@@ -80,16 +80,16 @@ def server() -> Iterator[SyncPrefectClient]:
         yield client
 
 
-def parameters(order: Any) -> dict[str, Any]:
+def parameters(options: Any) -> dict[str, Any]:
     """Return the preset and all fields that are not defaults, in the layout of the flow's form.
 
     Args:
-        order: options of a class whose fields are the flow's parameters.
+        options: options of a class whose fields are the flow's parameters.
     """
-    kind: type = type(order)
+    kind: type = type(options)
     values: dict[str, Any] = {}
     for field in describe_fields(kind):
-        value = getattr(order, field.name)
+        value = getattr(options, field.name)
         if field.name == "build" or value not in (field.default, {}):
             values[field.name] = _nest_groups(value) if isinstance(value, Mapping) else value
     plain: dict[str, Any] = json.loads(json.dumps(values))

@@ -4,7 +4,7 @@ Native code parses some of the bytes, so only processes with limits import this
 (pipeline.isolation).
 
 - `source_file`, `limits`: one bounded read of a file and of those that it names.
-- `load`, `textured_mesh`: the triangles of an object with their materials; `part`: those of a
+- `load_mesh`, `textured_mesh`: the triangles of an object with their materials; `part`: those of a
   scene with one material; `polygons` cuts them.
 - `material`, `picture`: a material as its file states it, and its pictures.
 - `light_pictures`, `openexr`, `radiance_hdr`, `linear_picture`: pictures of floats.

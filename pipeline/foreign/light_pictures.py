@@ -1,4 +1,4 @@
-"""Pictures of floats, OpenEXR or Radiance, recognized by their first bytes."""
+"""HDR pictures (floats), OpenEXR or Radiance, recognized by their first bytes."""
 
 from pipeline.foreign import openexr, radiance_hdr
 from pipeline.foreign.linear_picture import LinearPicture

@@ -19,7 +19,7 @@ MOST_UV_SETS = 4
 """Maximum number of texture coordinate sets of a mesh that are read."""
 
 LEAST_ROUGHNESS = 0.01
-"""Least roughness, the same as that of sampled materials (scene_templates.materials)."""
+"""Least roughness, the same as that of sampled materials (scene_templates.sample_material)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

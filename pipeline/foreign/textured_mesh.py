@@ -1,4 +1,4 @@
-"""The triangles of a file with their materials, the same triangles as those of `load`."""
+"""The triangles of a file with their materials, the same triangles as those of `load_mesh`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -11,8 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.prepare_isolated import ChildPool
-from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, call_with_retries, reach
+from pipeline.isolation import (
+    ChildFailed,
+    ChildLimits,
+    ChildPool,
+    IsolatedChild,
+    call_with_retries,
+    reach,
+)
 from pipeline.objects.maps.listing import PLURALS, FoundMap, find_maps
 from pipeline.objects.maps.prepared import MapFiles, decode_prepared, map_cache_key, prepare_map
 from pipeline.presets.settings import DatasetSettings
@@ -57,7 +63,7 @@ class MapFolders:
 NO_FOLDERS = MapFolders()
 
 
-def map_folders(order: GenerateOptions, settings: DatasetSettings) -> MapFolders:
+def map_folders(options: GenerateOptions, settings: DatasetSettings) -> MapFolders:
     """Return the folders of textures and maps that the options name.
 
     Raises:
@@ -66,8 +72,8 @@ def map_folders(order: GenerateOptions, settings: DatasetSettings) -> MapFolders
     """
     scenes = settings.scenes
     shares = {
-        TEXTURE: (order.textures, "textures", scenes.textures.share, scenes.textures.own_share),
-        SKY: (order.skies, "skies", scenes.skies.share, scenes.skies.own_share),
+        TEXTURE: (options.textures, "textures", scenes.textures.share, scenes.textures.own_share),
+        SKY: (options.skies, "skies", scenes.skies.share, scenes.skies.own_share),
     }
     for folder, name, share, own_share in shares.values():
         used = bool(share and own_share)
@@ -84,7 +90,7 @@ def map_folders(order: GenerateOptions, settings: DatasetSettings) -> MapFolders
             )
     return MapFolders(
         folders=tuple((kind, entry[0]) for kind, entry in shares.items() if entry[0] is not None),
-        licence=order.map_licence,
+        licence=options.map_licence,
     )
 
 

@@ -1,4 +1,7 @@
-"""Begins a dataset in a folder or a bucket, or resumes the one there with the same settings."""
+"""Begins a dataset in a folder or a bucket, or resumes the one there with the same settings.
+
+`DatasetWriter.unfinished_shards` says which shards are left: finished ones are skipped.
+"""
 
 import contextlib
 import dataclasses
@@ -15,7 +18,7 @@ from pipeline.generation.dataset_writer import (
     published_head,
 )
 from pipeline.presets.settings import DatasetSettings, differences
-from pipeline.renders.variant import device_of
+from pipeline.renders.mitsuba_variant import device_of
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder, place_of_part
 from storage.dataset.manifest import Manifest, read_head, write_manifest

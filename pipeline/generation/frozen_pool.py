@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.store import AssetStore
+from pipeline.assets.asset_store import AssetStore
 from pipeline.objects.maps.prepared import decode_prepared
-from pipeline.scenes.fitting import FitTable, least_triangles
 from pipeline.scenes.pool import IndexedPool, PooledAsset
+from pipeline.scenes.triangle_budget import FitTable, least_triangles
 from scene_templates.user_maps import OwnMaps, UserMap, UserTexture
 from storage.digests import sha256_hex
 from storage.errors import TrilightError

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.presets.registry import DATASET_PRESETS
+from pipeline.renders.mitsuba_variant import Device
 from pipeline.renders.settings import NoiseFloor, NoiseTargets, Resolution
-from pipeline.renders.variant import Device
 from storage.dataset.layout import dataset_folder
 from storage.dataset.settings import MOST_SCENES
 from storage.errors import TrilightError
@@ -144,28 +144,29 @@ class GenerateOptions:
         return range(int(match[1]), int(match[2]))
 
 
-def _refuse_maps(order: GenerateOptions) -> None:
+def _refuse_maps(options: GenerateOptions) -> None:
     """Raise if map folders are given for scenes that are not composed, or a licence without any."""
-    for name, value in (("--textures", order.textures), ("--skies", order.skies)):
-        if value is not None and (order.scenes_from or order.revisits):
+    for name, value in (("--textures", options.textures), ("--skies", options.skies)):
+        if value is not None and (options.scenes_from or options.revisits):
             raise TrilightError(
                 f"{name} was given with --scenes-from or --revisits; expected it only where scenes "
                 "are composed. Leave it out."
             )
-    if order.map_licence is not None and order.textures is None and order.skies is None:
+    if options.map_licence is not None and options.textures is None and options.skies is None:
         raise TrilightError(
-            f"--map-licence is {order.map_licence!r}; expected it only with --textures or --skies."
+            f"--map-licence is {options.map_licence!r}; expected it only with --textures or "
+            "--skies."
         )
 
 
-def generate_words(order: GenerateOptions) -> list[str]:
+def generate_words(options: GenerateOptions) -> list[str]:
     """Return the arguments of `generate` that repeat these options, without `--out`.
 
     Options of this machine alone (the range of shards, the number of processes) are left out; so
     are passwords.
     """
-    words = option_words(order, leave_out=_PER_MACHINE)
-    return ["generate", order.build, *map(_hide_secret, words)]
+    words = option_words(options, leave_out=_PER_MACHINE)
+    return ["generate", options.build, *map(_hide_secret, words)]
 
 
 def _hide_secret(word: str) -> str:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pipeline.exchange.open_scene import SceneSource, load_source
 from pipeline.exchange.reader import file_child, reach_of, unconfined_child
 from pipeline.isolation import ChildFailed, call_with_retries
+from pipeline.renders.mitsuba_variant import Variant, activate, choose_variant
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.variant import Variant, activate, choose_variant
 from storage.atomic import write_atomically
 from storage.conventions import look_at_c2w, preview_srgb8
 from storage.errors import Rejected, TrilightError

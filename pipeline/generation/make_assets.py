@@ -19,7 +19,7 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedObject
 from pipeline.documents.attribution import encode_attribution
 from pipeline.documents.quality_page import Pair, encode_quality_page
-from pipeline.exchange.gltf.write import encode_mesh_glb
+from pipeline.exchange.gltf.write_gltf import encode_mesh_glb
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.generation.prepare_isolated import asset_child, asset_store, prepare_isolated
 from pipeline.generation.unread_notes import UnreadNotes, write_unread

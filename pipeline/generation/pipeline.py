@@ -37,17 +37,9 @@ from pipeline.generation.accept_revisited import accept_revisited
 from pipeline.generation.accept_scene_files import accept_scene_files
 from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.environment import environment
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions, generate_words
-from pipeline.generation.render_children import (
-    close_children,
-    cores_of_child,
-    render_child,
-    scene_reader,
-)
-from pipeline.generation.restore_object import restore_object
-from pipeline.generation.run import (
+from pipeline.generation.generation_run import (
     Outcome,
     Run,
     ShardJob,
@@ -56,8 +48,16 @@ from pipeline.generation.run import (
     choose_dataset_variant,
     resolve_settings,
 )
+from pipeline.generation.render_children import (
+    close_children,
+    cores_of_child,
+    render_child,
+    scene_reader,
+)
+from pipeline.generation.restore_object import restore_object
 from pipeline.generation.runner import Runner
 from pipeline.generation.scene_worker import MAX_ATTEMPTS, SceneAttempt, SceneWorker
+from pipeline.generation.software_environment import environment
 from pipeline.generation.tasks import FIRST_PAUSE_S, Piece, TaskCutter, wait_for_others
 from pipeline.generation.unfinished_shard import UnfinishedShard
 from pipeline.isolation import ChildFailed, IsolatedChild, with_retries
@@ -74,19 +74,19 @@ from storage.records.scene import Scene
 
 
 def make_dataset(
-    order: GenerateOptions, runner: Runner, watch: Watcher = lambda run, outcome: None
+    options: GenerateOptions, runner: Runner, watch: Watcher = lambda run, outcome: None
 ) -> Outcome:
     """Make a dataset: all its missing shards, or those of a range.
 
     Args:
-        order: the dataset, and the range of shards to make.
+        options: the dataset, and the range of shards to make.
         runner: runs the tasks.
         watch: called after each task.
 
     Raises:
         TrilightError: an error that the user can fix; finished scenes stay on disk.
     """
-    with _begin_run(order) as run:  # objects, meshes
+    with _begin_run(options) as run:  # objects, meshes
         make_shards(run, runner, watch)  # scenes, renders, shards
         finished = run.publication.finish()
         run.require_within_budget()
@@ -96,56 +96,56 @@ def make_dataset(
     return run.outcome(finished, statistics)
 
 
-def prepare_dataset(order: GenerateOptions) -> Run:
+def prepare_dataset(options: GenerateOptions) -> Run:
     """Begin a dataset and freeze its objects, without rendering; raises as `make_dataset`."""
-    with _begin_run(order) as run:
+    with _begin_run(options) as run:
         return run
 
 
 @contextlib.contextmanager
-def _begin_run(order: GenerateOptions) -> Iterator[Run]:
+def _begin_run(options: GenerateOptions) -> Iterator[Run]:
     """Join a dataset's workers and yield the run; the first worker freezes the objects."""
-    folder = dataset_folder(order.place)
+    folder = dataset_folder(options.place)
     folder = replace(folder, root=Path(os.path.realpath(folder.root)))
     settings, listed = resolve_settings(
-        order, folder
-    )  # refuses an order before anything is written
+        options, folder
+    )  # refuses options before anything is written
     with hold_dataset_lock(folder):
-        user_folders = map_folders(order, settings)
-        variant = choose_dataset_variant(order, folder)
+        user_folders = map_folders(options, settings)
+        variant = choose_dataset_variant(options, folder)
         writer = begin_or_resume_dataset(
             folder,
             settings,
             environment(variant),
-            DATASET_PRESETS[order.build].num_scenes if order.scenes is None else order.scenes,
-            accept_environment=order.accept_environment,
+            DATASET_PRESETS[options.build].num_scenes if options.scenes is None else options.scenes,
+            accept_environment=options.accept_environment,
         )
-        requested = order.shard_range()
+        requested = options.shard_range()
         if requested is not None and requested.start >= writer.num_shards:
             raise TrilightError(
-                f"shards is {order.shards!r}; expected one that begins below {writer.num_shards}, "
-                f"the shards of {writer.manifest.num_scenes} scenes."
+                f"shards is {options.shards!r}; expected one that begins below "
+                f"{writer.num_shards}, the shards of {writer.manifest.num_scenes} scenes."
             )
-        if listed or order.revisits:
+        if listed or options.revisits:
             with folder.mutex("objects"):
                 writer.refresh()
                 accepted = (
-                    accept_scene_files(listed, order.licence, settings, writer)
+                    accept_scene_files(listed, options.licence, settings, writer)
                     if listed
-                    else accept_revisited(order.revisits or "", settings, writer)
+                    else accept_revisited(options.revisits or "", settings, writer)
                 )
         else:
             accepted = ObjectLock(
-                source=object_source(settings, order.objects),
-                licence=order.licence,
+                source=object_source(settings, options.objects),
+                licence=options.licence,
                 settings=settings,
                 writer=writer,
                 workers=available_cores(),
                 user_folders=user_folders,
             ).accept()
-        write_asked(folder, generate_words(order))
+        write_asked(folder, generate_words(options))
         yield Run(
-            order=order,
+            options=options,
             settings=settings,
             scene_folder=listed,
             publication=writer,
@@ -180,7 +180,7 @@ def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:
                 run.require_within_budget()
             if has_progress:
                 pause_s = FIRST_PAUSE_S
-            elif run.order.shards is None:
+            elif run.options.shards is None:
                 pause_s = wait_for_others(run, pause_s)
             else:  # others are making all that is left of the range
                 return

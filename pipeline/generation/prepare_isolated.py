@@ -1,51 +1,25 @@
 """Runs the mesh stage in children with limits, with the shared asset store."""
 
 import contextlib
-import queue
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from pipeline.assets.asset_store import AssetStore
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedObject, prepare_assets
-from pipeline.assets.store import AssetStore
-from pipeline.isolation import NO_FILES, ChildLimits, IsolatedChild, Reach, preload, reach
+from pipeline.isolation import (
+    NO_FILES,
+    ChildLimits,
+    ChildPool,
+    IsolatedChild,
+    Reach,
+    preload,
+    reach,
+)
 from storage.cache import cache_folder
 from storage.errors import TrilightError
 from storage.installation import module_name
 from storage.records.objects import Failure, ObjectRecord
-
-
-class ChildPool:
-    """At most `size` children, each with its compiled kernels warm for the next task."""
-
-    def __init__(self, make_child: Callable[[int], IsolatedChild], size: int) -> None:
-        """Make the children; each starts its process when it is first called.
-
-        Args:
-            make_child: called with the number of each child, from 0.
-            size: number of children.
-        """
-        self._children = [make_child(number) for number in range(size)]
-        self._free: queue.SimpleQueue[IsolatedChild] = queue.SimpleQueue()
-        for child in self._children:
-            self._free.put(child)
-        self.num_users = 0
-        """Number of tasks that use the pool; counted by the owner of several pools."""
-
-    @contextlib.contextmanager
-    def borrow(self) -> Iterator[IsolatedChild]:
-        """Lend a free child; wait while all are lent."""
-        child = self._free.get()
-        try:
-            yield child
-        finally:
-            self._free.put(child)
-
-    def close(self) -> None:
-        """End all children at once."""
-        for child in self._children:
-            child.close()
-
 
 _LIMITS = ChildLimits(memory_bytes=5 << 30, wall_s=300, cpu_s=60, calls_per_child=50)
 """Measured on 148 objects and 78 hostile files: a usable mesh takes seconds and far below 1 GiB.
@@ -130,7 +104,7 @@ def require_filters() -> None:
     Raises:
         TrilightError: pymeshlab is installed and lacks a filter that we use.
     """
-    from pipeline.assets.environment import missing_filters
+    from pipeline.assets.check_pymeshlab import missing_filters
 
     if missing := missing_filters():
         raise TrilightError(

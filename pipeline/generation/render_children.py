@@ -1,4 +1,4 @@
-"""Pools of children that make scenes: started by the first task of a job, then kept warm.
+"""Pools of worker processes that make scenes, started by the first task of a job, then kept warm.
 
 Render children get composed scenes, which are trusted. If scenes come from files, another child
 reads these, confined to their folder (pipeline.isolation.confinement).
@@ -12,13 +12,13 @@ from typing import Any
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.scene_files import SceneFiles
-from pipeline.generation.environment import environment
-from pipeline.generation.prepare_isolated import ChildPool, asset_child
-from pipeline.generation.run import ShardJob
+from pipeline.generation.generation_run import ShardJob
+from pipeline.generation.prepare_isolated import asset_child
 from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
-from pipeline.isolation import ChildLimits, IsolatedChild, call_with_retries, reach
+from pipeline.generation.software_environment import environment
+from pipeline.isolation import ChildLimits, ChildPool, IsolatedChild, call_with_retries, reach
 from pipeline.presets.settings import differences
-from pipeline.renders.variant import choose_variant
+from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.visible_gpus import visible_gpus
 from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions

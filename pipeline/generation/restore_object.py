@@ -5,8 +5,8 @@ from pathlib import Path
 
 from pipeline.generation.freeze_objects import object_changed_error, require_tried
 from pipeline.generation.frozen_pool import ComposedScenes
+from pipeline.generation.generation_run import ShardJob
 from pipeline.generation.prepare_isolated import asset_store, prepare_isolated
-from pipeline.generation.run import ShardJob
 from pipeline.objects.sources import ListedObjects, list_objects
 from storage.atomic import write_atomically
 from storage.digests import sha256_hex

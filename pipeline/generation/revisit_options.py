@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 from pipeline.exchange.open_scene import load_cameras, scene_source
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.presets.revisit import MOST_CAMERAS, GivenCamera, RevisitSettings
+from pipeline.renders.mitsuba_variant import Device
 from pipeline.renders.settings import NoiseFloor, Resolution
-from pipeline.renders.variant import Device
 from pipeline.shards.finished_dataset import open_finished
 from scene_templates.templates import TEMPLATES
 from storage.errors import TrilightError

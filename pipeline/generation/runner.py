@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from typing import Generic, Protocol, TypeVar
 
-from pipeline.generation.run import ShardJob, TaskResult
+from pipeline.generation.generation_run import ShardJob, TaskResult
 from pipeline.generation.tasks import Piece
 from storage.dataset.statistics import Statistics
 

@@ -1,18 +1,21 @@
-"""`SceneWorker`: composes scenes and renders their views, inside a render child."""
+"""`SceneWorker`: composes scenes and renders their views, inside a worker process.
+
+`render_children` starts these processes; `pipeline.isolation` survives their crashes.
+"""
 
 import contextlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from pipeline.assets.store import AssetStore
+from pipeline.assets.asset_store import AssetStore
 from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, user_maps
 from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
 from pipeline.generation.revisited_scenes import RevisitedScenes, SceneOrigin
 from pipeline.presets.settings import DatasetSettings
+from pipeline.renders.mitsuba_variant import Variant, activate
 from pipeline.renders.renderer import set_threads
-from pipeline.renders.variant import Variant, activate
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.settings import SceneSettings

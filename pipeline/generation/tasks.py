@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from pipeline.generation.run import Run, TaskResult
+from pipeline.generation.generation_run import Run, TaskResult
 from pipeline.generation.unfinished_shard import UnfinishedShard
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard

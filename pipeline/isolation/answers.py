@@ -1,4 +1,4 @@
-"""Encodes a child's answer to a call and decodes it in the owner; no byte of it is executed.
+"""Serializes a child's answer to a call, and reads it in the owner; no byte of it is executed.
 
 Errors are sentences, and their types come from a list. The parts of an answer are
 

@@ -1,4 +1,4 @@
-"""Confines children that read untrusted files: to their inputs, libraries, and nothing else.
+"""Sandbox of children that read untrusted files: their inputs, libraries, and nothing else.
 
 Limits of memory and time stop accidents. Confinement stops a file that takes over its parser: it
 reaches no other file, no network, no program, no other process. Each restriction applies if the

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 
 from storage.records.objects import Failure, ObjectRecord
+from storage.remote.retries import TransferFailed
 from storage.remote.safe_url import printable
-from storage.remote.tries import TransferFailed
 
 Fetched = tuple[list[ObjectRecord], list[Failure]]
 CountDone = Callable[[int, int], None]

@@ -9,8 +9,8 @@ import pydantic
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.presets.revisit import RevisitSettings
+from pipeline.renders.mitsuba_variant import Device
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.variant import Device
 from scene_templates.settings import SceneSettings
 from storage.dataset.settings import SplitSettings, StorageSettings
 from storage.digests import canonical_json, sha256_hex

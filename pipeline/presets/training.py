@@ -26,11 +26,11 @@ from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.presets.settings import DatasetPreset, DatasetSettings
 from pipeline.renders.settings import CALIBRATED_LOOKS, RenderSettings
-from scene_templates.cameras import CameraSettings
 from scene_templates.families import DEFAULT_FAMILIES, alone
-from scene_templates.lights import LightSettings
-from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
+from scene_templates.sample_camera import CameraSettings
+from scene_templates.sample_emitters import LightSettings
+from scene_templates.sample_material import MaterialSettings
 from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.skies.draw import SkyMapSettings
 from scene_templates.skies.settings import SkySettings

@@ -18,6 +18,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.renders.adaptive_sampling import TILE_PX
 from pipeline.renders.denoise_corrections import (
     DARKER,
     GLINT,
@@ -30,7 +31,6 @@ from pipeline.renders.noise_floor import BLOCK_PX, ErrorMeasures, MeasuredFloor
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import FIRST_SPP, PASS_SPP, RenderSettings
 from pipeline.renders.stopping import gaps_db
-from pipeline.renders.tiles import TILE_PX
 from storage.digests import canonical_json, sha256_hex
 from storage.metrics import MAX_DB
 from storage.settings.ranges import Within

@@ -1,4 +1,4 @@
-"""Open Image Denoise on arrays of Dr.Jit, where they are."""
+"""Denoising by Open Image Denoise (OIDN) on arrays of Dr.Jit, where they are."""
 
 import ctypes
 from collections.abc import Sequence

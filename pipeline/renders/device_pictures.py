@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.renders.adaptive_sampling import TILE_PX, tile_means
 from pipeline.renders.calibrated_error import (
     METRICS,
     CalibratedStatement,
@@ -48,7 +49,6 @@ from pipeline.renders.pixel_arithmetic import (
 from pipeline.renders.recorded_calls import KernelInputs, record_launches
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered, RenderSettings
-from pipeline.renders.tiles import TILE_PX, tile_means
 from pipeline.renders.view_pictures import (
     Group,
     MeasuredLook,

@@ -1,4 +1,4 @@
-"""All emitting triangles as one table: picked by power, in constant time, whatever their number.
+"""Light sampling: all emitting triangles as one table, picked by power in constant time.
 
 A triangle is picked with probability proportional to area x mean radiance (an alias table, Walker
 1977: two loads for 1 or for 1000 emitters), then a point uniformly on it. Both sides emit, so there

@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 
 from pipeline.isolation import die_with_parent
-from pipeline.renders.variant import Variant, activate, run_module
+from pipeline.renders.mitsuba_variant import Variant, activate, run_module
 from storage.denoiser import open_device
 from storage.installation import child_environment
 

@@ -1,4 +1,4 @@
-"""`LandedLight`: what light paths throw on the pictures of a scene, traced once for all its views.
+"""`LandedLight`: light tracing on the pictures of a scene, once for all its views.
 
 A path takes more than twice as long to trace as to join to a camera. So views whose light paths
 have the same seed are joined to them together: those that wait get pictures that they may not need.

@@ -1,4 +1,4 @@
-"""The path tracer inside a kernel: emitter sampling and BRDF sampling, weighed against each other.
+"""The path tracer inside a kernel: emitter and BRDF sampling by multiple importance sampling (MIS).
 
 Per path it does what Mitsuba's `path` integrator does with `hide_emitters` (same depth count, same
 roulette), for the one kind of surface and the one kind of emitter that a `Scene` has. An emitter

@@ -11,6 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from pipeline.renders.adaptive_sampling import TILE_PX
 from pipeline.renders.denoise_corrections import (
     DARKER,
     GLINT,
@@ -19,7 +20,6 @@ from pipeline.renders.denoise_corrections import (
     STANDS_OUT,
 )
 from pipeline.renders.noise_floor import BLOCK_PX, SMALLEST_STEP
-from pipeline.renders.tiles import TILE_PX
 from pipeline.renders.view_pictures import add_up
 
 assert BLOCK_PX == TILE_PX  # one order of pixels serves both

@@ -6,10 +6,10 @@ comes next, is not known here (pipeline.generation.render_sample).
 A picture is sampled as two halves that share nothing. They are denoised apart to measure its floors
 (pipeline.renders.noise_floor), until these reach their targets or the samples reach the cap
 (pipeline.renders.stopping); from the second measurement on, the tiles that need more samples get
-more (pipeline.renders.tiles). The picture itself is one denoise of the mean of all samples, which
-is better than the mean of two. With `per_light` all of this is done for each emitter and the sky
-alone, and the picture is their sum; with `split` direct and indirect light are kept apart, and it
-is theirs.
+more (pipeline.renders.adaptive_sampling). The picture itself is one denoise of the mean of all
+samples, which is better than the mean of two. With `per_light` all of this is done for each emitter
+and the sky alone, and the picture is their sum; with `split` direct and indirect light are kept
+apart, and it is theirs.
 
 Mitsuba is imported inside functions only: `activate` must come first.
 """
@@ -21,16 +21,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.renders.adaptive_sampling import TileChoice
 from pipeline.renders.calibrated_error import first_spp
 from pipeline.renders.camera import PixelCamera
-from pipeline.renders.frozen_arithmetic.host_pictures import HostPictures
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import MeasuredFloor
+from pipeline.renders.numpy_arithmetic.host_pictures import HostPictures
 from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.stopping import Floors, Goal, expected_spp, gaps_db, next_spp
-from pipeline.renders.tiles import TileChoice
 from pipeline.renders.tracer import Tracer
 from pipeline.renders.view_pictures import MeasuredLook, ViewPictures
 from storage.conventions import HALF_FLOAT_MAX

@@ -1,4 +1,4 @@
-"""The environment map inside a kernel: its radiance in a direction, and directions drawn by it.
+"""The environment map inside a kernel: its radiance, and importance sampling of directions.
 
 A texel is drawn with probability proportional to the light that comes through it, first its row and
 then its column (alias tables: two loads each, for any map), and a direction uniformly within it by

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.scenes.fitting import draw_rows, levels_within
+from pipeline.scenes.mesh_collision import MeshShape
 from pipeline.scenes.pieces import (
     ScenePiece,
     Skin,
@@ -23,10 +23,10 @@ from pipeline.scenes.pieces import (
 from pipeline.scenes.pool import PooledAsset, fits_of
 from pipeline.scenes.posing import pose_points
 from pipeline.scenes.scene_checks import require_valid
-from pipeline.scenes.shapes import MeshShape
 from pipeline.scenes.source_materials import source_skins, with_source_emission
 from pipeline.scenes.subdivision import fill_triangles
 from pipeline.scenes.textured_pieces import with_drawn_textures
+from pipeline.scenes.triangle_budget import draw_rows, levels_within
 from pipeline.scenes.views import with_first_cameras
 from scene_templates.layout import Layout
 from scene_templates.sample_layout import ScenePlan, sample_layout, scene_plan

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scenes.posing import not_slivers, without_slivers
-from pipeline.scenes.shading import ShadedMesh, flat_shaded, smooth_shaded
+from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded, smooth_shaded
 from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 from storage.errors import Rejected, TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows, laid_out

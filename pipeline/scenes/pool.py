@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.scenes.fitting import FitTable, least_triangles
+from pipeline.scenes.triangle_budget import FitTable, least_triangles
 from storage.licences import share_alike_camp
 from storage.records.asset import Asset
 from storage.records.objects import LockedObject

@@ -1,4 +1,4 @@
-"""Poses an asset's mesh in the scene: centers, scales, rotates and moves it."""
+"""Poses (transforms) an asset's mesh in the scene: centers, scales, rotates and moves it."""
 
 from typing import Literal
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.pieces import concatenate_pieces, emitter_piece, with_drawn_columns
 from pipeline.scenes.scene_checks import object_boxes
-from scene_templates.lights import LightSettings, sample_emitters
-from scene_templates.materials import MaterialSettings, sample_material
+from scene_templates.sample_emitters import LightSettings, sample_emitters
+from scene_templates.sample_material import MaterialSettings, sample_material
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
 from storage.records.material import DIFFUSE, ROUGHNESS, SPECULAR

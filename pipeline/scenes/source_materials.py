@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.pieces import ScenePiece, Skin
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.materials import MaterialSettings
+from scene_templates.sample_material import MaterialSettings
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, default_rows

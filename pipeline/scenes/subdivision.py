@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scenes.pieces import ScenePiece
-from pipeline.scenes.shading import ShadedMesh
+from pipeline.scenes.shading_normals import ShadedMesh
 
 Edge = tuple[int, int]
 

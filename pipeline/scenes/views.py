@@ -1,4 +1,4 @@
-"""Chooses cameras: tries up to sixteen proposals per view until one sees enough.
+"""Chooses camera views: tries up to sixteen proposals per view until one sees enough.
 
 Proposals are numbered, and each is a pure function of (seed, scene, attempt, view, number). A view
 whose picture turns out black can therefore continue with the next one, long after composition and
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scenes.visibility import ViewFacts, Visibility
-from scene_templates.cameras import path_position
+from scene_templates.sample_camera import path_position
 from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
@@ -124,7 +124,7 @@ def _accepted_proposals(
 
 
 def _proposal(scene: Scene, settings: SceneSettings, view: int, attempt: int) -> ViewCamera:
-    """Return proposal number `attempt` of a view (scene_templates.cameras.sample_camera).
+    """Return proposal number `attempt` of a view (scene_templates.sample_camera.sample_camera).
 
     The first proposal of a view stands on the path of the settings, if they have one.
     """

@@ -41,7 +41,7 @@ from storage.dataset.shard_notes import (
 )
 from storage.errors import TrilightError
 from storage.file_locks import hold_lock
-from storage.remote.cache import shard_cache
+from storage.remote.shard_cache import shard_cache
 from storage.remote.store import Store
 
 

@@ -1,4 +1,4 @@
-"""`draw_sky`: the light from all around a scene, from a generator."""
+"""`draw_sky`: a procedural environment map, the light from all around a scene."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from scene_templates.checks import Range, require
 from scene_templates.skies.draws import SkyDraws
-from scene_templates.skies.families import OUR_SKIES, SKIES
+from scene_templates.skies.procedural_skies import OUR_SKIES, SKIES
 from scene_templates.skies.texels import SkyTexels
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within

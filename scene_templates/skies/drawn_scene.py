@@ -1,4 +1,4 @@
-"""`scene_sky`: whether a scene has a sky, and which.
+"""`scene_sky`: whether a scene has an environment map (sky), and which.
 
 Its draws have a random stream of their own, so that a preset with skies has the objects, materials
 and lights that it has without them, and the cameras too, but for views that only the sky lights.

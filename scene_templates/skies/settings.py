@@ -1,4 +1,4 @@
-"""`SkySettings`: which scenes are lit from all around, and how strongly."""
+"""`SkySettings`: which scenes have an environment map, and how strongly it lights them."""
 
 from dataclasses import field
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""The texels of a latitude-longitude map of the sphere, and shapes and noise on it.
+"""Texels of a latitude-longitude (equirectangular) map, and shapes and noise on it.
 
 Orientation is that of Trilight's environment maps and of Blender: +Z is up, the first row is the
 top, the middle of the picture is +X, a quarter from its left edge is +Y, its edges are -X. Texel

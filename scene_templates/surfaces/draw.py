@@ -1,4 +1,4 @@
-"""`draw_surface`: a textured surface from a generator."""
+"""`draw_surface`: a procedural texture from a generator."""
 
 from typing import Annotated
 
@@ -6,8 +6,8 @@ import numpy as np
 
 from scene_templates.checks import Range, require
 from scene_templates.surfaces.draws import SurfaceDraws
-from scene_templates.surfaces.families import OUR_SURFACES, SURFACES
 from scene_templates.surfaces.maps import MOST_ALBEDO, SurfaceMaps, surface_maps
+from scene_templates.surfaces.procedural_textures import OUR_SURFACES, SURFACES
 from scene_templates.surfaces.texels import Texels
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within

@@ -26,10 +26,10 @@ from storage.records.sample import (
     decode_scene,
     require_lawful,
 )
-from storage.remote.cache import shard_cache
 from storage.remote.fetch import facts_of, fetch_if_there, unreadable
+from storage.remote.retries import TransferFailed, is_missing
+from storage.remote.shard_cache import shard_cache
 from storage.remote.store import MAX_FILE_BYTES, WRITABLE
-from storage.remote.tries import TransferFailed, is_missing
 from storage.remote.url import RemoteUrl, parse_url
 
 Record = TypeVar("Record", bound=SceneRecord)
@@ -158,7 +158,7 @@ class RemoteDatasetFiles(_Files):
         """Open a shard for reading; its digest is always checked on arrival.
 
         Raises:
-            TrilightError: as `storage.remote.cache`.
+            TrilightError: as `storage.remote.shard_cache`.
         """
         url = self.url.child(shard.name)
         return shard_cache().open(url, num_bytes=shard.num_bytes, sha256=shard.sha256)

@@ -1,4 +1,4 @@
-"""Progress of a dataset, from its files alone: counts, the rate of the last scenes, time left.
+"""Progress of a dataset, from its files alone: counts, rate of the last scenes, time left (ETA).
 
 Any process may read it. The rate is that of the logs (storage.dataset.scene_logs).
 """

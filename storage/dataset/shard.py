@@ -1,4 +1,4 @@
-"""Shards: byte-reproducible tar files, and a reader that does not trust them.
+"""Shards: byte-reproducible WebDataset tar files, and a reader that does not trust them.
 
 Written members are sorted and have no clock and no owner. The reader walks the headers itself, 512
 bytes at a time: anything that is not a plain file is refused before it is read, and no number in a

@@ -11,8 +11,8 @@ from typing import BinaryIO
 from storage.conventions import SPLITS
 from storage.errors import TrilightError
 from storage.records.safe_read import open_plain
-from storage.remote.cache import shard_cache
 from storage.remote.safe_url import printable, safe_text
+from storage.remote.shard_cache import shard_cache
 from storage.remote.url import RemoteUrl, parse_local_path, parse_url
 
 MAX_SHARDS = 100_000

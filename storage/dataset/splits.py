@@ -1,4 +1,4 @@
-"""Splits of objects and scenes, each from its own identity alone.
+"""Splits (train, validation, test) of objects and scenes, each from its own identity alone.
 
 An object's split is a hash of its cleaned geometry: copies under other names stay together, so no
 object leaks from one split into another, and adding objects moves none. A scene's split is that of

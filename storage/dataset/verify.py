@@ -34,7 +34,7 @@ from storage.records.parts import part_names, sum_of_parts
 from storage.records.passes.stored import decode_passes_exr, passes_in_file, picture_passes
 from storage.records.sample import Sample, decode_sample
 from storage.remote.fetch import download
-from storage.remote.tries import TransferFailed
+from storage.remote.retries import TransferFailed
 
 REMOTE_THREADS = 8
 """Shards of a server that are fetched, or asked for, at the same time."""

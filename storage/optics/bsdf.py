@@ -1,4 +1,4 @@
-"""The two lobes of a material as one mixture: which share of the samples each gets.
+"""BSDF of a material as a mixture of two lobes: which share of the samples each gets.
 
 An additive BRDF, diffuse d plus specular s, equals the blend (1 - w) * d/(1 - w) + w * s/w for any
 w between 0 and 1. With w = max s / (max s + max d) both scaled albedos stay at most max s + max d,

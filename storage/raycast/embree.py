@@ -1,4 +1,4 @@
-"""Triangles prepared for rays: the only module that calls Embree, but for one.
+"""Ray casting by Embree: the only module that calls it, but for one.
 
 Embree works in single precision, here in its robust mode, in which no ray slips between two
 triangles of one edge. `pipeline.assets.outside_rays` calls Embree by itself: it has no scene.

@@ -1,4 +1,4 @@
-"""`Environment`: light that comes from far away, from all directions, as a picture of them.
+"""`Environment`: an environment map (HDRI), light from far away from all directions.
 
 Its map is latitude-longitude, linear radiance, with the axes of storage.conventions. A scene may
 turn it. A map that is absent costs nothing, and is another thing than a black one that is seen.

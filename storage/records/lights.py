@@ -1,4 +1,4 @@
-"""Pictures by light: what each emitter adds, and the rule that their sum is the picture.
+"""Pictures by light (OLAT): what each emitter adds, and the rule that their sum is the picture.
 
 Light i is the i-th object of kind `emitter`, in the order of `Scene.objects`; a sky that shines is
 one more light, the last one. The member
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.exr import to_half
-from storage.records.layers import decode_layers, encode_layers
+from storage.records.exr_layers import decode_layers, encode_layers
 from storage.records.scene import Scene
 
 MAX_LIGHTS = 64

@@ -1,4 +1,4 @@
-"""Values of textures and environment maps at a point: the definition that kernels are tested by.
+"""Lookup of textures and environment maps at a point: the definition that kernels are tested by.
 
 Both are interpolated bilinearly between the centres of their texels, in double precision. Textures
 repeat along u and v; maps go round along u, and at the poles their last rows stand.

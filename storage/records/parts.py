@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import TrilightError
-from storage.records.layers import decode_layers, encode_layers
+from storage.records.exr_layers import decode_layers, encode_layers
 from storage.records.lights import MAX_LIGHTS, sum_of_lights
 
 Parts = Mapping[str, NDArray[np.float32]]

@@ -1,4 +1,4 @@
-"""Packing of samples: two named profiles, chosen from measured figures (study S47).
+"""Compression of samples: two named profiles, chosen from measured figures (study S47).
 
 | profile | arrays | pictures |
 |---|---|---|

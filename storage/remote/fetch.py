@@ -1,4 +1,4 @@
-"""Bytes of one file on a server: facts about it, or all of it to a file.
+"""Downloads one file of a server or bucket: facts about it, or all of it to a file.
 
 A transfer that breaks off goes on where it stopped, where the server can do that, and ends only
 when all announced bytes are there.
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 from storage.errors import Unreadable
-from storage.remote.tries import (
+from storage.remote.retries import (
     PATIENCE,
     Interrupted,
     Pace,
@@ -75,7 +75,7 @@ def download(url: RemoteUrl, stream: BinaryIO, *, num_bytes: int | None, max_byt
 
     Raises:
         TransferFailed: as `facts_of`, it has another size than `num_bytes`, it breaks off again and
-            again without moving on, or comes too slowly (storage.remote.tries).
+            again without moving on, or comes too slowly (storage.remote.retries).
         TrilightError: the driver's package is missing, or the disk is full.
     """
     driver = shared_driver(url)

@@ -1,4 +1,4 @@
-"""`Store`: the place where a dataset is published, a folder or a bucket (s3://, gs://).
+"""`Store`: where a dataset is published, a folder or a bucket (s3://, gs://) by fsspec.
 
 Files have names relative to it. A file appears whole or not at all, and once if asked. A bucket
 shows one when all of it has come, however large it is, so a kill leaves nothing half written; parts
@@ -27,7 +27,7 @@ from storage.atomic import atomic_writer, write_atomically
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.file_locks import hold_lock
 from storage.remote.fetch import fetch_if_there
-from storage.remote.tries import TransferFailed, is_missing, is_taken, may_pass, with_tries
+from storage.remote.retries import TransferFailed, is_missing, is_taken, may_pass, with_tries
 from storage.remote.url import RemoteUrl, shared_driver
 
 WRITABLE = ("s3", "gs")

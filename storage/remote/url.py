@@ -1,4 +1,4 @@
-"""URLs of files and folders on servers: which are admitted, and the driver that reads each."""
+"""URLs of files and folders on servers: which are admitted, and the fsspec driver of each."""
 
 import base64
 import dataclasses
@@ -147,7 +147,7 @@ def _driver_of(access: RemoteUrl, process: int) -> Any:
 
 
 def transfer_timeout(total_s: float | None = None) -> Any:
-    """Return the limits of a request; storage.remote.tries bounds one for a file as a whole."""
+    """Return the limits of a request; storage.remote.retries bounds one for a file as a whole."""
     import aiohttp
 
     return aiohttp.ClientTimeout(

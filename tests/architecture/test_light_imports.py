@@ -24,7 +24,7 @@ STEPS = (
     ("import infra.cli.app", {"torch", "mitsuba", "prefect", "pymeshlab"}),
     # a worker may have only what making data needs, and a wrong form need not wait for torch
     ("import infra.serving.train_model", {"torch"}),
-    ("import pipeline.flows.dataset_flows", {"torch"}),
+    ("import pipeline.flows.prefect_flows", {"torch"}),
 )
 """Statements in the order in which a process runs them, and what is not loaded after each."""
 LISTED = (

@@ -18,10 +18,10 @@ from model.neural_renderer import NeuralRenderer
 from model.open import BUILTIN, BUILTIN_NETWORKS
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
-from pipeline.exchange.usd.write import write_usd
-from pipeline.generation.environment import vector_extension
+from pipeline.exchange.usd.write_usd import write_usd
 from pipeline.generation.prepare_isolated import asset_store, prepare_isolated
 from pipeline.generation.scene_worker import MAX_ATTEMPTS
+from pipeline.generation.software_environment import vector_extension
 from pipeline.objects.generated import generate_objects
 from pipeline.objects.local.folder import list_folder
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings

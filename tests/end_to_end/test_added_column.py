@@ -20,7 +20,7 @@ from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.open_scene import scene_source
 from pipeline.generation.inspect_scene import _facts
-from pipeline.renders.variant import choose_variant
+from pipeline.renders.mitsuba_variant import choose_variant
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.dataset.dataset import Dataset
@@ -41,8 +41,8 @@ from train.data.bad_samples import BadSampleCounter
 from train.data.loader import load_batches
 from train.data.order import RankSlice
 from train.data.scenes import training_scene
-from train.loop.state import new_state
-from train.run import loader_settings
+from train.loop.train_state import new_state
+from train.run_training import loader_settings
 from train.settings import TrainSettings
 
 SETTINGS = SceneSettings(families=DEFAULT_FAMILIES, num_views=2, max_triangles=600)

@@ -38,7 +38,7 @@ from pipeline.flows import prefect_server as private
 private._START_UP_S = 600.0  # on two busy cores 120 s were not enough
 private.quiet_prefect()
 with private.prefect_server():
-    from pipeline.flows.dataset_flows import generate_scenes
+    from pipeline.flows.prefect_flows import generate_scenes
     generate_scenes(objects="env:TRILIGHT_SOURCE_TEST", scenes=12, resolution=32,
                     changes={FEW_SAMPLES_CHANGES!r}, out="s3://shards/flow")
 """

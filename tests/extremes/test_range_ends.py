@@ -29,12 +29,12 @@ from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import MAX_SPP, RenderSettings
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.cameras import CameraSettings
 from scene_templates.families import Family
-from scene_templates.lights import LightSettings
-from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom
+from scene_templates.sample_camera import CameraSettings
+from scene_templates.sample_emitters import LightSettings
+from scene_templates.sample_material import MaterialSettings
 from scene_templates.settings import SceneSettings, ViewLaws
 from storage.conventions import HALF_FLOAT_MAX
 from storage.dataset.settings import MOST_SCENES, SplitSettings
@@ -54,8 +54,8 @@ from train.data.augment import augment_scene
 from train.data.buckets import TrainingBatch, collate_batch
 from train.data.scenes import training_scene
 from train.loop.schedule import learning_rate
-from train.loop.state import new_state
-from train.loss.objective import TrainingLoss
+from train.loop.train_state import new_state
+from train.loss.training_loss import TrainingLoss
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
 
 GROUPS: dict[type, str] = {

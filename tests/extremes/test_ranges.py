@@ -29,13 +29,13 @@ from pipeline.presets.registry import preset_settings
 from pipeline.presets.revisit import GivenCamera, RevisitSettings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.settings import MAX_SPP, RenderSettings
-from scene_templates.cameras import CameraSettings
 from scene_templates.families import Family
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH
-from scene_templates.lights import LightSettings
-from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom
+from scene_templates.sample_camera import CameraSettings
+from scene_templates.sample_emitters import LightSettings
+from scene_templates.sample_material import MaterialSettings
 from scene_templates.separate_sides import SideRanges
 from scene_templates.settings import MAX_TRIANGLES, Excursion, SceneSettings, ViewLaws
 from scene_templates.skies.draw import SkyMapSettings

@@ -19,7 +19,7 @@ from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.exchange.open_scene import load_source, scene_source, source_keys
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
-from pipeline.foreign.load import load_mesh
+from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.source_file import read_source
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from storage.errors import Rejected, TrilightError

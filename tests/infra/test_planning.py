@@ -229,7 +229,7 @@ def test_a_probe_that_fails_is_missing(code: str, said: str) -> None:
 
 
 def test_no_llvm_is_missing_and_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.renders.variant.llvm_libraries", list)
+    monkeypatch.setattr("pipeline.renders.mitsuba_variant.llvm_libraries", list)
     monkeypatch.setattr(doctor, "_probe", _responds)
     monkeypatch.setattr(doctor, "CHECKS", {"renderer": doctor._renderer})
     (finding,) = doctor.examine()
@@ -239,7 +239,7 @@ def test_no_llvm_is_missing_and_says_what_to_install(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("note", ["", "the GPU is too old, so the CPU denoises pictures"])
 def test_a_gpu_is_well_or_says_what_it_lacks(note: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipeline.renders.variant import Variant
+    from pipeline.renders.mitsuba_variant import Variant
 
     gpu = Variant(name="cuda_ad_rgb", libllvm="", note=note, denoiser="CPU" if note else "CUDA")
     monkeypatch.setattr(doctor, "choose_variant", lambda default="cpu", device=None: gpu)

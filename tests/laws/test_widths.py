@@ -23,9 +23,9 @@ from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, collate_batch
 from train.data.scenes import training_scene
 from train.loop.distributed import DistributedContext
-from train.loop.state import new_state
 from train.loop.step import Stepper
-from train.loss.objective import TrainingLoss
+from train.loop.train_state import new_state
+from train.loss.training_loss import TrainingLoss
 
 PX, STEPS, RATE = 16, 4, 2e-3
 BASE = BaseWidths(width=32, head_width=32, pixel_width=16, filter_width=8)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from scene_templates.families import DEFAULT_FAMILIES, Family
 from scene_templates.layout import Pose, ShellPart
-from scene_templates.materials import MaterialSettings, sample_material
 from scene_templates.placement import TOUCHING
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
 from scene_templates.rooms import (
@@ -25,6 +24,7 @@ from scene_templates.rooms import (
     plane_of,
 )
 from scene_templates.sample_layout import sample_layout, scene_plan
+from scene_templates.sample_material import MaterialSettings, sample_material
 from scene_templates.separate_sides import SeparateSides
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES

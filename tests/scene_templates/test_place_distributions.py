@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scene_templates.cameras import CameraSettings, Sector, sample_camera
 from scene_templates.layout import CameraPose
-from scene_templates.lights import LightSettings, sample_emitters
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
 from scene_templates.rooms import SIDES, PatchPlacement, SharedRoom, plane_of
+from scene_templates.sample_camera import CameraSettings, Sector, sample_camera
+from scene_templates.sample_emitters import LightSettings, sample_emitters
 from scene_templates.templates import TEMPLATES
 from tests.for_each import for_each
 from tests.scene_templates.balls import DEFAULTS, MANY, Drawn, drawn, drawn_once, template_settings

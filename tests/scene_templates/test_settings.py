@@ -15,17 +15,17 @@ import numpy as np
 import pytest
 
 from pipeline.presets.registry import preset_settings
-from scene_templates.cameras import CameraSettings
 from scene_templates.exact import cosine, dot, lerp, ramp, sine, smoothstep
 from scene_templates.families import Family
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH
-from scene_templates.lights import LightSettings
-from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
 from scene_templates.recorded_sampler import RecordedSampler
 from scene_templates.rooms import SharedRoom
 from scene_templates.rotations import rotate_points, rotation_xyz, uniform_rotation
+from scene_templates.sample_camera import CameraSettings
+from scene_templates.sample_emitters import LightSettings
 from scene_templates.sample_layout import scene_plan
+from scene_templates.sample_material import MaterialSettings
 from scene_templates.separate_sides import SideRanges
 from scene_templates.settings import Excursion, SceneSettings, ViewLaws
 from scene_templates.skies.draw import SkyMapSettings

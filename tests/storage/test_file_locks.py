@@ -17,13 +17,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from pipeline.assets.store import AssetStore
+from pipeline.assets.asset_store import AssetStore
 from storage import file_locks
 from storage.atomic import atomic_writer, write_error
 from storage.dataset.layout import DatasetFolder
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.file_locks import describe_holder, hold_lock, is_locked
-from storage.remote.cache import ShardCache
+from storage.remote.shard_cache import ShardCache
 from storage.remote.url import RemoteUrl, parse_url
 from tests.conftest import ROOT
 from tests.for_each import for_each

@@ -24,13 +24,13 @@ from train.data.order import RankSlice
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.evaluate import EvalConfig
 from train.loop.distributed import DistributedContext
-from train.loop.state import TrainState, new_state
 from train.loop.step import Stepper
-from train.loss.objective import TrainingLoss
+from train.loop.train_state import TrainState, new_state
+from train.loss.training_loss import TrainingLoss
 from train.progress import TrainProgress
 from train.result import TrainResult
 from train.resume import StartOptions
-from train.run import train_run
+from train.run_training import train_run
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
 
 CPU = torch.device("cpu")

@@ -45,7 +45,7 @@ from tests.train.kit import (
     tiny_run,
     trained,
 )
-from tests.train.loss.test_objective import small_weights
+from tests.train.loss.test_training_loss import small_weights
 from tests.train.toy import (
     toy_picture,
     toy_sample,
@@ -55,16 +55,16 @@ from tests.train.toy import (
 from train.data.buckets import collate_batch
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.evaluate import judge_views, make_baselines
-from train.evaluation.judge import predict
 from train.evaluation.judged_view import NETWORK, summarize_views
 from train.evaluation.stored_pictures import MEDIAN, NEAREST
+from train.evaluation.validation import predict
 from train.loop.distributed import DistributedContext
 from train.loop.schedule import learning_rate
-from train.loop.state import TrainState, new_state
+from train.loop.train_state import TrainState, new_state
 from train.loss.lpips import LINEAR_FILE, VGG16_FILE, load_lpips
 from train.presets import override_training_preset
 from train.resume import StartOptions
-from train.run import loader_settings, train_run
+from train.run_training import loader_settings, train_run
 from train.settings import AugmentationSettings, TrainSettings
 
 SMALL = dataclasses.replace(

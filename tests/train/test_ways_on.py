@@ -19,7 +19,7 @@ from tests.for_each import for_each
 from tests.train.data.test_bad_samples import BAD_KEY, spoil_sample
 from tests.train.kit import Heard, Killed, tiny_run, trained
 from tests.train.toy import write_toy_dataset
-from train import run as run_module
+from train import run_training as run_module
 from train.data.buckets import TrainingBatch
 from train.folder import RunFolder
 from train.loop import step as step_module

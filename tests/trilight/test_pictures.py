@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.renders.variant import Variant
+from pipeline.renders.mitsuba_variant import Variant
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr
 from storage.renderer import Camera
@@ -25,7 +25,7 @@ def test_every_camera_is_rendered_but_where_some_are_named(monkeypatch: pytest.M
 
     monkeypatch.setattr("infra.render.path_tracer.SceneInChild", Scene)
     variant = Variant(name="llvm_ad_rgb", libllvm="", note="")  # nothing is traced here
-    monkeypatch.setattr("pipeline.renders.variant.choose_variant", lambda default: variant)
+    monkeypatch.setattr("pipeline.renders.mitsuba_variant.choose_variant", lambda default: variant)
     scene = tiny_scene(fov_deg=np.array([45, 50], np.float32))
     first, second = (45, 0), (50, 1)
     found: list[object] = [*render_views(scene)]

@@ -1,4 +1,4 @@
-"""Augmentation by exact symmetries of light transport.
+"""Data augmentation by exact symmetries of light transport.
 
 Each function returns a scene whose path-traced picture would be exactly the returned one. They hold
 for every scene that Trilight makes: materials are isotropic, color channels never mix, and light is

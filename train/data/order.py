@@ -1,4 +1,4 @@
-"""Order of a run's scenes: a pure function of seed, epoch and sizes of the shards.
+"""Shuffled order of a run's scenes: a pure function of seed, epoch and sizes of the shards.
 
 Shards are shuffled; then the samples of each window of a few consecutive shards are shuffled.
 Epochs follow one another without a gap, and global batch i is the samples at positions i B to

@@ -26,11 +26,11 @@ from storage.records.sample import Sample
 from storage.renderer import Camera, Renderer, fingerprint
 from storage.typed_json import read_json_lines
 from train.data.bad_samples import BadSampleCounter, first_samples
-from train.evaluation.judge import ValidationScene, validation_scene
 from train.evaluation.judged_view import JudgedView, scene_facts
 from train.evaluation.metrics import METRICS, noise_floors, picture_scores
 from train.evaluation.stored_pictures import PictureSource
 from train.evaluation.timing import Price, time_scene
+from train.evaluation.validation import ValidationScene, validation_scene
 from train.loss.lpips import Lpips
 
 UNKNOWN_MACHINE = "a machine that is not named"

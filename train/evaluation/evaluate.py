@@ -26,12 +26,12 @@ from storage.settings.described import checked
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.equal_time import CAPTION, TRACER, spread_views
-from train.evaluation.judge import ValidationScene, predict, validation_scene
 from train.evaluation.judged_view import GROUPED, NETWORK, JudgedView, scene_facts
 from train.evaluation.metrics import noise_floors, picture_scores
 from train.evaluation.options import SceneCount, Width
 from train.evaluation.sheet import SheetView
 from train.evaluation.stored_pictures import Baselines
+from train.evaluation.validation import ValidationScene, predict, validation_scene
 from train.loss.lpips import Lpips
 
 BASELINE_SCENES = 256

@@ -17,7 +17,7 @@ from storage.registry import Registry
 from storage.seeds import rng_for
 from train.loss.lpips import Lpips
 from train.loss.ms_ssim import ssim
-from train.loss.objective import tone_map
+from train.loss.training_loss import tone_map
 
 
 @dataclass(frozen=True, kw_only=True)

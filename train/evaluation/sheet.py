@@ -18,7 +18,7 @@ from train.evaluation.error_colors import (
     heat_colors,
     mean_error,
 )
-from train.evaluation.judge import Judge, ValidationResult
+from train.evaluation.validation import Judge, ValidationResult
 from train.settings import TrainSettings
 
 TILE_PX = 160

@@ -39,8 +39,8 @@ from storage.typed_json import FINITE, Sha256, read_json
 from train.data.mixture import RECORD, Mixture
 from train.loop.distributed import DistributedContext
 from train.loop.schedule import decay_start_step
-from train.loop.state import TrainState, new_state
 from train.loop.step import StepReport
+from train.loop.train_state import TrainState, new_state
 from train.resume import Event, ResumePlan, event_records
 from train.settings import Precision, TrainSettings, stored_settings
 

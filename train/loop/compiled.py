@@ -15,7 +15,7 @@ from model.hits.decoder import HitDecoder
 from model.renderformer import RenderFormer
 from storage.errors import TrilightError
 from train.loss.lpips import Lpips
-from train.loss.objective import TrainingLoss
+from train.loss.training_loss import TrainingLoss
 from train.settings import Compile
 
 MAX_GRAPHS = 32

@@ -1,4 +1,4 @@
-"""Processes that train together: one, or those that torchrun started.
+"""Distributed training: one process, or those that torchrun started.
 
 Each takes its slice of every batch (train.data.order.RankSlice); torch's DistributedDataParallel
 averages gradients over nccl or gloo. Only the first process logs, validates and saves.

@@ -7,10 +7,10 @@ from typing import Any
 
 from storage.atomic import append_line, write_atomically
 from storage.settings.described import settings_record
-from train.evaluation.judge import Judge
 from train.evaluation.sheet import draw_validation_sheet
+from train.evaluation.validation import Judge
 from train.folder import RunFolder
-from train.loop.state import TrainState
+from train.loop.train_state import TrainState
 from train.monitoring.boards import TensorBoardLogger, WandbLogger
 from train.monitoring.rows import add_note, read_rows
 from train.progress import TrainProgress

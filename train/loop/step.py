@@ -1,4 +1,4 @@
-"""One update of the weights, or none: a step that is not finite changes nothing.
+"""Training step: one update of the weights, or none if it is not finite.
 
 `Stepper.launch` enqueues a step and returns its statistics on the device; `Stepper.sync` waits for
 them. On a CPU a step is synced at once, on a GPU once per window (loop.trainer), so that the host
@@ -21,8 +21,8 @@ from train.data.buckets import TrainingBatch
 from train.loop.compiled import compile_parts, is_compiler_error, undo_compiling
 from train.loop.decision import defers_sync, make_decision
 from train.loop.distributed import DistributedContext
-from train.loop.state import TrainState
-from train.loss.objective import TrainingLoss
+from train.loop.train_state import TrainState
+from train.loss.training_loss import TrainingLoss
 from train.monitoring.activity import Activity
 from train.monitoring.layers import LayerNorms
 from train.settings import Precision, TrainSettings

@@ -22,10 +22,10 @@ from train.loop.interrupts import Stopped, ValidationInterrupted, deferred_inter
 from train.loop.muon import PRODUCTS
 from train.loop.recorder import Recorder
 from train.loop.schedule import decay_start_step, learning_rate
-from train.loop.state import TrainState
 from train.loop.step import PendingStats, Stepper, StepReport, explain_out_of_memory
+from train.loop.train_state import TrainState
 from train.loop.window import Window, device_peak
-from train.loss.objective import TrainingLoss
+from train.loss.training_loss import TrainingLoss
 from train.monitoring.process_monitor import ProcessMonitor
 from train.monitoring.settings import WatchSettings
 from train.progress import TrainProgress

@@ -1,4 +1,4 @@
-"""Structural similarity, at one scale (Wang et al. 2004) and at several (Wang et al. 2003)."""
+"""SSIM, structural similarity, at one scale (Wang et al. 2004) and several (Wang et al. 2003)."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Rows of the log as named scalars, and the boards that show them.
+"""Rows of the log as named scalars, for TensorBoard and Weights & Biases (W&B).
 
 TensorBoard always, Weights & Biases if requested and installed.
 """

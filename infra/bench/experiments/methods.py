@@ -25,8 +25,8 @@ from infra.render.path_tracer import RenderChild
 from infra.render.raw_references import RawReference, first_camera, true_error_db
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.generated import BENCHMARK
+from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.noise_floor import clamped_radiance
-from pipeline.renders.variant import choose_variant
 from storage.conventions import log10_radiance
 from storage.raycast.first_hits import first_hits
 from storage.records.scene import Scene

@@ -27,10 +27,10 @@ from pipeline.renders.visible_gpus import query_gpus
 from storage.conventions import look_at_c2w
 from train.data.buckets import TrainingBatch
 from train.loop.distributed import DistributedContext
-from train.loop.state import new_state
 from train.loop.step import Stepper
+from train.loop.train_state import new_state
 from train.loss.lpips import BLOCKS, Lpips
-from train.loss.objective import TrainingLoss
+from train.loss.training_loss import TrainingLoss
 from train.presets import training_preset
 from train.settings import TrainSettings
 

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from infra.bench.workloads.cost_scene import plain_surface, quad, scene_of_pieces
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.decimation.by_name import decimate
+from pipeline.assets.decimation.decimate import decimate
 from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.load import load_mesh
+from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
 from pipeline.renders.renderer import SceneRenderer

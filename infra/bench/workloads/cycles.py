@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.usd.write import write_usd
+from pipeline.exchange.usd.write_usd import write_usd
 from storage.cache import cache_folder
 from storage.errors import TrilightError
 from storage.records.scene import Scene

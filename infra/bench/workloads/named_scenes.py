@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from infra.render.held_out_scenes import first_composed
-from pipeline.exchange.gltf.read import SUFFIXES as GLTF_SUFFIXES
+from pipeline.exchange.gltf.read_gltf import SUFFIXES as GLTF_SUFFIXES
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.isolation import IsolatedChild
 from pipeline.presets.training import object_views, olat, smoke, textured_256

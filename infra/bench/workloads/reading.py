@@ -45,9 +45,9 @@ def render_scenes(px: int, place: Path) -> tuple[dict[str, float], list[Members]
         Wall-clock milliseconds and CPU seconds of a view; and the files of each scene.
     """
     splits = preset_settings(BUILD).splits
-    order = GenerateOptions(build=BUILD, resolution=px, scenes=splits.scenes_per_shard)
+    options = GenerateOptions(build=BUILD, resolution=px, scenes=splits.scenes_per_shard)
     marks: list[float] = []
-    measured = measure_scenes(order, SCENES, place, lambda: marks.append(time.monotonic()))
+    measured = measure_scenes(options, SCENES, place, lambda: marks.append(time.monotonic()))
     staged = DatasetFolder(place).staged_shard(shard_name(0, splits))
     members: list[Members] = [read_staged_scene(staged, row).members for row in range(SCENES)]
     view_s = (marks[-1] - marks[0]) / (len(marks) - 1) / measured.num_views
@@ -97,7 +97,7 @@ def time_reading(
     """
     from train.data.bad_samples import BadSampleCounter
     from train.data.loader import load_batches
-    from train.data.order import RankSlice
+    from train.data.options import RankSlice
 
     stream = load_batches(
         data.split("train"), settings, 0, rank_slice=RankSlice(),

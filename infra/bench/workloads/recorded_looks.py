@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 from infra.render.raw_references import RawReference, first_camera, true_error
 from pipeline.renders.camera import PixelCamera
-from pipeline.renders.frozen_arithmetic.halves import (
-    Half,
-    measure_errors,
-    squared_error,
-)
-from pipeline.renders.frozen_arithmetic.host_pictures import (
+from pipeline.renders.noise_floor import BLOCK_PX, Curve, clamped_radiance, secant_slope
+from pipeline.renders.numpy_arithmetic.host_pictures import (
     HostPictures,
     keep_converged,
     with_mean_of,
 )
-from pipeline.renders.noise_floor import BLOCK_PX, Curve, clamped_radiance, secant_slope
+from pipeline.renders.numpy_arithmetic.noise_floor import (
+    Half,
+    measure_errors,
+    squared_error,
+)
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tracer import Tracer

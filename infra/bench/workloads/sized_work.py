@@ -18,7 +18,7 @@ from pathlib import Path
 from infra.bench.workloads.cost_scene import cost_scene
 from infra.bench.workloads.reading import write_copies
 from infra.bench.workloads.traced_pictures import fixed_samples, render_shot
-from pipeline.renders.variant import activate, choose_variant
+from pipeline.renders.mitsuba_variant import activate, choose_variant
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from storage.installation import IMPORT_ROOT, child_environment

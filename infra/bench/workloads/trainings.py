@@ -16,15 +16,15 @@ from storage.errors import TrilightError
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.buckets import bucket_scenes
 from train.data.loader import load_batches
-from train.evaluation.judge import Judge
+from train.evaluation.validation import Judge
 from train.loop.distributed import DistributedContext
 from train.loop.muon import choose_muon_precision
 from train.loop.schedule import learning_rate
-from train.loop.state import new_state
 from train.loop.step import Stepper
+from train.loop.train_state import new_state
 from train.loop.trainer import scene_flops
-from train.loss.objective import TrainingLoss
-from train.run import loader_settings
+from train.loss.training_loss import TrainingLoss
+from train.run_training import loader_settings
 from train.settings import TrainSettings
 
 

@@ -1,4 +1,4 @@
-// Questions to the server that this page came from, and what it says of mistakes.
+// HTTP requests to the server of this page, and messages of its errors.
 
 export async function ask(path, body) {
   const options = body === undefined ? {} : {

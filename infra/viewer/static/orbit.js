@@ -1,4 +1,4 @@
-// A camera that turns around a point, by pointer, touch or keys. The world is +Z up.
+// Orbit controls of the camera, by pointer, touch or keys. The world is +Z up.
 
 import { Matrix4, Vector3 } from "./three/three.module.min.js";
 

@@ -1,4 +1,4 @@
-// Pictures by every way, one after another; whoever looks elsewhere gives them up.
+// Pictures by every renderer, one after another; leaving the page cancels them.
 
 import { ask, askJson, element, say, sleep } from "./ask.js";
 

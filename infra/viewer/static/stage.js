@@ -1,4 +1,4 @@
-// The scene in 3D, drawn by the graphics card: a help to find one's way, not a measurement.
+// The scene in 3D by three.js (WebGL): for orientation, not for measurement.
 
 import * as THREE from "./three/three.module.min.js";
 

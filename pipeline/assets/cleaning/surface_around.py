@@ -1,4 +1,4 @@
-"""A closed, oriented, manifold surface around any mesh, at a small distance from it.
+"""A watertight, oriented, manifold surface around any mesh, at a small distance from it.
 
 It is the surface at a distance of one cell of a grid, pulled back toward the mesh. Marching
 tetrahedra (Doi and Koide 1991) over Kuhn's six tetrahedra of each cube make it. Unlike marching

@@ -1,4 +1,4 @@
-"""meshoptimizer's two simplifiers; they never crashed, hung or left the bounding box in tests.
+"""Decimation by meshoptimizer: its two simplifiers never crashed, hung or left the box in tests.
 
 Their vertices are a subset of the source's, which costs about twice the error of edge collapse with
 free placement, at a twentieth of its time.

@@ -1,4 +1,4 @@
-"""The two filters of pymeshlab that the stage calls, with every parameter stated.
+"""Decimation and even remeshing by two filters of pymeshlab, with every parameter stated.
 
 pymeshlab takes a missing parameter from the previous call in the same process, so that results
 would depend on history. It may crash or hang: these functions run in child processes only.

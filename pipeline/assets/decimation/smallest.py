@@ -1,4 +1,4 @@
-"""A search for the smallest budget that still passes."""
+"""A search for the smallest triangle budget whose decimation still passes."""
 
 from collections.abc import Callable
 from typing import TypeVar

@@ -1,4 +1,4 @@
-"""Two-way distance of two surfaces, by evenly spread points and exact distances.
+"""Two-way (Hausdorff) distance of two surfaces, by evenly spread points and exact distances.
 
 The quality check uses the 99th percentile: one vertex decides the largest value, and a mean accepts
 almost anything. A component with less than one percent of the area escapes it; `Components`

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.assets.settings import OwnMaterialSettings
 from pipeline.assets.source_materials.nearest import SurfaceLookup
 from pipeline.assets.source_materials.source_surface import SourceSurface
-from pipeline.assets.source_materials.tiles import (
+from pipeline.assets.source_materials.texture_atlas import (
     FLAT,
     Atlas,
     cells_per_side,

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.assets.source_materials.bake import bake, level_emission
-from pipeline.assets.source_materials.measure import skin_quality
 from pipeline.assets.source_materials.nearest import SurfaceLookup
 from pipeline.assets.source_materials.source_surface import SourceSurface, match_source_surface
+from pipeline.assets.source_materials.texture_quality import skin_quality
 from pipeline.foreign.gltf.materials import GltfMaterials
 from pipeline.foreign.gltf.objects import gltf_textured_mesh
 from pipeline.foreign.mesh import TriangleMesh

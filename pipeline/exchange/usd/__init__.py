@@ -1,1 +1,1 @@
-"""Scenes as USD, both ways."""
+"""Scenes as USD, both ways: `read_usd`, `write_usd`. Untrusted files: pipeline.foreign.usd."""

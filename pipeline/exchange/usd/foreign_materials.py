@@ -24,7 +24,7 @@ from pipeline.exchange.usd.held_materials import (
     read_held_material,
     restore_stated,
 )
-from pipeline.exchange.usd.names import added_column
+from pipeline.exchange.usd.prim_names import added_column
 from pipeline.foreign.part import Part, drop_empty, unit_normals
 from pipeline.foreign.usd.materials import MeshMaterials
 from pipeline.foreign.usd.object_stage import UsdStage
@@ -39,7 +39,7 @@ from pipeline.foreign.usd.polygons import (
 )
 from pipeline.foreign.usd.shaders import StatedMaterial, read_material
 from pipeline.foreign.usd.stage_materials import read_stage_materials
-from pipeline.scenes.shading import smooth_shaded
+from pipeline.scenes.shading_normals import smooth_shaded
 from storage.records.material import laid_out
 from storage.records.texture import MapSource, Texture
 

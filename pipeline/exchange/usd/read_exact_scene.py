@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import MAX_ROWS
-from pipeline.exchange.usd import names
+from pipeline.exchange.usd import prim_names as names
 from pipeline.exchange.usd.dome import read_exact_dome
-from pipeline.exchange.usd.write import ENVIRONMENT, author_scene, new_layer
 from pipeline.exchange.usd.write_meshes import CENTER, sum_positions
 from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, SHADERS, ST, decode_texture
+from pipeline.exchange.usd.write_usd import ENVIRONMENT, author_scene, new_layer
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import asset_bytes
 from storage.conventions import require_readable

@@ -1,7 +1,7 @@
 """Reader of untrusted USD files: opened within bounds, and read as plain arrays and numbers.
 
-Scenes (pipeline.exchange.usd) and objects (pipeline.assets) both use it. Native code parses the
-bytes, so only processes with limits import this (pipeline.isolation).
+Objects (pipeline.assets) and scenes use it; pipeline.exchange.usd reads and writes scenes.
+Native code parses the bytes, so only processes with limits import this (pipeline.isolation).
 
 - `stage`, `composition`: a file and the files that it names, bounded before it is composed.
 - `placed`: the visible prims with their transforms; names of unread contents.

@@ -1,4 +1,4 @@
-"""Checks a user's environment map, repairs small negative values, and resamples it.
+"""Checks a user's environment map (HDRI), repairs small negative values, and resamples it.
 
 Radiance is linear. A NaN or infinite value rejects the map: half floats end at 65,504, so that a
 brighter sun was written as infinite and is lost. Small negative values, which color conversions

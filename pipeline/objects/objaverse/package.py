@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from storage.errors import TrilightError
 from storage.file_locks import hold_lock
-from storage.remote.tries import TransferFailed, with_tries
+from storage.remote.retries import TransferFailed, with_tries
 
 Result = TypeVar("Result")
 

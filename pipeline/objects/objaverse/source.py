@@ -15,8 +15,8 @@ from pipeline.objects.listing import CountDone, Fetched, Listing, failure, fetch
 from pipeline.objects.objaverse.package import ObjaversePackage
 from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
+from storage.remote.retries import TransferFailed
 from storage.remote.safe_url import printable
-from storage.remote.tries import TransferFailed
 
 PREFIX = "objaverse:"
 _CATEGORY = "category/"

@@ -21,8 +21,8 @@ from storage.atomic import atomic_writer, remove_leftovers, write_atomically
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.remote.fetch import download, version_of
+from storage.remote.retries import TransferFailed, with_tries
 from storage.remote.safe_url import printable
-from storage.remote.tries import TransferFailed, with_tries
 from storage.typed_json import read_json
 
 _MAX_NAME_BYTES = 220

@@ -6,7 +6,7 @@ from typing import Any
 from urllib.parse import quote, unquote
 
 from storage.errors import TrilightError
-from storage.remote.tries import TransferFailed, is_absent, with_tries
+from storage.remote.retries import TransferFailed, is_absent, with_tries
 from storage.remote.url import RemoteUrl, shared_driver
 
 _MAX_FOLDERS = 10_000

@@ -23,8 +23,8 @@ from storage.cache import cache_folder
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
+from storage.remote.retries import TransferFailed
 from storage.remote.safe_url import printable, safe_url
-from storage.remote.tries import TransferFailed
 from storage.remote.url import RemoteUrl
 
 MAX_BYTES = 200_000_000

@@ -1,1 +1,1 @@
-"""Passes: pictures of what the pixels of a camera see, as functions of a stored scene."""
+"""Render passes (AOVs): what the pixels of a camera see, as functions of a stored scene."""

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from infra.bench import run as running
+from infra.bench import run_benchmark as running
 from infra.bench.context import BenchContext
 from infra.bench.experiment import (
     FULL,
@@ -27,7 +27,7 @@ from infra.bench.experiment import (
     experiment_of,
 )
 from infra.bench.rows import Row, plot, rows_of, table_of
-from infra.bench.run import commit_text, machine_record, run
+from infra.bench.run_benchmark import commit_text, machine_record, run
 from infra.bench.store import Run, Store
 from infra.bench_options import BenchOptions
 from storage.errors import Rejected, TrilightError

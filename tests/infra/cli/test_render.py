@@ -27,8 +27,8 @@ from infra.render.preview_table import (
 from model.neural_renderer import NeuralRenderer
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
-from pipeline.exchange.usd.write import write_usd
-from pipeline.renders.variant import choose_variant
+from pipeline.exchange.usd.write_usd import write_usd
+from pipeline.renders.mitsuba_variant import choose_variant
 from storage.conventions import preview_srgb8
 from storage.dataset.shard import write_shard
 from storage.errors import TrilightError

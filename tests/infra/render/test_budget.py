@@ -31,9 +31,9 @@ from infra.render.preview_table import (
 )
 from infra.render.quality import FixedSamples, TimeBudget
 from infra.setup.preview_table import NETWORK, WIDTHS, ladder, part_names, table_of
+from pipeline.renders.mitsuba_variant import Variant
 from pipeline.renders.preview import all_parts
 from pipeline.renders.settings import Filtered
-from pipeline.renders.variant import Variant
 from storage.errors import TrilightError
 from storage.settings.described import settings_record
 from tests.for_each import case

@@ -22,9 +22,9 @@ from infra.render.raw_references import RawReference, true_error, true_error_db
 from model.config import hits_smoke
 from model.neural_renderer import NeuralRenderer
 from pipeline.exchange.open_scene import SceneSource
+from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.settings import NoiseTargets
-from pipeline.renders.variant import choose_variant
 from storage.conventions import log10_radiance
 from storage.errors import Unrenderable
 from storage.metrics import psnr_linear_db, psnr_log_db

@@ -24,7 +24,7 @@ from infra.serving import access, local
 from infra.serving.access import grant, next_command, revoke, settings_file, state_folder
 from infra.serving.deployments import limits
 from infra.serving.local import running, start, stop
-from infra.serving.train_model import RunChanges, TrainOptions, train_model, train_order
+from infra.serving.train_model import RunChanges, TrainOptions, train_model, train_options
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
 from pipeline.flows.prefect_server import STOPPED_BY_PARENT, wait_until_healthy
 from storage.errors import TrilightError
@@ -331,7 +331,7 @@ def test_laws_between_settings_are_checked_before_the_command() -> None:
         with case(message):
             form = RunChanges(**given["changes"]) if "changes" in given else None
             with pytest.raises(TrilightError, match=message):
-                train_order(_parameters(**{**given, "changes": form}))
+                train_options(_parameters(**{**given, "changes": form}))
 
 
 def test_a_second_stage_begins_with_the_first() -> None:
@@ -339,14 +339,14 @@ def test_a_second_stage_begins_with_the_first() -> None:
         with case(run):
             form = RunChanges(**{"loss": {"perceptual_weight": 0.1}, "num_steps": 9000})
             given = {"run": run, "begin_with": "runs/pretrain", "lpips": "hub", "changes": form}
-            command = train_order(_parameters(**given)).command()
+            command = train_options(_parameters(**given)).command()
             words = " ".join(command[command.index("train") :])
             assert words == (
                 f"train {run} --data a --begin-with runs/pretrain --lpips hub "
                 "--changes loss.perceptual_weight=0.1 --changes num_steps=9000"
             )
             going_on = {"resume": True, "changes": None, "decisions": {"learning_rate": 1e-5}}
-            command = train_order(_parameters(**going_on)).command()
+            command = train_options(_parameters(**going_on)).command()
             assert (
                 " ".join(command[4:]) == "smoke --data a --resume --decisions learning_rate=1e-05"
             )

@@ -18,7 +18,7 @@ from infra.viewer.dataset_index import filter_of
 from infra.viewer.folder_handlers import THUMBNAIL_PX, FolderHandlers
 from infra.viewer.scene_list import scene_list
 from pipeline.exchange.convert import write_scene
-from pipeline.renders.variant import Variant, choose_variant
+from pipeline.renders.mitsuba_variant import Variant, choose_variant
 from pipeline.shards.finished_dataset import FinishedDataset
 from pipeline.shards.listing import list_scenes
 from pipeline.shards.plans import Selection

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.assets.decimation.by_name import decimate, safe_method
+from pipeline.assets.check_pymeshlab import missing_filters
+from pipeline.assets.decimation.decimate import decimate, safe_method
 from pipeline.assets.decimation.pymeshlab_filters import REQUIRED_FILTERS, pymeshlab
 from pipeline.assets.decimation.smallest import smallest_passing
-from pipeline.assets.environment import missing_filters
 from pipeline.assets.quality.distance import Surface
 from pipeline.assets.recipe import methods_of
 from pipeline.assets.settings import AssetSettings, GateSettings

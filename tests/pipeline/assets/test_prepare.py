@@ -22,8 +22,8 @@ from pipeline.assets.quality.distance import Surface
 from pipeline.assets.recipe import RECIPE, methods_of
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.generation.environment import vector_extension
 from pipeline.generation.prepare_isolated import prepare_isolated
+from pipeline.generation.software_environment import vector_extension
 from pipeline.objects.generated import generate_objects
 from pipeline.objects.sources import find_objects
 from pipeline.presets.registry import preset_settings
@@ -139,7 +139,7 @@ def test_two_processes_write_the_same_bytes(tmp_path: Path, asset: Asset) -> Non
 def test_what_the_parent_needs_loads_no_mesh_library() -> None:
     code = (
         "import sys, pipeline.assets.settings, pipeline.assets.recipe, pipeline.assets.stage,"
-        "pipeline.assets.store, pipeline.foreign.source_file;"
+        "pipeline.assets.asset_store, pipeline.foreign.source_file;"
         "print(*sys.modules)"
     )
     heavy = {"trimesh", "igl", "pymeshlab", "embreex", "wasmtime"}

@@ -12,8 +12,8 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
 from pipeline.exchange.scene_files import build_scene
-from pipeline.exchange.usd.read import read_usd
-from pipeline.exchange.usd.write import write_usd
+from pipeline.exchange.usd.read_usd import read_usd
+from pipeline.exchange.usd.write_usd import write_usd
 from storage.records.lookup import textured_rows
 from storage.records.material import EMISSION
 from storage.records.scene import Scene

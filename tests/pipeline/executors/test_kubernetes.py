@@ -138,6 +138,6 @@ def test_files_of_this_machine_are_refused(asked: dict[str, str], message: str) 
     given: dict[str, Any] = {"scenes": 8, "out": "gs://sets/mine", **asked}
     order = GenerateOptions(**given | {"build": "smoke"})
     object.__setattr__(order, "build", asked.get("build", "smoke"))  # --extend has loaded it
-    job = ArrayJob(order=order, tasks=[0], per_task=1, at_once=1)
+    job = ArrayJob(options=order, tasks=[0], per_task=1, at_once=1)
     with pytest.raises(TrilightError, match=f"submit kubernetes: .*{message}"):
         job_manifest(job, KubernetesOptions(image=IMAGE))

@@ -22,7 +22,7 @@ from pipeline.flows.prefect_runner import PrefectRunner
 from pipeline.flows.run_artifacts import RunArtifacts, report_url, small_picture, usd_per_core_hour
 from pipeline.generation.dataset_writer import DatasetProgress
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.run import TaskResult
+from pipeline.generation.generation_run import TaskResult
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
@@ -195,8 +195,8 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
             for task in job.tasks:
                 monkeypatch.setenv("SHARDS_PER_TASK", str(job.per_task))
                 monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(task))
-                find_executor("slurm", None, None).make(job.order, None)
-            Path(job.order.place, "README.md").write_text("# A set")  # the last document
+                find_executor("slurm", None, None).make(job.options, None)
+            Path(job.options.place, "README.md").write_text("# A set")  # the last document
 
         arrays.append(list(job.tasks))
         threading.Thread(target=work).start()

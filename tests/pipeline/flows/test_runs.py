@@ -10,8 +10,8 @@ from typing import Any, cast
 
 import pytest
 
-from pipeline.flows import dataset_flows as building
 from pipeline.flows import on_dask
+from pipeline.flows import prefect_flows as building
 from pipeline.flows import prefect_runner as runner
 from pipeline.flows.forms import DatasetInRuns, options_of_form
 from pipeline.flows.limits import GPU_LIMIT

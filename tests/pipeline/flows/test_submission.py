@@ -22,8 +22,8 @@ from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.states import Completed, Failed, Running, Scheduled, State
 
 from pipeline.flows import guarded_server
-from pipeline.flows.dataset_flows import generate_scenes
 from pipeline.flows.guarded_server import RequestGuard
+from pipeline.flows.prefect_flows import generate_scenes
 from pipeline.flows.prefect_server import (
     name_prefect_failures,
     prefect_server,

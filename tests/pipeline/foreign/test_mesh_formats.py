@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.foreign.gltf.container import data_uri_bytes, local_path
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.load import load_mesh
+from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.material import SourceMaterial
 from pipeline.foreign.mesh import FileMesh
 from pipeline.foreign.mesh_materials import read_textured_mesh

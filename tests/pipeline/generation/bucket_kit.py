@@ -18,7 +18,7 @@ from storage.dataset.layout import dataset_folder
 from storage.dataset.staging import stage_scene
 from storage.records.objects import Failure
 from storage.records.sample import sample_key
-from storage.remote import store, tries
+from storage.remote import retries, store
 from storage.remote import url as remote_url
 from tests.pipeline.generation.test_dataset_writer import ENVIRONMENT, _build, _sample
 from tests.s3_server import CREDENTIALS, control
@@ -39,7 +39,7 @@ def empty_bucket(
     """
     for name, value in {**CREDENTIALS, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(tries, "PAUSE_S", 0.0)
+    monkeypatch.setattr(retries, "PAUSE_S", 0.0)
     monkeypatch.setattr(dataset_writer, "_PATIENCE_S", 0.0)
     control(port, "reset")
     if not keep_driver:

@@ -174,7 +174,7 @@ def test_a_sent_shard_need_not_be_fetched(
         def never(*arguments: Any) -> None:
             raise AssertionError("fetched")
 
-        monkeypatch.setattr("storage.remote.cache.download", never)
+        monkeypatch.setattr("storage.remote.shard_cache.download", never)
         dataset = open_dataset(OUT)
         assert len(list(dataset.read_shard(dataset.manifest.shards[0]))) == 4
 

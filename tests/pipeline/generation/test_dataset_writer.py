@@ -8,13 +8,13 @@ import pytest
 from pipeline.generation import dataset_writer
 from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.environment import environment
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.run import choose_dataset_variant
+from pipeline.generation.generation_run import choose_dataset_variant
+from pipeline.generation.software_environment import environment
 from pipeline.objects.generated import generate_objects
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
-from pipeline.renders.variant import Device, Variant, _ProbeResult, device_of
+from pipeline.renders.mitsuba_variant import Device, Variant, _ProbeResult, device_of
 from pipeline.shards.pack import pack_shard
 from storage.dataset import layout
 from storage.dataset.dataset import open_dataset
@@ -149,9 +149,9 @@ def test_a_dataset_stays_on_the_device_that_it_began_on(
     monkeypatch.setenv("TRILIGHT_VARIANT", named)
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
-    monkeypatch.setattr("pipeline.renders.variant._probe", lambda variant: _ProbeResult())
+    monkeypatch.setattr("pipeline.renders.mitsuba_variant._probe", lambda variant: _ProbeResult())
     on_cpu = Variant(name="llvm_ad_rgb", libllvm="", note="")
-    monkeypatch.setattr("pipeline.renders.variant._on_processor", lambda: on_cpu)
+    monkeypatch.setattr("pipeline.renders.mitsuba_variant._on_processor", lambda: on_cpu)
     order = GenerateOptions(build=build, device=device)
     variant = choose_dataset_variant(order, folder)
     assert variant.device == device_of(environment(variant)) == chosen

@@ -170,7 +170,7 @@ def test_a_dataset_never_causes_an_import(
 
 
 def test_a_form_cannot_name_a_file(tmp_path: Path) -> None:
-    from pipeline.flows.dataset_flows import generate_scenes
+    from pipeline.flows.prefect_flows import generate_scenes
 
     trap = written(tmp_path, TRAP)
     with pytest.raises(ParameterTypeError, match="build"):

@@ -24,8 +24,8 @@ from pipeline.objects.maps.prepared import MapFiles, prepare_map
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.scenes.compose import compose_scene
-from pipeline.scenes.fitting import draw_rows
 from pipeline.scenes.pool import PooledAsset, fits_of
+from pipeline.scenes.triangle_budget import draw_rows
 from scene_templates.user_maps import UserMap, draw_user_map
 from storage.conventions import SPLITS
 from storage.dataset.manifest import Manifest

@@ -16,11 +16,11 @@ from infra.render.quality import ToStatedError
 from pipeline.exchange.convert import convert_scene
 from pipeline.exchange.open_scene import SceneSource
 from pipeline.exchange.reader import SceneReader
-from pipeline.exchange.usd.write import write_usd
+from pipeline.exchange.usd.write_usd import write_usd
 from pipeline.generation import inspect_scene as inspecting
 from pipeline.generation.inspect_scene import ROWS, VIEWS, inspect_scene, seen_into, turntable_poses
+from pipeline.renders.mitsuba_variant import Device, Variant, choose_variant
 from pipeline.renders.settings import NoiseTargets
-from pipeline.renders.variant import Device, Variant, choose_variant
 from storage.conventions import look_at_c2w
 from storage.dataset.shard import write_shard
 from storage.errors import TrilightError

@@ -14,8 +14,8 @@ import pytest
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation import pipeline
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generation_run import Outcome
 from pipeline.generation.pipeline import make_dataset, prepare_dataset
-from pipeline.generation.run import Outcome
 from pipeline.generation.scene_worker import SceneWorker
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset

@@ -13,8 +13,8 @@ from pipeline.generation import render_sample as rendering
 from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
+from pipeline.renders.mitsuba_variant import activate, choose_variant
 from pipeline.renders.results import RenderedView
-from pipeline.renders.variant import activate, choose_variant
 from pipeline.scenes.compose import compose_scene
 from storage.dataset.layout import DatasetFolder
 from storage.errors import Rejected, TrilightError

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from infra.cli.options import SHOWN
 from infra.cli.overrides import parse_overrides
 from pipeline.generation.generate_options import GenerateOptions, generate_words
-from pipeline.generation.run import TaskResult, children_of_gpu
+from pipeline.generation.generation_run import TaskResult, children_of_gpu
 from pipeline.generation.runner import Runner
 from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece, TaskCutter
 from pipeline.renders.visible_gpus import visible_gpus

@@ -16,14 +16,13 @@ from PIL import Image
 
 from pipeline.generation import pipeline, render_children, tasks, unfinished_shard
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generation_run import Run, ShardJob, TaskResult
 from pipeline.generation.pipeline import make_dataset, make_piece
-from pipeline.generation.prepare_isolated import ChildPool
-from pipeline.generation.run import Run, ShardJob, TaskResult
 from pipeline.generation.runner import Runner
 from pipeline.generation.scene_worker import SceneAttempt
 from pipeline.generation.tasks import Piece
 from pipeline.generation.unfinished_shard import UnfinishedShard
-from pipeline.isolation import ChildFailed, IsolatedChild
+from pipeline.isolation import ChildFailed, ChildPool, IsolatedChild
 from pipeline.shards.pack import pack_shard
 from storage import file_locks
 from storage.dataset.layout import DatasetFolder
@@ -236,7 +235,7 @@ class Idle(Runner[Any]):
 
 def _run(root: Path, scenes: int) -> Run:
     return Run(
-        order=GenerateOptions(out=str(root), scenes=scenes),
+        options=GenerateOptions(out=str(root), scenes=scenes),
         settings=_build(),
         scene_folder=None,
         publication=begin_tiny(root, scenes),
@@ -277,7 +276,7 @@ def test_a_range_leaves_to_others_what_they_are_at(
 
     monkeypatch.setattr(tasks.time, "sleep", sleep)
     run, runner = _run(tmp_path, 8), Idle()
-    ranged = dataclasses.replace(run, order=dataclasses.replace(run.order, shards="0:1"))
+    ranged = dataclasses.replace(run, options=dataclasses.replace(run.options, shards="0:1"))
     pipeline.make_shards(ranged, runner, lambda run, outcome: None)
     assert runner.rounds == [1]
     assert ranged.unfinished_shards() == [0]
@@ -316,7 +315,7 @@ def test_a_rerun_does_not_escape_the_failure_budget(
     assert [row.item for row in read_failures(folder.failures)] == [*map(sample_key, range(4))]
     monkeypatch.setattr(pipeline, "_begin_run", lambda order: contextlib.nullcontext(run))
     with pytest.raises(TrilightError, match="4 of 4 scenes could not be made"):
-        make_dataset(run.order, Idle())
+        make_dataset(run.options, Idle())
 
 
 def test_scenes_that_are_given_up_are_not_counted_as_made(tmp_path: Path) -> None:

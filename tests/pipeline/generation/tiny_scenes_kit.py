@@ -11,8 +11,8 @@ from pipeline.executors.threads import ThreadRunner
 from pipeline.generation.freeze_objects import AcceptedObjects, ObjectLock
 from pipeline.generation.frozen_pool import ComposedScenes, FrozenPool
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.run import ShardJob
-from pipeline.renders.variant import Variant
+from pipeline.generation.generation_run import ShardJob
+from pipeline.renders.mitsuba_variant import Variant
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.statistics import Statistics
 from storage.records.objects import Failure
@@ -79,7 +79,7 @@ def without_rendering(
 def without_probe(monkeypatch: pytest.MonkeyPatch) -> None:
     """Try no library: nothing is rendered."""
     unprobed = Variant(name="llvm_ad_rgb", libllvm="", note="")
-    monkeypatch.setattr("pipeline.renders.variant._on_processor", lambda: unprobed)
+    monkeypatch.setattr("pipeline.renders.mitsuba_variant._on_processor", lambda: unprobed)
 
 
 class Undocumented(ThreadRunner):

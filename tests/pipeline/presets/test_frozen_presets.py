@@ -15,9 +15,10 @@ import pytest
 from pipeline.presets.judging import PRESETS_FOR_JUDGING
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.presets.renderformer import RENDERFORMER_PRESETS
-from scene_templates import lights, placement
-from scene_templates.cameras import sample_camera
+from scene_templates import placement
+from scene_templates import sample_emitters as emitters
 from scene_templates.rooms import PATCH_FACES, QUADS, SIDES
+from scene_templates.sample_camera import sample_camera
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.digests import sha256_hex
@@ -70,12 +71,16 @@ def test_the_layouts_of_a_frozen_set_stay_what_they_are() -> None:
     assert (QUADS, len(PATCH_FACES)) == (8, 128)
     assert PATCH_FACES[:3].tolist() == [[0, 9, 10], [0, 10, 1], [1, 10, 11]]
     assert (placement.ARRANGEMENT_TRIES, placement.PLACE_TRIES) == (100, 16)
-    assert lights.TRIANGLE.tolist() == [
+    assert emitters.TRIANGLE.tolist() == [
         [-0.025, 0.025, 0.025],
         [0.025, -0.025, 0.025],
         [0.025, 0.025, -0.025],
     ]
-    assert (lights.SPACING_RADIUS**2, lights.SPACING_TRIES, lights.PALEST) == (
+    assert (
+        emitters.SPACING_RADIUS**2,
+        emitters.SPACING_TRIES,
+        emitters.PALEST,
+    ) == (
         pytest.approx(0.75),
         256,
         0.2,

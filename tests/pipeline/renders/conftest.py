@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
+from pipeline.renders.mitsuba_variant import Variant, activate, choose_variant
 from pipeline.renders.renderer import set_threads
-from pipeline.renders.variant import Variant, activate, choose_variant
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -11,7 +11,7 @@ _RENDERS = 1024
 
 
 def main() -> None:
-    from pipeline.renders.variant import activate, choose_variant
+    from pipeline.renders.mitsuba_variant import activate, choose_variant
 
     activate(choose_variant())
     from pipeline.renders.variant_probe import probe_blocks

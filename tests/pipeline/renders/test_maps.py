@@ -20,8 +20,8 @@ from pipeline.scenes.pieces import apply_skin, concatenate_pieces, emitter_piece
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.source_materials import source_skins
 from scene_templates.layout import Emitter
-from scene_templates.materials import MaterialSettings
 from scene_templates.rotations import uniform_rotation
+from scene_templates.sample_material import MaterialSettings
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.raycast.first_hits import first_hits

@@ -17,7 +17,7 @@ import pytest
 from numpy.typing import NDArray
 
 from infra.bench.workloads.cycles import installed_python, render_with_cycles, run_blender
-from pipeline.exchange.usd.write import write_usd
+from pipeline.exchange.usd.write_usd import write_usd
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.settings import RenderSettings
 from storage.metrics import psnr_linear_db, psnr_log_db

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.renders.frozen_arithmetic import host_pictures
-from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans, with_mean_of
 from pipeline.renders.load_tracer import choose_tracing_scale, load_tracer
+from pipeline.renders.numpy_arithmetic import host_pictures
+from pipeline.renders.numpy_arithmetic.host_pictures import HostMeans, with_mean_of
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import RenderedView
 from pipeline.renders.samples import DualBuffer
@@ -62,7 +62,7 @@ TILED = dataclasses.replace(CHEAP, noise_floor_db=90.0, max_spp=512)
 """Tiles are chosen, and where a mirror lights a floor, paths are guided."""
 
 _IN_ANOTHER_PROCESS = """
-from pipeline.renders.variant import activate, choose_variant
+from pipeline.renders.mitsuba_variant import activate, choose_variant
 activate(choose_variant())
 from tests.pipeline.renders import test_renderer as t
 t.set_threads(1)

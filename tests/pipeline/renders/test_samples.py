@@ -11,15 +11,20 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from infra.render.quality import ToStatedError
+from pipeline.renders.adaptive_sampling import TILE_PX, TileChoice, passes_of_tiles
 from pipeline.renders.camera import PixelCamera
-from pipeline.renders.frozen_arithmetic.halves import Half, estimate_error, squared_error, surprises
-from pipeline.renders.frozen_arithmetic.host_pictures import HostMeans, LogChanges
 from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.numpy_arithmetic.host_pictures import HostMeans, LogChanges
+from pipeline.renders.numpy_arithmetic.noise_floor import (
+    Half,
+    estimate_error,
+    squared_error,
+    surprises,
+)
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import NoiseTargets, RenderSettings
 from pipeline.renders.stopping import Goal, expected_spp, gaps_db, next_spp, slope_db
-from pipeline.renders.tiles import TILE_PX, TileChoice, passes_of_tiles
 from pipeline.renders.tracer import Chosen
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError

@@ -142,7 +142,7 @@ def test_a_picture_one_percent_brighter_and_one_wrong_pixel_are_found() -> None:
 
 
 if __name__ == "__main__":
-    from pipeline.renders.variant import activate, choose_variant
+    from pipeline.renders.mitsuba_variant import activate, choose_variant
 
     activate(choose_variant())
     for scene_name, made in scenes().items():

@@ -21,7 +21,7 @@ from pipeline.scenes.pieces import (
 )
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.redrawn import with_new_lights
-from pipeline.scenes.shading import flat_shaded
+from pipeline.scenes.shading_normals import flat_shaded
 from pipeline.scenes.source_materials import source_skins, with_source_emission
 from pipeline.scenes.subdivision import fill_triangles, subdivide
 from pipeline.scenes.textured_pieces import cube_coordinates, with_drawn_textures

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from scene_templates.surfaces.draw import SurfaceMapSettings, draw_surface
-from scene_templates.surfaces.families import (
+from scene_templates.surfaces.maps import MOST_ALBEDO, finish, surface_maps
+from scene_templates.surfaces.procedural_textures import (
     HEXAGONS,
     OUR_SURFACES,
     SURFACES,
@@ -15,7 +16,6 @@ from scene_templates.surfaces.families import (
     exceeded_by,
     lay_rows,
 )
-from scene_templates.surfaces.maps import MOST_ALBEDO, finish, surface_maps
 from scene_templates.surfaces.texels import Texels, stones
 from scene_templates.textures import TexturedLook, TextureSettings, draw_look
 from storage.seeds import rng_for

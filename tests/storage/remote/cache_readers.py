@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from storage.digests import sha256_hex
-from storage.remote.cache import ShardCache
+from storage.remote.shard_cache import ShardCache
 from storage.remote.url import RemoteUrl, parse_url
 
 BYTES = 1000

@@ -12,7 +12,7 @@ import pytest
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.digests import sha256_hex
 from storage.records.sample import encode_sample
-from storage.remote import tries, url
+from storage.remote import retries, url
 from tests.http_server import Site, serve
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes
 from tests.s3_server import s3_server
@@ -31,7 +31,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("TRILIGHT_SHARD_CACHE_GB", raising=False)
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    monkeypatch.setattr(tries, "PAUSE_S", 0.0)
+    monkeypatch.setattr(retries, "PAUSE_S", 0.0)
     return tmp_path / "cache" / "shards"
 
 

@@ -19,8 +19,8 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.remote import fetch, store
 from storage.remote import url as remote_url
+from storage.remote.retries import with_tries
 from storage.remote.store import BucketStore, LocalStore, Store
-from storage.remote.tries import with_tries
 from storage.remote.url import RemoteUrl
 from tests.for_each import for_each
 from tests.pipeline.generation.bucket_kit import empty_bucket

@@ -38,7 +38,7 @@ from train.data.scenes import TrainingScene, stored_levels
 from train.data.workers import MAX_THREADS, Machine, choose_workers, detect_machine
 from train.loop.checkpoints import read_checkpoint
 from train.resume import StartOptions
-from train.run import train_run
+from train.run_training import train_run
 from train.settings import AugmentationSettings
 
 BATCH = 4

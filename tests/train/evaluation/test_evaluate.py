@@ -24,7 +24,7 @@ from storage.seeds import rng_for
 from tests.command_line import trilight
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.train.kit import eval_config, tiny_run
-from tests.train.loss.test_objective import small_weights
+from tests.train.loss.test_training_loss import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
 from train.evaluation.chart import plot_excursions
@@ -38,14 +38,14 @@ from train.evaluation.evaluate import (
     worst_and_median,
     worst_of_each_excursion,
 )
-from train.evaluation.judge import predict, validation_scene
 from train.evaluation.judged_view import NETWORK, JudgedView, by_group, scene_facts, summarize_views
 from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
 from train.evaluation.options import EvaluationOptions
 from train.evaluation.pages import evaluation_page
 from train.evaluation.report import BENCHMARK, record
 from train.evaluation.stored_pictures import MEDIAN, NEAREST, Baselines, median_picture
-from train.loop.state import new_state
+from train.evaluation.validation import predict, validation_scene
+from train.loop.train_state import new_state
 from train.loss.lpips import Lpips
 
 

@@ -47,7 +47,7 @@ from train.loop.checkpoints import (
 from train.loop.distributed import DistributedContext, choose_device, join_processes
 from train.loop.interrupts import deferred_interrupts
 from train.loop.recorder import MetricsLog
-from train.loop.state import TrainState, new_state
+from train.loop.train_state import TrainState, new_state
 from train.monitoring.rows import read_rows
 from train.progress import TrainProgress
 from train.resume import plan_resume
@@ -61,7 +61,7 @@ from pathlib import Path
 from typing import Any
 from storage.settings.described import from_record
 from train.loop.checkpoints import save_checkpoint
-from train.loop.state import new_state
+from train.loop.train_state import new_state
 from train.settings import TrainSettings
 from train.settings import known_settings
 

@@ -36,8 +36,8 @@ from train.data import loader
 from train.data.scenes import TrainingScene
 from train.folder import RunFolder
 from train.loop.distributed import DistributedContext, join_processes
-from train.loop.state import new_state
 from train.loop.step import StepReport
+from train.loop.train_state import new_state
 from train.monitoring import spikes, watchdog
 from train.monitoring.activity import PHASES, Activity
 from train.monitoring.boards import WandbLogger, require_wandb, scalars
@@ -49,7 +49,7 @@ from train.monitoring.settings import WatchSettings
 from train.monitoring.spikes import LEAST_REMEMBERED, Spike, SpikeDetector, spike_bound
 from train.monitoring.watchdog import Watchdog
 from train.progress import TrainProgress
-from train.run import train_run
+from train.run_training import train_run
 
 
 def until(done: Callable[[], object]) -> None:

@@ -14,10 +14,10 @@ from PIL import Image
 from infra.bench.workloads import cycles as environment
 from infra.bench.workloads.traced_pictures import fixed_samples, render_shot
 from pipeline.exchange.loaded_scene import LoadedScene
-from pipeline.exchange.usd.read import read_usd
-from pipeline.exchange.usd.write import write_usd
+from pipeline.exchange.usd.read_usd import read_usd
+from pipeline.exchange.usd.write_usd import write_usd
 from pipeline.isolation import ChildLimits, IsolatedChild
-from pipeline.renders.variant import activate, choose_variant
+from pipeline.renders.mitsuba_variant import activate, choose_variant
 from scene_templates.rotations import uniform_rotation
 from storage.conventions import preview_srgb8
 from storage.metrics import psnr_linear_db

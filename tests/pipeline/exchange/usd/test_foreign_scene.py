@@ -11,8 +11,8 @@ from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
 
 from pipeline.exchange.loaded_scene import LoadedScene
-from pipeline.exchange.usd.read import read_usd, usd_keys
-from pipeline.exchange.usd.write import SUFFIXES, write_usd
+from pipeline.exchange.usd.read_usd import read_usd, usd_keys
+from pipeline.exchange.usd.write_usd import SUFFIXES, write_usd
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError

@@ -9,14 +9,14 @@ import pytest
 from pxr import Sdf, UsdGeom
 
 from pipeline.exchange.loaded_scene import LoadedScene
-from pipeline.exchange.usd.read import read_usd
-from pipeline.exchange.usd.write import write_usd
+from pipeline.exchange.usd.read_usd import read_usd
+from pipeline.exchange.usd.write_usd import write_usd
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
 from storage.records.texture import Texture
 from tests.columns_kit import COAT, WAVES, declared
 from tests.for_each import for_each
-from tests.pipeline.exchange.usd.test_write import odd_scene
+from tests.pipeline.exchange.usd.test_write_usd import odd_scene
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import number_texture, sky, textured_scene
 

@@ -12,8 +12,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from pipeline.exchange.formats import FORMATS, drop_uncarried_maps, list_lost_members
 from pipeline.exchange.loaded_scene import LoadedScene
-from pipeline.exchange.usd.read import read_usd
-from pipeline.exchange.usd.write import SUFFIXES, write_usd, write_usd_shard
+from pipeline.exchange.usd.read_usd import read_usd
+from pipeline.exchange.usd.write_usd import SUFFIXES, write_usd, write_usd_shard
 from scene_templates.rotations import uniform_rotation
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.assets.source_materials.skin import _parts
-from pipeline.exchange.gltf.read import read_gltf
+from pipeline.exchange.gltf.read_gltf import read_gltf
 from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.load import load_mesh
+from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.material import MaterialSamples, SourceMaterial, source_columns
 from pipeline.foreign.picture import Decoder
 from pipeline.foreign.source_file import read_source

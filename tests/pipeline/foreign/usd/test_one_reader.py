@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
 from pipeline.exchange.loaded_scene import LoadedScene
-from pipeline.exchange.usd.read import read_usd
+from pipeline.exchange.usd.read_usd import read_usd
 from pipeline.foreign.material import MaterialSamples, source_columns
 from pipeline.foreign.source_file import read_source
 from pipeline.foreign.usd.materials import usd_textured_mesh

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
 
-from pipeline.exchange.usd.write import write_usd
+from pipeline.exchange.usd.write_usd import write_usd
 from pipeline.foreign.usd import composition, placed
 from pipeline.foreign.usd import stage as opening
 from pipeline.foreign.usd.stage import OpenedStage, read_quietly

@@ -14,9 +14,9 @@ from pipeline.objects.licences import DEFAULT_ALLOWED, USER_PROVIDED
 from pipeline.objects.remote import source as remote_source
 from pipeline.objects.sources import list_objects
 from storage.errors import TrilightError
-from storage.remote import tries
+from storage.remote import retries
 from storage.remote import url as remote_url
-from storage.remote.tries import Patience
+from storage.remote.retries import Patience
 from storage.remote.url import PACKAGES, RemoteUrl, open_driver, parse_url
 from tests.for_each import for_each
 from tests.http_server import Fault, Site, serve
@@ -406,7 +406,7 @@ def test_one_dead_link_costs_one_object(
 
 def test_an_object_that_trickles_costs_itself(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is fast enough here, and what comes whole is taken: no clock decides the test."""
-    monkeypatch.setattr(tries, "PATIENCE", Patience(window_s=0.0, least_bytes_per_s=1e12))
+    monkeypatch.setattr(retries, "PATIENCE", Patience(window_s=0.0, least_bytes_per_s=1e12))
     site.put("a.obj", "content of a")
     site.put("b.obj", "v 0 0 0\n" * 1000)
     site.always["/b.obj"] = Fault(trickle=(1, 0.02))

@@ -1,0 +1,319 @@
+"""Chooses the Mitsuba variant of this machine, by rendering a small picture with each.
+
+LLVM is loaded at run time, and a library that loads may still abort the whole process while it
+compiles (LLVM 15 does, "Cannot select: fminimum"). So each candidate renders a small picture in a
+process of its own, without any kernel that another library compiled, and must meet the stored one
+within its noise. The answer is remembered.
+
+A GPU is used only after the same probe; its answer is remembered for this driver. It denoises as
+well if Open Image Denoise gives the same picture on it as on the CPU.
+
+Nothing here imports mitsuba, except `activate`.
+"""
+
+import contextlib
+import dataclasses
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+from pipeline.renders import probe_picture
+from pipeline.renders.visible_gpus import gpu_identity, visible_gpus
+from storage.atomic import write_atomically
+from storage.cache import cache_folder
+from storage.denoiser import DenoiserDevice, set_denoiser_device
+from storage.digests import canonical_json, sha256_hex
+from storage.errors import EnvironmentFailure, TrilightError
+from storage.installation import IMPORT_ROOT, child_environment
+from storage.typed_json import read_json
+
+_PROBE_S = (180, 360)
+"""Wall time of a probe, and of a second try where the first gave no answer: many may start at once,
+on a machine that is busy."""
+_REMEMBERED_TRIES = 32
+
+_RAYS_LEFT_OUT = "Disabling this ray tracing operation"
+"""Dr.Jit only logs this where a kernel is too large for OptiX; it raises no error."""
+
+
+VariantName = Literal["llvm_ad_rgb", "cuda_ad_rgb"]
+
+Device = Literal["cpu", "gpu", "auto"]
+"""What traces pictures; `auto` is a GPU where one passes the probe, or else the CPU."""
+
+_ASK = "TRILIGHT_VARIANT"
+_DEVICES: Mapping[str, Device] = {"llvm_ad_rgb": "cpu", "cuda_ad_rgb": "gpu"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """Mitsuba variant, with its libraries and devices."""
+
+    name: VariantName
+    """Name of the Mitsuba variant, with its backend and color mode."""
+    libllvm: str
+    """The LLVM library that it compiles with; empty on a GPU."""
+    note: str
+    """Note for the user about this choice; empty if there is none."""
+    denoiser: DenoiserDevice = "CPU"
+    """Device of Open Image Denoise."""
+
+    @property
+    def device(self) -> Device:
+        """`cpu` or `gpu`."""
+        return _DEVICES[self.name]
+
+    def address_space(self, num_bytes: int) -> int:
+        """Return the limit of a child: `num_bytes`, or far more for CUDA, which maps all memory."""
+        return num_bytes if self.device == "cpu" else 1 << 46
+
+
+def device_of(environment: Mapping[str, Any]) -> Device:
+    """Return the device in a dataset's environment (pipeline.generation.software_environment)."""
+    return _DEVICES.get(str(environment.get("mitsuba_variant")), "cpu")
+
+
+def named_device() -> Device | None:
+    """Return the device that TRILIGHT_VARIANT names; raises TrilightError if it names none."""
+    name = os.environ.get(_ASK, "")
+    if name not in ("", *_DEVICES):
+        raise TrilightError(f"{_ASK} is {name!r}; expected one of {', '.join(_DEVICES)}, or none.")
+    return _DEVICES.get(name)
+
+
+def choose_variant(default: Device = "cpu", *, device: Device | None = None) -> Variant:
+    """Return the variant of a device, on a CPU with the newest LLVM library that works.
+
+    Later calls read the remembered probes.
+
+    Args:
+        default: device where neither `device` nor TRILIGHT_VARIANT names one.
+        device: device of an option or a dataset, before which TRILIGHT_VARIANT does not count.
+
+    Raises:
+        TrilightError: no LLVM library works here; TRILIGHT_VARIANT names no variant; a GPU is named
+            and renders no right picture.
+        EnvironmentFailure: a probe gave no answer, which says nothing about its library: with
+            another one, the same dataset would be of other bytes.
+    """
+    chosen = device or named_device() or default
+    if chosen == "cpu" or (chosen == "auto" and not visible_gpus()):
+        return _on_processor()
+    probed = _remembered_probe(_GPU, _gpu_identity(), retry_failed=chosen == "gpu")
+    if not probed.problem:
+        note = (
+            probed.denoiser_problem and f"{probed.denoiser_problem}, so the CPU denoises pictures"
+        )
+        return dataclasses.replace(_GPU, denoiser="CPU" if note else "CUDA", note=note)
+    if chosen == "auto":
+        note = f"the GPU renders no right picture ({probed.problem}), so the CPU renders"
+        return dataclasses.replace(_on_processor(), note=note)
+    raise TrilightError(
+        f"rendering on a GPU: no right picture could be rendered with it here ({probed.problem}); "
+        f"expected one of CUDA with OptiX. Choose --device cpu, or unset {_ASK}."
+    )
+
+
+def _on_processor() -> Variant:
+    tried = []
+    for library in llvm_libraries():
+        variant = Variant(name="llvm_ad_rgb", libllvm=str(library), note="")
+        identity = sha256_hex(canonical_json([_identity(library), probe_picture.TABLE]))
+        probed = _remembered_probe(variant, identity, retry_failed=True)
+        if probed.is_silent:
+            raise EnvironmentFailure(
+                f"{library}: the probe of this LLVM library gave {probed.problem}, at "
+                f"{len(_PROBE_S)} tries; expected a small picture within seconds. Run again when "
+                "the machine is less busy; if the library hangs, name another one by "
+                "DRJIT_LIBLLVM_PATH."
+            )
+        if not probed.problem:
+            return variant
+        tried.append(library.name)
+    reason = f"of {', '.join(tried)} none works with Mitsuba" if tried else "no LLVM library found"
+    raise TrilightError(
+        f"rendering: {reason}; expected LLVM, by which Mitsuba compiles. Install it: "
+        "pip install karellen-llvm-core."
+    )
+
+
+def activate(variant: Variant) -> None:
+    """Make Mitsuba ready in this process; call before anything imports mitsuba.
+
+    Compiled kernels are kept below the cache folder, apart for each LLVM library: Dr.Jit itself
+    would run kernels of one library under another.
+    """
+    if variant.libllvm:
+        os.environ["DRJIT_LIBLLVM_PATH"] = variant.libllvm
+        kernels = cache_folder("kernels") / _identity(Path(variant.libllvm))[:16]
+        with contextlib.suppress(OSError):  # a cache that cannot be written costs time, no more
+            kernels.mkdir(parents=True, exist_ok=True)
+            os.environ["DRJIT_CACHE_DIR"] = str(kernels)
+    import mitsuba
+
+    mitsuba.set_variant(variant.name)
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)
+    set_denoiser_device(variant.denoiser)
+
+
+def _remembered_probe(variant: Variant, identity: str, *, retry_failed: bool) -> "_ProbeResult":
+    """Return the result of a probe of what has this identity, remembered or new.
+
+    Args:
+        variant: the variant to probe.
+        identity: a name that changes whenever its answer may.
+        retry_failed: whether a remembered problem is probed again: its cause may be fixed.
+    """
+    memory = cache_folder("probes.json")
+    known: dict[str, tuple[str, str]] = {}
+    with contextlib.suppress(OSError, TrilightError):  # none yet, or damaged: probed again
+        known = read_json(memory.read_bytes(), dict[str, tuple[str, str]], str(memory))
+    if last := known.pop(identity, None):
+        problem, denoiser_problem = last
+        if not (problem and retry_failed):
+            return _ProbeResult(problem=problem, denoiser_problem=denoiser_problem)
+    probed = _probe(variant)
+    if not (probed.problem and retry_failed):
+        known[identity] = (probed.problem, probed.denoiser_problem)
+        newest = dict(list(known.items())[-_REMEMBERED_TRIES:])
+        with contextlib.suppress(TrilightError):  # remembered next time, or probed again
+            write_atomically(memory, json.dumps(newest).encode())
+    return probed
+
+
+def _identity(library: Path) -> str:
+    """Return a name that changes whenever the library or Mitsuba does."""
+    status = library.stat()
+    versions = [metadata.version(name) for name in ("mitsuba", "drjit")]
+    return sha256_hex(canonical_json([str(library), status.st_mtime_ns, status.st_size, *versions]))
+
+
+def _gpu_identity() -> str:
+    """Return a name that changes whenever the GPUs, their driver, or what renders does."""
+    versions = [metadata.version(name) for name in ("mitsuba", "drjit", "pyoidn")]
+    return sha256_hex(canonical_json([gpu_identity(), *versions, probe_picture.TABLE]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ProbeResult:
+    """Result of a probe."""
+
+    problem: str = ""
+    """Reason why the variant cannot be used; empty if it can."""
+    is_silent: bool = False
+    """True if there was no answer in time, which a busy machine may cause."""
+    denoiser_problem: str = ""
+    """Reason why its GPU cannot denoise; empty if it can, or if there is no GPU."""
+
+
+_GPU = Variant(name="cuda_ad_rgb", libllvm="", note="", denoiser="CUDA")
+
+
+def _probe(variant: Variant) -> _ProbeResult:
+    """Render a small picture in a child, and once more where it gave no answer."""
+    result = _probe_within(variant, _PROBE_S[0])
+    for wall_s in _PROBE_S[1:]:
+        if result.is_silent:
+            result = _probe_within(variant, wall_s)
+    return result
+
+
+def _probe_within(variant: Variant, wall_s: float) -> _ProbeResult:
+    """Render a small picture in a child; an abort, a hang or a wrong picture is a problem."""
+    with tempfile.TemporaryDirectory() as kernels:
+        environment = {**child_environment(), "DRJIT_CACHE_DIR": kernels}
+        if variant.libllvm:
+            environment["DRJIT_LIBLLVM_PATH"] = variant.libllvm
+        try:
+            result = run_module("variant_probe", variant.name, wall_s, environment)
+        except subprocess.TimeoutExpired:
+            return _ProbeResult(problem=f"no answer within {wall_s:g} s", is_silent=True)
+    if _RAYS_LEFT_OUT in result.stderr:
+        return _ProbeResult(problem="Dr.Jit left out some of the rays")
+    if result.returncode == 0:
+        return _ProbeResult(denoiser_problem=result.stdout.strip())
+    lines = result.stderr.strip().splitlines()
+    return _ProbeResult(problem=lines[-1] if lines else f"it ended with status {result.returncode}")
+
+
+def run_module(
+    name: str, argument: str, wall_s: float, environment: Mapping[str, str]
+) -> subprocess.CompletedProcess[str]:
+    """Run a module of this package in a child; raises TimeoutExpired after so many seconds."""
+    return subprocess.run(
+        [sys.executable, "-m", f"{__package__}.{name}", argument],
+        cwd=IMPORT_ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=wall_s,
+        check=False,
+    )
+
+
+_FOLDERS = (
+    "/usr/lib/*-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib64/llvm*/lib64",
+    "/usr/lib/llvm-*/lib",
+    "/usr/local/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+    "/usr/local/opt/llvm*/lib",
+)
+_NAME = re.compile(r"libLLVM(?:-(\d+))?(?:\.so|\.dylib)?(?:\.(\d+))?[\d.]*(?:\.so|\.dylib)?[\d.]*$")
+_LDCONFIG_S = 20
+_WHEEL = "karellen-llvm-core"
+
+
+def llvm_libraries() -> list[Path]:
+    """Return what may be LLVM: DRJIT_LIBLLVM_PATH, the wheel's, the others by falling version.
+
+    Symbolic links are resolved, so that one library is named once.
+    """
+    named = os.environ.get("DRJIT_LIBLLVM_PATH")
+    candidates = {path.resolve() for path in (*_known_to_loader(), *_in_usual_folders())}
+    ordered = sorted(candidates, key=lambda path: (-_major_version(path), str(path)))
+    first = [Path(named).resolve()] if named else []
+    return [path for path in dict.fromkeys([*first, *_of_wheel(), *ordered]) if path.is_file()]
+
+
+def _of_wheel() -> list[Path]:
+    """Return the library of the wheel: with it, no picture depends on the distribution's LLVM."""
+    try:
+        members = metadata.files(_WHEEL) or []
+    except metadata.PackageNotFoundError:
+        return []
+    return [Path(str(file.locate())).resolve() for file in members if _NAME.match(file.name)]
+
+
+def _major_version(path: Path) -> int:
+    match = _NAME.match(path.name)
+    numbers = [int(group) for group in match.groups() if group] if match else []
+    return numbers[0] if numbers else 0
+
+
+def _known_to_loader() -> Iterable[Path]:
+    ldconfig = shutil.which("ldconfig") or shutil.which("ldconfig", path="/sbin:/usr/sbin")
+    if ldconfig is None:
+        return []
+    listing = subprocess.run(
+        [ldconfig, "-p"], capture_output=True, text=True, timeout=_LDCONFIG_S, check=False
+    ).stdout
+    return [Path(path) for path in re.findall(r"=> (\S*/libLLVM[-.]\S*)", listing)]
+
+
+def _in_usual_folders() -> Iterable[Path]:
+    for pattern in _FOLDERS:
+        for folder in Path("/").glob(pattern.lstrip("/")):
+            for name in ("libLLVM*.so*", "libLLVM*.dylib"):
+                yield from (path for path in folder.glob(name) if _NAME.match(path.name))

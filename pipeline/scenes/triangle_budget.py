@@ -1,0 +1,198 @@
+"""The triangle budget: draws objects that still fit, and chooses a level of detail (LOD) for each.
+
+A limit per object would either waste most of a scene's triangles or overflow it (the published
+recipes do both). Here objects are drawn among those that still fit; each begins with its coarsest
+level. The object with the largest distance to its source gets the next finer level, until all are
+near enough or no finer level fits.
+
+A split may have millions of objects. A draw needs the triangles of each and the camp of its
+licence: two columns that are read in chunks, and not at all if every object fits, as usual.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.errors import Rejected
+from storage.records.asset import Asset, Level
+from storage.records.object_index import CampSizes
+
+_CHUNK = 1 << 16
+"""Rows of a column that are read together: half a megabyte."""
+
+
+class Column(Protocol):
+    """Numbers of the rows of a split, in memory or in a file."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, rows: slice, /) -> NDArray[Any]: ...
+
+
+class FitTable:
+    """Triangles and camp of every object of a split, in the order of their uids."""
+
+    def __init__(
+        self, least: Column, camp: Column, camps: Sequence[str], sizes: Mapping[str, CampSizes]
+    ) -> None:
+        """Make a table of columns.
+
+        Args:
+            least: triangles of the coarsest level of each row.
+            camp: number of each row's camp.
+            camps: name of each camp by number; "" is for objects without a camp.
+            sizes: number and sizes of the objects of each camp that occurs.
+        """
+        self._least = least
+        self._camp = camp
+        self._camps = tuple(camps)
+        self.sizes = sizes
+
+    @classmethod
+    def of(cls, least: Sequence[int], camps: Sequence[str] = ()) -> "FitTable":
+        """Return the table of some objects; without `camps` none has a camp."""
+        names = sorted({*camps}) or [""]
+        sizes = np.array(least, np.int64)
+        numbers = np.array([names.index(camp) for camp in camps] or [0] * len(least), np.int64)
+        return cls(
+            sizes,
+            numbers,
+            names,
+            {
+                name: CampSizes(count=len(some), least=int(some.min()), most=int(some.max()))
+                for number, name in enumerate(names)
+                if len(some := sizes[numbers == number])
+            },
+        )
+
+    def size(self, row: int) -> int:
+        """Return the triangles of a row."""
+        return int(self._least[row : row + 1][0])
+
+    def camp(self, row: int) -> str:
+        """Return the camp of a row."""
+        return self._camps[int(self._camp[row : row + 1][0])]
+
+    def draw_row(self, rng: np.random.Generator, rooms: Mapping[str, int]) -> int | None:
+        """Draw a row uniformly among those that fit; None if none does.
+
+        Args:
+            rng: source of the random number.
+            rooms: most triangles by camp; rows of other camps do not fit.
+        """
+        if rooms.keys() == self.sizes.keys() and all(
+            self.sizes[camp].most <= room for camp, room in rooms.items()
+        ):
+            return int(rng.integers(len(self._least)))
+        limits = np.full(len(self._camps), -1, np.int64)
+        for camp, room in rooms.items():
+            limits[self._camps.index(camp)] = room
+        starts = range(0, len(self._least), _CHUNK)
+        counts = np.cumsum([np.count_nonzero(self._fits(start, limits)) for start in starts])
+        if not counts[-1]:
+            return None
+        number = int(rng.integers(counts[-1]))
+        chunk = int(np.searchsorted(counts, number, side="right"))
+        before = int(counts[chunk - 1]) if chunk else 0
+        fitting = np.flatnonzero(self._fits(starts[chunk], limits))
+        return starts[chunk] + int(fitting[number - before])
+
+    def _fits(self, start: int, limits: NDArray[np.int64]) -> NDArray[np.bool_]:
+        chunk = slice(start, start + _CHUNK)
+        fits: NDArray[np.bool_] = self._least[chunk] <= limits[self._camp[chunk]]
+        return fits
+
+
+def draw_rows(
+    rng: np.random.Generator, table: FitTable, count: int, num_triangles: int
+) -> list[int]:
+    """Draw rows with replacement, uniformly among those that fit beside the earlier ones.
+
+    If all fit, this is a uniform draw. Otherwise simple objects are drawn more often beside
+    demanding ones, as they would be if whole scenes were drawn until one fits. Objects of two
+    different camps never fit beside each other.
+
+    Args:
+        rng: source of the random numbers.
+        table: table to draw from, with at least one row.
+        count: number of rows to draw.
+        num_triangles: most triangles of all rows together.
+
+    Raises:
+        Rejected: "over_budget" if not even the simplest objects fit.
+    """
+    allowed = set(table.sizes)
+    remaining = num_triangles
+    rows = list[int]()
+    for following in range(count - 1, -1, -1):
+        rooms = {
+            camp: remaining - following * _simplest_after(table, camp, allowed) for camp in allowed
+        }
+        row = table.draw_row(rng, rooms)
+        if row is None:
+            least = min(sizes.least for sizes in table.sizes.values())
+            raise Rejected(
+                "over_budget",
+                f"{count} objects of at least {least} triangles each do not fit into the "
+                f"{num_triangles} that the scene has for them",
+            )
+        rows.append(row)
+        remaining -= table.size(row)
+        if camp := table.camp(row):
+            allowed &= {"", camp}
+    return rows
+
+
+def _simplest_after(table: FitTable, camp: str, allowed: set[str]) -> int:
+    """Return the triangles of the simplest object that is allowed after one of a camp."""
+    camps = allowed & {"", camp} if camp else allowed
+    return min(table.sizes[other].least for other in camps)
+
+
+def levels_within(
+    assets: Sequence[Asset], num_triangles: int, enough_error: float
+) -> tuple[Level, ...]:
+    """Choose one level per asset, together at most `num_triangles`.
+
+    Args:
+        assets: assets whose coarsest levels fit together (`draw_rows`).
+        num_triangles: most triangles of all assets together.
+        enough_error: two-way distance to the source (99th percentile, fraction of the diagonal)
+            below which an asset is not refined.
+
+    Raises:
+        Rejected: "over_budget" if the coarsest levels do not fit.
+    """
+    ladders = [sorted(asset.levels, key=_size) for asset in assets]
+    rungs = [0] * len(assets)
+    remaining = num_triangles - sum(_size(ladder[0]) for ladder in ladders)
+    if remaining < 0:
+        raise Rejected(
+            "over_budget",
+            f"{len(assets)} objects need {num_triangles - remaining} triangles at least, and the "
+            f"scene has {num_triangles} for them",
+        )
+    while True:
+        finer = [
+            (ladder[rung].record.quality.error_p99, -row)
+            for row, (ladder, rung) in enumerate(zip(ladders, rungs, strict=True))
+            if rung + 1 < len(ladder)
+            and ladder[rung].record.quality.error_p99 > enough_error
+            and _size(ladder[rung + 1]) - _size(ladder[rung]) <= remaining
+        ]
+        if not finer:
+            return tuple(ladder[rung] for ladder, rung in zip(ladders, rungs, strict=True))
+        row = -max(finer)[1]  # the first of equals
+        remaining -= _size(ladders[row][rungs[row] + 1]) - _size(ladders[row][rungs[row]])
+        rungs[row] += 1
+
+
+def least_triangles(asset: Asset) -> int:
+    """Return the triangles of the coarsest level."""
+    return min(_size(level) for level in asset.levels)
+
+
+def _size(level: Level) -> int:
+    return len(level.faces)

@@ -1,0 +1,365 @@
+"""glTF as a scene: places, colours at corners, Fresnel, what is lost; GLB as it is written."""
+
+import base64
+import dataclasses
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+
+from pipeline.exchange.convert import convert_scene, write_scene
+from pipeline.exchange.gltf.read_gltf import read_gltf
+from pipeline.exchange.gltf.write_gltf import encode_mesh_glb, encode_scene_glb
+from pipeline.exchange.loaded_scene import LoadedScene
+from pipeline.exchange.open_scene import load_source, scene_source
+from storage.conventions import linear_from_srgb8
+from storage.errors import TrilightError
+from storage.records.asset import Level
+from storage.records.lookup import environment_values, texture_values
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.records.scene import Scene
+from tests.for_each import for_each
+from tests.pipeline.assets.meshes_by_hand import geometry, prepare, write_glb
+from tests.pipeline.assets.source_materials.textured_kit import (
+    CORNERS,
+    KEEP,
+    QUARTERS,
+    SQUARE,
+    UV_UP,
+    F,
+    picture_bytes,
+    seen_at,
+    textured_glb,
+    textured_tree,
+)
+from tests.pipeline.exchange.exchange_kit import row_at
+from tests.scenes_by_hand import FLOOR, tiny_scene
+from tests.textured_by_hand import (
+    bumpy_scene,
+    colour_texture,
+    corner_uv,
+    number_texture,
+    sky,
+    textured_scene,
+)
+
+RED, GREEN, BLUE, GREY = (255, 0, 0), (0, 255, 0), (0, 0, 255), (128, 128, 128)
+PICTURE = np.array([[RED, GREEN], [BLUE, GREY]], np.uint8)
+"""The top row first: red is the upper left corner, at (-1, 1)."""
+
+FLOOR_MESH = dataclasses.replace(SQUARE, positions=2 * SQUARE.positions[:, [0, 2, 1]])
+"""Its corners are (-1, -1), (1, -1), (1, 1), (-1, 1)."""
+
+
+def quad(
+    *pictures: bytes | str, uv: Any = UV_UP, material: Any = None, **changes: Any
+) -> tuple[dict[str, Any], bytes]:
+    """Return tree and buffer of a textured floor, whose first picture is `PICTURE` by default."""
+    first, *more = pictures or (picture_bytes(PICTURE),)
+    tree, buffer = textured_tree(first, uv, FLOOR_MESH)
+    tree["asset"]["copyright"] = "A. Maker"
+    tree["nodes"][0]["name"] = "floor"
+    tree["materials"][0]["pbrMetallicRoughness"]["roughnessFactor"] = 0.5
+    tree["materials"][0] |= material or {}
+    for picture in more:
+        assert isinstance(picture, bytes)
+        tree["images"].append({"uri": "data:;base64," + base64.b64encode(picture).decode()})
+        tree["textures"].append({"source": len(tree["textures"])})
+    return {**tree, **changes}, buffer
+
+
+def saved(folder: Path, tree: dict[str, Any], buffer: bytes) -> LoadedScene:
+    return read_gltf(write_glb(folder / "a.glb", tree, buffer), "CC0-1.0")
+
+
+def read(folder: Path, *pictures: bytes | str, **changes: Any) -> LoadedScene:
+    return saved(folder, *quad(*pictures, **changes))
+
+
+def diffuse_of(srgb: tuple[int, int, int]) -> np.ndarray:
+    return np.asarray(linear_from_srgb8()[list(srgb)] * (1 - F))
+
+
+TEXELS = {(-0.5, 0.5): RED, (0.5, 0.5): GREEN, (-0.5, -0.5): BLUE, (0.5, -0.5): GREY}
+"""Centres of the texels on the floor: where the picture's own top is +Y."""
+
+CODED = 0.005
+"""Half a step of 8 sRGB-encoded bits is at most 0.0045 in linear light."""
+
+
+def test_every_texel_lies_where_gltf_puts_it(tmp_path: Path) -> None:
+    """A mirrored u, a flipped v or a turned floor would exchange colours; sRGB is decoded."""
+    scene = read(tmp_path).scene
+    for (x, y), colour in TEXELS.items():
+        found = row_at(scene, x, y)
+        assert found[:3] == pytest.approx(diffuse_of(colour), abs=CODED), colour
+        assert found[3:7] == pytest.approx([F, F, F, 0.5], abs=1e-6)
+    assert scene.vertex_normals == pytest.approx(np.tile([0, 0, 1], (4, 1)), abs=1e-6)
+    assert scene.objects[0].attribution == "A. Maker"
+    loaded = load_source(scene_source(str(tmp_path / "a.glb")))
+    assert any("no light" in note for note in loaded.notes)
+
+
+def test_cameras_lights_and_emission(tmp_path: Path) -> None:
+    lens = {"type": "perspective", "perspective": {"yfov": 0.5, "aspectRatio": 1.0}}
+    tree, buffer = quad(
+        material={"emissiveFactor": [1, 0.5, 0],
+                  "extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": 4}}},
+        cameras=[lens],
+        extensions={"KHR_lights_punctual": {"lights": [{"type": "point", "intensity": 3.0}]}},
+    )  # fmt: skip
+    tree["nodes"] += [
+        {"camera": 0, "translation": [0, 2, 5]},
+        {
+            "name": "lamp",
+            "translation": [0, 3, 0],
+            "extensions": {"KHR_lights_punctual": {"light": 0}},
+        },
+    ]
+    tree["scenes"][0]["nodes"] = [0, 1, 2]
+    found = saved(tmp_path, tree, buffer)
+    scene = found.scene
+    assert scene.environment is None
+    assert scene.c2w[0, :3, 3] == pytest.approx([0, -5, 2], abs=1e-6)
+    assert scene.c2w[0, :3, 2] == pytest.approx([0, -1, 0], abs=1e-6), "it looks along +Y"
+    assert scene.fov_deg[0] == pytest.approx(np.degrees(0.5))
+    assert [entry.name for entry in scene.objects] == ["floor", "lamp"]
+    rows = scene.materials[scene.material_index]
+    assert rows[0, 7:10] == pytest.approx([4, 2, 0])
+    own = scene.faces[scene.object_index == 1]
+    a, b, c = np.moveaxis(scene.vertex_positions[own].astype(np.float64), 1, 0)
+    cross = np.cross(b - a, c - a)
+    outward = np.einsum("ti,ti->t", cross, a + b + c - 3 * np.array([0, 0, 3]))
+    assert (outward > 0).all() and len(own) == 8
+    seen = np.linalg.norm(cross, axis=1).sum() / 8
+    assert rows[-1, 7] * seen == pytest.approx(3.0, rel=1e-5)  # candela, on average
+
+
+def test_a_directional_light_is_a_sun_of_as_many_lux(tmp_path: Path) -> None:
+    light = {"type": "directional", "intensity": 7.0, "color": [1, 0.5, 0]}
+    tree, buffer = quad(extensions={"KHR_lights_punctual": {"lights": [light]}})
+    turned = {"rotation": [-(0.5**0.5), 0, 0, 0.5**0.5]}  # its -z looks down glTF's -y
+    tree["nodes"].append({**turned, "extensions": {"KHR_lights_punctual": {"light": 0}}})
+    tree["scenes"][0]["nodes"] = [0, 1]
+    sky = saved(tmp_path, tree, buffer).scene.environment
+    assert sky is not None
+    rng = np.random.default_rng(0)
+    near = rng.normal(size=(200_000, 3)) * [0.02, 0.02, 0] + [0, 0, 1]
+    density = np.exp(-np.square(near[:, :2]).sum(axis=1) / 2 / 0.02**2) / (2 * np.pi * 0.02**2)
+    weight = (1 + np.square(near[:, :2]).sum(axis=1)) ** -2.0  # of the plane's area, seen from 0
+    irradiance = (environment_values(sky, near) * (weight / density)[:, None]).mean(axis=0)
+    assert irradiance == pytest.approx([7, 3.5, 0], rel=0.1)
+
+
+def test_what_is_lost_is_said_once(tmp_path: Path) -> None:
+    material = {
+        "normalTexture": {"index": 0},
+        "occlusionTexture": {"index": 0},
+        "alphaMode": "BLEND",
+        "emissiveFactor": [1, 1, 1],
+        "emissiveTexture": {"index": 0},
+        "extensions": {"KHR_materials_clearcoat": {"clearcoatFactor": 1}},
+    }
+    found = read(tmp_path, material=material, animations=[{}])
+    for words in (
+        "normal map",
+        "occlusion",
+        "transparency",
+        "emission",
+        "clearcoat",
+        "animations",
+    ):
+        assert sum(words in text for text in found.notes) == 1, words
+    files = convert_scene(
+        scene_source(str(tmp_path / "a.glb")), tmp_path / "a.usda", budget=None,
+        done=lambda finished, total: None,
+    )  # fmt: skip
+    assert any("normal map" in note for note in files.notes)
+    assert not any("cannot hold textures" in note for note in files.notes)
+    pictures = sorted(tmp_path.glob("texture-*.png"))
+    assert pictures and files.files == (tmp_path / "a.usda", *pictures)
+
+
+def test_a_missing_picture_leaves_the_factor(tmp_path: Path) -> None:
+    found = read(tmp_path, "gone.png")
+    assert any("left out: 'gone.png'" in text for text in found.notes)
+    assert row_at(found.scene, 0.5, 0.5)[:3] == pytest.approx([1 - F] * 3, abs=1e-6)
+
+
+@for_each("uri", ["../a.png", "http://example.com/a.png", "/etc/hostname"])
+def test_pictures_elsewhere_are_refused(tmp_path: Path, uri: str) -> None:
+    with pytest.raises(TrilightError, match=r"a\.glb: .*lies (outside|elsewhere)"):
+        read(tmp_path, uri)
+
+
+def test_a_mesh_without_coordinates_takes_the_mean_and_one_texel_is_a_constant(
+    tmp_path: Path,
+) -> None:
+    found = read(tmp_path, uv=None)
+    assert any("without texture coordinates" in text for text in found.notes)
+    assert not found.scene.textures
+    mean = linear_from_srgb8()[PICTURE].mean(axis=(0, 1)) * (1 - F)
+    assert found.scene.materials[0, :3] == pytest.approx(mean, abs=1e-5)
+    one = read(tmp_path, picture_bytes(PICTURE[:1, 1:])).scene
+    assert not one.textures
+    assert one.materials[0, :3] == pytest.approx(diffuse_of(GREEN), abs=1e-6)
+
+
+@for_each("value", [float("nan"), "red", -1, 2])
+def test_factors_that_are_no_albedo(tmp_path: Path, value: Any) -> None:
+    surface = {"metallicFactor": value, "baseColorFactor": [0.5, 0.5, 0.5, 1]}
+    found = read(tmp_path, material={"pbrMetallicRoughness": surface})
+    assert any("metallicFactor" in text for text in found.notes)
+
+
+def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    broken = UV_UP.copy()
+    broken[0, 0] = np.nan
+    with pytest.raises(TrilightError, match="TEXCOORD_0 is not finite"):
+        read(tmp_path, uv=broken)
+
+
+def there_and_back(folder: Path, scene: Scene) -> Scene:
+    write_scene(folder / "a.glb", scene)
+    return read_gltf(folder / "a.glb", "CC0-1.0").scene
+
+
+@for_each("specular", [(0.2, 0.2, 0.2), (0, 0, 0), (0.4, 0.1, 0.3), (0.9, 0.5, 0.1)])
+def test_a_scene_comes_back(tmp_path: Path, specular: tuple[float, float, float]) -> None:
+    materials = tiny_scene().materials.copy()
+    materials[FLOOR, DIFFUSE], materials[FLOOR, SPECULAR] = (0.1, 0.05, 0.3), specular
+    scene = tiny_scene(materials=materials)
+    found = there_and_back(tmp_path, scene)
+    assert found.num_triangles == scene.num_triangles
+    for name in ("c2w", "fov_deg"):
+        np.testing.assert_allclose(getattr(found, name), getattr(scene, name), atol=1e-6)
+    mine, theirs = (each.vertex_positions[each.faces] for each in (scene, found))
+    np.testing.assert_allclose(theirs, mine, atol=1e-6)
+    mine, theirs = (each.vertex_normals[each.faces] for each in (scene, found))
+    np.testing.assert_allclose(theirs, mine, atol=1e-6)
+    rows = found.materials[found.material_index]
+    np.testing.assert_allclose(rows, scene.materials[scene.material_index], rtol=1e-5, atol=1e-5)
+    assert [entry.name for entry in found.objects] == ["floor", "light"]
+    assert [entry.kind for entry in found.objects] == ["object", "emitter"]
+
+
+def _looked_up(scene: Scene, column: int) -> NDArray[np.float64]:
+    """Return what the texture of a column says in the middle of the first triangle."""
+    assert scene.uv is not None and scene.material_textures is not None
+    middle = scene.uv.reshape(-1, 3, 2)[0].mean(axis=0)
+    row = scene.material_textures[scene.material_index[0], column]
+    return texture_values(scene.textures[row], middle)
+
+
+def test_textures_come_back_to_their_eight_bits(tmp_path: Path) -> None:
+    scene = textured_scene(4)
+    found = there_and_back(tmp_path, scene)
+    for column, most in ((0, 0.01), (2, 0.003)):
+        wanted, got = (_looked_up(each, column) for each in (scene, found))
+        np.testing.assert_allclose(got, wanted, atol=most)
+    assert found.materials[found.material_index[2], EMISSION].tolist() == [100, 100, 100]
+
+
+def test_two_textured_albedos_of_different_widths_are_one_grid(tmp_path: Path) -> None:
+    glossy = dataclasses.replace(colour_texture(1), texels=colour_texture(1).texels[::2] // 4)
+    rough = number_texture()
+    wide = dataclasses.replace(colour_texture(2), texels=colour_texture(2).texels // 2)
+    index = np.full((2, 3), -1, np.int32)
+    index[FLOOR] = [0, 1, 2]
+    scene = textured_scene(0, wide, glossy, rough, material_textures=index)
+    found = there_and_back(tmp_path, scene)
+    row = found.material_index[0]
+    kept = scene.materials[FLOOR]
+    assert found.materials[row, ROUGHNESS] == pytest.approx(rough.mean[0], abs=0.01)
+    assert found.materials[row, SPECULAR] == pytest.approx(glossy.mean, abs=0.01), kept
+
+
+def test_what_a_glb_loses_is_said(tmp_path: Path) -> None:
+    lost = " ".join(write_scene(tmp_path / "a.glb", textured_scene(environment=sky())))
+    for word in ("environment", "8 bits", "floors and walls", "provenance"):
+        assert word in lost
+    dark = tiny_scene(
+        materials=np.where(np.arange(10) >= 7, 0, tiny_scene().materials).astype(np.float32),
+        objects=tuple(dataclasses.replace(e, kind="object") for e in tiny_scene().objects),
+        environment=sky(),
+    )
+    with pytest.raises(TrilightError, match="only light is its environment"):
+        write_scene(tmp_path / "b.glb", dark)
+
+
+def test_a_stranger_reads_a_normal_map(tmp_path: Path) -> None:
+    scene = bumpy_scene()
+    assert "normal" not in " ".join(write_scene(tmp_path / "a.glb", scene))
+    meshes = trimesh.load_scene(tmp_path / "a.glb").geometry.values()
+    maps = [mesh.visual.material.normalTexture for mesh in meshes]
+    (found,) = (np.asarray(each.convert("RGB")) for each in maps if each is not None)
+    assert np.array_equal(found[::-1], scene.textures[2].texels)
+
+
+def test_a_stranger_reads_it(tmp_path: Path) -> None:
+    """trimesh, which knows nothing of ours, sees the triangles with +Y up."""
+    (tmp_path / "a.glb").write_bytes(encode_scene_glb(textured_scene()))
+    seen: Any = trimesh.load_scene(tmp_path / "a.glb").to_geometry()
+    assert len(seen.faces) == 3
+    assert seen.bounds[1][1] == pytest.approx(2) and seen.bounds[0][1] == pytest.approx(0)
+
+
+def test_the_file_keeps_the_laws_of_its_format() -> None:
+    data = encode_scene_glb(textured_scene())
+    magic, version, length, head = struct.unpack("<4sIII", data[:16])
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    tree = json.loads(data[20 : 20 + head])
+    (size,) = struct.unpack("<I", data[20 + head : 24 + head])
+    assert tree["buffers"] == [{"byteLength": size}] or size - tree["buffers"][0]["byteLength"] < 4
+    for view in tree["bufferViews"]:
+        assert view["byteOffset"] % 4 == 0
+        assert view["byteOffset"] + view["byteLength"] <= tree["buffers"][0]["byteLength"]
+    for mesh in tree["meshes"]:
+        for primitive in mesh["primitives"]:
+            points = tree["accessors"][primitive["attributes"]["POSITION"]]
+            assert len(points["min"]) == len(points["max"]) == 3
+    for material in tree["materials"]:
+        assert max(material.get("emissiveFactor", [0])) <= 1
+        assert max(material["pbrMetallicRoughness"].get("baseColorFactor", [0])) <= 1
+    assert corner_uv(textured_scene()).shape[1] == 2
+
+
+STEPS = 0.03
+"""The texture is resampled once more, and rounded to 8 bits as base colour and as diffuse part."""
+
+
+def glb_of(path: Path, level: Level) -> Path:
+    assert level.skin is not None
+    path.write_bytes(
+        encode_mesh_glb(level.positions, level.faces, level.skin.uv, level.skin.textures)
+    )
+    return path
+
+
+def test_colours_and_triangles_come_back(tmp_path: Path) -> None:
+    asset = prepare(textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS)), KEEP)
+    again = prepare(glb_of(tmp_path / "b.glb", asset.levels[0]), KEEP)
+    assert geometry(again) == geometry(asset)
+    for place in QUARTERS:
+        for column in range(3):
+            before, after = seen_at(asset, *place, column), seen_at(again, *place, column)
+            assert np.abs(before - after).max() < STEPS, (place, column)
+
+
+def test_metal_comes_back_as_the_same_light(tmp_path: Path) -> None:
+    """Not as a metal: what both lobes reflect is what we keep."""
+    tree, buffer = textured_tree(picture_bytes(np.array([[[9, 51, 0], [9, 204, 255]]], np.uint8)))
+    metal = tree["materials"][0]["pbrMetallicRoughness"]
+    metal |= {"metallicRoughnessTexture": metal.pop("baseColorTexture"), "metallicFactor": 1}
+    metal["baseColorFactor"] = [0.9, 0.4, 0.2, 1]
+    asset = prepare(write_glb(tmp_path / "a.glb", tree, buffer), KEEP)
+    again = prepare(glb_of(tmp_path / "b.glb", asset.levels[0]), KEEP)
+    for right in (-0.25, 0.25):
+        for column in range(3):
+            before, after = seen_at(asset, right, 0, column), seen_at(again, right, 0, column)
+            assert np.abs(before - after).max() < STEPS, (right, column)

@@ -1,0 +1,279 @@
+"""One training run from a dataset to weights, scores and a sheet."""
+
+import dataclasses
+import time
+from collections.abc import Generator, Sequence
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from model.checkpoint_format import saved_steps
+from model.renderformer import count_parameters
+from model.scene_tensors import lit_sky, require_known_sky
+from storage.dataset.mixed_data import open_mixture
+from storage.dataset.training_data import TrainingData
+from storage.errors import TrilightError
+from train.data.bad_samples import BadSampleCounter, first_samples
+from train.data.buckets import decodes_on_device, step_scenes
+from train.data.loader import LoaderSettings, load_batches
+from train.data.scenes import TrainingScene, training_scene
+from train.data.workers import choose_workers, detect_machine
+from train.evaluation.stored_pictures import median_picture
+from train.evaluation.validation import Judge
+from train.folder import RunFolder, claim_run
+from train.initial_state import init_or_resume_state, plan_start
+from train.loop.distributed import DistributedContext
+from train.loop.recorder import Recorder
+from train.loop.train_state import TrainState
+from train.loop.trainer import Trainer, scene_flops
+from train.loss.lpips import load_lpips
+from train.loss.training_loss import TrainingLoss
+from train.monitoring.boards import require_wandb
+from train.monitoring.rows import add_note
+from train.monitoring.settings import WatchSettings
+from train.progress import TrainProgress
+from train.result import TrainResult, finish_run
+from train.resume import StartOptions
+from train.settings import TrainSettings
+
+MEDIAN_SCENES = 256
+"""Number of training scenes for the median picture; more would not change it."""
+
+VALIDATION = "validation"
+"""Split of the scenes that a run is evaluated on and never trained on."""
+
+UNJUDGED = (
+    "the data has no validation split, so the network is not judged on scenes that it has never "
+    "seen, and there is no sheet; a dataset of more scenes has one"
+)
+
+
+def train_run(
+    settings: TrainSettings,
+    *,
+    data: Sequence[str],
+    out: Path,
+    start: StartOptions | None = None,
+    dist_context: DistributedContext | None = None,
+    workers: int | None = None,
+    watched: WatchSettings | None = None,
+    progress: TrainProgress | None = None,
+) -> TrainResult | None:
+    """Train a network and evaluate it.
+
+    Args:
+        settings: the run; `train.presets.training_preset` returns those that have a name.
+        data: root of a dataset, or of several that are mixed (storage.dataset.mixed_data), or a
+            list of shards (storage.dataset.training_data), with a train split; without a validation
+            split nothing is evaluated.
+        out: folder of the run (train.folder), new unless it resumes.
+        start: how the run starts; by default new, with random weights.
+        dist_context: processes of a distributed run (`join_processes`); by default this one alone.
+        workers: threads that read and decode samples; by default as many as fit. The weights do
+            not depend on them.
+        watched: settings of the monitoring, on which the weights do not depend either.
+        progress: receives the events of the run, in the first process.
+
+    Returns:
+        The result of the run; None in all processes but the first.
+
+    Raises:
+        TrilightError: no dataset, an empty split, a damaged shard, a bad target, a resolution or
+            number of views that the data does not have, a folder that already holds a run, a
+            checkpoint that is missing or of another run, LPIPS without its weights, a start that
+            went dead, too little memory, or a signal that asked to stop.
+    """
+    watched = watched or WatchSettings()
+    require_wandb(watched.wandb)
+    dist_context = dist_context or DistributedContext(device=torch.device("cpu"))
+    if progress is None or not dist_context.is_first:
+        progress = TrainProgress()
+    folder = RunFolder(out)
+    start = start or StartOptions()
+    with claim_run(folder, dist_context):
+        return _train(settings, data, folder, start, dist_context, workers, watched, progress)
+
+
+def _train(
+    settings: TrainSettings,
+    data: Sequence[str],
+    folder: RunFolder,
+    start: StartOptions,
+    dist_context: DistributedContext,
+    workers: int | None,
+    watched: WatchSettings,
+    progress: TrainProgress,
+) -> TrainResult | None:
+    """Train and evaluate in a folder that is locked; arguments as in `train_run`."""
+    began = time.monotonic()
+    dataset = open_mixture(data)
+    start = _resolve_restart(start, folder, dist_context)
+    early_notes = _NoteBuffer(progress)
+    for note in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
+        early_notes.note(note)
+    if workers is None:
+        workers = _choose_workers(settings, dist_context, early_notes)
+    plan = plan_start(settings, folder, dataset.digest, start, dist_context, early_notes)
+    settings = plan.settings
+    lpips = dist_context.run_once_per_machine(partial(load_lpips, start.lpips))
+    objective = TrainingLoss(settings.loss, lpips).to(dist_context.device)
+    _check_data(dataset, settings)
+    state = init_or_resume_state(plan, folder, dataset, dist_context, early_notes)
+    judge = recorder = None
+    if dist_context.is_first:
+        judge = _make_judge(dataset, settings, state.bad_samples)
+        recorder = _begin_records(state, settings, folder, judge, progress, watched)
+        how = "went on" if start.resume else "began"
+        many = "process" if dist_context.world_size == 1 else "processes"
+        where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"
+        for text in (where, *early_notes.texts):
+            add_note(folder.notes, state.step, text)
+    trainer = Trainer(
+        state=state,
+        settings=settings,
+        objective=objective,
+        dist_context=dist_context,
+        folder=folder,
+        data_digest=dataset.digest,
+        recorder=recorder,
+        watched=watched,
+    )
+    with closing(_batches(dataset, settings, state, dist_context, workers)) as batches:
+        cost = partial(scene_flops, settings)
+        most = settings.scenes_per_pass
+        with closing(step_scenes(batches, cost, most, dist_context.device)) as steps:
+            trainer.run(steps)
+    if recorder is None:
+        return None
+    recorder.close()
+    return finish_run(state, settings, folder, dataset, judge, time.monotonic() - began)
+
+
+def _choose_workers(
+    settings: TrainSettings, dist_context: DistributedContext, progress: TrainProgress
+) -> int:
+    """Return the number of decoding threads, and report the reason."""
+    choice = choose_workers(
+        detect_machine(),
+        settings,
+        on_gpu=dist_context.device.type == "cuda",
+        busy_threads=torch.get_num_threads(),
+    )
+    progress.note(choice.reason)
+    return choice.threads
+
+
+def _resolve_restart(
+    start: StartOptions, folder: RunFolder, dist_context: DistributedContext
+) -> StartOptions:
+    """Decide in all processes alike whether a restartable run resumes.
+
+    All processes must call it: torchrun counts restarts for each machine separately, and a network
+    file system shows a new file to one machine before another.
+    """
+    has_checkpoint = dist_context.any(start.restartable and bool(saved_steps(folder.checkpoints)))
+    return dataclasses.replace(start, resume=start.resume or has_checkpoint, restartable=False)
+
+
+def _batches(
+    data: TrainingData,
+    settings: TrainSettings,
+    state: TrainState,
+    dist_context: DistributedContext,
+    workers: int,
+) -> Generator[list[TrainingScene], None, None]:
+    """Return the scenes of this process for each step, beginning with the state's step."""
+    stream = dataclasses.replace(
+        loader_settings(settings), lookup_in_threads=not decodes_on_device(dist_context.device)
+    )
+    return load_batches(
+        data.split("train"),
+        stream,
+        state.step,
+        rank_slice=dist_context.rank_slice,
+        workers=workers,
+        unusable=state.bad_samples,
+        mixture=state.mixture,
+    )
+
+
+class _NoteBuffer(TrainProgress):
+    """Forwards notes, and keeps them until the run's folder may be written."""
+
+    def __init__(self, progress: TrainProgress) -> None:
+        self._progress = progress
+        self.texts: list[str] = []
+
+    def note(self, text: str) -> None:
+        self._progress.note(text)
+        self.texts.append(text)
+
+
+def loader_settings(settings: TrainSettings) -> LoaderSettings:
+    """Return the settings of the data loader that feeds a run."""
+    return LoaderSettings(
+        seed=settings.seed,
+        window=settings.shuffle_shards,
+        batch_size=settings.scenes_per_step,
+        resolution=settings.resolution,
+        views_per_scene=settings.views_per_scene,
+        most_triangles=settings.most_triangles,
+        augmentation=settings.augmentation,
+        network=settings.model,
+    )
+
+
+def _check_data(data: TrainingData, settings: TrainSettings) -> None:
+    """Raise if the data lacks views or lights; damage is only counted when it is read."""
+    shards = data.split("train")
+    per_light = settings.augmentation.light_mix > 1
+    num_views = [source.num_views for source in data.sources]
+    if None in num_views or per_light:
+        unusable = BadSampleCounter(settings.most_unusable)
+        samples = list(first_samples(shards, len(data.sources), unusable))
+        num_views = [sample.scene.num_views for sample in samples]
+        for sample in samples:
+            training_scene(sample, settings.resolution, lights_apart=per_light)
+    fewest = min(count for count in num_views if count is not None)
+    if settings.views_per_scene > fewest:
+        raise TrilightError(
+            f"views_per_scene is {settings.views_per_scene}, but scenes of {data.display_name} "
+            f"have {fewest} views; expected at most that many."
+        )
+
+
+def _make_judge(
+    data: TrainingData, settings: TrainSettings, unusable: BadSampleCounter
+) -> Judge | None:
+    if VALIDATION not in data.splits:
+        return None
+    training = [
+        training_scene(sample, settings.resolution).target_VRR3.numpy()
+        for sample in first_samples(data.split("train"), MEDIAN_SCENES, unusable)
+    ]
+    # no damage is allowed here: a score over fewer scenes would be another score
+    samples = list(
+        first_samples(data.split(VALIDATION), settings.validation_scenes, BadSampleCounter(0))
+    )
+    for sample in samples:  # before any step, not at the first validation
+        require_known_sky(lit_sky(sample.scene.environment), settings.model)
+    return Judge(samples, settings.resolution, median_picture(training))
+
+
+def _begin_records(
+    state: TrainState,
+    settings: TrainSettings,
+    folder: RunFolder,
+    judge: Judge | None,
+    progress: TrainProgress,
+    watched: WatchSettings,
+) -> Recorder:
+    progress.begin(
+        step=state.step,
+        num_steps=settings.num_steps,
+        num_parameters=count_parameters(state.model),
+        median_scores=judge.median_scores if judge else None,
+    )
+    return Recorder(folder, settings, judge, progress, first_step=state.step, wandb=watched.wandb)
