@@ -224,7 +224,6 @@ _OMITTED_AT_DEFAULT = (
     "hit_anchors",
     "gather_rays",
     "pixel_width",
-    "filter_width",
     "scene_tokens",
     "demodulated",
     "sky_rays",
