@@ -15,7 +15,7 @@ import torch
 from infra.render.networks import NetworkRenderer
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import FixedSamples
-from model.neural_renderer import NeuralRenderer
+from model.inference import NeuralRenderer
 from model.open import find_network
 from model.weights import network_digest
 from pipeline.renders.mitsuba_variant import choose_variant

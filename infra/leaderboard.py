@@ -21,7 +21,7 @@ from infra.render.methods import (
     network_name,
 )
 from infra.render.path_tracer import RenderChild
-from model.neural_renderer import NeuralRenderer
+from model.inference import NeuralRenderer
 from pipeline.exchange.exports.scenes import picture_name
 from pipeline.exchange.pictures import MAX_BYTES, decode_pixels
 from pipeline.renders.mitsuba_variant import choose_variant

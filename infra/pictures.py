@@ -22,7 +22,7 @@ from infra.cli.console import console
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import ToStatedError
 from infra.render.sources import own_camera
-from model.neural_renderer import NeuralRenderer
+from model.inference import NeuralRenderer
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.preview import preview

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_task, prepare_dataset
-from pipeline.generation.render_children import close_children
+from pipeline.generation.render_workers import close_children
 from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.presets.settings import DatasetSettings

@@ -48,7 +48,7 @@ CHOSEN = (
     "tests/model/hits/test_decoder.py",
     "tests/model/hits/test_view_inputs.py",
     "tests/model/test_open.py",
-    "tests/model/test_neural_renderer.py",
+    "tests/model/test_inference.py",
     "tests/model/test_renderformer.py",
     "tests/pipeline/objects/builtin/test_builtin.py",
     "tests/pipeline/renders/test_stored_pictures.py",

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from infra.judging import Judgement as Judgement
     from infra.judging import judge_network as judge_network
     from infra.judging import write_judgement as write_judgement
-    from model.neural_renderer import NeuralRenderer as NeuralRenderer
+    from model.inference import NeuralRenderer as NeuralRenderer
     from pipeline.generation.generate_options import GenerateOptions as GenerateOptions
     from pipeline.generation.generation_run import Outcome as Outcome
     from pipeline.renders.results import RenderedView as RenderedView

@@ -20,7 +20,7 @@ from storage.errors import TrilightError
 from storage.records.scene import Scene
 
 if TYPE_CHECKING:
-    from model.neural_renderer import NeuralRenderer
+    from model.inference import NeuralRenderer
 
 
 def render(
@@ -152,7 +152,7 @@ def open_network(
         TrilightError: no such file, not a network, or PyTorch is not installed.
     """
     require_torch("open_network")
-    from model.neural_renderer import NeuralRenderer
+    from model.inference import NeuralRenderer
 
     return NeuralRenderer.load(os.fspath(checkpoint), device=device, precision=precision)
 

@@ -14,7 +14,7 @@ from storage.denoiser import Features, Quality, denoise
 from storage.renderer import Renderer
 
 if TYPE_CHECKING:
-    from model.neural_renderer import NeuralRenderer
+    from model.inference import NeuralRenderer
 
 DIRECT_LIGHT = DirectLightRenderer.name
 TRACED_LIGHT = "all traced light, no network"

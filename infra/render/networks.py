@@ -16,7 +16,7 @@ from storage.renderer import Camera, Facts, Image, OnProgress, ignore_progress
 
 if TYPE_CHECKING:
     from model.config import ModelConfig
-    from model.neural_renderer import NeuralRenderer
+    from model.inference import NeuralRenderer
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,7 +83,7 @@ class NetworkRenderer(RendererHere):
         """The network; raises TrilightError where it is unusable, or cannot render the width."""
         import torch
 
-        from model.neural_renderer import NeuralRenderer
+        from model.inference import NeuralRenderer
 
         if self.threads is not None:
             torch.set_num_threads(self.threads)
@@ -205,7 +205,7 @@ def untrained_network(config: "ModelConfig") -> "NeuralRenderer":
     """Return a hybrid network of any size that renders only the traced light."""
     import torch
 
-    from model.neural_renderer import NeuralRenderer
+    from model.inference import NeuralRenderer
     from model.renderformer import RenderFormer
 
     model = RenderFormer(config)

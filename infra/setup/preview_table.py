@@ -51,7 +51,7 @@ from storage.renderer import Camera, Renderer
 from storage.settings.described import settings_record
 
 if TYPE_CHECKING:
-    from model.neural_renderer import NeuralRenderer
+    from model.inference import NeuralRenderer
 
 SCENES = 12
 """Number of scenes that are evaluated and timed."""
@@ -76,7 +76,7 @@ _SERIAL = (SCENE,)
 
 def main() -> None:
     """Measure, and write the file."""
-    from model.neural_renderer import NeuralRenderer
+    from model.inference import NeuralRenderer
 
     errors = dict[int, Errors]()
     costs = dict[int, Costs]()

@@ -24,7 +24,7 @@ from storage.records.scene import Scene
 from storage.renderer import Camera, Image, Renderer
 
 if TYPE_CHECKING:
-    from model.neural_renderer import NeuralRenderer
+    from model.inference import NeuralRenderer
 
 SAMPLES = (1, 4, 16, 64)
 """Samples per pixel of the previews, beside the progressive picture."""
@@ -192,7 +192,7 @@ def network_on_page(checkpoint: str, title: str, means: str) -> PageRenderer:
 
     @functools.cache
     def network() -> "NeuralRenderer":
-        from model.neural_renderer import NeuralRenderer
+        from model.inference import NeuralRenderer
 
         return NeuralRenderer.load(checkpoint)
 

@@ -15,7 +15,7 @@ from pipeline.flows.on_prefect import as_flow
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import Outcome
-from pipeline.generation.render_children import close_idle_children
+from pipeline.generation.render_workers import close_idle_children
 from storage.atomic import write_atomically
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError

@@ -240,7 +240,7 @@ class DatasetWriter:
     def unfinished_shards(self, requested: range | None = None) -> list[int]:
         """Return the unfinished or growing shards among the requested ones; by default of all.
 
-        A resumed run skips the finished ones. The cost depends on the number of requested
+        To resume is to skip finished shards. The cost depends on the number of requested
         shards alone.
         """
         self._shards.publish_all()

@@ -48,7 +48,7 @@ from pipeline.generation.generation_run import (
     choose_dataset_variant,
     resolve_settings,
 )
-from pipeline.generation.render_children import (
+from pipeline.generation.render_workers import (
     close_children,
     cores_of_child,
     render_child,

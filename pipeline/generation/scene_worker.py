@@ -1,6 +1,6 @@
 """`SceneWorker`: composes scenes and renders their views, inside a worker process.
 
-`render_children` starts these processes; `pipeline.isolation` survives their crashes.
+`render_workers` starts these processes; `pipeline.isolation` survives their crashes.
 """
 
 import contextlib

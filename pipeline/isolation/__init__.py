@@ -1,7 +1,7 @@
 """Child processes for native code: a crash, a hang or a memory leak costs one item, not the run.
 
 - `child`: the owner's side: starts, calls, replaces and ends children.
-- `child_pool`: the children, worker processes, that tasks share.
+- `worker_pool`: the children, worker processes, that tasks share.
 - `child_main`: the child's side: applies its limits and never outlives its owner.
 - `waiting`: waits for an answer; a pause of the whole command does not count as time.
 - `confinement`: restricts children that read untrusted files, by `landlock` and `seccomp`.
@@ -17,8 +17,8 @@ from pipeline.isolation.child import (
     preload,
 )
 from pipeline.isolation.child_main import die_with_parent
-from pipeline.isolation.child_pool import ChildPool
 from pipeline.isolation.confinement import NO_FILES, Reach, reach
+from pipeline.isolation.worker_pool import ChildPool
 
 __all__ = [
     "ChildClosed",

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from model.check_reference import differences, read_reference
-from model.neural_renderer import NeuralRenderer
+from model.inference import NeuralRenderer
 from model.open import BUILTIN, BUILTIN_NETWORKS
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import FixedSamples
-from model.neural_renderer import NeuralRenderer
+from model.inference import NeuralRenderer
 from model.open import open_network, save_published
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from pipeline.exchange.convert import write_scene

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from model.neural_renderer import NeuralRenderer
+from model.inference import NeuralRenderer
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
 from tests.conftest import ROOT

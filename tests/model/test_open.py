@@ -28,7 +28,7 @@ from model.check_reference import (
     read_reference,
 )
 from model.config import SIZES
-from model.neural_renderer import NeuralRenderer
+from model.inference import NeuralRenderer
 from model.open import (
     BUILTIN,
     BUILTIN_NETWORKS,

@@ -23,7 +23,7 @@ import torch
 from model.config import ModelConfig
 from model.config import smoke as smoke_model
 from model.hits.traced import INPUTS
-from model.neural_renderer import NeuralRenderer
+from model.inference import NeuralRenderer
 from model.open import open_network
 from model.renderformer import RenderFormer
 from storage.dataset.dataset import Dataset, open_dataset

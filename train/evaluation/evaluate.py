@@ -10,8 +10,8 @@ from pydantic import SkipValidation
 
 from model.hits.traced import INPUTS, with_others_tokens
 from model.hits.tracing import with_traced
+from model.inference import NeuralRenderer
 from model.light_groups import light_groups
-from model.neural_renderer import NeuralRenderer
 from model.renderformer import RenderFormer
 from model.scene_tensors import SceneTensors
 from model.weights import MAX_LIGHTS

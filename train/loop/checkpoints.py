@@ -1,7 +1,7 @@
 """Checkpoints of a run: one safetensors file each, with the whole mutable state.
 
-That is weights, averages and the optimizer's state dict; no rng_state, since all randomness follows
-from seed and step.
+That is weights, averages and the optimizer's state dict; no RNG state (no set_rng_state): all
+randomness follows from seed and step.
 
 A checkpoint appears by rename, so that a kill while saving leaves the previous one intact. It also
 holds the settings, the digest of the data and the decisions about them (train.resume), so that a

@@ -77,7 +77,7 @@ def _set_up(
     context: BenchContext,
 ) -> tuple[Mapping[tuple[int, str], Renderer], IsolatedChild]:
     """Return the renderers by width and name, and a child that composes scenes and references."""
-    from model.neural_renderer import NeuralRenderer
+    from model.inference import NeuralRenderer
 
     paths = context.options.checkpoint
     paths_by_label = dict(zip(network_labels(paths), paths, strict=True))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from infra.bench.gpu.steps import time_calls
 from infra.bench.workloads.cost_scene import cost_scene
-from model.neural_renderer import NeuralRenderer
+from model.inference import NeuralRenderer
 from model.open import BUILTIN_NETWORKS
 from storage.conventions import log10_radiance, radiance_from_log10
 from storage.digests import sha256_hex

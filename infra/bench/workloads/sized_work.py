@@ -141,7 +141,7 @@ def _trace(num_triangles: int, folder: Path) -> None:
 
 
 def _show_by_network(num_triangles: int, folder: Path) -> None:
-    from model.neural_renderer import NeuralRenderer
+    from model.inference import NeuralRenderer
 
     scene = cost_scene(num_triangles, _LIGHTS)
     renderer = NeuralRenderer.load("builtin:tokens", device="cpu")

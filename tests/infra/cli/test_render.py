@@ -24,7 +24,7 @@ from infra.render.preview_table import (
     machine_name,
     shipped_table,
 )
-from model.neural_renderer import NeuralRenderer
+from model.inference import NeuralRenderer
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from pipeline.exchange.usd.write_usd import write_usd
@@ -45,7 +45,7 @@ from tests.crash import CrashingRenderer
 from tests.for_each import case
 from tests.infra.child_here import use_processes
 from tests.infra.conftest import write_network
-from tests.model.test_neural_renderer import many_lights
+from tests.model.test_inference import many_lights
 from tests.pipeline.exchange.strangers_stage import write_stage
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 from train.evaluation.error_colors import error_picture

@@ -20,7 +20,7 @@ from infra.render.path_tracer import MOST_SCENES, PathTracer, RenderChild, Rende
 from infra.render.quality import FixedSamples, ToStatedError
 from infra.render.raw_references import RawReference, true_error, true_error_db
 from model.config import hits_smoke
-from model.neural_renderer import NeuralRenderer
+from model.inference import NeuralRenderer
 from pipeline.exchange.open_scene import SceneSource
 from pipeline.renders.mitsuba_variant import choose_variant
 from pipeline.renders.noise_floor import clamped_radiance

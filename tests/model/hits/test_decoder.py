@@ -25,7 +25,7 @@ from model.hits.device_rays import SOURCE, DeviceTriangles, build_tree
 from model.hits.traced import INPUTS
 from model.hits.tracing import traced_scene, traced_views, with_traced
 from model.hits.view_inputs import Channel
-from model.neural_renderer import NeuralRenderer
+from model.inference import NeuralRenderer
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneBatch, SceneTensors, batch_scenes, scene_tensors
 from model.weights import decode_weights, encode_weights

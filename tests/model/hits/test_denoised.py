@@ -11,7 +11,7 @@ from model.hits.denoised import denoise_traced
 from model.hits.traced import Traced
 from model.hits.tracing import with_traced
 from model.hits.view_inputs import Channel
-from model.neural_renderer import NeuralRenderer
+from model.inference import NeuralRenderer
 from model.renderformer import radiance
 from model.scene_tensors import batch_scenes, scene_tensors
 from storage.metrics import pepper

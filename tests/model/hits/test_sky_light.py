@@ -19,7 +19,7 @@ from model.hits.reflectance import gloss_at, sample_lobe
 from model.hits.sky_light import add_sky_light, escaped_light, sees_sky
 from model.hits.sky_sampler import SkySampler
 from model.hits.view_inputs import Channel
-from model.neural_renderer import NeuralRenderer
+from model.inference import NeuralRenderer
 from model.renderformer import radiance
 from model.scene_tensors import scene_tensors
 from scene_templates.rotations import uniform_rotation

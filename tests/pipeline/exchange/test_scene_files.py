@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pipeline.exchange.scene_files import SceneFiles, find_scene_files
-from pipeline.generation import render_children
+from pipeline.generation import render_workers
 from pipeline.generation.accept_scene_files import (
     accept_scene_files,
     build_once,
@@ -235,7 +235,7 @@ def test_a_run_reads_files_in_a_confined_child(
         accepted=SimpleNamespace(origin=files), num_at_once=1, device="",
     ))  # fmt: skip
     try:
-        with render_children.scene_reader(job) as read:
+        with render_workers.scene_reader(job) as read:
             assert read is not None
             scene, expected = read(0), _scene(files, 0, settings)
             assert scene.provenance == expected.provenance
@@ -244,15 +244,15 @@ def test_a_run_reads_files_in_a_confined_child(
                 read(1)
             wrong = dataclasses.replace(scene, faces=scene.faces + len(scene.vertex_positions))
             with monkeypatch.context() as patch:  # as a child that has been taken over
-                patch.setattr(render_children, "call_with_retries", lambda *asked: wrong)
+                patch.setattr(render_workers, "call_with_retries", lambda *asked: wrong)
                 with pytest.raises(TrilightError):
                     read(0)
-            (child,) = next(iter(render_children._pools.values()))._children
+            (child,) = next(iter(render_workers._pools.values()))._children
             assert child._reach is not None and child._reach.reads == {folder.resolve()}
     finally:
-        render_children.close_children()
+        render_workers.close_children()
     job.accepted.origin = NO_OBJECTS.origin
-    with render_children.scene_reader(job) as nothing:
+    with render_workers.scene_reader(job) as nothing:
         assert nothing is None
 
 

@@ -16,7 +16,7 @@ import pytest
 from infra.cli.overrides import BaseSettings, with_base_settings
 from infra.repair import repair
 from pipeline.executors.threads import ThreadRunner
-from pipeline.generation import render_children
+from pipeline.generation import render_workers
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset
 from pipeline.generation.revisit_options import RevisitOptions, to_generate_options
@@ -83,9 +83,9 @@ def samples(dataset: Dataset) -> list[Sample]:
 def here() -> Iterator[pytest.MonkeyPatch]:
     """Make scenes in this process."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(render_children, "IsolatedChild", ChildHere)
+        patch.setattr(render_workers, "IsolatedChild", ChildHere)
         yield patch
-        render_children.close_children()
+        render_workers.close_children()
 
 
 @pytest.fixture(scope="module")
@@ -101,9 +101,9 @@ def test_another_view_is_that_of_a_dataset_with_more_views(
     So are the passes that are stored beside both of them.
     """
     passes = {"storage.passes": ["depth"]}
-    monkeypatch.setattr(render_children, "IsolatedChild", IsolatedChild)
+    monkeypatch.setattr(render_workers, "IsolatedChild", IsolatedChild)
     more = revisited(source.folder.root, tmp_path / "more", cameras="2", changes=passes)
-    monkeypatch.setattr(render_children, "IsolatedChild", ChildHere)
+    monkeypatch.setattr(render_workers, "IsolatedChild", ChildHere)
     fresh = generated(tmp_path / "fresh", 2, **passes)
     found, expected = members(more), members(fresh)
     assert found.keys() == expected.keys()

@@ -14,7 +14,7 @@ from typing import Any, cast
 import pytest
 from PIL import Image
 
-from pipeline.generation import pipeline, render_children, tasks, unfinished_shard
+from pipeline.generation import pipeline, render_workers, tasks, unfinished_shard
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import Run, ShardJob, TaskResult
 from pipeline.generation.pipeline import make_dataset, make_piece
@@ -353,11 +353,11 @@ def test_only_children_that_nobody_uses_are_closed(monkeypatch: pytest.MonkeyPat
         folder=DatasetFolder(Path("a")), settings=SimpleNamespace(digest="d"), lock_sha256="l",
         device="cpu",
     ))  # fmt: skip
-    monkeypatch.setattr(render_children, "_pools", {("b", "d", "l"): pool("other")})
-    monkeypatch.setattr(render_children, "_render_pool", lambda job: pool("ours"))
-    with render_children.render_child(job):
+    monkeypatch.setattr(render_workers, "_pools", {("b", "d", "l"): pool("other")})
+    monkeypatch.setattr(render_workers, "_render_pool", lambda job: pool("ours"))
+    with render_workers.render_child(job):
         assert closed == ["other"]
-        render_children.close_idle_children()
+        render_workers.close_idle_children()
         assert closed == ["other"]
-    render_children.close_idle_children()
+    render_workers.close_idle_children()
     assert closed == ["other", "ours"]

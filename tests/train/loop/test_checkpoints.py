@@ -21,7 +21,7 @@ import torch
 from safetensors.torch import save as save_tensors
 
 from model.checkpoint_format import HEADER_KEY, path_of_step, saved_steps
-from model.neural_renderer import NeuralRenderer
+from model.inference import NeuralRenderer
 from model.open import find_network, open_network
 from model.weights import encode_weights
 from storage.dataset.dataset import Dataset

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from model import neural_renderer
+from model import inference
 from model.config import ModelConfig, smoke
 from model.demodulated import compose_radiance, with_albedo
 from model.image_head import BilinearUpsample, DptHead, Fusion
+from model.inference import NeuralRenderer
 from model.light_groups import LightGroup, light_groups
-from model.neural_renderer import NeuralRenderer
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from model.weights import RANGE_KEY, TrainedRange, encode_weights, trained_range
@@ -108,8 +108,8 @@ def test_groups_give_what_a_linear_network_gives_at_once(
     monkeypatch: pytest.MonkeyPatch, count: int, most: int
 ) -> None:
     """Emission goes through log10 in float32: 1e-6 relative."""
-    monkeypatch.setattr(neural_renderer, "_encode", _light_of)
-    monkeypatch.setattr(neural_renderer, "_decode", _flat_picture)
+    monkeypatch.setattr(inference, "_encode", _light_of)
+    monkeypatch.setattr(inference, "_decode", _flat_picture)
     scene, renderer = many_lights(count), NeuralRenderer(network())
 
     def picture(lights_per_pass: int) -> NDArray[np.float32]:
@@ -181,10 +181,10 @@ def test_equal_networks_have_equal_digests() -> None:
 def test_what_memory_cannot_hold_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     renderer = NeuralRenderer(network())
     # as control groups leave it, whatever the machine has
-    monkeypatch.setattr(neural_renderer, "free_memory", lambda: 1000)
+    monkeypatch.setattr(inference, "free_memory", lambda: 1000)
     with pytest.raises(TrilightError, match="3 triangles need more than 0.0 GB of memory"):
         renderer.prepare(tiny_scene())
-    monkeypatch.setattr(neural_renderer, "free_memory", lambda: None)
+    monkeypatch.setattr(inference, "free_memory", lambda: None)
     renderer.prepare(tiny_scene())
 
 
