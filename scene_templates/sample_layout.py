@@ -1,8 +1,8 @@
 """Draws a whole layout: the plan, then the room, the objects in it, and the lights.
 
-`scene_templates.placement` places objects without intersections. A plan is the family of a scene and its counts. It depends on seed and scene index alone, never on
-the attempt: scenes that are hard to compose are replaced by scenes of the same kind, so that
-rejection does not distort their shares.
+`scene_templates.placement` places objects without intersections. A plan is the family of a scene
+and its counts. It depends on seed and scene index alone, never on the attempt: scenes that are hard
+to compose are replaced by scenes of the same kind, so that rejection does not distort their shares.
 """
 
 from collections.abc import Sequence
