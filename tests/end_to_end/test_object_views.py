@@ -13,9 +13,11 @@ from pipeline.exchange.exports.pictures import stands_alone
 from storage.conventions import preview_srgb8
 from storage.dataset.dataset import open_dataset
 from storage.records.lights import num_light_pictures, sum_of_lights
+from storage.records.passes.pictures import view_passes
 from tests.command_line import run_program, trilight
 from tests.conftest import ROOT
 from tests.end_to_end.production_kit import SIXTEEN_SAMPLES
+from tests.foreign_packages import foreign_packages, nerfstudio_pictures
 
 ONE_VIEW = ("--set", "scenes.num_views=1")
 
@@ -27,7 +29,10 @@ def _generate(out: Path, *words: str) -> None:
 
 
 @pytest.mark.slow("commands")
-def test_objects_alone_from_the_preset_to_the_exports(tmp_path: Path) -> None:
+def test_objects_alone_from_the_preset_to_the_exports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path, str(foreign_packages())])
     made = tmp_path / "views"
     views = ["--set", "scenes.num_views=12", "--set", "scenes.skies.maps.height=16"]
     _generate(made, "object-views", "--scenes", "2", *views)
@@ -46,13 +51,13 @@ def test_objects_alone_from_the_preset_to_the_exports(tmp_path: Path) -> None:
     out = tmp_path / "nerfstudio"
     result = trilight(["export", str(made), "--form", "nerfstudio", "--out", str(out)])
     assert result.exit_code == 0, result.exception
-    for transforms in out.glob("*/transforms.json"):
-        frames = json.loads(transforms.read_text())["frames"]
-        assert len(frames) == 12
-        for frame in frames:
-            with Image.open(transforms.parent / frame["file_path"]) as picture:
-                alpha = np.asarray(picture)[..., 3]
-            assert alpha.max() == 255 and (alpha == 0).any()
+    for sample in open_dataset(str(made)).samples("train"):
+        for view, rgba in nerfstudio_pictures(out / sample.key, sample).items():
+            covered = view_passes(
+                sample.scene, ["coverage"], view=view, resolution=32, rays_a_side=4
+            )["coverage"]
+            assert rgba.shape == (32, 32, 4) and {0.0, 1.0} < set(np.unique(covered))
+            np.testing.assert_allclose(rgba[..., 3], np.round(255 * covered) / 255, rtol=1e-6)
 
 
 @pytest.mark.slow("commands")

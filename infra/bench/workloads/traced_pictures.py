@@ -57,18 +57,25 @@ def fixed_samples(resolution: int, spp: int) -> RenderSettings:
 
 def render_shot(scene: Scene, settings: RenderSettings) -> RenderedView:
     """Return a scene's first view, always of one seed; runs in a render child."""
-    return render_shots(scene, settings, 1)[0]
+    return render_shots(scene, settings, 1)[0][0]
 
 
-def render_shots(scene: Scene, settings: RenderSettings, count: int) -> list[RenderedView]:
-    """Return the first `count` views of a scene, always of one seed; runs in a render child."""
+def render_shots(
+    scene: Scene, settings: RenderSettings, count: int
+) -> tuple[list[RenderedView], float]:
+    """Return the first `count` views of a scene, always of one seed; runs in a render child.
+
+    The CPU seconds of all of them come second, with loading the scene and every look.
+    """
     small = dataclasses.replace(settings, resolution=_SMALL, max_spp=settings.min_spp)
     poses = [(scene.c2w[view], float(scene.fov_deg[view])) for view in range(count)]
     SceneRenderer(scene, small).render_view(*poses[0], seed=0)  # compiles
     if settings.denoiser != "off":
         warm_up_denoiser(settings.resolution, settings.denoiser)
+    started = time.process_time()
     renderer = SceneRenderer(scene, settings)
-    return [renderer.render_view(*pose, SAMPLE_SEED) for pose in poses]
+    views = [renderer.render_view(*pose, SAMPLE_SEED) for pose in poses]
+    return views, time.process_time() - started
 
 
 _RR_DEPTH = 5
