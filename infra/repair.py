@@ -7,7 +7,7 @@ from typing import cast
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.pipeline import make_dataset
+from pipeline.generation.pipeline import make_dataset, prepare_dataset
 from pipeline.objects.licences import BY_USER
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import differences
@@ -42,7 +42,7 @@ def repair(
 
     Raises:
         TrilightError: the dataset is on a server, was derived from other datasets, or was begun in
-            another environment; scene files are missing or differ; or the generated shards differ
+            another environment; objects or scene files are missing or differ; or the generated shards differ
             from the manifest.
     """
     root = parse_url(dataset, what="dataset")
@@ -72,7 +72,8 @@ def repair(
         views=manifest.num_views if scenes_from else None,
         albedo_over_one=cast(AlbedoOverOne, value_of(command, "--albedo-over-one") or "scale"),
         changes=_changes(manifest),
-    )  # checks everything before a shard is moved
+    )
+    prepare_dataset(options)  # refuses other objects before a shard is moved
     for name in bad_shards:
         if (root / name).exists():
             (root / name).replace(root / f"{name}{ASIDE}")

@@ -87,8 +87,8 @@ class ModelConfig:
     """Number of register tokens: learned tokens that belong to no triangle."""
     rope_num_freqs: Annotated[int, Within(1, 64)]
     """Rotary frequencies per coordinate; 2 x 9 x rope_num_freqs may not exceed the head width."""
-    rope_max_freq: Annotated[float, Within(1, 1000, unit="radians per metre")]
-    """Highest rotary frequency in radians per metre; the lowest is 1, the rest log-spaced."""
+    rope_max_freq: Annotated[float, Within(1, 1000, unit="radians per meter")]
+    """Highest rotary frequency in radians per meter; the lowest is 1, the rest log-spaced."""
     register_eps: Annotated[float, Within(0, 1)] = 0.0
     """Added to the number of triangles by which the registers' mean position is divided; the
     published weights use 1e-5."""

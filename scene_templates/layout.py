@@ -20,7 +20,7 @@ class SurfaceLook:
     diffuse_scale: float
     """Largest diffuse albedo that a channel may have; plus `specular_rgb` at most 1."""
     diffuse_rgb: RGB
-    """Diffuse albedo where the surface has one colour."""
+    """Diffuse albedo where the surface has one color."""
     specular_rgb: RGB
     """Linear specular albedo, each channel in [0, 1]."""
     roughness: float
@@ -28,7 +28,7 @@ class SurfaceLook:
     smooth: bool
     """Normals interpolated across edges below the smoothing angle; otherwise flat."""
     colours: Literal["one", "groups", "triangles"]
-    """`one`: `diffuse_rgb`. Otherwise a colour for each shading group or for each triangle, each
+    """`one`: `diffuse_rgb`. Otherwise a color for each shading group or for each triangle, each
     channel uniform in [0, diffuse_scale]."""
 
 

@@ -38,7 +38,7 @@ class PlacementSettings:
 
     orientation: Orientation = "uniform"
     """Distribution of the objects' rotations: `uniform` on SO(3), `euler` as published, which
-    favours the poles, or `kept` as in their files."""
+    favors the poles, or `kept` as in their files."""
     resting_share: Share = 0.5
     """Share of objects that rest on the floor; the others float. The published ones all float."""
     overlap_share: Share = 0.1

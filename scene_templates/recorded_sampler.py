@@ -21,11 +21,11 @@ class RecordedDraw:
     """Stated distribution of one name, and the drawn values."""
 
     kind: Kind
-    """Distribution: uniform in a range; uniform whole numbers; true with a probability; a colour
-    with independent uniform channels; a uniform place on the line between two colours; a direction
+    """Distribution: uniform in a range; uniform whole numbers; true with a probability; a color
+    with independent uniform channels; a uniform place on the line between two colors; a direction
     uniform by solid angle; or equally likely words."""
     stated: Any
-    """Lowest and highest value; a probability; the two colours; the lowest and highest elevation in
+    """Lowest and highest value; a probability; the two colors; the lowest and highest elevation in
     degrees; or the words."""
     values: list[Any] = field(default_factory=list)
     """Drawn values in order: one number, or one for each such thing of the sky or surface; a shade

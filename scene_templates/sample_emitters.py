@@ -53,7 +53,7 @@ class LightSettings:
     orientation: Orientation = "uniform"
     """Distribution of the emitters' rotations; see `PlacementSettings.orientation`."""
     coloured_share: Share = 0.0
-    """Share of emitters that are coloured instead of white, with the same mean radiance. An option:
+    """Share of emitters that are colored instead of white, with the same mean radiance. An option:
     published lights are white, and a network trained on white ones alone has never seen another."""
     reflectance: Share = 0.0
     """Diffuse albedo of an emitter. What shines at 300 need not reflect; the published ones do,

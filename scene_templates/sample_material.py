@@ -33,14 +33,14 @@ class MaterialSettings:
     roughness_clip: Annotated[Range, Within(0, 1)] = (0.01, 1.0)
     """Minimum and maximum roughness."""
     coloured_share: Share = 0.5
-    """Share of the surfaces with interpolated normals that have many colours: a floor or wall has
+    """Share of the surfaces with interpolated normals that have many colors: a floor or wall has
     one for each triangle, an object one for each shading group or triangle."""
     triangle_colours_share: Share = 0.5
-    """Share of the many-coloured objects with a colour for each triangle instead of each shading
+    """Share of the many-colored objects with a color for each triangle instead of each shading
     group; one half as in the paper (the published code makes none)."""
     coloured_specular_share: Share = 0.0
     """Share of surfaces whose specular albedo is tinted: each channel is uniform between 0 and the
-    untinted value. An option: the published scenes have none, and so no metal but grey ones."""
+    untinted value. An option: the published scenes have none, and so no metal but gray ones."""
     smooth_angle_deg: Annotated[float, Within(0, 180, unit="degrees")] = 30.0
     """Angle between faces above which an edge separates shading groups."""
     source: Literal["drawn", "object"] = "drawn"

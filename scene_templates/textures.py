@@ -24,12 +24,12 @@ class TextureSettings:
 
     share: Share = 0.0
     """Share of the objects, floors and walls that have a texture in the place of their drawn
-    colours and roughness. Of more than 64, the first ones are."""
+    colors and roughness. Of more than 64, the first ones are."""
     own_share: Share = 0.0
     """Share of those textures that are of your own folder (`--textures`), each equally likely; the
     others are procedural, and so are all in a split to which none of the folder belongs."""
     tile_m: Annotated[Range, Within(0.05, 100, unit="m")] = (0.4, 1.6)
-    """Range of the width of a texture on a surface, in metres; it repeats after that."""
+    """Range of the width of a texture on a surface, in meters; it repeats after that."""
     surfaces: SurfaceMapSettings = field(default_factory=SurfaceMapSettings)
     """Families of procedural textures. The size holds for your own too, as the most texels along a
     side, and so does the range of roughness, which is uniform where no picture says it."""

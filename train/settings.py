@@ -29,7 +29,7 @@ class AugmentationSettings:
 
     rotation: Rotation = "none"
     """Distribution of the random rotation of scene and cameras together."""
-    translation: Annotated[float, Within(0, 100, unit="metres")] = 0.0
+    translation: Annotated[float, Within(0, 100, unit="meters")] = 0.0
     """Standard deviation per axis of the random translation of scene and cameras together."""
     mirror: bool = False
     """Mirror the scene at half of the visits."""

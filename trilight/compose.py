@@ -98,7 +98,7 @@ class SceneBuilder:
                 raise TrilightError(f"{loaded.path}: no such file; expected a mesh.")
             name = name or self._unique_name(loaded.path.stem)
         if size is not None and not 0 < size < np.inf:
-            raise TrilightError(f"{name}: size is {size}; expected metres above 0.")
+            raise TrilightError(f"{name}: size is {size}; expected meters above 0.")
         if size is not None and isinstance(loaded, LoadedMesh) and loaded.reach == 0:
             raise TrilightError(f"{name}: all vertices are one point; expected a mesh.")
         scale = 1.0 if size is None else float(size)
@@ -188,7 +188,7 @@ class SceneBuilder:
         )
         if middle == target or not 0 < size < np.inf:
             raise TrilightError(
-                f"{name}: size is {size} and towards is {target} from {middle}; expected metres "
+                f"{name}: size is {size} and towards is {target} from {middle}; expected meters "
                 "above 0, and another point."
             )
         up = (0.0, 0.0, 1.0) if middle[:2] != target[:2] else (0.0, 1.0, 0.0)

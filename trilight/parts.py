@@ -65,7 +65,7 @@ def mesh_of_arrays(positions: ArrayLike, faces: ArrayLike, *, uid: str, licence:
     rows = np.asarray(faces)
     if points.ndim != 2 or points.shape[1:] != (3,) or not np.isfinite(points).all():
         raise TrilightError(
-            f"{uid}: vertices have shape {points.shape}; expected [V, 3] finite metres."
+            f"{uid}: vertices have shape {points.shape}; expected [V, 3] finite meters."
         )
     is_integer = np.issubdtype(rows.dtype, np.integer)
     if rows.ndim != 2 or rows.shape[1:] != (3,) or len(rows) == 0 or not is_integer:

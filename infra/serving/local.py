@@ -82,7 +82,7 @@ def start(*, host: str, port: int, workers: int) -> str:
         _say(f"starting Prefect's server at {url.removesuffix('/api')}; all takes about a minute")
         server = [*SERVER, "--host", host, "--port", str(port)]
         process = _launch("server", server, environment)
-        wait_until_healthy(url, process, _log("server"))
+        wait_until_healthy(url, process, _log("server"), _say)
         _say(f"making the pool `{POOL}`, its limits and the deployments")
         deploy = [sys.executable, "-m", f"{__package__}.deployments", POOL]
         _call([*deploy, "infra/serving/pool.json"], environment)

@@ -42,9 +42,9 @@ returns them as arrays, with row 0 on top, in the conventions of [Formats](forma
   have no texture coordinates: there, the pass `uv` is NaN, and left out where all passes are asked
   for, and of files: a file has the channels `uv.U` and `uv.V` exactly where its scene has textures.
 
-A view of 256 x 256 pixels of a scene with 1,500 triangles takes 0.04 core-seconds with all passes,
+A view of 256 x 256 pixels of a scene with 1,500 triangles takes 0.04 CPU seconds with all passes,
 and 0.9 with 4 x 4 rays a pixel: 1.3 to 1.5 million rays a core-second; making Embree's
-tree adds 0.2 core-seconds for 100,000 triangles. Passes were compared with
+tree adds 0.2 CPU seconds for 100,000 triangles. Passes were compared with
 Mitsuba's `aov` integrator: positions differ by 0.7 micrometres at most and normals by 5e-6, which
 is its single precision. Two of its passes mean something else. Its depth begins at the near plane
 of the camera. Its albedo leaves out the specular lobe where that is narrow: it is wrong on glossy
@@ -75,7 +75,7 @@ depth, normals, object ids, diffuse albedo and roughness, computed when they are
 The table says how many kB of a view of 256 x 256 pixels each pass takes (mean of 6 views of 3
 scenes with about 1,500 triangles, 2026-11-23). Depth, normal and object together take 400 kB, and
 all passes 2,450 kB, which is many times the compact picture. Computing and writing takes 0.05
-core-seconds a view for the three and 0.12 for all; reading a stored file takes 0.004 and 0.03. So
+CPU seconds a view for the three and 0.12 for all; reading a stored file takes 0.004 and 0.03. So
 storing pays where many readers want one pass without Embree. ZSTD would save a quarter, but only
 readers of OpenEXR from 3.4 on know it.
 

@@ -107,13 +107,13 @@ class StoredPictures(RendererHere):
     def load(self, scene: Scene, name: str) -> SceneHere:
         """Return the pictures; raises Unrenderable for another scene than theirs."""
         if scene is not self.scene:
-            raise Unrenderable("The file's picture shows the scene without your changes.")
+            raise Unrenderable("The file's image shows the scene without your changes.")
         return SceneHere(render_image=self._look_up)
 
     def _look_up(self, camera: Camera) -> Image:
         if camera.view is None or camera.view >= len(self.radiance_rgb):
             raise Unrenderable(
-                "The file holds pictures of the scene's own cameras alone; choose one of them."
+                "The file holds images of the scene's own cameras alone; choose one of them."
             )
         return Image(
             radiance_rgb=self.radiance_rgb[camera.view],
@@ -134,7 +134,7 @@ def page_renderers(
     offered = {
         "traced": PageRenderer(
             title="Path traced",
-            means="All light, traced until the measured error reaches its goal.",
+            means="All light, traced until the stated error reaches its goal.",
             make=lambda options: _path_tracer(child, options),
         )
     }
@@ -153,13 +153,13 @@ def page_renderers(
         offered[f"samples-{spp}"] = samples_on_page(child, spp)
     offered["direct"] = PageRenderer(
         title="Direct light",
-        means="Lamp, surface, camera: traced without any further bounce.",
+        means="Light, surface, camera: traced without any further bounce.",
         make=lambda options: _path_tracer(child, options, max_depth=_DIRECT_DEPTH),
     )
     if target is not None:
         offered["target"] = PageRenderer(
             title="Target",
-            means="The picture that the file holds of this camera.",
+            means="The image that the file holds of this camera.",
             make=lambda options: target,
         )
     return offered | {

@@ -171,7 +171,7 @@ def _move_lamp(
     rows: NDArray[np.float32],
 ) -> None:
     if not 0 <= row < len(scene.objects) or scene.objects[row].kind != "emitter":
-        raise TrilightError(f"edits: object {row} is no lamp of the scene.")
+        raise TrilightError(f"edits: object {row} is no light of the scene.")
     mine = scene.object_index == row
     move = _numbers(change.get("move", (0, 0, 0)), "move", 3, -MAX_POSITION_M, MAX_POSITION_M)
     positions[np.unique(scene.faces[mine])] += move.astype(np.float32)

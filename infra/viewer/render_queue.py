@@ -109,7 +109,7 @@ class RenderQueue:
         """Return a job by its id; raises TrilightError where it is no longer kept."""
         with self._changed:
             if number not in self._jobs:
-                raise TrilightError("The picture is not kept any more; ask for it again.")
+                raise TrilightError("The image is not kept any more; ask for it again.")
             return self._jobs[number]
 
     def wait_for_update(self, number: str, after: int) -> RenderJob:

@@ -8,7 +8,7 @@ import pydantic
 from pipeline.foreign.limits import ReadLimits
 from storage.errors import TrilightError
 from storage.settings.described import checked
-from storage.settings.ranges import Within
+from storage.settings.ranges import LowFirst, Within
 
 Profile = Literal["faithful", "uniform"]
 Decimator = Literal["pymeshlab", "libigl"]
@@ -26,7 +26,10 @@ class GateSettings:
     diagonal of the source's bounding box."""
     max_outside: Annotated[float, PART] = 0.01
     """Largest distance of a vertex outside the source's bounding box, in diagonals."""
-    area_ratio: Annotated[tuple[float, float], Within(0, 1000, low_open=True)] = (0.75, 1.25)
+    area_ratio: Annotated[tuple[float, float], LowFirst(), Within(0, 1000, low_open=True)] = (
+        0.75,
+        1.25,
+    )
     """Accepted area as a multiple of the source's."""
     max_normal_error_deg: Annotated[float, Within(0, 90, low_open=True, unit="degrees")] = 35.0
     """Largest accepted mean angle between normals; 57 is the mean of unrelated ones."""

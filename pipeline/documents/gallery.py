@@ -33,7 +33,13 @@ _AT_CAP = "at the cap"
 _WHERE = {_WITHIN: "not any(at_cap)", _AT_CAP: "any(at_cap)"}
 _OPTIONS = {"split": "--split", "layout": "--template", "views": "--where"}
 """Option that selects the scenes of a choice, by the name of its filter."""
-_ORDERS = ("least floor", "fewest triangles", "most triangles", "most lights", "least coverage")
+_ORDERS = (
+    "least stated error",
+    "fewest triangles",
+    "most triangles",
+    "most lights",
+    "least coverage",
+)
 
 
 @dataclass(frozen=True, kw_only=True)

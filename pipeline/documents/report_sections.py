@@ -153,9 +153,9 @@ def _materials(distributions: Distributions) -> ReportPart:
     for kind, name in _KINDS.items():
         count, *those = (distributions.surfaces.get((kind, key), 0) for key in SURFACE_COUNTS)
         rows.append([name, count, *(_share(of_them, count) for of_them in those)])
-    shares = Table(["surfaces"], ["count", "smooth", "many colours", "textured"], rows)
+    shares = Table(["surfaces"], ["count", "smooth", "many colors", "textured"], rows)
     note = (
-        "A surface is an object, a floor or a wall in one scene. Of many colours the mean over "
+        "A surface is an object, a floor or a wall in one scene. Of many colors the mean over "
         "triangles counts, of a texture its mean. Albedos are those of the strongest channel. "
         "Smooth surfaces share vertices between triangles; the others are flat."
     )

@@ -94,7 +94,7 @@ def _range_caption(form: str) -> Callable[[NDArray], str]:
 
 def _ids_seen(ids: NDArray) -> str:
     seen = len(np.unique(ids[ids != MISS]))
-    return f"{seen} seen, in the colours of the table Objects"
+    return f"{seen} seen, in the colors of the table Objects"
 
 
 PASS_VIEWS = (

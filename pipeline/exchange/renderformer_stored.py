@@ -153,7 +153,7 @@ def read_grey_textures(file: Any, count: int, lost: list[str]) -> StoredTextures
     rows[:, TEXTURE_EMISSION] = light
     lost.append(
         f"materials: nine channels of a learned code for a BRDF, which no formula turns into "
-        f"albedos; all {count} triangles are a diffuse grey of {_GREY}"
+        f"albedos; all {count} triangles are a diffuse gray of {_GREY}"
     )
     return StoredTextures(rows=rows, varies=np.zeros(count, np.bool_), cells=None)
 

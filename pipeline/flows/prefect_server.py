@@ -19,7 +19,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,7 +45,8 @@ _NO_PAGE = {
     "PREFECT_SERVER_MEMOIZE_BLOCK_AUTO_REGISTRATION": "false",
 }
 """Variables of a server without its page, and without the blocks of that page, which are slow."""
-_START_UP_S = 120.0
+_START_UP_S = 600.0
+_SIGN_OF_LIFE_S = 15.0
 _LOG_NAME = "server.log"
 SERVER = (sys.executable, "-m", f"{__package__}.guarded_server")
 """Program of every server that we start; --host and --port follow."""
@@ -214,9 +215,20 @@ def new_password() -> str:
     return f"trilight:{secrets.token_urlsafe(24)}"
 
 
-def wait_until_healthy(url: str, server: "subprocess.Popen[bytes]", log: Path) -> None:
-    """Wait until a server answers; raises TrilightError if it ends or takes too long."""
-    deadline = time.monotonic() + _START_UP_S
+def wait_until_healthy(
+    url: str,
+    server: "subprocess.Popen[bytes]",
+    log: Path,
+    say: Callable[[str], None] = lambda text: None,
+) -> None:
+    """Wait until a server answers; raises TrilightError if it ends or takes too long.
+
+    Args:
+        say: gets a sign of life every _SIGN_OF_LIFE_S seconds.
+    """
+    began = time.monotonic()
+    deadline = began + _START_UP_S
+    next_sign = began + _SIGN_OF_LIFE_S
     direct = urllib.request.build_opener(
         urllib.request.ProxyHandler({})
     )  # no proxy: it is on this machine
@@ -225,14 +237,19 @@ def wait_until_healthy(url: str, server: "subprocess.Popen[bytes]", log: Path) -
             with direct.open(f"{url}/health", timeout=2):
                 if server.poll() is None:  # else another server answered at this port
                     return
+        if (now := time.monotonic()) >= next_sign:
+            next_sign = now + _SIGN_OF_LIFE_S
+            say(f"the server is still starting: {now - began:.0f} of at most {_START_UP_S:.0f} s")
         time.sleep(0.1)
     load_prefect()  # raises if a setting made the server fail
     lines = log.read_text(errors="replace").splitlines() if log.exists() else []
     said = safe_text(lines[-1]) if lines else "without a word"
-    what = "ended" if server.poll() is not None else f"did not answer within {_START_UP_S:.0f} s"
+    what, advice = "ended", "try `trilight doctor`"
+    if server.poll() is None:
+        what = f"did not answer within {_START_UP_S:.0f} s"
+        advice = "repeat the command when this machine is less busy"
     raise TrilightError(
-        f"Prefect: the server did not start: it {what} ({said}); see {log}, and try "
-        "`trilight doctor`."
+        f"Prefect: the server did not start: it {what} ({said}); see {log}, and {advice}."
     )
 
 

@@ -123,7 +123,7 @@ class RenderSettings:
     """Rays per pixel for the albedo and normal pictures that guide the denoiser, on a regular grid.
     16 cost a quarter of 64 and are 0.06 dB worse at 256 samples; pictures beyond 60 dB want 64."""
     denoiser: Filtered = "high"
-    """Quality of Open Image Denoise; `fast` costs 1 to 2 dB and saves 0.3 core-seconds."""
+    """Quality of Open Image Denoise; `fast` costs 1 to 2 dB and saves 0.3 CPU seconds."""
     min_mean_radiance: Annotated[float, Within(0, HALF_FLOAT_MAX)] = 0.01
     """A view whose first samples are darker than this on average is rejected as black_view."""
     per_light: bool = False

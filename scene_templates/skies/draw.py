@@ -40,7 +40,7 @@ class SkyMapSettings:
     """Range of the mean radiance over the sphere and the three channels. A white Lambert floor
     under a constant sky has the radiance of the sky."""
     coloured_share: Share = 0.1
-    """Share of the skies whose lights have any colour; in the others, they are black bodies."""
+    """Share of the skies whose lights have any color; in the others, they are black bodies."""
     sun_elevation_deg: Annotated[Range, Within(-90, 90, unit="degrees")] = (2.0, 75.0)
     """Range of the elevation of a sun, uniform by solid angle."""
     sun_to_sky: Annotated[Range, Within(0, 1e9)] = (0.5, 8.0)

@@ -23,10 +23,10 @@ class SurfaceMapSettings:
     """Width and height of a map, a power of two. The same seed gives the same surface at every
     size; below 64 the finest pattern is a blur."""
     natural_share: Share = 0.7
-    """Share of the surfaces with the colours of their family; in the others, each channel of each
-    base colour is uniform in `albedo`."""
+    """Share of the surfaces with the colors of their family; in the others, each channel of each
+    base color is uniform in `albedo`."""
     albedo: Annotated[Range, Within(0, MOST_ALBEDO)] = (0.02, 0.9)
-    """Range of each channel of a base colour that is not natural."""
+    """Range of each channel of a base color that is not natural."""
     roughness_clip: Annotated[Range, Within(0, 1)] = (0.01, 1.0)
     """Minimum and maximum roughness, as of constant materials."""
 

@@ -52,7 +52,7 @@ class ShardPlace:
         except OSError as error:
             raise TrilightError(
                 f"shard {self.display_name!r}: cannot be read ({error.strerror}); expected a file. "
-                "Check the list."
+                "Check the list: a dataset numbers its shards over all splits."
             ) from error
 
 

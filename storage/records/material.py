@@ -59,7 +59,7 @@ class MaterialColumn:
         if not 1 <= self.width <= MAX_WIDTH:
             _wrong(self.name, f"a width of {self.width}", f"a whole number from 1 to {MAX_WIDTH}")
         if self.is_colour and self.width != 3:
-            _wrong(self.name, f"a width of {self.width}", "3, since it is a colour")
+            _wrong(self.name, f"a width of {self.width}", "3, since it is a color")
         if not -FLOAT32_MAX <= self.within.low <= self.within.high <= FLOAT32_MAX:
             _wrong(self.name, f"the range {self.within}", "one within the finite float32 numbers")
         if not self.within.holds(self.default):

@@ -54,13 +54,13 @@ def leaderboard_page(
     lines = ["# Leaderboard", "", *_facts(about)]
     lines += [
         "",
-        "Medians over views, in brackets the worse 5 %; sorted by psnr_log_db. Core-seconds are "
+        "Medians over views, in brackets the worse 5 %; sorted by psnr_log_db. CPU seconds are "
         "medians over the timed scenes, one thread of a processor, everything warm: a scene's "
         "first view with its loading, and a further one. A row is on the front where no other one "
         f"is as good at its price. The first row, {NOISE}, is what the targets leave open: rows "
         "near or above it cannot be ranked by these references.",
         "",
-        "![Core-seconds and error](leaderboard.png)",
+        "![CPU seconds and error](leaderboard.png)",
     ]
     for one in widths:
         lines += ["", f"## {one.width} x {one.width} pixels", ""]
@@ -147,7 +147,7 @@ def _medians_table(parts: Mapping[str, Any]) -> str:
 
 
 def _standings_table(one: WidthStandings) -> str:
-    head = ["", "first view, core-s", "further view", *METRICS, "front"]
+    head = ["", "first view, CPU s", "further view", *METRICS, "front"]
     rows = [
         [
             text(standing.name),

@@ -55,7 +55,7 @@ function card(row) {
 }
 
 const short = (row) => `${row.template}, ${row.split}; ${row.triangles.toLocaleString("en")} tri, ${
-  row.lights} lamp${row.lights === 1 ? "" : "s"}; ${row.floor.toFixed(1)} dB`;
+  row.lights} light${row.lights === 1 ? "" : "s"}; ${row.floor.toFixed(1)} dB`;
 
 function enlarge(at) {
   const row = rows[at];

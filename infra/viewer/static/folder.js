@@ -50,7 +50,7 @@ async function tell(card) {
 
 const some = (count, what) => `${count.toLocaleString("en")} ${what}${count === 1 ? "" : "s"}`;
 
-const about = (found) => [some(found.triangles, "triangle"), some(found.lights, "lamp"),
+const about = (found) => [some(found.triangles, "triangle"), some(found.lights, "light"),
   found.textures ? some(found.textures, "texture") : "", some(found.views, "camera"),
   found.notes ? some(found.notes, "note") : ""].filter(Boolean).join(", ");
 

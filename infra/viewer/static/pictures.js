@@ -17,7 +17,7 @@ export class Pictures {
     this.told = new Map();
     this.generation = 0;
     this.cards = new Map();
-    this.engine = engines.some((each) => each.name === "hits") ? "hits" : engines[0].name;
+    this.engine = engines[0].name; // path traced: its previews come before any other image
     this.#fill("ways", engines.filter((each) => !isPass(each.name)));
     this.#fill("passes", engines.filter((each) => isPass(each.name)));
     this.#fillRungs(engines.filter((each) => each.name.startsWith(SAMPLES)));
@@ -57,10 +57,11 @@ export class Pictures {
   async #makeAll(mine) {
     const all = document.getElementById("all").checked;
     const rungs = [...this.cards.keys()].filter((name) => name.startsWith(SAMPLES));
-    const others = ["target", "hits", "network", "tokens", "direct", ...rungs, "traced"]
-      .filter((name) => all && this.#isShown(name) && name !== this.engine);
+    const others = ["hits", "network", "tokens", "direct", ...rungs, "traced"];
+    const names = new Set(["target", this.engine, ...others]); // the target is stored: no wait
     try {
-      for (const name of [this.engine, ...others]) {
+      for (const name of names) {
+        if (name !== this.engine && !(all && this.#isShown(name))) continue;
         const before = this.told.get(name);
         if (before && ["done", "failed"].includes(before.state)) continue;
         if (!await this.#make(name, mine)) return;
@@ -231,7 +232,7 @@ const seconds = (value) => (value < 0.995 ? value.toPrecision(2) : value.toFixed
 
 function figures(told) {
   const parts = [];
-  if (told.core_s != null) parts.push(`${seconds(told.core_s)} core-s`);
+  if (told.core_s != null) parts.push(`${seconds(told.core_s)} CPU s`);
   if (told.spp) parts.push(`${told.spp} spp`);
   if (told.floor_db != null) {
     const probably = told.expected_db == null ? "" : `, probably ${told.expected_db.toFixed(1)}`;
@@ -243,7 +244,7 @@ function figures(told) {
 
 function progress(told) {
   const parts = [figures(told)];
-  if (told.scene_core_s) parts.push(`+ ${seconds(told.scene_core_s)} core-s for the scene`);
+  if (told.scene_core_s) parts.push(`+ ${seconds(told.scene_core_s)} CPU s for the scene`);
   if (told.state !== "done" && told.sampling) {
     parts.push(`at ${told.sampling.spp} of about ${told.sampling.expected_spp} samples`);
   }
@@ -257,7 +258,7 @@ function progress(told) {
 const truth = (told) => (told.truth === "target" ? "the target" : "path traced");
 
 function noError(told, engine) {
-  if (engine === "traced" || engine === "target") return "The others are judged by this picture";
+  if (engine === "traced" || engine === "target") return "The others are judged by this image";
   if (engine.startsWith("pass-")) return "A pass has no error: it is exact";
-  return "The error comes once there is a target or a path traced picture";
+  return "The error comes once there is a target or a path traced image";
 }

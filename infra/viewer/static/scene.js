@@ -72,7 +72,7 @@ function describe(facts) {
   document.title = `${facts.name} – Trilight`;
   byId("name").textContent = facts.name;
   const some = (count, what) => `${count.toLocaleString("en")} ${what}${count === 1 ? "" : "s"}`;
-  byId("facts").textContent = [some(facts.triangles, "triangle"), some(facts.lights, "lamp"),
+  byId("facts").textContent = [some(facts.triangles, "triangle"), some(facts.lights, "light"),
     some(facts.materials, "material"), some(facts.textures, "texture"),
     some(facts.views, "camera"), facts.template].filter(Boolean).join(", ");
   byId("notes").append(...facts.notes.map((note) => element("li", {}, note)));

@@ -119,7 +119,7 @@ class SkinBaker:
         if quality.colour_error > self._settings.max_colour_error:
             raise Rejected(
                 "colours_changed",
-                f"colours are off by {quality.colour_error:.3f} on average at {budget} faces; "
+                f"colors are off by {quality.colour_error:.3f} on average at {budget} faces; "
                 f"expected <= {self._settings.max_colour_error}",
             )
         if quality.missed_cells > self._settings.max_missed:

@@ -57,7 +57,7 @@ def usd_textured_mesh(source: UsdSource, decode: Decode, *, emission: bool = Fal
     material = np.concatenate([rows for rows, _ in looks_of_meshes])
     tint = np.concatenate([tints for _, tints in looks_of_meshes])
     if (material == looks.plain).all() and (tint == _UNBOUND).all():
-        raise Rejected("no_materials", "the stage has no materials and no display colours")
+        raise Rejected("no_materials", "the stage has no materials and no display colors")
     sets = looks.primvars or ["st"]
     return TexturedMesh(
         mesh=source.mesh,

@@ -99,7 +99,7 @@ def prepare_map(map_files: MapFiles) -> tuple[bytes, tuple[str, ...]]:
         values, notes = _picture_of(part, path)
         unread += [f"{note} of its {part}" for note in notes]
         if packed_channels(part) and values.shape[2] < 3:
-            unread.append(f"its {part}, which is grey: it has no channels")
+            unread.append(f"its {part}, which is gray: it has no channels")
         pictures[part] = values
     if "base" in pictures and are_normals(pictures["base"]):
         raise Rejected(

@@ -25,6 +25,7 @@ from infra.serving.access import grant, next_command, revoke, settings_file, sta
 from infra.serving.deployments import limits
 from infra.serving.local import running, start, stop
 from infra.serving.train_model import RunChanges, TrainOptions, train_model, train_options
+from pipeline.flows import prefect_server
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
 from pipeline.flows.prefect_server import STOPPED_BY_PARENT, wait_until_healthy
 from storage.errors import TrilightError
@@ -106,8 +107,22 @@ def test_an_answer_counts_only_while_our_server_lives(tmp_path: Path) -> None:
             self.answers += 1
             return None if self.answers == 1 else 1
 
-    with healthy_server() as url, pytest.raises(TrilightError, match="did not start"):
+    with healthy_server() as url, pytest.raises(TrilightError, match="did not start: it ended"):
         wait_until_healthy(url, cast(Any, Ends()), tmp_path / "log")
+
+
+def test_a_slow_server_is_waited_for_with_signs_of_life(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prefect_server, "_START_UP_S", 1.0)
+    monkeypatch.setattr(prefect_server, "_SIGN_OF_LIFE_S", 0.3)
+    said = list[str]()
+    with (
+        subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as server,
+        pytest.raises(TrilightError, match=r"did not answer within 1 s .* less busy"),
+    ):
+        wait_until_healthy("http://127.0.0.1:9", server, tmp_path / "log", said.append)
+    assert said and "still starting" in said[0]
 
 
 @contextlib.contextmanager

@@ -319,7 +319,7 @@ def test_geometry_lights_and_cameras_are_read_and_the_code_is_not(tmp_path: Path
     assert rows[2, 7:10].tolist() == ours.materials[LIGHT, 7:10].tolist()
     assert scene.environment is None
     (note,) = found.notes
-    assert "learned code" in note and "grey of 0.5" in note
+    assert "learned code" in note and "gray of 0.5" in note
 
 
 @pytest.mark.parametrize("processed", [True, False])

@@ -200,6 +200,19 @@ def test_a_run_goes_on_after_a_kill_and_a_bad_shard_is_repaired(
     assert not verify_dataset(again).problems
 
 
+def test_a_repair_from_other_objects_is_refused_before_a_shard_is_moved(
+    source: Dataset, tmp_path: Path
+) -> None:
+    copy = tmp_path / "set"
+    shutil.copytree(source.folder.root, copy)
+    shard = source.manifest.shards[0].name
+    (copy / shard).write_bytes(b"not a shard")
+    before = {path.name: path.read_bytes() for path in copy.iterdir() if path.is_file()}
+    with pytest.raises(TrilightError, match="name the source that has it by --objects"):
+        repair(str(copy), [shard], objects="builtin:1", scenes_from=None)
+    assert {path.name: path.read_bytes() for path in copy.iterdir() if path.is_file()} == before
+
+
 def test_another_source_is_refused(source: Dataset, tmp_path: Path) -> None:
     order = order_of(source.folder.root, tmp_path / "set")
     other = dict(order.changes["revisit"], source_digest="0" * 64)

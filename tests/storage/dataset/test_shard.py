@@ -5,6 +5,7 @@ Lists and brace patterns of shards: what they stand for, and what is never opene
 
 import io
 import os
+import re
 import shutil
 import sys
 import tarfile
@@ -24,6 +25,7 @@ from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import index_shard
 from storage.dataset.mixed_data import open_mixture
+from storage.dataset.settings import SplitSettings
 from storage.dataset.shard import (
     contents_of,
     iterate_samples,
@@ -32,6 +34,7 @@ from storage.dataset.shard import (
     write_shard,
 )
 from storage.dataset.shard_places import expand_pattern, listed_shards
+from storage.dataset.splits import shard_name
 from storage.dataset.training_data import open_training_data
 from storage.digests import sha256_of_file
 from storage.errors import TrilightError
@@ -40,6 +43,7 @@ from storage.records.profiles import PROFILES, Profile, keeps_law
 from storage.records.sample import Sample, decode_scene, encode_sample, sample_key
 from storage.records.scene_file import encode_arrays
 from storage.remote.url import parse_local_path
+from tests.conftest import ROOT
 from tests.for_each import case, for_each
 from tests.pipeline.documents.dataset_by_hand import five_scenes, write_dataset
 from tests.scenes_by_hand import tiny_sample
@@ -298,6 +302,14 @@ def test_a_map_twice_or_behind_its_sample_is_refused(tmp_path: Path) -> None:
 )
 def test_patterns(pattern: str, names: list[str]) -> None:
     assert expand_pattern(pattern) == names
+
+
+def test_quoted_patterns_name_shards_that_a_dataset_has() -> None:
+    splits = SplitSettings(scenes_per_shard=4)
+    for quoting in ("docs/how-to/train-and-evaluate.md", "infra/train_options.py"):
+        (pattern,) = re.findall(r"\w+://\S+\.tar\b", (ROOT / quoting).read_text())
+        for name in (each.rpartition("/")[2] for each in expand_pattern(pattern)):
+            assert name == shard_name(int(name[-10:-4]), splits)
 
 
 @for_each(
