@@ -5,7 +5,7 @@ of model.width_scales. With a width of 0 they are the same at every width, as in
 """
 
 import dataclasses
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from model.config import VERTEX_COORDINATES, ModelConfig
 from storage.errors import TrilightError
@@ -24,8 +24,8 @@ class BaseWidths:
     """Width of an attention head there; it divides `width`."""
     pixel_width: Annotated[int, Within(1, 4096)] = 64
     """hits: width of the network that each pixel passes there."""
-    REMOVED: ClassVar = ("filter_width",)
-    """Names of settings of earlier versions, which old files may hold."""
+    filter_width: Annotated[int, Within(1, 1024)] = 32
+    """hits: width of the filter's network there."""
 
     def __post_init__(self) -> None:
         if self.head_width % 2 or self.width % self.head_width:
@@ -56,4 +56,5 @@ class BaseWidths:
             dpt_features=in_proportion(config.dpt_features),
             dpt_channels=tuple(map(in_proportion, config.dpt_channels)),
             pixel_width=self.pixel_width if config.pixel_width else 0,
+            filter_width=self.filter_width if config.filter_width else 0,
         )

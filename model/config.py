@@ -26,12 +26,7 @@ VERTEX_COORDINATES = 9
 NUM_TAPS = 4
 """Number of decoder layers that a DPT head reads (Ranftl et al. 2021)."""
 
-REMOVED: Mapping[str, Any] = {
-    "projected_freqs": 0,
-    "texture_cells": 0,
-    "sky_cells": 0,
-    "filter_width": 0,
-}
+REMOVED: Mapping[str, Any] = {"projected_freqs": 0, "texture_cells": 0, "sky_cells": 0}
 """Removed settings that files of networks may hold, with the values that switched them off."""
 
 HITS_PX = 8
@@ -57,6 +52,7 @@ class HitStage:
     hit_anchors: int
     gather_rays: int
     pixel_width: int
+    filter_width: int
     sky_rays: int
     denoise_from_px: int
 
@@ -123,6 +119,9 @@ class ModelConfig:
     of lamps is traced. 0 with bundles."""
     pixel_width: Annotated[int, Within(0, 4096)] = 0
     """hits: width of the network that runs per pixel; 0 with bundles."""
+    filter_width: Annotated[int, Within(0, 1024)] = 0
+    """hits: width of the network that filters reflections over neighboring pixels; 0 filters none.
+    0 with bundles."""
     scene_tokens: bool = True
     """hits: anchors attend to the scene's tokens; false leaves out the view-independent stage."""
     material_columns: tuple[str, ...] = PUBLISHED_COLUMNS
@@ -132,7 +131,8 @@ class ModelConfig:
     with bundles."""
     denoise_from_px: Annotated[int, Within(0, 16_384, unit="pixels")] = 0
     """hits: picture width from which Open Image Denoise filters direct and mirrored light before
-    the network reads it; with 0, it never does. 0 with bundles."""
+    the network reads it, in place of filter_width's network; with 0, it never does. 0 with
+    bundles."""
 
     def __post_init__(self) -> None:
         if self.width % self.num_heads or self.head_width % 2:
@@ -175,7 +175,7 @@ class ModelConfig:
                 )
             if self.demodulated:
                 _wrong("demodulated with view_stage hits", "false")
-        elif any([*required.values(), self.gather_rays, not self.scene_tokens]):
+        elif any([*required.values(), self.gather_rays, self.filter_width, not self.scene_tokens]):
             _wrong("fields of hits beside view_stage bundles", "0, and scene_tokens true")
         elif self.sky_rays or self.denoise_from_px:
             got = f"sky_rays {self.sky_rays} and denoise_from_px {self.denoise_from_px}"
@@ -226,10 +226,9 @@ def hits_smoke() -> ModelConfig:
         view_stage="hits",
         hit_rays=2,
         hit_anchors=16,
-        gather_rays=32,
+        gather_rays=16,
         pixel_width=64,
-        sky_rays=4,
-        denoise_from_px=HITS_PX,
+        filter_width=32,
     )
 
 
@@ -247,6 +246,7 @@ def hits_base() -> ModelConfig:
         hit_anchors=32,
         gather_rays=64,
         pixel_width=128,
+        filter_width=64,
     )
 
 

@@ -224,6 +224,7 @@ _OMITTED_AT_DEFAULT = (
     "hit_anchors",
     "gather_rays",
     "pixel_width",
+    "filter_width",
     "scene_tokens",
     "demodulated",
     "sky_rays",

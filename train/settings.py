@@ -206,18 +206,13 @@ def _wrong(name: str, got: object, expected: str) -> None:
     raise TrilightError(f"train settings: {name} is {got}; expected {expected}.")
 
 
-_REMOVED: Mapping[str, Mapping[str, Any]] = {
-    "model": REMOVED_FROM_MODEL,
-    "loss": {"lpips_precision": "float32"},
-    "base_widths": {"filter_width": 32},
-}
+_REMOVED = {"model": REMOVED_FROM_MODEL, "loss": {"lpips_precision": "float32"}}
 """Removed settings of each group, with the value that switched them off."""
 
 _BEFORE = {
     "projected_freqs": "rope_max_freq",
     "texture_cells": "material_columns",
     "sky_cells": "texture_cells",
-    "filter_width": "pixel_width",
     "lpips_precision": "perceptual_weight",
 }
 """Name of the setting after which a removed one is stored."""

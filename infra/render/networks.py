@@ -196,7 +196,7 @@ def traced_network() -> "NeuralRenderer":
     smallest = dataclasses.replace(
         hits_smoke(), width=2 * VERTEX_COORDINATES, num_heads=1, rope_num_freqs=1,
         encoder_layers=1, decoder_layers=1, hidden_width=1, num_registers=0, pixel_width=1,
-        scene_tokens=False,
+        filter_width=0, scene_tokens=False,
     )  # fmt: skip
     return untrained_network(smallest)
 

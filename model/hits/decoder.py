@@ -5,7 +5,7 @@ Each pixel mixes what the nine nearest anchors know, by what it is like them, an
 says how much of each light that was traced counts, and what is missing:
 
     radiance = diffuse albedo * (gain * mixed gathered light + irradiance)
-             + specular albedo * radiance + gain * direct light + gain * mirrored light
+             + specular albedo * radiance + gain * direct light + gain * filtered mirrored light
 
 Nothing of it is negative. All light is in units of the scene's mean light, by color: the picture
 scales with the lamps exactly. There are no pixels from elsewhere in it, so any width will do.
@@ -23,6 +23,7 @@ from torch.nn.functional import normalize, silu, softplus
 from model.attention import Keys, attend
 from model.config import HitStage, ModelConfig, hit_stage
 from model.encoded_scene import EncodedScene, KeysValues, TokenPositions
+from model.hits.light_filter import LightFilter, filter_flops
 from model.hits.second_hits import DEVICE_BLOCK
 from model.hits.traced import INPUTS, Traced
 from model.hits.view_inputs import Channel
@@ -130,7 +131,9 @@ def view_flops(config: ModelConfig, tokens: int, resolution: int) -> dict[str, i
     asks = 4 * a * d * d + 4 * a * tokens * d if config.scene_tokens else 0
     pixel = PIXEL_DIM * p + p * p + NEIGHBOURS * (2 * p + 3) + OFFSET_DIM * p + NEIGHBOURS * 4 * 3
     pixel += (2 * p + 3) * 2 * p + 2 * p * p + p * 3 * (_GAINED + 2)
+    width = stage.filter_width
     return {
+        "filter": filter_flops(PIXEL_DIM, width, resolution**2) if width else 0,
         "anchors": 2 * a * ((PIXEL_DIM + 3) * d + d * d),
         "cross-attention": config.decoder_layers * asks,
         "view feed-forward": config.decoder_layers * 6 * a * d * config.hidden_width,
@@ -229,6 +232,7 @@ class HitDecoder(nn.Module):
         self.rotary = rotary
         self.recompute = False
         stage = hit_stage(config)
+        self.filter = LightFilter(PIXEL_DIM, stage.filter_width) if stage.filter_width else None
         self.told = nn.Linear(PIXEL_DIM + 3, config.width)
         self.anchors = nn.Linear(config.width, config.width)
         self.layers = nn.ModuleList(AnchorLayer(config) for _ in range(config.decoder_layers))
@@ -272,14 +276,24 @@ class HitDecoder(nn.Module):
             )
 
     def _pixel_features(self, traced: Traced, unit_B1113: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the features of pixels [B, V, R, R, F], and their mirrored light."""
+        """Return the features of pixels [B, V, R, R, F], and their mirrored light, filtered."""
         pixels = traced.pixels_VRRC
         surface = _surface(pixels)
         light = torch.cat([pixels[..., channel] / unit_B1113 for channel in _LIGHTS], dim=-1)
         available = traced.given_VI[:, :, None, None, :].expand(*surface.shape[:-1], -1)
         mirrored = pixels[..., Channel.MIRRORED] / unit_B1113
-        lights = torch.log1p(4 * torch.cat([light, mirrored], dim=-1))
-        return torch.cat([surface, lights, available], dim=-1), mirrored
+
+        def stack_features() -> Tensor:
+            lights = torch.log1p(4 * torch.cat([light, mirrored], dim=-1))
+            return torch.cat([surface, lights, available], dim=-1)
+
+        is_denoised = hit_stage(self.config).denoises(pixels.shape[2])
+        if self.filter is not None and not is_denoised:
+            albedo = pixels[..., Channel.SPECULAR] * pixels[..., Channel.COVERAGE]
+            views = mirrored.shape[:2]
+            flat = [each.flatten(0, 1) for each in (stack_features(), mirrored, albedo)]
+            mirrored = self.filter(*flat).unflatten(0, views)
+        return stack_features(), mirrored
 
     def _read_scene(
         self, scene: EncodedScene, traced: Traced, anchor_BVAF: Tensor, position_BVA3: Tensor

@@ -149,7 +149,7 @@ BESIDE: dict[tuple[type, str, End], dict[str, Any]] = {
     (ModelConfig, "dpt_features", "low"): _LINEAR,
     (ModelConfig, "dpt_taps", "high"): {"decoder_layers": 256},
     **{(ModelConfig, name, "high"): _LINEAR | _HITS
-       for name in ("hit_rays", "hit_anchors", "gather_rays", "pixel_width",
+       for name in ("hit_rays", "hit_anchors", "gather_rays", "pixel_width", "filter_width",
                     "sky_rays", "denoise_from_px")},
 }  # fmt: skip
 """What must stand beside an end."""

@@ -28,7 +28,7 @@ from train.loop.train_state import new_state
 from train.loss.training_loss import TrainingLoss
 
 PX, STEPS, RATE = 16, 4, 2e-3
-BASE = BaseWidths(width=32, head_width=32, pixel_width=16)
+BASE = BaseWidths(width=32, head_width=32, pixel_width=16, filter_width=8)
 WIDTHS = (64, 256)
 SEEDS = (0, 1)
 
@@ -52,6 +52,7 @@ def hits_of(width: int) -> ModelConfig:
         num_heads=grown,
         hidden_width=width,
         pixel_width=BASE.pixel_width * grown,
+        filter_width=BASE.filter_width * grown,
     )
 
 

@@ -127,6 +127,7 @@ def hits_config(**changes: Any) -> ModelConfig:
         hit_anchors=8,
         gather_rays=16,
         pixel_width=16,
+        filter_width=8,
     )
     return dataclasses.replace(config, **changes)
 

@@ -152,6 +152,7 @@ def wider(config: ModelConfig, times: int) -> ModelConfig:
         num_heads=times * config.num_heads,
         hidden_width=times * config.hidden_width,
         pixel_width=times * config.pixel_width,
+        filter_width=times * config.filter_width,
     )
 
 
@@ -197,13 +198,14 @@ def test_heads_that_grow_ask_less_loudly() -> None:
     assert all(gain.adamw == gain.muon == gain.start for gain in gains)
 
 
-def test_the_width_of_pixels_counts_for_itself() -> None:
-    config = dataclasses.replace(hits_smoke(), pixel_width=256)
+def test_widths_of_pixels_and_filters_count_for_themselves() -> None:
+    config = dataclasses.replace(hits_smoke(), pixel_width=256, filter_width=64)
     scales = width_scales(made(config), BASE)
     assert scales["decoder.head.second.weight"].adamw == 1 / 4
     # what pixels ask anchors by is asked by 1 / d as well
     assert scales["decoder.head.query.weight"].adamw == pytest.approx(1 / 4 * 1 / 2)
     assert scales["decoder.head.query.bias"].start == 1 / 2
+    assert scales["decoder.filter.second.weight"].adamw == 1 / 2
     assert scales["decoder.layers.0.ffn.up.weight"] == WidthScale()
 
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import torch
 from torch import nn
 
+from model.hits.decoder import HitDecoder
 from model.renderformer import RenderFormer
 from storage.errors import TrilightError
 from train.loss.lpips import Lpips
@@ -82,6 +83,8 @@ def compiled_parts(
         yield "keys and values", model.decoder, "keys_values"
     for layer in model.decoder.layers:
         yield "decoder layers", layer, "forward"
+    if isinstance(model.decoder, HitDecoder) and model.decoder.filter is not None:
+        yield "filter", model.decoder.filter, "mix_level"
     yield "head", model.decoder.head, "forward"
     for module in objective.modules():
         if isinstance(module, Lpips):
