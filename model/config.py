@@ -226,9 +226,11 @@ def hits_smoke() -> ModelConfig:
         view_stage="hits",
         hit_rays=2,
         hit_anchors=16,
-        gather_rays=16,
+        gather_rays=32,
         pixel_width=64,
         filter_width=32,
+        sky_rays=8,
+        denoise_from_px=128,
     )
 
 
@@ -246,7 +248,7 @@ def hits_base() -> ModelConfig:
         hit_anchors=32,
         gather_rays=64,
         pixel_width=128,
-        filter_width=64,
+        filter_width=0,
     )
 
 
