@@ -93,8 +93,9 @@ def hits_tokens() -> TrainSettings:
 def hits_256() -> TrainSettings:
     """Return our first stage with traced hits at Base size, for a GPU; only tried for some steps.
 
-    Tracing and denoising a view of 256 pixels takes 0.2 to 0.45 CPU seconds: the 256 views of a step keep 50
-    cores busy for a second or two, so that with fewer cores the loader limits the speed.
+    Tracing and denoising a view of 256 pixels takes 0.2 to 0.45 CPU seconds: the 256 views of a
+    step keep 50 cores busy for a second or two, so that with fewer cores the loader limits the
+    speed.
     """
     return dataclasses.replace(
         pretrain(),
