@@ -42,8 +42,8 @@ def repair(
 
     Raises:
         TrilightError: the dataset is on a server, was derived from other datasets, or was begun in
-            another environment; objects or scene files are missing or differ; or the generated shards differ
-            from the manifest.
+            another environment; objects or scene files are missing or differ, and then no shard
+            is moved; or the generated shards differ from the manifest.
     """
     root = parse_url(dataset, what="dataset")
     if not isinstance(root, Path):
