@@ -31,7 +31,7 @@ class VerifyOptions:
     repair: bool = False
     """Make missing and bad shards again, and check again."""
     objects: str | None = None
-    """Source of objects for --repair, as `generate` had it; by default the built-in ones."""
+    """Source of objects for --repair; by default that of the generate command."""
     scenes_from: str | None = None
     """Folder of the dataset's scene files, for --repair; by default none."""
 
