@@ -1,6 +1,7 @@
 """Repair of a local dataset: makes exactly its missing or bad shards again."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -33,17 +34,18 @@ def repair(
     """Set bad shards aside and generate them again from the settings of the manifest.
 
     Intact shards stay exactly as they are. The bad files are deleted at the end; if the generation
-    fails, they stay in the dataset with the suffix `.bad`.
+    fails, those without a replacement are put back.
 
     Args:
         bad_shards: names of the shards (storage.dataset.verify).
+        objects: source of objects; None: that of the `generate` command.
         scenes_from: folder of the scene files, as in the `generate` command; their digests are in
             the lock, so that no other files are accepted.
 
     Raises:
         TrilightError: the dataset is on a server, was derived from other datasets, or was begun in
-            another environment; objects or scene files are missing or differ; or the generated shards differ
-            from the manifest.
+            another environment; objects or scene files are missing or differ, and then no shard
+            is moved; or the generated shards differ from the manifest.
     """
     root = parse_url(dataset, what="dataset")
     if not isinstance(root, Path):
@@ -60,7 +62,7 @@ def repair(
     maps = _user_maps(opened, command)
     options = GenerateOptions(
         build=manifest.build,
-        objects=None if scenes_from or revisits else objects,
+        objects=None if scenes_from or revisits else objects or value_of(command, "--objects"),
         out=str(root),
         scenes=None if scenes_from or revisits else manifest.num_scenes,
         licence=_stated_licence(opened),
@@ -74,17 +76,31 @@ def repair(
         changes=_changes(manifest),
     )
     prepare_dataset(options)  # refuses other objects before a shard is moved
-    for name in bad_shards:
-        if (root / name).exists():
-            (root / name).replace(root / f"{name}{ASIDE}")
-    outcome = make_dataset(options, ThreadRunner())
-    if outcome.digest != manifest.dataset_digest:
-        raise TrilightError(
-            f"{root}: the shards were made again, but the dataset digest is {outcome.digest}; "
-            f"expected {manifest.dataset_digest}. The bad ones are kept as *.tar{ASIDE}."
-        )
-    for name in bad_shards:
-        (root / f"{name}{ASIDE}").unlink(missing_ok=True)
+    with _set_aside(root, bad_shards):
+        outcome = make_dataset(options, ThreadRunner())
+        if outcome.digest != manifest.dataset_digest:
+            raise TrilightError(
+                f"{root}: the shards were made again, but the dataset digest is {outcome.digest}; "
+                f"expected {manifest.dataset_digest}. The bad ones are kept as *.tar{ASIDE}."
+            )
+
+
+@contextlib.contextmanager
+def _set_aside(root: Path, bad_shards: Sequence[str]) -> Iterator[None]:
+    """Rename bad shards, and delete them at the end; put back what an error left unreplaced."""
+    renamed = {root / name: root / f"{name}{ASIDE}" for name in bad_shards}
+    for path, aside in renamed.items():
+        if path.exists():
+            path.replace(aside)
+    try:
+        yield
+    except TrilightError:
+        for path, aside in renamed.items():
+            if aside.exists() and not path.exists():
+                aside.replace(path)
+        raise
+    for aside in renamed.values():
+        aside.unlink(missing_ok=True)
 
 
 def _require_generated(manifest: Manifest, scenes_from: str | None) -> None:

@@ -244,12 +244,14 @@ def wait_until_healthy(
     load_prefect()  # raises if a setting made the server fail
     lines = log.read_text(errors="replace").splitlines() if log.exists() else []
     said = safe_text(lines[-1]) if lines else "without a word"
-    what, advice = "ended", "try `trilight doctor`"
-    if server.poll() is None:
-        what = f"did not answer within {_START_UP_S:.0f} s"
-        advice = "repeat the command when this machine is less busy"
+    if server.poll() is not None:
+        raise TrilightError(
+            f"Prefect: the server did not start: it ended ({said}); see {log}, and try "
+            "`trilight doctor`."
+        )
     raise TrilightError(
-        f"Prefect: the server did not start: it {what} ({said}); see {log}, and {advice}."
+        f"Prefect: the server did not start: it did not answer within {_START_UP_S:.0f} s "
+        f"({said}); see {log}, and repeat the command when this machine is less busy."
     )
 
 

@@ -393,8 +393,8 @@ def object_changed_error(source: str, uid: str, state: str) -> TrilightError:
     """Return the error of a frozen object that its source has lost or changed."""
     return TrilightError(
         f"objects {source!r}: {uid!r} {state}; expected the objects that the dataset was begun "
-        "with (objects.lock.jsonl). Restore it, name the source that has it by --objects, or choose "
-        "another --out."
+        "with (objects.lock.jsonl). Restore it, name the source that has it by --objects, or "
+        "choose another --out."
     )
 
 

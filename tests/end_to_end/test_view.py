@@ -106,7 +106,7 @@ def test_a_scene_is_turned_and_every_way_to_its_picture_follows(
     page: Browser, address: str, size: tuple[int, int], scheme: str
 ) -> None:
     opened(page, f"{address}scene/000000002/", size, scheme)
-    assert fits(page)
+    assert fits(page) and page.run("viewer.pictures.engine") == "traced"
     assert page.run("getComputedStyle(document.body).backgroundColor") == (
         "rgb(255, 255, 255)" if scheme == "light" else "rgb(21, 23, 27)"
     )

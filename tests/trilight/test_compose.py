@@ -106,8 +106,8 @@ def _described(place: dict[str, object]) -> dict[str, object]:
         (lambda: _lit().add_mesh("missing.glb"), "missing.glb: no such file"),
         (lambda: _lit().add_mesh(([[0, 0]], [[0, 0, 0]])), r"shape \(1, 2\); expected \[V, 3\]"),
         (lambda: _lit().add_mesh(([[0, 0, 0]], [[0, 0, 1]])), "vertices 0 to 1; expected 0 to 0"),
-        (lambda: _lit().add_mesh(TETRAHEDRON, size=0), "size is 0; expected metres above 0"),
-        (lambda: _lit().add_mesh(TETRAHEDRON, size=np.inf), "size is inf; expected metres above"),
+        (lambda: _lit().add_mesh(TETRAHEDRON, size=0), "size is 0; expected meters above 0"),
+        (lambda: _lit().add_mesh(TETRAHEDRON, size=np.inf), "size is inf; expected meters above"),
         (lambda: _lit().add_mesh(TETRAHEDRON, at=(0, 0)), "at is .*three finite numbers"),  # type: ignore[arg-type]
         (lambda: _lit().add_mesh(([[1, 1, 1]] * 3, [[0, 1, 2]]), size=1), "object1: all vertices"),
         (lambda: _lit().add_builtin("rok"), "did you mean rock"),

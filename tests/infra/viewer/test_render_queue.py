@@ -253,8 +253,8 @@ def test_a_material_takes_the_place_of_its_texture() -> None:
 
 
 WRONG_EDITS: list[tuple[dict[str, Any], str]] = [
-    ({"lamps": {"0": {}}}, "no lamp"),
-    ({"lamps": {"-1": {}}}, "no lamp"),
+    ({"lamps": {"0": {}}}, "no light"),
+    ({"lamps": {"-1": {}}}, "no light"),
     ({"lamps": {"1": {"move": [0, 0, 1e9]}}}, "move"),
     ({"lamps": {"1": {"gain": 0}}}, "gain"),
     ({"lamps": {"1": 3}}, "lamps"),

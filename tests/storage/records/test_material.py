@@ -40,7 +40,7 @@ def test_the_published_columns_stand_where_files_and_kernels_expect_them() -> No
     [
         ({"name": "Clear coat"}, "has the name; expected lower case letters"),
         ({"width": 0}, "a width of 0; expected a whole number from 1 to 64"),
-        ({"width": 2, "is_colour": True}, "a width of 2; expected 3, since it is a colour"),
+        ({"width": 2, "is_colour": True}, "a width of 2; expected 3, since it is a color"),
         ({"within": Within(0, np.inf)}, "expected one within the finite float32 numbers"),
         ({"default": 2.0}, "the default 2.0; expected a number from 0 to 1"),
         ({"within": Within(-1, 1), "is_log_encoded": True}, "since networks read its log"),
