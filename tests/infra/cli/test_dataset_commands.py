@@ -16,6 +16,7 @@ from infra.run_record import is_run, run_facts
 from storage.dataset.asked import write_asked
 from storage.dataset.dataset import open_dataset
 from storage.dataset.manifest import write_manifest
+from storage.dataset.progress import announce_objects
 from storage.dataset.scene_logs import log_scene
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -176,11 +177,11 @@ def test_an_unfinished_set_is_not_verified(tmp_path: Path) -> None:
     assert "Unfinished" in empty.output
     assert "Verified" not in empty.output
     make_tiny_shard(publication, 0)
-    write_asked(publication.folder, ["generate", "smoke", "--seed", "7"])
+    write_asked(publication.folder, ["generate", "smoke", "--noise-floor-db", "7"])
     begun = trilight(["verify", place, "--fast"], env=WIDE)
     assert begun.exit_code == 1
     assert "1 of 3" in begun.output
-    assert f"Next: trilight generate smoke --seed 7 --out '{place}'" in begun.output
+    assert f"Next: trilight generate smoke --noise-floor 7 --out '{place}'" in begun.output
     told = json.loads(trilight(["verify", place, "--fast", "--json"]).output)
     assert (told["finished"], told["shards"], told["shards_planned"]) == (False, 1, 3)
     # words that do not print are not repeated: whoever hands out a dataset may have written them
@@ -224,6 +225,8 @@ def test_status_says_how_far_and_what_next(tmp_path: Path) -> None:
     row = json.loads(told.output)
     assert (row["shards_done"], row["scenes_planned"], row["finished"]) == (1, 12, False)
     assert row["cost_usd"] == 0.5
+    announce_objects(publication.folder, 7)
+    assert "0 of 7" in trilight(["status", str(tmp_path)], env=WIDE).output
 
 
 def test_objects_of_one_split_limit_the_scenes_to_that_split() -> None:

@@ -24,6 +24,7 @@ from tests.textured_by_hand import number_texture, sky, textured_scene
 MATERIAL = f"/Scene/Materials/material_{FLOOR}"
 PREVIEW = f"{MATERIAL}/Preview"
 OLD_CENTER = "xformOp:translate:center"
+MOVE = np.array([1.0, 2.0, 3.0])
 EXACT = ("trilight:exactRows", "trilight:exactPositions")
 
 
@@ -195,16 +196,16 @@ def test_moved_objects_are_read_as_moved(tmp_path: Path, is_old: bool) -> None:
         light = UsdGeom.Xformable(stage.GetPrimAtPath("/Scene/Objects/light"))
         if is_old:
             with_named_centers(layer)
-            light.AddTranslateOp().Set((1, 2, 3))
+            light.AddTranslateOp().Set(tuple(MOVE))
         else:
             center = np.array(light.GetPrim().GetAttribute(CENTER).Get())
-            assert UsdGeom.XformCommonAPI(light).SetTranslate((center + [1, 2, 3]).tolist())
+            assert UsdGeom.XformCommonAPI(light).SetTranslate((center + MOVE).tolist())
 
     scene = tiny_scene()
     found = edited(tmp_path, scene, move)
     assert any("changed since Trilight wrote it: read as any other" in text for text in found.notes)
     was, now = (s.vertex_positions[s.faces[2]] for s in (scene, found.scene))
-    assert now == pytest.approx(was + [1, 2, 3], abs=1e-6)
+    assert now == pytest.approx(was + MOVE, abs=1e-6)
 
 
 def test_objects_turn_about_their_centers(tmp_path: Path) -> None:
