@@ -242,7 +242,7 @@ def _write_leaderboard(
     write_atomically(options.out / "leaderboard.md", page.encode())
     write_atomically(options.out / "leaderboard.csv", standings_csv(tables, board.machine))
     write_atomically(options.out / "pairs.csv", pairs_csv(tables))
-    title = f"{opened.build or 'leaderboard'}: what core-seconds buy"
+    title = f"{opened.build or 'leaderboard'}: what CPU seconds buy"
     plot_leaderboard(tables, title, options.out / "leaderboard.png")
     return Leaderboard(widths=tables, notes=notes, rival=rival, out=options.out)
 
@@ -252,7 +252,7 @@ def _notes(board: Board, tables: Sequence[WidthStandings]) -> Iterator[str]:
         yield f"scene {key} is left out at {width} pixels: {why}"
     for machine in sorted(board.rows.machines() - {board.machine}):
         yield (
-            f"rows.jsonl also has core-seconds of {machine}, which are not in the table: those of "
+            f"rows.jsonl also has CPU seconds of {machine}, which are not in the table: those of "
             "two machines do not compare"
         )
     if any(one.num_scenes == 1 for one in tables):
@@ -261,7 +261,7 @@ def _notes(board: Board, tables: Sequence[WidthStandings]) -> Iterator[str]:
         yield f"fewer than {FEW_SCENES} scenes: intervals are narrower than they should be"
     if board.lpips is None:
         yield "LPIPS is n/a without its weights (--lpips)"
-    yield "targets went through the path tracer's denoiser, which favours its rows a little"
+    yield "targets went through the path tracer's denoiser, which favors its rows a little"
     yield (
         "the references' noise was measured at the width of the set; less is left at smaller ones. "
         "In log_l1 it is an upper bound, and in metrics after it, SSIM, LPIPS and HDR-FLIP that of "

@@ -37,6 +37,7 @@ def repair(
 
     Args:
         bad_shards: names of the shards (storage.dataset.verify).
+        objects: source of objects; None: that of the `generate` command.
         scenes_from: folder of the scene files, as in the `generate` command; their digests are in
             the lock, so that no other files are accepted.
 
@@ -60,7 +61,7 @@ def repair(
     maps = _user_maps(opened, command)
     options = GenerateOptions(
         build=manifest.build,
-        objects=None if scenes_from or revisits else objects,
+        objects=None if scenes_from or revisits else objects or value_of(command, "--objects"),
         out=str(root),
         scenes=None if scenes_from or revisits else manifest.num_scenes,
         licence=_stated_licence(opened),

@@ -27,7 +27,7 @@ class TrainOptions:
     """Training preset, such as tiny or pretrain; `trilight presets` lists them."""
     data: tuple[str, ...] = ("data/smoke",)
     """Dataset (a folder or a URL), or shards by name or pattern. Several are mixed by the setting
-    data_weights; a pattern is such as s3://b/{train,validation}-{000000..000007}.tar."""
+    data_weights; a pattern is such as s3://b/{train-000000,validation-000002}.tar."""
     out: str | None = None
     """Folder for the run, on the machine that trains; by default runs/PRESET."""
     resume: bool = False

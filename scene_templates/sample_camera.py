@@ -30,7 +30,8 @@ class Sector:
     def __post_init__(self) -> None:
         """Raise TrilightError for angles that no direction has."""
         low, high = self.elevation_deg
-        require(-90 <= low <= high <= 90, "elevation_deg", (low, high), "two from -90 to 90")
+        expected = "two from -90 to 90, the least first"
+        require(-90 <= low <= high <= 90, "elevation_deg", (low, high), expected)
         require(0 <= self.half_width_deg <= 180, "half_width_deg", self.half_width_deg, "0 to 180")
 
     def sample_direction(self, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -45,7 +45,7 @@ _NO_PAGE = {
     "PREFECT_SERVER_MEMOIZE_BLOCK_AUTO_REGISTRATION": "false",
 }
 """Variables of a server without its page, and without the blocks of that page, which are slow."""
-_START_UP_S = 120.0
+_START_UP_S = 600.0  # two busy cores need more than 120
 _LOG_NAME = "server.log"
 SERVER = (sys.executable, "-m", f"{__package__}.guarded_server")
 """Program of every server that we start; --host and --port follow."""

@@ -260,6 +260,7 @@ class DatasetStatus:
     objects_done: int
     """Objects that are prepared or rejected; of a bucket, 0."""
     objects_planned: int
+    """Objects to prepare; 0 before they are counted, and of a bucket."""
     num_views: int
     finished: bool
     """Every shard is listed, and the documents are there."""

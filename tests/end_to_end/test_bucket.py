@@ -35,7 +35,6 @@ RUN_S = 900
 """A run takes half a minute; on busy machines many times that."""
 FLOW = f"""
 from pipeline.flows import prefect_server as private
-private._START_UP_S = 600.0  # on two busy cores 120 s were not enough
 private.quiet_prefect()
 with private.prefect_server():
     from pipeline.flows.prefect_flows import generate_scenes

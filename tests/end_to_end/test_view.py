@@ -162,7 +162,7 @@ def test_a_lamp_and_a_material_are_changed_and_saved(
              "g.dispatchEvent(new Event('input'))})()")  # fmt: skip
     page.run("(() => {const r = document.getElementById('roughness'); r.value = 0.25;"
              "r.dispatchEvent(new Event('input'))})()")  # fmt: skip
-    assert "1 of the lamps, 1 of the materials" in page.run("document.body.innerText")
+    assert "1 of the lights, 1 of the materials" in page.run("document.body.innerText")
     page.until(f"(viewer.pictures.told.get('traced') || {{id: '{bright}'}}).id !== '{bright}'")
     until_done(page, "traced")
     page.until("viewer.pictures.told.get('target')")

@@ -258,7 +258,7 @@ def test_prices_of_two_machines_do_not_mix(
     assert (first["first_core_s"], first["processor"]) == ("8.0", "Slow 1")
     second, board = prices("Quick 2", 2.0)
     assert (second["first_core_s"], second["processor"]) == ("2.0", "Quick 2"), "no price is old"
-    assert any("core-seconds of Slow 1, which are not in the table" in say for say in board.notes)
+    assert any("CPU seconds of Slow 1, which are not in the table" in say for say in board.notes)
     again, _ = prices("Slow 1", 99.0)
     assert again["first_core_s"] == "8.0", "what was measured here before is still there"
 

@@ -41,7 +41,7 @@ def _plot(widths: Sequence[WidthStandings], title: str, path: Path) -> None:
     figure.suptitle(title, fontsize=12)
     for axes, one in zip(panels.flat, widths, strict=True):
         axes.set_title(f"{one.width} x {one.width} pixels, {one.num_views} views", fontsize=11)
-        axes.set_xlabel("core-seconds, one thread", fontsize=_FONT)
+        axes.set_xlabel("CPU seconds, one thread", fontsize=_FONT)
         axes.set_ylabel(f"median {METRIC}, higher is better", fontsize=_FONT)
         for standing in one.standings:
             if standing.first_s is None:

@@ -186,7 +186,7 @@ def equal_time(views: Sequence[JudgedView], times: EqualTimeResult, which: str) 
 def sentences(figures: Mapping[str, Any]) -> list[str]:
     """Return the comparison as sentences."""
     network_sentence = (
-        f"A further view takes the network {figures['network_further_s']:.3g} core-seconds, the "
+        f"A further view takes the network {figures['network_further_s']:.3g} CPU seconds, the "
         f"first of a scene {figures['network_first_s']:.3g} (medians of {figures['scenes']} "
         "scenes, one thread of a processor)."
     )
@@ -211,6 +211,6 @@ def sentences(figures: Mapping[str, Any]) -> list[str]:
         f"{figures['tracer']['psnr_log_db']['median']:.2f} dB, medians of psnr_log_db; view by "
         f"view the network less the path tracer is {lead['mean']:+.2f} dB ({interval}), "
         f"and the network is better in {figures['share_better']:.0%}.",
-        "The targets went through the same denoiser, which favours the path tracer a little.",
+        "The targets went through the same denoiser, which favors the path tracer a little.",
     ]
     return [*lines, *([f"{preview['note']}."] if preview["note"] else [])]

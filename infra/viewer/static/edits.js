@@ -137,7 +137,7 @@ export class Edits {
     const lamps = Object.keys(this.lamps).length;
     const materials = Object.keys(this.materials).length;
     byId("changes").textContent = this.empty ? "Nothing is changed."
-      : `Changed: ${lamps} of the lamps, ${materials} of the materials. The file stays as it is.`;
+      : `Changed: ${lamps} of the lights, ${materials} of the materials. The file stays as it is.`;
     byId("undo").disabled = this.empty;
     this.changed({ lamps: this.lamps, materials: this.materials });
   }

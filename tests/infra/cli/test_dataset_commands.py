@@ -13,6 +13,7 @@ from infra.cli.assets import generate_from_meshes
 from infra.cli.extend_option import load_extensions
 from infra.repair import repair
 from infra.run_record import is_run, run_facts
+from pipeline.generation.generate_options import GenerateOptions
 from storage.dataset.asked import write_asked
 from storage.dataset.dataset import open_dataset
 from storage.dataset.manifest import write_manifest
@@ -164,6 +165,25 @@ def test_a_bad_derived_shard_is_made_of_its_sources_again(tmp_path: Path) -> Non
     (a / "train-000000.tar").unlink()
     found = trilight(["verify", str(a)])
     assert f"Next: trilight verify {a} --repair" in found.output
+
+
+def test_a_repair_has_the_objects_of_the_generate_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    orders: list[GenerateOptions] = []
+
+    def refuse(options: GenerateOptions, runner: object) -> None:
+        orders.append(options)
+        raise TrilightError("refused")
+
+    publication = begin_tiny(tmp_path, 4)
+    make_tiny_shard(publication, 0)
+    write_asked(publication.folder, ["generate", "smoke", "--objects", "mine"])
+    monkeypatch.setattr("infra.repair.make_dataset", refuse)
+    for objects in (None, "others"):
+        with pytest.raises(TrilightError, match="refused"):
+            repair(str(tmp_path), ["train-000000.tar"], objects=objects, scenes_from=None)
+    assert [options.objects for options in orders] == ["mine", "others"]
 
 
 WIDE = {"COLUMNS": "200"}

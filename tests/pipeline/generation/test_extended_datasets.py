@@ -134,7 +134,10 @@ def test_a_bug_in_an_extension_is_its_authors_and_stops_at_once(tmp_path: Path) 
         ),
         ('parts=("wall0", "floor")', "('wall0', 'floor'); expected none, or floor first"),
         ('parts=("floor", "wall0", "wall0")', "'wall0'); expected none, or floor first"),
-        ('parts=("floor",), lights=sector(99)', "elevation_deg is (3, 99); expected two from -90"),
+        (
+            'parts=("floor",), lights=sector(2)',
+            "elevation_deg is (3, 2); expected two from -90 to 90, the least first",
+        ),
     ],
 )
 def test_a_template_is_checked_when_it_is_made(tmp_path: Path, changed: str, said: str) -> None:

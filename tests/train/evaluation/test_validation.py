@@ -273,7 +273,7 @@ def test_both_are_judged_on_the_same_views(judging: tuple[EvalConfig, list[Judge
     page = evaluation_page(record(views, {}, found))
     assert "In the network's own time".lower() in page.lower()
     assert "takes 0.022 (0.025) with 4 samples a pixel and its fast filter." in page
-    assert "takes the network 0.06 core-seconds, the first of a scene 0.12" in page
+    assert "takes the network 0.06 CPU seconds, the first of a scene 0.12" in page
     assert list(record(views, {}, found)["contestants"]) == [NETWORK], "a column is of all views"
 
 
