@@ -38,7 +38,7 @@ class TrainResult:
     loss_at_end: float
     """The same over the last twentieth."""
     scores: dict[str, float] | None
-    """The network on the validation split (evaluation.judge); None where the data has none."""
+    """The network on the validation split (evaluation.validation); None where the data has none."""
     median_scores: dict[str, float] | None
     """The median picture of the training views on the same split."""
     lead: Lead | None

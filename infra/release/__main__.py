@@ -14,8 +14,8 @@ import cyclopts
 from cyclopts import Parameter
 
 from infra.cli.console import first_words, next_step, print_rows, progress_bars
-from infra.release.page import chosen_scenes, compare_scenes, write_page
 from infra.release.push_to_hub import NETWORK_FILE, kind_of, require_within_limits
+from infra.release.release_page import chosen_scenes, compare_scenes, write_page
 from model.open import BUILTIN_NETWORKS
 from pipeline.documents.checksums import write_sums
 from storage.atomic import write_atomically

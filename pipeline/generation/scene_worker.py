@@ -1,4 +1,7 @@
-"""`SceneWorker`: composes scenes and renders their views, inside a worker process."""
+"""`SceneWorker`: composes scenes and renders their views, inside a worker process.
+
+`render_children` starts these processes; `pipeline.isolation` survives their crashes.
+"""
 
 import contextlib
 import os

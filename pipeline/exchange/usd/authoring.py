@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.usd.names import NAMESPACE
+from pipeline.exchange.usd.prim_names import NAMESPACE
 
 Attributes = Mapping[str, tuple[str, Any]]
 """Type name and value of each attribute by name; the prefix "uniform " sets its variability."""

@@ -17,7 +17,7 @@ from pipeline.exchange.pictures import MAX_BYTES, decode_pixels, linear_rgb
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
 from pipeline.exchange.usd.foreign_lights import read_light_color
 from pipeline.exchange.usd.held_materials import parse_map_text
-from pipeline.exchange.usd.names import (
+from pipeline.exchange.usd.prim_names import (
     MAP_TEXTS,
     SKY_ROWS,
     SKY_SOURCE,

@@ -24,7 +24,7 @@ from pipeline.exchange.usd.held_materials import (
     read_held_material,
     restore_stated,
 )
-from pipeline.exchange.usd.names import added_column
+from pipeline.exchange.usd.prim_names import added_column
 from pipeline.foreign.part import Part, drop_empty, unit_normals
 from pipeline.foreign.usd.materials import MeshMaterials
 from pipeline.foreign.usd.object_stage import UsdStage

@@ -12,7 +12,7 @@ from pipeline.exchange.textured_triangles import SceneParts, TexturedTriangles, 
 from pipeline.exchange.usd.dome import read_foreign_dome
 from pipeline.exchange.usd.foreign_lights import compute_radiance, light_triangles
 from pipeline.exchange.usd.foreign_materials import StageSurfaces, read_mesh
-from pipeline.exchange.usd.names import FOV_DEG, INDEX, OBJECT_TEXTS, parse_camera_row
+from pipeline.exchange.usd.prim_names import FOV_DEG, INDEX, OBJECT_TEXTS, parse_camera_row
 from pipeline.foreign.numbers import read_number
 from pipeline.foreign.usd.object_stage import UsdStage
 from pipeline.foreign.usd.placed import DOMES, PlacedPrim, placed_prims

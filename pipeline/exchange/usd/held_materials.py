@@ -22,7 +22,7 @@ from pipeline.exchange.linear_maps import (
 )
 from pipeline.exchange.pictures import MAX_BYTES, MAX_PIXELS
 from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles
-from pipeline.exchange.usd.names import (
+from pipeline.exchange.usd.prim_names import (
     ADDED_COLUMNS,
     MATERIAL_ATTRIBUTES,
     column_attribute,

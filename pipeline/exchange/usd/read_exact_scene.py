@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import MAX_ROWS
-from pipeline.exchange.usd import names
+from pipeline.exchange.usd import prim_names as names
 from pipeline.exchange.usd.dome import read_exact_dome
 from pipeline.exchange.usd.write_meshes import CENTER, sum_positions
 from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, SHADERS, ST, decode_texture

@@ -25,7 +25,7 @@ from pipeline.exchange.usd.authoring import (
     add_prim,
     usd_value,
 )
-from pipeline.exchange.usd.names import (
+from pipeline.exchange.usd.prim_names import (
     ADDED_COLUMNS,
     MATERIAL_ATTRIBUTES,
     column_attribute,

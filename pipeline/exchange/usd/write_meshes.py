@@ -19,7 +19,7 @@ from pipeline.exchange.usd.authoring import (
     add_prim,
     add_relationship,
 )
-from pipeline.exchange.usd.names import (
+from pipeline.exchange.usd.prim_names import (
     EXACT_POSITIONS,
     EXACT_ROWS,
     FACE_ROWS,

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.usd.authoring import Attributes
-from pipeline.exchange.usd.names import MAP_TEXTS, TEXTURE_ROW, format_map, texture_attribute
+from pipeline.exchange.usd.prim_names import MAP_TEXTS, TEXTURE_ROW, format_map, texture_attribute
 from storage.errors import TrilightError
 from storage.records.exr import MAX_RESOLUTION, decode_channels, encode_channels
 from storage.records.scene import Scene

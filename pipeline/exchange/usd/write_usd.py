@@ -2,7 +2,7 @@
 
 Stages are Z up, in meters, with a default prim; textures and an environment map are files next to
 the stage, or in the archive. Equal scenes give equal bytes.
-`pipeline.exchange.usd.names` lists the paths; `pipeline.exchange.usd.read_exact_scene` reads them.
+`prim_names` lists the paths; `read_exact_scene` reads them.
 A camera has a pose and a lens, in tenths of a meter, on a square film of 36 mm. A `.usdz` file is a
 zip archive of uncompressed members that begin at multiples of 64 bytes.
 """
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
 from pipeline.exchange.usd.dome import add_dome, map_files, sky_attributes
-from pipeline.exchange.usd.names import (
+from pipeline.exchange.usd.prim_names import (
     DIGEST,
     FOV_DEG,
     OBJECT_TEXTS,

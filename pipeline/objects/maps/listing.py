@@ -21,7 +21,7 @@ from pipeline.objects.licences import (
 from pipeline.objects.listing import failure
 from pipeline.objects.local.catalogue import only_catalogue, read_catalogue
 from pipeline.objects.local.folder import file_record, is_below, walk_files
-from pipeline.objects.maps.names import PICTURES, group_textures
+from pipeline.objects.maps.texture_names import PICTURES, group_textures
 from storage.errors import TrilightError
 from storage.records.objects import SKY, TEXTURE, Failure, ObjectRecord
 from storage.remote.safe_url import printable
@@ -46,7 +46,7 @@ class FoundMap:
     record: ObjectRecord
     """Identity and rights of the texture or map."""
     files: Mapping[str, Path]
-    """Picture files by component (pipeline.objects.maps.names); a map has one, "map"."""
+    """Picture files by component (pipeline.objects.maps.texture_names); a map has one, "map"."""
 
 
 @dataclass(frozen=True, kw_only=True)

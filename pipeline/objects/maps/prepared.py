@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 
 from pipeline.foreign.light_pictures import read_linear_picture
-from pipeline.objects.maps.names import TEXTURE_PARTS, packed_channels
 from pipeline.objects.maps.picture import are_normals, picture_values
 from pipeline.objects.maps.radiance import usable_map
 from pipeline.objects.maps.resample import area_means
+from pipeline.objects.maps.texture_names import TEXTURE_PARTS, packed_channels
 from storage.conventions import linear_from_srgb
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected

@@ -252,7 +252,7 @@ def test_what_an_executor_is_and_has_no_use_for() -> None:
     assert set(EXECUTORS) == {"threads", "slurm", "kubernetes", "prefect", "dask"}
     for home in homes:
         make = import_module(f"pipeline.{home}").make
-        assert make.__code__.co_varnames[: make.__code__.co_argcount] == ("order", "address")
+        assert make.__code__.co_varnames[: make.__code__.co_argcount] == ("options", "address")
 
 
 def test_names_of_executors_load_neither_prefect_nor_the_stages() -> None:

@@ -9,7 +9,6 @@ from PIL import Image
 
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.maps.listing import FoundMaps, find_maps
-from pipeline.objects.maps.names import _parse_name, group_textures
 from pipeline.objects.maps.prepared import (
     MapFiles,
     decode_prepared,
@@ -18,6 +17,7 @@ from pipeline.objects.maps.prepared import (
 )
 from pipeline.objects.maps.radiance import usable_map
 from pipeline.objects.maps.resample import area_means, flux, solid_angle_means
+from pipeline.objects.maps.texture_names import _parse_name, group_textures
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected, TrilightError
 from storage.records.exr import encode_channels
