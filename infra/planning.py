@@ -178,11 +178,11 @@ def describe_run(options: GenerateOptions, folder: DatasetFolder) -> str:
     scenes = _num_scenes(options)
     remaining = scenes
     core_s: list[float] = []
-    size = kept = ""
+    size = size_note = ""
     if folder.manifest.exists():
         manifest = read_manifest(folder.manifest)
         last = sample_logs(folder).last
-        kept = keeps_scenes(manifest.num_scenes, options.scenes, settings.splits)
+        size_note = keeps_scenes(manifest.num_scenes, options.scenes, settings.splits)
         scenes = max(scenes, manifest.num_scenes)
         remaining = max(scenes - read_progress(folder).scenes_done, 0)
         core_s = [row.seconds * row.cores for row in last]
@@ -192,7 +192,7 @@ def describe_run(options: GenerateOptions, folder: DatasetFolder) -> str:
             size = f", about {_total(sizes, scenes / 1e6).value:,.1f} MB"
     shards = shards_for(scenes, settings.splits)
     lacking = lacks_validation(scenes, settings.splits)
-    notes = "".join(f" ({text})" for text in (kept, lacking) if text)
+    notes = "".join(f" ({text})" for text in (size_note, lacking) if text)
     part = f", of which this run makes {options.shards}" if options.shards else ""
     views = f"{settings.scenes.num_views} views each"
     counts = f"{_count_text(scenes, 'scene')} of {views} in {_count_text(shards, 'shard')}"

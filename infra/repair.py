@@ -1,6 +1,7 @@
 """Repair of a local dataset: makes exactly its missing or bad shards again."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -33,7 +34,7 @@ def repair(
     """Set bad shards aside and generate them again from the settings of the manifest.
 
     Intact shards stay exactly as they are. The bad files are deleted at the end; if the generation
-    fails, they stay in the dataset with the suffix `.bad`.
+    fails, those without a replacement are put back.
 
     Args:
         bad_shards: names of the shards (storage.dataset.verify).
@@ -74,17 +75,31 @@ def repair(
         albedo_over_one=cast(AlbedoOverOne, value_of(command, "--albedo-over-one") or "scale"),
         changes=_changes(manifest),
     )  # checks everything before a shard is moved
-    for name in bad_shards:
-        if (root / name).exists():
-            (root / name).replace(root / f"{name}{ASIDE}")
-    outcome = make_dataset(options, ThreadRunner())
-    if outcome.digest != manifest.dataset_digest:
-        raise TrilightError(
-            f"{root}: the shards were made again, but the dataset digest is {outcome.digest}; "
-            f"expected {manifest.dataset_digest}. The bad ones are kept as *.tar{ASIDE}."
-        )
-    for name in bad_shards:
-        (root / f"{name}{ASIDE}").unlink(missing_ok=True)
+    with _set_aside(root, bad_shards):
+        outcome = make_dataset(options, ThreadRunner())
+        if outcome.digest != manifest.dataset_digest:
+            raise TrilightError(
+                f"{root}: the shards were made again, but the dataset digest is {outcome.digest}; "
+                f"expected {manifest.dataset_digest}. The bad ones are kept as *.tar{ASIDE}."
+            )
+
+
+@contextlib.contextmanager
+def _set_aside(root: Path, bad_shards: Sequence[str]) -> Iterator[None]:
+    """Rename bad shards, and delete them at the end; put back what an error left unreplaced."""
+    renamed = {root / name: root / f"{name}{ASIDE}" for name in bad_shards}
+    for path, aside in renamed.items():
+        if path.exists():
+            path.replace(aside)
+    try:
+        yield
+    except TrilightError:
+        for path, aside in renamed.items():
+            if aside.exists() and not path.exists():
+                aside.replace(path)
+        raise
+    for aside in renamed.values():
+        aside.unlink(missing_ok=True)
 
 
 def _require_generated(manifest: Manifest, scenes_from: str | None) -> None:

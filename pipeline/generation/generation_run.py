@@ -92,8 +92,11 @@ class Run:
             notes = frozen_note(self.options.build, statistics)
             splits = self.settings.splits
             num_scenes = writer.manifest.num_scenes
-            kept = keeps_scenes(num_scenes, self.options.scenes, splits)
-            notes += tuple(text for text in (kept, lacks_validation(num_scenes, splits)) if text)
+            size_notes = (
+                keeps_scenes(num_scenes, self.options.scenes, splits),
+                lacks_validation(num_scenes, splits),
+            )
+            notes += tuple(filter(None, size_notes))
         return Outcome(
             digest=finished.dataset_digest if finished else "",
             num_objects_found=self.accepted.num_found,

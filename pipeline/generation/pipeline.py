@@ -144,10 +144,10 @@ def _begin_run(options: GenerateOptions) -> Iterator[Run]:
                 workers=available_cores(),
                 user_folders=user_folders,
             ).accept()
-        asked = options
+        repeated_options = options
         if keeps_scenes(writer.manifest.num_scenes, options.scenes, settings.splits):
-            asked = replace(options, scenes=writer.manifest.num_scenes)
-        write_asked(folder, generate_words(asked))
+            repeated_options = replace(options, scenes=writer.manifest.num_scenes)
+        write_asked(folder, generate_words(repeated_options))
         yield Run(
             options=options,
             settings=settings,

@@ -184,6 +184,7 @@ def test_a_repair_has_the_objects_of_the_generate_command(
         with pytest.raises(TrilightError, match="refused"):
             repair(str(tmp_path), ["train-000000.tar"], objects=objects, scenes_from=None)
     assert [options.objects for options in orders] == ["mine", "others"]
+    assert [path.name for path in tmp_path.glob("*.tar*")] == ["train-000000.tar"]
 
 
 WIDE = {"COLUMNS": "200"}
