@@ -26,7 +26,13 @@ from storage.dataset.manifest import read_manifest
 from storage.dataset.progress import read_progress
 from storage.dataset.scene_logs import sample_logs
 from storage.dataset.shard import contents_of
-from storage.dataset.splits import lacks_validation, planned_scenes, shard_name, shards_for
+from storage.dataset.splits import (
+    keeps_scenes,
+    lacks_validation,
+    planned_scenes,
+    shard_name,
+    shards_for,
+)
 from storage.dataset.staging import read_staged_scene
 from storage.machine import available_cores
 from storage.records.safe_read import open_plain
@@ -172,10 +178,11 @@ def describe_run(options: GenerateOptions, folder: DatasetFolder) -> str:
     scenes = _num_scenes(options)
     remaining = scenes
     core_s: list[float] = []
-    size = ""
+    size = size_note = ""
     if folder.manifest.exists():
         manifest = read_manifest(folder.manifest)
         last = sample_logs(folder).last
+        size_note = keeps_scenes(manifest.num_scenes, options.scenes, settings.splits)
         scenes = max(scenes, manifest.num_scenes)
         remaining = max(scenes - read_progress(folder).scenes_done, 0)
         core_s = [row.seconds * row.cores for row in last]
@@ -185,11 +192,11 @@ def describe_run(options: GenerateOptions, folder: DatasetFolder) -> str:
             size = f", about {_total(sizes, scenes / 1e6).value:,.1f} MB"
     shards = shards_for(scenes, settings.splits)
     lacking = lacks_validation(scenes, settings.splits)
-    lacking = f" ({lacking})" if lacking else ""
+    notes = "".join(f" ({text})" for text in (size_note, lacking) if text)
     part = f", of which this run makes {options.shards}" if options.shards else ""
     views = f"{settings.scenes.num_views} views each"
     counts = f"{_count_text(scenes, 'scene')} of {views} in {_count_text(shards, 'shard')}"
-    return f"{counts}{lacking}{part}{size}; {_expected_time(settings, remaining, core_s)}"
+    return f"{counts}{notes}{part}{size}; {_expected_time(settings, remaining, core_s)}"
 
 
 def _expected_time(settings: DatasetSettings, remaining: int, core_s: Sequence[float]) -> str:

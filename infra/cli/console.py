@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shlex
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType, TracebackType
 from typing import Any, Literal
@@ -25,6 +26,8 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from infra.cli.extend_option import extend_words
+from infra.cli.options import SHOWN
+from storage.settings.fields import option_of
 
 _OBEYED = dict.fromkeys(
     [
@@ -53,6 +56,9 @@ if not console.is_terminal and "COLUMNS" not in os.environ:
     console.width = 1000  # a log is searched by whole words, so that no line is wrapped
 
 _DIGEST = re.compile("[0-9a-f]{64}")
+
+_DOCUMENTED = {option_of(field): name for field, name in SHOWN.items()}
+"""Options that help shows, by the options of their fields."""
 
 _LEAST_RATED_S = 1.0
 """Seconds before a task's rate is printed."""
@@ -84,7 +90,8 @@ def next_step(*commands: Sequence[str], recorded: Mapping[str, str] = MappingPro
 
 
 def command_line(words: Sequence[str], recorded: Mapping[str, str] = MappingProxyType({})) -> str:
-    """Return a command as it is typed, with its `--extend` files."""
+    """Return a command as it is typed, by the options of help and with its `--extend` files."""
+    words = [_DOCUMENTED.get(word, word) for word in words]
     safe = [f"./{word}" if re.match("-[^-].*/", word) else word for word in words]
     return shlex.join(["trilight", *safe, *extend_words(recorded)])
 
@@ -107,6 +114,10 @@ def note(text: str) -> None:
     console.print(Text(f"Note: {text}.", style="yellow"))
 
 
+_LOG_S = 60.0
+"""Seconds between two lines of progress in a log."""
+
+
 class RateColumn(ProgressColumn):
     """Column with items per second, or per minute where they are slower."""
 
@@ -120,7 +131,11 @@ class RateColumn(ProgressColumn):
 
 
 class Bars(Progress):
-    """Progress bars; each is drawn only once its total is known."""
+    """Progress bars, each drawn once its total is known; without a terminal, a line a minute."""
+
+    def __init__(self, *columns: str | ProgressColumn, **options: Any) -> None:
+        super().__init__(*columns, **options)
+        self._next_line_s = time.monotonic() + _LOG_S
 
     def add_task(self, *args: Any, **fields: Any) -> TaskID:
         task = super().add_task(*args, **fields)
@@ -130,6 +145,11 @@ class Bars(Progress):
     def update(self, *args: Any, **fields: Any) -> None:
         super().update(*args, **fields)
         self._begin()
+        self._log()
+
+    def advance(self, *args: Any) -> None:
+        super().advance(*args)
+        self._log()
 
     def make_tasks_table(self, tasks: Iterable[Task]) -> Table:
         return super().make_tasks_table(list(filter(_is_drawn, tasks)))
@@ -146,6 +166,16 @@ class Bars(Progress):
         if self.live.is_started:
             self.stop()
 
+    def _log(self) -> None:
+        drawn = list(filter(_is_drawn, self.tasks))
+        if self.console.is_terminal or not drawn or time.monotonic() < self._next_line_s:
+            return
+        self._next_line_s = time.monotonic() + _LOG_S
+        for task in drawn:
+            counts = f"{task.description} {task.completed:.0f} of {task.total:.0f}"
+            note = task.fields["note"]
+            self.console.print(f"{counts}, {note}" if note else counts, soft_wrap=True)
+
     def _begin(self) -> None:
         if not self.live.is_started and any(map(_is_drawn, self.tasks)):
             self.start()
@@ -156,7 +186,7 @@ def _is_drawn(task: Task) -> bool:
 
 
 def progress_bars() -> Bars:
-    """Return progress bars with count, rate, elapsed time and ETA; invisible without a terminal."""
+    """Return progress bars with count, rate, elapsed time and ETA."""
     return Bars(
         TextColumn("{task.description:<8}", markup=False),
         BarColumn(bar_width=20),

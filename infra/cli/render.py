@@ -45,7 +45,7 @@ class _Bars:
         note = "" if now.missing_db is None else f"{now.missing_db:.1f} dB to go"
         self._bars.update(
             self._samples,
-            completed=now.spp,
+            completed=min(now.spp, now.expected_spp),
             total=now.expected_spp,
             note=note,
             visible=self._visible,

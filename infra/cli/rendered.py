@@ -135,7 +135,11 @@ def _describe(renderer: Renderer, facts: Facts) -> Rows:
             if settings.stated_error == "calibrated":
                 rows.append(("", _meaning(settings, facts)))
             mean = f"{facts['mean_radiance']:.4g} (radiance), that of its samples"
-            rows = [("samples per pixel", f"{facts['spp']}"), *rows, ("mean brightness", mean)]
+            rows = [
+                ("samples per pixel", f"{facts['spp']} on average"),
+                *rows,
+                ("mean brightness", mean),
+            ]
             for part in settings.part_names:
                 floor_db = float(facts[f"{part}.noise_floor_db"])
                 rows.append((f"layer {part}", f"{floor_db:.1f} dB (psnr_log_db)"))

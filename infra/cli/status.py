@@ -55,7 +55,9 @@ def status(options: StatusOptions, core: CorePrice, output: OutputOptions) -> No
         row = {**dataclasses.asdict(progress), "next": _next(progress), "cost_usd": cost}
         print_json(row)
         return
+    objects = f"{progress.objects_done} of {progress.objects_planned}"
     rows = [
+        *([("objects", objects)] if progress.objects_done < progress.objects_planned else []),
         ("shards", f"{progress.shards_done} of {progress.shards_planned}"),
         ("scenes", f"{progress.scenes_done} of {progress.scenes_planned}"),
         *([("given up", f"{progress.scenes_given_up} scenes")] if progress.scenes_given_up else []),

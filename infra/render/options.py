@@ -56,7 +56,7 @@ class RenderOptions:
     """mitsuba: stop at this stated error as object_psnr_log_db (without background); by default
     none."""
     max_spp: Samples = MOST_TRACED_SPP
-    """mitsuba: maximum number of samples per pixel."""
+    """mitsuba: maximum average of samples per pixel; the last round may end a little above it."""
     stated_error: StatedError = ToStatedError.stated_error
     """mitsuba: how the error is stated: calibrated on other scenes, with an expected error; or as a
     bound."""

@@ -17,7 +17,7 @@ from pipeline.renders.mitsuba_variant import Device, Variant, choose_variant, de
 from pipeline.renders.visible_gpus import gpu_memory_bytes, visible_gpus
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, read_head
-from storage.dataset.splits import lacks_validation
+from storage.dataset.splits import keeps_scenes, lacks_validation
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
 from storage.records.objects import Failure
@@ -92,8 +92,11 @@ class Run:
             notes = frozen_note(self.options.build, statistics)
             splits = self.settings.splits
             num_scenes = writer.manifest.num_scenes
-            if lacking := lacks_validation(num_scenes, splits):
-                notes += (lacking,)
+            size_notes = (
+                keeps_scenes(num_scenes, self.options.scenes, splits),
+                lacks_validation(num_scenes, splits),
+            )
+            notes += tuple(filter(None, size_notes))
         return Outcome(
             digest=finished.dataset_digest if finished else "",
             num_objects_found=self.accepted.num_found,

@@ -65,6 +65,7 @@ from pipeline.presets.registry import DATASET_PRESETS, object_source
 from storage.dataset.asked import write_asked
 from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import ShardEntry
+from storage.dataset.splits import keeps_scenes
 from storage.dataset.statistics import Statistics
 from storage.errors import Rejected, TrilightError
 from storage.machine import available_cores
@@ -143,7 +144,10 @@ def _begin_run(options: GenerateOptions) -> Iterator[Run]:
                 workers=available_cores(),
                 user_folders=user_folders,
             ).accept()
-        write_asked(folder, generate_words(options))
+        repeated_options = options
+        if keeps_scenes(writer.manifest.num_scenes, options.scenes, settings.splits):
+            repeated_options = replace(options, scenes=writer.manifest.num_scenes)
+        write_asked(folder, generate_words(repeated_options))
         yield Run(
             options=options,
             settings=settings,

@@ -257,6 +257,10 @@ class DatasetStatus:
     """Scenes that no attempt could save; of a bucket, known once it is finished."""
     scenes_planned: int
     """Scenes of the finished dataset."""
+    objects_done: int
+    """Objects that are prepared or rejected; of a bucket, 0."""
+    objects_planned: int
+    """Objects to prepare; 0 before they are counted, and of a bucket."""
     num_views: int
     finished: bool
     """Every shard is listed, and the documents are there."""
@@ -304,6 +308,7 @@ def read_status(url: str) -> DatasetStatus:
     given_up = _scenes_given_up(local, manifest) if local else 0
     done -= given_up
     given_up += max(manifest.num_scenes - sum(planned.values()), 0)
+    objects = read_progress(local) if local else None
     looked, share = (sample_logs(local), 1.0) if local else _sampled_logs(dataset)
     last = looked.last
     core_s = looked.core_s
@@ -317,6 +322,8 @@ def read_status(url: str) -> DatasetStatus:
         scenes_done=done,
         scenes_given_up=given_up,
         scenes_planned=manifest.num_scenes,
+        objects_done=objects.objects_done if objects else 0,
+        objects_planned=objects.objects_planned if objects else 0,
         num_views=manifest.num_views,
         finished=_is_finished(dataset),
         views_per_hour=views_per_hour,

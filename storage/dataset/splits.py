@@ -109,6 +109,13 @@ def lacks_validation(num_scenes: int, settings: "SplitSettings") -> str:
     return "" if num_scenes >= least else f"no shard is for validation before --scenes {least}"
 
 
+def keeps_scenes(num_scenes: int, requested: int | None, settings: "SplitSettings") -> str:
+    """Say that a dataset keeps its scenes, where fewer are requested; empty otherwise."""
+    if requested is None or planned_scenes(requested, settings) >= num_scenes:
+        return ""
+    return f"the dataset keeps its {num_scenes} scenes; for {requested}, choose another --out"
+
+
 def require_objects(num_by_split: Mapping[str, int], required_splits: set[str]) -> None:
     """Raise TrilightError where a split that is needed has no object to draw from."""
     empty = [split for split in SPLITS if split in required_splits and not num_by_split.get(split)]

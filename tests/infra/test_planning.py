@@ -17,6 +17,7 @@ from pipeline.generation.tasks import MAX_TASKS
 from pipeline.isolation import confinement
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
+from storage.dataset.progress import read_status
 from storage.dataset.shard import scan_members
 from storage.machine import available_cores
 from tests.for_each import case
@@ -129,6 +130,12 @@ def test_what_a_run_will_make_is_said_before_it_begins(
     assert lacking in make_dataset(order, ThreadRunner()).notes
     said = describe_run(dataclasses.replace(order, scenes=9, shards="1:3"), folder)
     assert said.startswith("9 scenes of 2 views each in 3 shards, of which this run makes 1:3")
+    fewer = dataclasses.replace(order, scenes=2)
+    kept = "the dataset keeps its 3 scenes; for 2, choose another --out"
+    assert f"({kept})" in describe_run(fewer, folder)
+    assert kept in make_dataset(fewer, ThreadRunner()).notes
+    asked = read_status(str(tmp_path)).asked
+    assert asked and asked[asked.index("--scenes") + 1] == "3"
     assert re.search(r"; 6 of them are still to make: [\d.]+ \([\d.]+ to [\d.]+\) minutes on", said)
 
 

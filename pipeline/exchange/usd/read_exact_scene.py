@@ -158,9 +158,10 @@ def _read_vertices(root: Any, meshes: list[Any]) -> tuple[NDArray[np.float32], N
 def _read_positions(mesh: Any) -> NDArray[np.float32]:
     """Return the positions [V, 3] of a mesh's vertices; meshes of old files have no center."""
     points = _read_vectors(mesh, "points")
-    if CENTER not in mesh.attributes:
+    name = _OLD_CENTER if _OLD_CENTER in mesh.attributes else CENTER
+    if name not in mesh.attributes:
         return points
-    center = np.array(mesh.attributes[CENTER].default, np.float64)
+    center = np.array(mesh.attributes[name].default, np.float64)
     positions = sum_positions(center, points)
     positions[_read_integers(mesh, names.EXACT_ROWS)] = _read_vectors(mesh, names.EXACT_POSITIONS)
     return positions
@@ -283,6 +284,8 @@ def _list_columns(prim: Any) -> tuple[str, ...]:
 
 _PLAIN_INFO = {"specifier", "typeName", "apiSchemas", "documentation", "comment", "displayName"}
 """Metadata that does not change how a prim looks."""
+_OLD_CENTER = "xformOp:translate:center"
+"""Name of the transform to the center in older files."""
 _PLACED = {CENTER, "xformOpOrder", names.EXACT_ROWS, names.EXACT_POSITIONS}
 _ADDED = {"inputs:ior", COAT_ROUGHNESS, "outputs:r", *map(names.texture_attribute, TEXTURED)}
 _ADDED |= {names.SKY_SOURCE, names.SKY_VISIBLE, *names.SKY_ROWS, *_PLACED}
@@ -296,6 +299,9 @@ class _Changed(Exception):
 def _require_same(stored: Any, expected: Any, roots: tuple[str, str]) -> None:
     """Require that a prim and all below it, at two root paths, are as export writes them."""
     properties = {each.name: each for each in stored.properties}
+    if _OLD_CENTER in properties:
+        expected.attributes[CENTER].name = _OLD_CENTER
+        expected.attributes["xformOpOrder"].default = (_OLD_CENTER,)
     expected_properties = {each.name: each for each in expected.properties}
     missing = expected_properties.keys() - properties.keys()
     _require(properties.keys() <= expected_properties.keys() and missing <= _ADDED)

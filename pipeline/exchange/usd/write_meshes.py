@@ -46,8 +46,8 @@ MESH: Attributes = {
     "subdivisionScheme": ("uniform token", "none"),
     "subsetFamily:materialBind:familyType": ("uniform token", "partition"),
 }
-CENTER = "xformOp:translate:center"
-"""Name of the transform to the center; the suffix lets programs add a translation."""
+CENTER = "xformOp:translate"
+"""Name of the transform to the center, which USD's common API sets."""
 
 SUBSET: Attributes = {
     "elementType": ("uniform token", "face"),

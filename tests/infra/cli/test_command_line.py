@@ -287,6 +287,23 @@ def test_the_page_of_quantities_names_what_a_condition_can_ask() -> None:
         condition(text)
 
 
+def test_a_log_has_a_line_of_progress_a_minute(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: now[0])
+    with console.progress_bars() as bars:
+        task = bars.add_task("scenes", total=None, note="")
+        for second in (59, 60, 61, 119, 120):
+            now[0] = second
+            bars.update(task, total=8, completed=second // 20, note="noted")
+        bars.add_task("silent", total=1, note="", visible=False)
+        now[0] = 240
+        bars.advance(task)
+        said = capsys.readouterr().out
+    assert said.splitlines() == [f"scenes {done} of 8, noted" for done in (3, 6, 7)]
+
+
 def test_what_is_printed_tells_the_terminal_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Strangers' names hold no escapes, no colors of rich and no emojis, however they are shown."""
     obeyed = [*range(9), *range(11, 32), *range(0x7F, 0xA0), 0x202E, 0x2066, 0x200F]

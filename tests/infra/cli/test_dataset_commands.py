@@ -13,9 +13,11 @@ from infra.cli.assets import generate_from_meshes
 from infra.cli.extend_option import load_extensions
 from infra.repair import repair
 from infra.run_record import is_run, run_facts
+from pipeline.generation.generate_options import GenerateOptions
 from storage.dataset.asked import write_asked
 from storage.dataset.dataset import open_dataset
 from storage.dataset.manifest import write_manifest
+from storage.dataset.progress import announce_objects
 from storage.dataset.scene_logs import log_scene
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -165,6 +167,26 @@ def test_a_bad_derived_shard_is_made_of_its_sources_again(tmp_path: Path) -> Non
     assert f"Next: trilight verify {a} --repair" in found.output
 
 
+def test_a_repair_has_the_objects_of_the_generate_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    orders: list[GenerateOptions] = []
+
+    def refuse(options: GenerateOptions, runner: object) -> None:
+        orders.append(options)
+        raise TrilightError("refused")
+
+    publication = begin_tiny(tmp_path, 4)
+    make_tiny_shard(publication, 0)
+    write_asked(publication.folder, ["generate", "smoke", "--objects", "mine"])
+    monkeypatch.setattr("infra.repair.make_dataset", refuse)
+    for objects in (None, "others"):
+        with pytest.raises(TrilightError, match="refused"):
+            repair(str(tmp_path), ["train-000000.tar"], objects=objects, scenes_from=None)
+    assert [options.objects for options in orders] == ["mine", "others"]
+    assert [path.name for path in tmp_path.glob("*.tar*")] == ["train-000000.tar"]
+
+
 WIDE = {"COLUMNS": "200"}
 
 
@@ -176,11 +198,11 @@ def test_an_unfinished_set_is_not_verified(tmp_path: Path) -> None:
     assert "Unfinished" in empty.output
     assert "Verified" not in empty.output
     make_tiny_shard(publication, 0)
-    write_asked(publication.folder, ["generate", "smoke", "--seed", "7"])
+    write_asked(publication.folder, ["generate", "smoke", "--noise-floor-db", "7"])
     begun = trilight(["verify", place, "--fast"], env=WIDE)
     assert begun.exit_code == 1
     assert "1 of 3" in begun.output
-    assert f"Next: trilight generate smoke --seed 7 --out '{place}'" in begun.output
+    assert f"Next: trilight generate smoke --noise-floor 7 --out '{place}'" in begun.output
     told = json.loads(trilight(["verify", place, "--fast", "--json"]).output)
     assert (told["finished"], told["shards"], told["shards_planned"]) == (False, 1, 3)
     # words that do not print are not repeated: whoever hands out a dataset may have written them
@@ -224,6 +246,8 @@ def test_status_says_how_far_and_what_next(tmp_path: Path) -> None:
     row = json.loads(told.output)
     assert (row["shards_done"], row["scenes_planned"], row["finished"]) == (1, 12, False)
     assert row["cost_usd"] == 0.5
+    announce_objects(publication.folder, 7)
+    assert "0 of 7" in trilight(["status", str(tmp_path)], env=WIDE).output
 
 
 def test_objects_of_one_split_limit_the_scenes_to_that_split() -> None:

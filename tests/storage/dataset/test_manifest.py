@@ -383,6 +383,11 @@ def test_shards_scenes_and_what_to_do_next(tmp_path: Path) -> None:
     assert found.views_per_hour is None
     assert (found.shards_done, found.shards_planned) == (1, 3)
     assert (found.scenes_done, found.scenes_planned) == (4, 12)
+    assert (found.objects_done, found.objects_planned) == (0, 0)
+    announce_objects(publication.folder, 7)
+    count_object(publication.folder, 2)
+    begun = read_status(str(tmp_path))
+    assert (begun.objects_done, begun.objects_planned) == (2, 7)
     assert not found.finished
     assert found.next_words is None  # nobody wrote down how it was begun
     write_asked(publication.folder, ["generate", "smoke", "--scenes", "12"])

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pxr import Sdf, UsdGeom
+from pxr import Sdf, Usd, UsdGeom
 
 from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.usd.read_usd import read_usd
+from pipeline.exchange.usd.write_meshes import CENTER
 from pipeline.exchange.usd.write_usd import write_usd
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
@@ -22,6 +23,8 @@ from tests.textured_by_hand import number_texture, sky, textured_scene
 
 MATERIAL = f"/Scene/Materials/material_{FLOOR}"
 PREVIEW = f"{MATERIAL}/Preview"
+OLD_CENTER = "xformOp:translate:center"
+MOVE = np.array([1.0, 2.0, 3.0])
 EXACT = ("trilight:exactRows", "trilight:exactPositions")
 
 
@@ -160,25 +163,53 @@ def as_written_before(layer: Any) -> None:
     for mesh in layer.GetPrimAtPath("/Scene/Objects").nameChildren:
         if mesh.typeName == "Mesh":
             points = np.array(mesh.attributes["points"].default, np.float64)
-            points += np.array(mesh.attributes["xformOp:translate:center"].default)
+            points += np.array(mesh.attributes[CENTER].default)
             positions = points.astype(np.float32)
             exact, known = (mesh.attributes[name].default for name in EXACT)
             positions[list(exact)] = np.array(known, np.float32).reshape(-1, 3)
             mesh.attributes["points"].default = positions
-            for name in ("xformOp:translate:center", "xformOpOrder", *EXACT):
+            for name in (CENTER, "xformOpOrder", *EXACT):
                 del mesh.properties[name]
 
 
-def test_files_of_an_older_trilight_are_exact(tmp_path: Path) -> None:
+def with_named_centers(layer: Any) -> None:
+    """Name the transform of each mesh as an older Trilight did."""
+    for mesh in layer.GetPrimAtPath("/Scene/Objects").nameChildren:
+        if mesh.typeName == "Mesh":
+            mesh.attributes[CENTER].name = OLD_CENTER
+            mesh.attributes["xformOpOrder"].default = (OLD_CENTER,)
+
+
+@for_each("as_older", [as_written_before, with_named_centers])
+def test_files_of_an_older_trilight_are_exact(
+    tmp_path: Path, as_older: Callable[[Any], None]
+) -> None:
     for scene in (odd_scene(), textured_scene()):
-        found = edited(tmp_path, scene, as_written_before)
+        found = edited(tmp_path, scene, as_older)
         assert not found.notes and encode_scene(found.scene) == encode_scene(scene)
+
+
+@for_each("is_old", [False, True])
+def test_moved_objects_are_read_as_moved(tmp_path: Path, is_old: bool) -> None:
+    def move(layer: Any) -> None:
+        stage = Usd.Stage.Open(layer)
+        light = UsdGeom.Xformable(stage.GetPrimAtPath("/Scene/Objects/light"))
+        if is_old:
+            with_named_centers(layer)
+            light.AddTranslateOp().Set(tuple(MOVE))
+        else:
+            center = np.array(light.GetPrim().GetAttribute(CENTER).Get())
+            assert UsdGeom.XformCommonAPI(light).SetTranslate((center + MOVE).tolist())
+
+    scene = tiny_scene()
+    found = edited(tmp_path, scene, move)
+    assert any("changed since Trilight wrote it: read as any other" in text for text in found.notes)
+    was, now = (s.vertex_positions[s.faces[2]] for s in (scene, found.scene))
+    assert now == pytest.approx(was + MOVE, abs=1e-6)
 
 
 def test_objects_turn_about_their_centers(tmp_path: Path) -> None:
     def turn(layer: Any) -> None:
-        from pxr import Usd
-
         stage = Usd.Stage.Open(layer)
         UsdGeom.Xformable(stage.GetPrimAtPath("/Scene/Objects/light")).AddRotateZOp().Set(180)
 
