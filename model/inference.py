@@ -182,11 +182,13 @@ class NeuralRenderer:
         angle = torch.tensor(fov_deg, dtype=torch.float32, device=self.device)
         views = prepared.views
         if resolution not in views:
-            predict = functools.partial(_predict_picture, self._model, prepared.groups, resolution)
             if isinstance(self._model.config.stage, HitStage):
                 ((encoded, _),) = prepared.groups
-                predict = _TracedView(self._model, encoded, resolution)
-            views[resolution] = predict
+                views[resolution] = _TracedView(self._model, encoded, resolution)
+            else:
+                views[resolution] = functools.partial(
+                    _predict_picture, self._model, prepared.groups, resolution
+                )
         picture: NDArray[np.float32] = views[resolution](c2w_44, angle).cpu().numpy()
         return picture
 
