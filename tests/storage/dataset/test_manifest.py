@@ -386,8 +386,8 @@ def test_shards_scenes_and_what_to_do_next(tmp_path: Path) -> None:
     assert (found.objects_done, found.objects_planned) == (0, 0)
     announce_objects(publication.folder, 7)
     count_object(publication.folder, 2)
-    begun = read_status(str(tmp_path))
-    assert (begun.objects_done, begun.objects_planned) == (2, 7)
+    counted = read_status(str(tmp_path))
+    assert (counted.objects_done, counted.objects_planned) == (2, 7)
     assert not found.finished
     assert found.next_words is None  # nobody wrote down how it was begun
     write_asked(publication.folder, ["generate", "smoke", "--scenes", "12"])
