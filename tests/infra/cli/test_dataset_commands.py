@@ -172,14 +172,14 @@ def test_a_repair_has_the_objects_of_the_generate_command(
 ) -> None:
     orders: list[GenerateOptions] = []
 
-    def refuse(options: GenerateOptions, runner: object) -> None:
+    def refuse(options: GenerateOptions) -> None:
         orders.append(options)
         raise TrilightError("refused")
 
     publication = begin_tiny(tmp_path, 4)
     make_tiny_shard(publication, 0)
     write_asked(publication.folder, ["generate", "smoke", "--objects", "mine"])
-    monkeypatch.setattr("infra.repair.make_dataset", refuse)
+    monkeypatch.setattr("infra.repair.prepare_dataset", refuse)
     for objects in (None, "others"):
         with pytest.raises(TrilightError, match="refused"):
             repair(str(tmp_path), ["train-000000.tar"], objects=objects, scenes_from=None)
