@@ -1,4 +1,4 @@
-"""Places objects in the room: resting or floating, and free of collisions.
+"""Places objects in the room: resting or floating, with a collision test.
 
 Sizes and rotations are drawn first, then places, the largest object first and each several times
 over, before sizes are given up and drawn again. Drawing whole arrangements until one fits would be

@@ -1,4 +1,4 @@
-"""Subcommands of `trilight`; the module of a command is imported when the command runs."""
+"""Every subcommand of `trilight` (cyclopts); its module is imported when the command runs."""
 
 import sys
 from collections.abc import Collection

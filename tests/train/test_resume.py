@@ -326,8 +326,8 @@ def test_every_size_can_be_asked_for_by_name() -> None:
 
 SHIPPED = {
     "builtin": "f414db1e0417fdce",
-    "hits": "62ab9f9520cd9d79",
-    "hits-tokens": "ca39119c1c965aa5",
+    "hits": "696e3232ddd7ef98",
+    "hits-tokens": "a50675f786a1c963",
     "paper-pretrain-large": "54b5eefedba2fa94",  # of the published training code
     "paper-finetune-large": "c54e4a456bc09c9d",
 }

@@ -97,7 +97,7 @@ def time_reading(
     """
     from train.data.bad_samples import BadSampleCounter
     from train.data.loader import load_batches
-    from train.data.options import RankSlice
+    from train.data.order import RankSlice
 
     stream = load_batches(
         data.split("train"), settings, 0, rank_slice=RankSlice(),
