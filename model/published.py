@@ -1,4 +1,4 @@
-"""Published RenderFormer checkpoints (safetensors): configuration and weights, converted to ours and back.
+"""Published RenderFormer checkpoints (safetensors): configuration, weights, converted and back.
 
 Of the configurations that their JSON allows, two families were published: V1-Base, and V1.1-Large
 with Swin windows. Any other value of a field is refused by name.

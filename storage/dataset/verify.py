@@ -1,4 +1,4 @@
-"""Checks a dataset against its manifest: each checksum, each member, and the laws of every sample."""
+"""Checks a dataset against its manifest: each checksum, each member, the laws of every sample."""
 
 import io
 from collections import Counter, deque
