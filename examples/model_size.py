@@ -3,7 +3,7 @@
     trilight model nano --extend model_size.py
     trilight train smoke --extend model_size.py --set model=nano --data data/smoke --out runs/nano
 
-A checkpoint holds the numbers and not the name, so that it opens where nobody knows this file. What
+A checkpoint holds the numbers and not the name, so that it opens where this file is unknown. What
 a size cannot change, and what each number means, stands in model/config.py.
 """
 
