@@ -15,6 +15,7 @@ from typing import Annotated, Any
 
 import cyclopts
 from cyclopts import Parameter
+from PIL import Image
 
 from model.open import BUILTIN_NETWORKS
 from model.weights import decode_weights, network_digest
@@ -45,6 +46,9 @@ _HEADS = {
 }
 """Introduction of each built-in network's card, by its name."""
 
+_SHEETS = ("median", "worst")
+"""Sheets of the evaluation that the card shows."""
+
 WORST = 5
 """Number of worst views on the card."""
 
@@ -73,6 +77,12 @@ def main(
     summary = json.loads(folder.summary.read_text())
     lines = [f"# The network `{name}`", "", _HEADS[name], ""]
     lines += _card(dataset, about, judged, summary, weights, command)
+    for sheet in _SHEETS:
+        Image.open(evaluation / f"{sheet}.png").save(place.with_name(f"{sheet}.webp"), quality=80)
+        lines += [
+            "",
+            f"![Views of {sheet} error, beside the path tracer in equal time]({sheet}.webp)",
+        ]
     for each in other_evaluations:
         lines += ["", *_scores(each)]
     lines += [
