@@ -21,6 +21,8 @@ from infra.setup.generated_pages import PAGES
 ROOT = Path(__file__).parents[2]
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)#:\s]+)(#[^)\s]*)?\)")
 """Relative link or picture: bang, words, target, anchor."""
+PICTURES = (".webp", ".png", ".jpg", ".svg")
+"""Suffixes of files that the site shows as they are; every other linked file is text."""
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -33,7 +35,11 @@ def on_files(files: Files, config: Any) -> Files:
             if target in known or target.startswith("docs/") or not (ROOT / target).is_file():
                 continue
             known.add(target)
-            added = File.generated(config, _site_uri(target), content=_source_page(target))
+            if target.endswith(PICTURES):
+                source = str(ROOT / target)
+                added = File.generated(config, _site_uri(target), abs_src_path=source)
+            else:
+                added = File.generated(config, _site_uri(target), content=_source_page(target))
             added.inclusion = InclusionLevel.NOT_IN_NAV
             files.append(added)
             if target.endswith(".md"):
@@ -79,7 +85,7 @@ def _site_uri(path: str) -> str:
     """Return the MkDocs source path of a file of the checkout."""
     if path.startswith("docs/"):
         return path.removeprefix("docs/")
-    return f"source/{path}" if path.endswith(".md") else f"source/{path}.md"
+    return f"source/{path}" if path.endswith((".md", *PICTURES)) else f"source/{path}.md"
 
 
 def _source_page(path: str) -> str:
