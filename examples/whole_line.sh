@@ -44,7 +44,7 @@ trilight inspect "$DATA/set"
 if [ -d "$RUN/checkpoints" ]; then resume=--resume; else resume=; fi
 trilight train smoke --data "$DATA/set" --steps "$STEPS" --out "$RUN" $resume
 
-# 6. Judge: view by view beside each view's own noise floor, and beside two baselines that have
+# 6. Judge: view by view beside each view's own stated error, and beside two baselines that have
 #    learned nothing (the median picture, and the nearest training view).
 trilight evaluate "$RUN" --data "$DATA/set" --split test --out "$RUN/evaluation"
 

@@ -83,7 +83,7 @@ def judge_network(
     device: str | None = None,
     done: Callable[[int, int], None] = lambda now, total: None,
 ) -> Judgement:
-    """Evaluate a network on each view, with the view's noise floor and simple baselines.
+    """Evaluate a network on each view, with the view's stated error and simple baselines.
 
     Args:
         checkpoint: folder of a run, its model.safetensors, a checkpoint, or `builtin:`.

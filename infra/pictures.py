@@ -355,7 +355,7 @@ def main() -> None:
     parser.add_argument("objects", type=Path, help="folder of at least 30 objects")
     parser.add_argument("--out", type=Path, default=Path("docs/pictures"))
     parser.add_argument("--data", type=Path, default=Path("data/pictures"))
-    parser.add_argument("--room", type=int, nargs=2, default=(15, 1), help="scene and view to show")
+    parser.add_argument("--room", type=int, nargs=2, default=(14, 1), help="scene and view to show")
     parser.add_argument("--only", nargs="*", choices=NAMES, default=NAMES)
     arguments = parser.parse_args()
     pictures = Pictures(arguments.objects, arguments.data, arguments.out, tuple(arguments.room))

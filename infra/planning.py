@@ -216,8 +216,8 @@ def _expected_time(settings: DatasetSettings, remaining: int, core_s: Sequence[f
     hours = views * pixels * low_s * (high_s / low_s) ** power / cores / 3600
     said = f"{hours:,.0f} hours" if hours > 2 else _count_text(math.ceil(60 * hours), "minute")
     return (
-        f"all together roughly {said} {on_cores}, where scenes cost what ours did; `trilight plan` "
-        "measures it"
+        f"once objects are prepared, roughly {said} {on_cores}, where scenes cost what ours did; "
+        "`trilight plan` measures it"
     )
 
 

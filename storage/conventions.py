@@ -174,7 +174,7 @@ def latlong_direction(uv: ArrayLike) -> NDArray[np.float64]:
 
 
 def log10_radiance(radiance_rgb: ArrayLike) -> NDArray:
-    """Return log10(1 + radiance), the space of the network's output and of the noise floor."""
+    """Return log10(1 + radiance), the space of the network's output and of the stated error."""
     return np.log10(1.0 + np.asarray(radiance_rgb))
 
 

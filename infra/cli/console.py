@@ -26,8 +26,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from infra.cli.extend_option import extend_words
-from infra.cli.options import SHOWN
-from storage.settings.fields import option_of
+from storage.settings.fields import SHOWN, option_of
 
 _OBEYED = dict.fromkeys(
     [

@@ -31,33 +31,9 @@ from storage.settings.fields import (
     describe_fields,
     option_of,
     parts_of,
+    shown_name,
     unwrap,
 )
-
-SHOWN = {
-    "allow_licences": "--allow-licence",
-    "arc_deg": "--arc",
-    "begin_with": "--from",
-    "changes": "--set",
-    "decisions": "--change",
-    "error_db": "--error",
-    "exposure_ev": "--exposure",
-    "LeaderboardOptions.scenes": "--max-scenes",
-    "LeaderboardOptions.width": "--resolution",
-    "InspectOptions.scenes": "--max-scenes",
-    "hang_after_s": "--hang-after",
-    "min_noise_floor_db": "--min-noise-floor",
-    "most_scenes": "--max-scenes",
-    "most_unusable": "--skip-unusable",
-    "noise_floor_db": "--noise-floor",
-    "noise_floor_linear_db": "--noise-floor-linear",
-    "noise_floor_objects_db": "--noise-floor-objects",
-    "other_networks": "--beside",
-    "samples": "--probe-scenes",
-    "shards": "--range",
-}
-"""Name of an option that help shows, by field or Class.field, where the field's own name is not the
-best for people; that one works too."""
 
 PRESETS = {"build": "PRESET", "run": "PRESET"}
 """Arguments by what help calls them."""
@@ -145,12 +121,6 @@ def _parameter(field: FieldDescription, group: Group, *, by_place: bool) -> insp
         default=inspect.Parameter.empty if required else None,
         annotation=Annotated[(list[word] if several else word) | None, declared],
     )
-
-
-def shown_name(field: FieldDescription) -> str:
-    """Return the name of a field's option that help shows."""
-    by_class = SHOWN.get(f"{field.owner.__name__}.{field.name}")
-    return by_class or SHOWN.get(field.name) or option_of(field.name)
 
 
 def _help(

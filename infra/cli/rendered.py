@@ -25,7 +25,7 @@ _FLOORS = {
     "noise_floor_linear_db": "psnr_linear_db",
     "object_noise_floor_db": "object_psnr_log_db",
 }
-"""Metric by the name of the stated error (noise floor) of a path traced picture."""
+"""Metric by the name of the stated error of a path traced picture."""
 
 _EXPECTED = {
     "noise_floor_db": "expected_error_db",
@@ -127,11 +127,11 @@ def _describe(renderer: Renderer, facts: Facts) -> Rows:
         case PathTracer(settings=PreviewSettings() as preview):
             unknown = "unknown: a preview measures none"
             samples = f"{facts['spp']}, {_FILTERS[preview.denoiser]}"
-            return [("samples per pixel", samples), ("noise floor", unknown)]
+            return [("samples per pixel", samples), ("stated error", unknown)]
         case PathTracer(settings=RenderSettings() as settings):
             names = _shown_floors(settings)
             floors = [_floor(settings, facts, name, metric) for name, metric in names.items()]
-            rows = [("noise floor", floors[0]), *(("", floor) for floor in floors[1:])]
+            rows = [("stated error", floors[0]), *(("", floor) for floor in floors[1:])]
             if settings.stated_error == "calibrated":
                 rows.append(("", _meaning(settings, facts)))
             mean = f"{facts['mean_radiance']:.4g} (radiance), that of its samples"
@@ -156,7 +156,7 @@ def _shown_floors(settings: RenderSettings) -> dict[str, str]:
 
 
 def _floor(settings: RenderSettings, facts: Facts, name: str, metric: str) -> str:
-    """Return the text of one noise floor, and whether its target was reached."""
+    """Return the text of one stated error, and whether its target was reached."""
     floor_db = float(facts[name])
     target_db = settings.targets_db.get(metric)
     probably = f", probably {float(facts[e]):.1f}" if (e := _EXPECTED[name]) in facts else ""
@@ -168,7 +168,7 @@ def _floor(settings: RenderSettings, facts: Facts, name: str, metric: str) -> st
 
 
 def _meaning(settings: RenderSettings, facts: Facts) -> str:
-    """Return what a noise floor promises, in one sentence."""
+    """Return what a stated error promises, in one sentence."""
     if _EXPECTED["noise_floor_db"] in facts:
         return promise_sentence(settings.resolution)
     return f"a bound: pictures like this one are not calibrated ({OUTSIDE})"
@@ -195,7 +195,7 @@ def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: fl
     floors = _floors(plan, shots)
     agreements = [shot.psnr_log_db for shot in shots if shot.psnr_log_db is not None]
     for metric, values in floors.items():
-        rows += _spread("noise floor", values, metric)
+        rows += _spread("stated error", values, metric)
     rows += _spread("agreement", agreements, "psnr_log_db")
     if flickers := [shot.flicker for shot in shots if shot.flicker is not None]:
         db = np.median([flicker.db for flicker in flickers])

@@ -92,7 +92,7 @@ def _pictures(folder: Path, each: SceneComparison) -> Iterator[Figure]:
     """Write the pictures of a scene, and yield them."""
     error = error_picture(each.pictures_rgb[NETWORK], each.target_rgb)
     pictures = [
-        ("traced", preview_srgb8(each.target_rgb), f"traced, noise floor {each.floor_db:.1f} dB")
+        ("traced", preview_srgb8(each.target_rgb), f"traced, stated error {each.floor_db:.1f} dB")
     ]
     for place, (name, radiance_rgb) in enumerate(each.pictures_rgb.items()):
         caption = f"{name}, {each.psnr_db[name]:.1f} dB"

@@ -188,11 +188,11 @@ def _caveats(renderer: Renderer, finished: Sequence[FinishedShot]) -> list[str]:
     sampled = [facts for facts in every if "spp" in facts]
     if any("noise_floor_db" not in facts for facts in sampled):
         notes.append(
-            "the error of a preview is not measured, so that its noise floor is unknown: "
+            "the error of a preview is not measured, so that its stated error is unknown: "
             "--noise-floor 40 measures it and samples on to it"
         )
     elif any(
         int(facts["spp"]) < FIRST_SPP and "expected_error_db" not in facts for facts in sampled
     ):
-        notes.append(f"below {FIRST_SPP} samples the measured noise floor may flatter")
+        notes.append(f"below {FIRST_SPP} samples the measured stated error may flatter")
     return [*notes, *renderer.notes]

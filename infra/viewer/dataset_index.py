@@ -56,7 +56,7 @@ class SceneRow:
     lights: int
     """Number of emitter objects, not of their triangles."""
     floor: float
-    """Noise floor of the worst view as psnr_log_db."""
+    """Stated error of the worst view as psnr_log_db."""
     coverage: float
     """Least fraction over the views of pixels on objects."""
     spp: int

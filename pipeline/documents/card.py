@@ -28,7 +28,7 @@ _SETTINGS = (
     ("seed", "seed"),
     ("objects from", "source"),
     ("picture width, pixels", "renders.resolution"),
-    ("target noise floor, dB", "renders.noise_floor_db"),
+    ("target stated error, dB", "renders.noise_floor_db"),
     ("target as linear PSNR, dB", "renders.noise_floor_linear_db"),
     ("target over geometry, dB", "renders.noise_floor_objects_db"),
     ("most samples per pixel", "renders.max_spp"),

@@ -50,7 +50,7 @@ class Distributions:
     failures: Sequence[Failure]
     """Rejections of objects, scenes and views."""
     targets: Mapping[str, float | None]
-    """Target values of the settings: max_triangles, the three noise floors, min_spp, max_spp; None
+    """Target values of the settings: max_triangles, the three stated errors, min_spp, max_spp; None
     if the manifest lacks one."""
 
     def add(self, record: SceneRecord, split: str) -> Mapping[str, Values]:

@@ -26,7 +26,7 @@ _CARD_PX = 176
 _MOST_CHOICES = 12
 """Most choices of one filter; a dataset with more layouts shows the first ones by name."""
 _MOST_DB = 1e9
-"""Shown for the noise floor of a picture without any error: JSON has no infinity."""
+"""Shown for the stated error of a picture without any error: JSON has no infinity."""
 
 _WITHIN = "within the target"
 _AT_CAP = "at the cap"

@@ -102,7 +102,7 @@ def _pictures(sample: Sample) -> Iterator[Figure]:
 
 
 def _parts(sample: Sample) -> Iterator[tuple[int, str, PartFloor, Figure]]:
-    """Yield view, name, noise floors and picture of each stored light component."""
+    """Yield view, name, stated errors and picture of each stored light component."""
     if sample.parts_rgb is None:
         return
     gain = preview_gain(sample.radiance_rgb)

@@ -48,7 +48,7 @@ def write_contact_sheet(
         return
     values = dict(statistics.lines())
     title = f"{dataset.manifest.build}: {values['scenes']}, {values['views']} views"
-    floors = f"noise floor {values['noise floor']}; at the cap {values['views at the cap']}; "
+    floors = f"stated error {values['stated error']}; at the cap {values['views at the cap']}; "
     floors += "bright scenes are shown darker"
     cells = ((sample, entry.split) for entry, sample in read_chosen(dataset, chosen))
     sheet = _draw_sheet(title, floors, cells, len(chosen), dataset.manifest.num_views)

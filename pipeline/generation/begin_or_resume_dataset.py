@@ -162,7 +162,7 @@ def _require_same_dataset(
             raise TrilightError(
                 f"{folder.display_name}: this dataset was begun on a {before.upper()} and would "
                 f"go on with a {now.upper()}; choose --device {before} or another --out, or accept "
-                "pictures that agree only within their noise floors with --accept-environment."
+                "pictures that agree only within their stated errors with --accept-environment."
             )
         _require_same(
             folder,

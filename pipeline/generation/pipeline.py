@@ -5,7 +5,7 @@
     objects    files whose licence allows their use                  pipeline.objects.sources
     meshes     the same objects, cleaned, with fewer triangles       pipeline.assets.stage
     scenes     meshes with a room, materials, lights and cameras     pipeline.scenes.compose
-    renders    a picture of each camera, down to the noise floor     pipeline.renders.renderer
+    renders    a picture of each camera, down to the stated error     pipeline.renders.renderer
     shards     tars of finished scenes, the same bytes everywhere    pipeline.shards.pack
     documents  card, report and contact sheet for readers            pipeline.documents
 

@@ -152,5 +152,5 @@ def require_environment(expected: Mapping[str, Any], actual: Mapping[str, Any]) 
         raise TrilightError(
             f"this worker differs from the machine that began the run: {name} is {new!r}; "
             f"expected {old!r}. Use machines of one kind and one image, or accept pictures that "
-            "agree only within their noise floors with --accept-environment."
+            "agree only within their stated errors with --accept-environment."
         )

@@ -31,7 +31,7 @@ from storage.settings.described import checked
 from storage.settings.ranges import Within
 
 MOST_SPP = 4096
-"""Maximum number of samples of a preview; above it, use a noise floor."""
+"""Maximum number of samples of a preview; above it, use a stated error."""
 
 FAST_SPP = 16
 """Up to so many samples the fast filter is the better trade: more samples cost less than the better

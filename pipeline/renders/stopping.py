@@ -37,7 +37,7 @@ class Goal:
     """Targets and cap of the samples of a view."""
 
     targets_db: Floors
-    """Noise floors to reach, in dB by metric."""
+    """Stated errors to reach, in dB by metric."""
     step: int
     """Samples per pixel that one pass adds, both halves together."""
     max_spp: int

@@ -38,7 +38,7 @@ class SceneFacts:
     shard: ShardEntry  # the shard that holds it
     key: str  # its key in that shard
     template: str  # layout of the scene
-    noise_floor_db: float  # noise floor of its worst view, as psnr_log_db
+    noise_floor_db: float  # stated error of its worst view, as psnr_log_db
     uids: tuple[str, ...]  # its objects, and the user's textures and map in it
     arrays_sha256: str  # digest of its unpacked arrays: equal for equal scenes
     values: Mapping[str, Any]  # requested values by name (pipeline.shards.expression)

@@ -24,7 +24,7 @@ class Selection:
     split: str | None = None  # take only scenes of this split
     template: str | None = None  # take only scenes of this layout
     min_noise_floor_db: float | None = None
-    """Take only scenes whose views all have at least this noise floor (psnr_log_db)."""
+    """Take only scenes whose views all have at least this stated error (psnr_log_db)."""
     where: str | None = None
     """Take only scenes for which this condition holds (pipeline.shards.expression)."""
 

@@ -73,10 +73,10 @@ class Statistics:
             *beyond,
             *([("what follows is", sample)] if sample else []),
             ("views", f"{self.num_views}"),
-            ("noise floor", _spread(self.noise_floor_db, "psnr_log_db")),
+            ("stated error", _spread(self.noise_floor_db, "psnr_log_db")),
             *expected,
             *(
-                (f"noise floor, {part}", _spread(floors_db, "psnr_log_db"))
+                (f"stated error, {part}", _spread(floors_db, "psnr_log_db"))
                 for part, floors_db in self.part_noise_floor_db.items()
             ),
             ("views at the cap", f"{100 * self.at_cap.mean():.1f} %"),

@@ -6,7 +6,7 @@
 | `compact` | the same behind gzip, exact | OpenEXR DWAB at the coarsest level that keeps the law |
 
 **The law of the tenth**: a codec may add at most a tenth of the noise that is in a picture already.
-As errors of log10(1 + radiance), its mean square is at most 0.1 of the noise floor's, that is, its
+As errors of log10(1 + radiance), its mean square is at most 0.1 of the stated error's, that is, its
 `psnr_log_db` is at least the view's floor + 10 dB. As the two errors are independent, the recorded
 floor is then at most 0.41 dB too high; where camera rays miss there is hardly any noise, so this
 nearly holds over the pixels that show geometry too. It is tested on what comes back from each file;
@@ -28,7 +28,7 @@ Profile = Literal["lossless", "compact"]
 PROFILES: tuple[Profile, ...] = get_args(Profile)
 
 LAW_DB = 10.0
-"""Margin of a codec over the noise floor: a tenth of its mean square."""
+"""Margin of a codec over the stated error: a tenth of its mean square."""
 
 DWA_LEVELS = (200.0, 100.0, 45.0, 20.0, 10.0)
 """What `compact` tries, from coarse to fine. Coarser ones flatten what the eye sees, though the law

@@ -49,7 +49,7 @@ from storage.settings.ranges import Within
 from storage.typed_json import read_json
 
 Plausible = Annotated[float, Within(-1000, 1000, low_open=True, high_open=True)]
-"""Number within bounds beyond any noise floor in dB and any share."""
+"""Number within bounds beyond any stated error in dB and any share."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +86,7 @@ class ViewRecord:
     camera_attempt: int
     """Number of cameras that were rejected before this one."""
     expected: PartFloor | None = None
-    """Errors that are as often better as worse, where the noise floors are calibrated bounds; a
+    """Errors that are as often better as worse, where the stated errors are calibrated bounds; a
     record whose floors are bounds by estimate and allowances is written without this field."""
     parts: Mapping[str, PartFloor] | None = None
     """Floors of the parts that are stored, by name (storage.records.parts); a record that has none

@@ -22,6 +22,32 @@ _KINDS = {bool: "true or false", str: "a text", int: "a whole number", float: "a
 _NUMBERS = {int: "whole numbers", float: "numbers"}
 
 
+SHOWN = {
+    "allow_licences": "--allow-licence",
+    "arc_deg": "--arc",
+    "begin_with": "--from",
+    "changes": "--set",
+    "decisions": "--change",
+    "error_db": "--error",
+    "exposure_ev": "--exposure",
+    "LeaderboardOptions.scenes": "--max-scenes",
+    "LeaderboardOptions.width": "--resolution",
+    "InspectOptions.scenes": "--max-scenes",
+    "hang_after_s": "--hang-after",
+    "min_noise_floor_db": "--min-noise-floor",
+    "most_scenes": "--max-scenes",
+    "most_unusable": "--skip-unusable",
+    "noise_floor_db": "--noise-floor",
+    "noise_floor_linear_db": "--noise-floor-linear",
+    "noise_floor_objects_db": "--noise-floor-objects",
+    "other_networks": "--beside",
+    "samples": "--probe-scenes",
+    "shards": "--range",
+}
+"""Name of an option that help shows, by field or Class.field, where the field's own name is not the
+best for people; that one works too."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class FieldDescription:
     """Description of one field of a dataclass."""
@@ -149,6 +175,12 @@ def group_of(hint: Any) -> bool:
 def option_of(field: str) -> str:
     """Return the option of the command line that fills a field."""
     return "--" + field.replace("_", "-")
+
+
+def shown_name(field: FieldDescription) -> str:
+    """Return the name of a field's option that help shows."""
+    by_class = SHOWN.get(f"{field.owner.__name__}.{field.name}")
+    return by_class or SHOWN.get(field.name) or option_of(field.name)
 
 
 def expected_of(hint: Any) -> str:

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 from storage.errors import TrilightError, expected_one_of
 from storage.removed import removal_message
 from storage.settings.described import field_value, settings_record
-from storage.settings.fields import describe_fields, option_of
+from storage.settings.fields import describe_fields, shown_name
 
 Settings = TypeVar("Settings")
 
@@ -60,12 +60,12 @@ def option_words(settings: Any, *, leave_out: tuple[str, ...] = ()) -> list[str]
         if field.name in leave_out or value == field.default:
             continue
         if isinstance(value, bool):
-            words.append(option_of(field.name))
+            words.append(shown_name(field))
             continue
         if isinstance(value, Mapping):
             value = tuple(f"{name}={_write_value(new)}" for name, new in value.items())
         for entry in value if isinstance(value, tuple) else (value,):
-            words += (option_of(field.name), str(entry))
+            words += (shown_name(field), str(entry))
     return words
 
 

@@ -121,7 +121,9 @@ def test_what_a_run_will_make_is_said_before_it_begins(
     order, folder = tiny_order(out=str(tmp_path), scenes=3), DatasetFolder(tmp_path)
     lacking = "no shard is for validation before --scenes 9"
     monkeypatch.setenv("TRILIGHT_CORES", "3")
-    rough = "all together roughly 1 minute on 3 cores, where scenes cost what ours did"
+    rough = (
+        "once objects are prepared, roughly 1 minute on 3 cores, where scenes cost what ours did"
+    )
     scenes = f"3 scenes of 2 views each in 1 shard ({lacking})"
     assert describe_run(order, folder) == f"{scenes}; {rough}; `trilight plan` measures it"
     for build, said in (("smoke", "3 minutes"), ("textured-256", "94 hours")):

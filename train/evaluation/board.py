@@ -1,7 +1,7 @@
 """Judges every method on every view of a split, and adds the missing rows.
 
 The evaluation is that of one network (`train.evaluation.evaluate`): targets, masks, metrics and
-noise floors are equal. Scores are stored in rows.jsonl, so that no view is evaluated twice; its
+stated errors are equal. Scores are stored in rows.jsonl, so that no view is evaluated twice; its
 first line names the dataset, each other one is a `Row`.
 """
 

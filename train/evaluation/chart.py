@@ -87,7 +87,7 @@ def plot_excursions(path: Path, views: Sequence[JudgedView]) -> int:
     """Plot psnr_log_db beyond the usual range of scenes; return the number of axes.
 
     Each axis has a plot: a dot is a view, the line the median at each value, the dashed line the
-    median of the noise floors. Nothing is written if no view leaves the usual range.
+    median of the stated errors. Nothing is written if no view leaves the usual range.
     """
     import matplotlib
 
@@ -113,7 +113,7 @@ def plot_excursions(path: Path, views: Sequence[JudgedView]) -> int:
         medians = [np.median(scores[at == value]) for value in values]
         place.plot(values, medians, "-o", color="tab:blue", label="network")
         noise = [np.median(floors[at == value]) for value in values]
-        place.plot(values, noise, "--", color="grey", label="noise floor")
+        place.plot(values, noise, "--", color="grey", label="stated error")
         place.set(title=axis.replace("_", " "), xlabel="value", ylabel="psnr_log_db")
         if values[0] > 0 and values[-1] / values[0] > 8:
             place.set_xscale("log")

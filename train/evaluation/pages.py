@@ -142,7 +142,7 @@ def _medians_table(parts: Mapping[str, Any]) -> str:
         ]
         for name, part in parts.items()
     ]
-    head = ["part", "views", *METRICS, "dB below noise floor"]
+    head = ["part", "views", *METRICS, "dB below stated error"]
     return table(head, rows, numbers=len(head) - 1)
 
 

@@ -81,7 +81,7 @@ def write_picture(path: Path, picture: Image.Image) -> None:
 def noise_picture(view: SheetView) -> NDArray[np.uint8]:
     """Return the error relative to the view's noise [R, R, 3], on a log scale, black at the noise.
 
-    The noise is one number for the whole view, its noise floor.
+    The noise is one number for the whole view, its stated error.
     """
     error = mean_error(view.predicted_rgb, view.target_rgb)
     times = np.maximum(error / max(view.noise, 1e-6), 1.0)

@@ -4,9 +4,9 @@
 
 Columns: `image` (8-bit sRGB), `depth` (float32, meters along the axis of the camera, infinite where
 nothing is met), `object` and `triangle` (int32 rows of the scene's objects and triangles, -1 where
-nothing is met), all as pictures; the camera, the picture's noise floor, and the objects' names.
-Scenes that stand alone have an RGBA `image`, the columns `normal` and `albedo`, and the noise floor
-over the object.
+nothing is met), all as pictures; the camera, the picture's stated error, and the objects' names.
+Scenes that stand alone have an RGBA `image`, the columns `normal` and `albedo`, and the stated
+error over the object.
 https://huggingface.co/docs/datasets/image_dataset
 """
 

@@ -89,7 +89,7 @@ def test_parts_show_with_their_floors(tmp_path: Path) -> None:
     views = tuple(dataclasses.replace(view, parts=floors) for view in made.views)
     whole = dataclasses.replace(made, parts_rgb=parts, views=views)
     write_dataset(tmp_path, {"train-000000.tar": [whole]})
-    assert "noise floor, indirect median 38.2 dB" in " ".join(inspect(tmp_path).split())
+    assert "stated error, indirect median 38.2 dB" in " ".join(inspect(tmp_path).split())
     read = json.loads(inspect(tmp_path, "--json"))
     assert read["part_noise_floor_db"] == {"direct": [47.5] * 2, "indirect": [38.25] * 2}
     (page,) = (tmp_path / "report").glob("*.html")
@@ -198,7 +198,7 @@ def test_an_unfinished_set_is_not_verified(tmp_path: Path) -> None:
     assert "Unfinished" in empty.output
     assert "Verified" not in empty.output
     make_tiny_shard(publication, 0)
-    write_asked(publication.folder, ["generate", "smoke", "--noise-floor-db", "7"])
+    write_asked(publication.folder, ["generate", "smoke", "--noise-floor", "7"])
     begun = trilight(["verify", place, "--fast"], env=WIDE)
     assert begun.exit_code == 1
     assert "1 of 3" in begun.output

@@ -266,7 +266,7 @@ def test_a_turn_is_path_traced_to_a_video_and_kept(source: Path, tmp_path: Path)
     assert [picture["kept"] for picture in render(*words)["pictures"]] == [True, False, True]
     np.testing.assert_array_equal(decode_exr(exrs[1].read_bytes()), pictures[1])
     said = printed(*words, *SMALL)
-    floors = r"noise floor +median -?\d+\.\d dB, 5th percentile -?\d+\.\d dB \(psnr_log_db\)"
+    floors = r"stated error +median -?\d+\.\d dB, 5th percentile -?\d+\.\d dB \(psnr_log_db\)"
     assert len(re.findall(floors, said)) == said.count("percentile") == 1
 
 
@@ -330,7 +330,7 @@ def test_a_promise_and_what_is_probable_are_said(source: Path, tmp_path: Path) -
     words = (source, "--out", out, "--noise-floor", "5", "--max-spp", "128")
     assert "probably" not in printed(*words, "--resolution", "64", "--stated-error", "bound")
     said = printed(*words, "--resolution", "64")
-    assert re.search(r"noise floor +-?\d+\.\d dB, probably -?\d+\.\d \(psnr_log_db; ", said)
+    assert re.search(r"stated error +-?\d+\.\d dB, probably -?\d+\.\d \(psnr_log_db; ", said)
     assert re.search(r"hundred pictures .* \d\d or more are at most 1 dB worse, and half are", said)
     assert header(out)["expected_error_db"] > header(out)["noise_floor_db"]
     said = printed(*words, "--resolution", "256")
@@ -376,7 +376,7 @@ def test_a_preview_says_that_its_error_is_unknown(source: Path, tmp_path: Path) 
     out = tmp_path / "x.exr"
     words = (source, "--out", out, "--resolution", "16", "--spp", "3")
     said = printed(*words)
-    assert "samples per pixel 3, one fast denoise noise floor unknown" in said
+    assert "samples per pixel 3, one fast denoise stated error unknown" in said
     assert "--noise-floor 40 measures it and samples on to it" in said
     assert f"Look at {out.with_suffix('.png')}; measure with {out}" in said
     found = header(out)
@@ -392,7 +392,7 @@ def test_what_is_chosen_is_said_made_and_recorded(source: Path, tmp_path: Path) 
     said = printed(*words, "--error", "20")
     assert "--error 20: chosen: " in said and "a pixel, filter fast; expected" in said
     assert f"dB in the median of {shipped_table().scenes} scenes" in said
-    assert "noise floor unknown: a preview measures none" in said
+    assert "stated error unknown: a preview measures none" in said
     assert "s after start-up; expected" in said
     recorded = header(out)
     assert recorded["chosen_for"] == "--error 20"

@@ -191,11 +191,11 @@ def test_several_processes_are_launched_by_torchrun(monkeypatch: pytest.MonkeyPa
     assert trilight([*asked, "--json"]).exit_code == 0
     (words,) = seen
     assert words[1:6] == ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m"]
-    assert " ".join(words[6:]) == "trilight train smoke --most-unusable 1 --changes seed=3 --json"
+    assert " ".join(words[6:]) == "trilight train smoke --skip-unusable 1 --set seed=3 --json"
     watched = ["train", "smoke", "--processes", "2", "--hang-after", "9", "--profile", "2"]
     assert trilight([*watched, "--wandb", "light"]).exit_code == 0
     assert " ".join(seen.pop()[6:]) == (
-        "trilight train smoke --hang-after-s 9.0 --profile 2 --wandb light"
+        "trilight train smoke --hang-after 9.0 --profile 2 --wandb light"
     )
     monkeypatch.setenv("RANK", "0")
     assert trilight(asked).mistake.startswith("--processes is 2 under torchrun")

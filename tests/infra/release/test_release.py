@@ -60,7 +60,7 @@ def test_the_page_shows_everybody_and_opens_from_disk(tmp_path: Path) -> None:
     assert len(pictures) == 2 * 4 and all((tmp_path / name).is_file() for name in pictures)
     text = " ".join(" ".join(tags.text).split())
     assert "network 29.5 28.0 1 sample, filtered 30.0 30.0 1 of 2" in text
-    assert "traced, noise floor 41.3 dB" in text
+    assert "traced, stated error 41.3 dB" in text
     assert not {"script", "link"} & set(tags.tags)
     assert planned_upload(tmp_path, "ada/page").kind == "space"
     write_page(tmp_path, [beside("000000002", 28.0)], about=[])

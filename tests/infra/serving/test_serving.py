@@ -357,16 +357,16 @@ def test_a_second_stage_begins_with_the_first() -> None:
             command = train_options(_parameters(**given)).command()
             words = " ".join(command[command.index("train") :])
             assert words == (
-                f"train {run} --data a --begin-with runs/pretrain --lpips hub "
-                "--changes loss.perceptual_weight=0.1 --changes num_steps=9000"
+                f"train {run} --data a --from runs/pretrain --lpips hub "
+                "--set loss.perceptual_weight=0.1 --set num_steps=9000"
             )
             going_on = {"resume": True, "changes": None, "decisions": {"learning_rate": 1e-5}}
             command = train_options(_parameters(**going_on)).command()
             assert (
-                " ".join(command[4:]) == "smoke --data a --resume --decisions learning_rate=1e-05"
+                " ".join(command[4:]) == "smoke --data a --resume --change learning_rate=1e-05"
             )
             again = TrainOptions(run=run, resume=True).command()
-            assert "--resume" in again and "--begin-with" not in again
+            assert "--resume" in again and "--from" not in again
 
 
 def test_the_command_line_takes_every_option_of_the_command(tmp_path: Path) -> None:

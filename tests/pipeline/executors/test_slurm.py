@@ -142,7 +142,7 @@ def test_settings_that_divide_the_dataset_count(cluster: Path) -> None:
     assert job.tasks == [0, 1, 2, 3]
     words = sbatch_command(job)
     assert words[:3] == ["sbatch", "--parsable", "--array=0-3%3"]
-    assert words[4:] == ["--changes", "splits.scenes_per_shard=8"]
+    assert words[4:] == ["--set", "splits.scenes_per_shard=8"]
     given = sbatch_environment(job)
     assert given["OBJECTS"] == "my objects" and given["SCENES"] == "64"
     for refused in (GenerateOptions(shards="0:1"), GenerateOptions(scenes_from="folder")):

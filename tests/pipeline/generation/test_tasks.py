@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infra.cli.options import SHOWN
 from infra.cli.overrides import parse_overrides
 from pipeline.generation.generate_options import GenerateOptions, generate_words
 from pipeline.generation.generation_run import TaskResult, children_of_gpu
@@ -22,7 +21,6 @@ from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.machine import available_cores
-from storage.settings.fields import option_of
 from tests.command_line import trilight
 from tests.for_each import for_each
 
@@ -141,21 +139,19 @@ def test_every_option_that_was_given_is_there() -> None:
         ("--scenes", "2000000"),
         ("--seed", "7"),
         ("--resolution", "64"),
-        ("--noise-floor-db", "25.5"),
-        ("--noise-floor-linear-db", "20.5"),
-        ("--noise-floor-objects-db", "24.5"),
-        ("--allow-licences", "CC-BY-NC-4.0"),
-        ("--allow-licences", "MIT"),
+        ("--noise-floor", "25.5"),
+        ("--noise-floor-linear", "20.5"),
+        ("--noise-floor-objects", "24.5"),
+        ("--allow-licence", "CC-BY-NC-4.0"),
+        ("--allow-licence", "MIT"),
         ("--licence", "CC0-1.0"),
         ("--failure-budget", "0.2"),
     }
     assert "--accept-environment" in words
-    changes = [words[i + 1] for i, word in enumerate(words) if word == "--changes"]
+    changes = [words[i + 1] for i, word in enumerate(words) if word == "--set"]
     assert parse_overrides(changes) == json.loads(json.dumps(dict(ASKED.changes)))
     shown = trilight(["generate", "--help-all"], env={"COLUMNS": "200"}).output
-    fields = [word[2:].replace("-", "_") for word in words if word.startswith("--")]
-    for field in fields:  # a field's own name works beside the name that help shows
-        assert SHOWN.get(field, option_of(field)) in shown
+    assert all(word in shown for word in words if word.startswith("--"))
 
 
 def test_words_are_what_was_asked_for_and_no_more() -> None:

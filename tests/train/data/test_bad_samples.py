@@ -172,7 +172,7 @@ CASES: dict[str, tuple[Callable[[Members], object], str]] = {
     "no JSON": (lambda m: m.pop("json"), "json is missing"),
     "views are a number": (record(lambda r: r.update(views=3)), "views is 3; expected a list"),
     "a view too few": (record(lambda r: r["views"].pop()), "1 records of views; expected 2"),
-    "noise floor of text": (view("noise_floor_db", "loud"), "noise_floor_db is 'loud'"),
+    "stated error of text": (view("noise_floor_db", "loud"), "noise_floor_db is 'loud'"),
     "samples of half a ray": (view("spp", 0.5), "spp is 0.5; expected a whole number"),
     "vertex NaN": (put("vertex_positions", (0, 1), np.nan), r"vertex_positions\[0, 1\] is nan"),
     "face out of range": (put("faces", (0, 0), 10**6), r"faces\[0, 0\] is 1000000"),
