@@ -1,7 +1,8 @@
 """The draw of mutants: changes of single lines that a test must notice, chosen by a seed.
 
 `python -m tests.mutants.draw [N]` prints the first N of each kind and package, as lines of JSON.
-The list beside this file holds the first two of each that can change what a program does.
+The list beside this file holds, of each that can change what a program does, the first two of the
+first draw and the first one of the second.
 """
 
 import ast
@@ -18,8 +19,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-SEED = 20261127
-COMMIT = "dbd5de6f792d44ec2c4508b01f4f70e28e08787f"  # its source is drawn from
+DRAWS = {
+    "": (20261127, "dbd5de6f792d44ec2c4508b01f4f70e28e08787f"),
+    "second-": (20261129, "601073e8550c21dfca0f5fc2c19588c0c0f043fd"),
+}
+"""Seed and commit, whose source is drawn from, by the beginning of the names."""
 PACKAGES = ("storage", "scene_templates", "pipeline", "model", "train", "infra", "trilight")
 KINDS = ("sign", "bound", "order", "guard", "constant")
 REMOVED = re.compile(
@@ -213,9 +217,9 @@ def described(source: Source, change: Change) -> dict[str, str]:
     return {"path": source.path, "function": name, "source": text[first:last], "changed": changed}
 
 
-def _sources() -> Iterator[Source]:
+def _sources(commit: str) -> Iterator[Source]:
     """Yield the files of the commit that mutants are drawn from."""
-    archive = subprocess.run(["git", "archive", COMMIT, *PACKAGES], capture_output=True, check=True)
+    archive = subprocess.run(["git", "archive", commit, *PACKAGES], capture_output=True, check=True)
     with tarfile.open(fileobj=io.BytesIO(archive.stdout)) as files:
         for member in files:
             file = files.extractfile(member)
@@ -223,14 +227,15 @@ def _sources() -> Iterator[Source]:
                 yield Source(member.name, file.read().decode())
 
 
-def drawn(number: int) -> Iterator[dict[str, str]]:
-    """Yield the first mutants of each kind and package: lines in the order of their hashes."""
+def drawn(draw: str, number: int) -> Iterator[dict[str, str]]:
+    """Yield a draw's first mutants of each kind and package: lines in the order of their hashes."""
+    seed, commit = DRAWS[draw]
 
     def key(*parts: object) -> bytes:
-        return hashlib.sha256(":".join(map(str, (SEED, *parts))).encode()).digest()
+        return hashlib.sha256(":".join(map(str, (seed, *parts))).encode()).digest()
 
     places = defaultdict[tuple[str, str, Source, int], list[Change]](list)
-    for source in _sources():
+    for source in _sources(commit):
         for change in changes(source):
             line = source.text.count("\n", 0, change.first) + 1
             places[source.path.split("/")[0], change.kind, source, line].append(change)
@@ -239,10 +244,11 @@ def drawn(number: int) -> Iterator[dict[str, str]]:
         lines.sort(key=lambda each: key(kind, each[2].path, each[3]))
         for n, place in enumerate(lines[:number], 1):
             change = min(places[place], key=lambda each: key(each.first, each.last, each.text))
-            name = {"id": f"{package}-{kind}-{n}", "package": package, "kind": kind}
+            name = {"id": f"{draw}{package}-{kind}-{n}", "package": package, "kind": kind}
             yield name | described(place[2], change)
 
 
 if __name__ == "__main__":
-    for mutant in drawn(int(sys.argv[1]) if len(sys.argv) > 1 else 2):
+    most = int(sys.argv[1]) if len(sys.argv) > 1 else 2
+    for mutant in itertools.chain.from_iterable(drawn(draw, most) for draw in DRAWS):
         sys.stdout.write(json.dumps(mutant, ensure_ascii=False) + "\n")
