@@ -127,7 +127,7 @@ COMMANDS = {
     "export": "Write a dataset for other renderers, nerfstudio, COCO tools or Hugging Face.",
     "passes": "Write depth, normals, ids and more of stored scenes as OpenEXR.",
     "push": "Upload a finished dataset, a network or a page to Hugging Face.",
-    "presets": "List the names that commands take: presets, networks, sizes, sources of objects.",
+    "presets": "List presets, networks, sizes and sources of objects, or the settings of a preset.",
     "submit": "Run generate remotely: on Slurm, on Kubernetes, or by a Prefect server's workers.",
     "revisit": "Render a finished dataset's scenes again with new cameras, lights or materials."
     "\n\nPictures that stay the same are copied.",

@@ -142,7 +142,7 @@ model:
 
 presets:
     presets
-    presets --json
+    presets tiny
     presets --extend FILE.py
 
 doctor:

@@ -149,7 +149,7 @@ def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json
     counts = Counter(entry.licence for entry in read_objects_lock(folder.objects_lock))
     licences = ", ".join(f"{name} ({count})" for name, count in counts.most_common())
     licences = licences.replace(USER_PROVIDED, f"{USER_PROVIDED}, taken as yours to use")
-    rows = [("objects used", used), ("licences", licences)]
+    rows = [("objects used", used), ("licenses", licences)]
     rows += statistics.lines() if statistics else []
     if outcome.num_scenes_given_up:
         rows.append(("scenes given up", str(outcome.num_scenes_given_up)))

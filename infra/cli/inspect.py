@@ -171,7 +171,7 @@ def _print_summary(
         ("build", opened.manifest.build),
         *statistics.lines(),
         ("objects", ", ".join(f"{count} {split}" for split, count in sorted(splits.items()))),
-        ("licences", ", ".join(f"{count} {name}" for name, count in sorted(licences.items()))),
+        ("licenses", ", ".join(f"{count} {name}" for name, count in sorted(licences.items()))),
         *(("rejected", f"{count} x {stage}: {reason}") for stage, reason, count in rejected),
         ("dataset digest", opened.digest),
     ]

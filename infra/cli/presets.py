@@ -1,15 +1,29 @@
-"""`trilight presets`: lists the names that commands take."""
+"""`trilight presets`: lists the names that commands take, or the settings of a preset."""
 
-from collections.abc import Mapping
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-from infra.cli.console import console, print_json, print_table
+from infra.cli.console import console, print_json, print_rows, print_table
 from infra.cli.options import OutputOptions, command
 from storage.aliases import NETWORKS, OBJECTS, PRESET_ALIASES
+from storage.settings.described import checked
 
 
-@command()
-def presets(output: OutputOptions) -> None:
+@checked()
+class PresetOptions:
+    """What to list."""
+
+    build: str | None = None
+    """Dataset or training preset whose settings are listed; by default all names are."""
+
+
+@command("build")
+def presets(options: PresetOptions, output: OutputOptions) -> None:
+    if options.build is not None:
+        _print_settings(options.build, as_json=output.json)
+        return
     tables = {
         "Datasets: trilight generate PRESET": _datasets(),
         "Trainings: trilight train PRESET": _trainings(),
@@ -23,6 +37,40 @@ def presets(output: OutputOptions) -> None:
     for title, rows in tables.items():
         print_table(title, rows)
         console.print()
+
+
+def _print_settings(name: str, *, as_json: bool) -> None:
+    """Print the settings of the dataset preset and of the training preset of a name."""
+    from pipeline.presets.registry import (
+        DATASET_PRESETS,
+        preset_settings,
+        resolve_dataset_preset,
+    )
+    from train.presets import TRAINING_PRESETS
+
+    settings: dict[str, Any] = {}
+    if name in DATASET_PRESETS or name not in TRAINING_PRESETS:
+        settings[f"trilight generate {name}"] = preset_settings(resolve_dataset_preset(name))
+    if name in TRAINING_PRESETS:
+        settings[f"trilight train {name}"] = TRAINING_PRESETS[name]()
+    tables = {title: dict(_values(dataclasses.asdict(each))) for title, each in settings.items()}
+    if as_json:
+        print_json(tables)
+        return
+    for title, values in tables.items():
+        rows = [(dotted, json.dumps(value)) for dotted, value in values.items()]
+        print_rows(f"{title} --set NAME=VALUE", rows)
+
+
+def _values(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of a record by dotted name; groups in lists have numbers."""
+    groups = value if isinstance(value, dict) else {}
+    if isinstance(value, list | tuple) and value and isinstance(value[0], dict):
+        groups = {str(place): group for place, group in enumerate(value)}
+    if not groups:
+        yield name, value
+    for below, each in groups.items():
+        yield from _values(each, f"{name}.{below}" if name else below)
 
 
 def _name_for_people(name: str, aliases: Mapping[str, str]) -> str:

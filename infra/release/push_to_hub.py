@@ -84,7 +84,7 @@ def planned_upload(folder: Path, repository: str) -> Upload:
         raise TrilightError(
             f"{folder}: has no README.md, the card that the hub shows; a dataset's is written by "
             "trilight inspect, those of a release by make release, that of your own network by "
-            "you: what it is, what it learnt from, and its licence."
+            "you: what it is, what it learnt from, and its license."
         )
     if stale := stale_sums(folder):
         raise TrilightError(

@@ -17,11 +17,12 @@ from pipeline.flows.forms import PublicUrl, options_of_form, overrides_form, par
 from pipeline.flows.limits import GPU_LIMIT
 from pipeline.flows.process import run_to_end
 from pipeline.renders.visible_gpus import visible_gpus
+from storage.aliases import PRESET_ALIASES
 from storage.errors import TrilightError
 from train.presets import TRAINING_PRESETS, smoke
 from train.settings import TrainSettings
 
-TrainingPresetName = Literal[tuple(TRAINING_PRESETS)]  # type: ignore[valid-type]
+TrainingPresetName = Literal[(*PRESET_ALIASES, *TRAINING_PRESETS)]  # type: ignore[valid-type]
 """Names of the training presets, a list of choices in the form."""
 RunChanges = overrides_form(TrainSettings, smoke())
 """Form of every setting; an empty one keeps the preset's value."""

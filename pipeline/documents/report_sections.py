@@ -72,7 +72,7 @@ def report_sections(distributions: Distributions) -> dict[str, list[ReportPart]]
         "Cameras": [_histograms(distributions, seen_from, notes=[note])],
         "Pictures": [_histograms(distributions, measured, tables=[floors])],
         "Rejections": [_rejections(distributions)],
-        "Licences": [_licences(distributions)],
+        "Licenses": [_licences(distributions)],
     }
 
 
@@ -246,7 +246,7 @@ def _licences(distributions: Distributions) -> ReportPart:
     rows = [(name, *counts) for name, counts in distributions.licences.items()]
     head = ["objects", "of them in scenes", "places in scenes"]
     note = "attribution.csv names the author of each object."
-    return ReportPart("", "", [Table(["licence"], head, rows)], [note])
+    return ReportPart("", "", [Table(["license"], head, rows)], [note])
 
 
 def _share(count: int, total: int) -> str:

@@ -47,7 +47,7 @@ def write_contact_sheet(
     if not chosen:
         return
     values = dict(statistics.lines())
-    title = f"{dataset.manifest.build}: {values['scenes']}, {values['views']} views"
+    title = f"{dataset.manifest.build}: scenes {values['scenes']}, views {values['views']}"
     floors = f"stated error {values['stated error']}; at the cap {values['views at the cap']}; "
     floors += "bright scenes are shown darker"
     cells = ((sample, entry.split) for entry, sample in read_chosen(dataset, chosen))

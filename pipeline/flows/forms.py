@@ -19,6 +19,7 @@ from pipeline.generation.generate_options import GenerateOptions
 from pipeline.objects.sources import SOURCES
 from pipeline.presets.registry import DATASET_PRESETS
 from pipeline.presets.settings import DatasetSettings
+from storage.aliases import OBJECTS, PRESET_ALIASES
 from storage.dataset.shard_places import MAX_SHARDS
 from storage.errors import TrilightError
 from storage.settings.described import checked
@@ -85,7 +86,10 @@ def changed_values(form: BaseModel | None) -> dict[str, Any]:
     return values
 
 
-_NAMED = "|".join(re.escape(name) for name, source in SOURCES.items() if not source.is_place)
+_NAMED = "|".join(
+    [re.escape(name) for name, source in SOURCES.items() if not source.is_place]
+    + [alias.removesuffix(":") for alias in OBJECTS]
+)
 _NO_SECRET = (
     rf"^(?:env:TRILIGHT_SOURCE_\w*|(?:{_NAMED}):[^@?]*"
     r"|[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|[^:]*)$"
@@ -100,8 +104,8 @@ PublicPlace = Annotated[
     Field(pattern=r"^(?:[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|(?:[^:]|:+[^:/]|:+/[^:/])*:*/?)$"),
 ]
 """An output folder of any name, or a URL without secrets."""
-DatasetPresetName = Literal[tuple(DATASET_PRESETS)]  # type: ignore[valid-type]
-"""Names of the registered presets, as a list to choose from."""
+DatasetPresetName = Literal[(*PRESET_ALIASES, *DATASET_PRESETS)]  # type: ignore[valid-type]
+"""Names of the registered presets, for people and as they are stored: a list to choose from."""
 DatasetOverrides = overrides_form(DatasetSettings, DATASET_PRESETS["smoke"].settings())
 """Every setting of a preset."""
 

@@ -116,7 +116,6 @@ SPECIAL = {
 
 TABLES = [
     ("error-against-cost.md", "| target |", "frontier.jsonl", "trilight {}"),
-    ("error-against-cost.md", "| width |", "calibration.jsonl", "{0} x {0}"),
     ("which-network.md", "| 64 pixels |", "rungs-64.jsonl", "{}"),
     ("which-network.md", "| 256 pixels |", "rungs-256.jsonl", "{}"),
     ("beside-cycles.md", "| Trilight's image |", "agreement.jsonl", "stated {}"),

@@ -124,7 +124,7 @@ def _wait_for_both_workers(environment: dict[str, str]) -> None:
 
 def _submits(out: Path, environment: dict[str, str], digest: str) -> None:
     """Ask for what is there already: the run finds it whole, and its summary arrives here."""
-    words = ("submit", "generate-scenes", "smoke", *OPTIONS, "--scenes", str(SCENES), "--json")
+    words = ("submit", "generate-scenes", "tiny", *OPTIONS, "--scenes", str(SCENES), "--json")
     text = call(["-m", "trilight", *words, "--out", str(out)], environment, RUN_S)
     told = json.loads(text)
     assert (told["state"], told["summary"]["dataset digest"]) == ("Completed", digest)

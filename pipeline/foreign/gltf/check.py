@@ -165,7 +165,7 @@ def _rows(tree: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
 def _list_unread(kind: str, row: Mapping[str, Any]) -> Iterator[str]:
     """Yield sentences on one JSON object of the tree, its extensions excluded."""
     if "extras" in row:
-        yield f"extras of {kind}"
+        yield f"data of other programs (extras) of {kind}"
     if kind in _KEYS:
         known = {*_KEYS[kind].split(), "extensions", "extras"}
         yield from (f"key {key!r:.60} of {kind}" for key in row if key not in known)

@@ -21,10 +21,11 @@ from infra.cli.options import kind_of as kind_of_field
 from infra.setup.command_line_page import every_command
 from infra.setup.generated_pages import PAGES
 from model.config import SIZES
-from pipeline.presets.registry import DATASET_PRESETS
+from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.shards.expression import TEXTS, condition, kind_of
 from storage.records.quantities import QUANTITIES
 from storage.settings.fields import option_of
+from storage.settings.overrides import apply_overrides
 from tests.command_line import run_program, trilight
 from tests.for_each import case
 from train.presets import TRAINING_PRESETS
@@ -109,6 +110,15 @@ def test_presets_lists_what_there_is_by_its_name_for_people() -> None:
     ):
         assert name in shown
     assert json.loads(trilight(["presets", "--json"]).stdout)["datasets"][0]["scenes"] == 24
+
+
+def test_the_settings_of_a_preset_are_listed_as_set_takes_them() -> None:
+    told = json.loads(trilight(["presets", "tiny", "--json"]).stdout)
+    values = told["trilight generate tiny"]
+    assert apply_overrides(preset_settings("pretrain-256"), values) == preset_settings("tiny")
+    assert told["trilight train tiny"]["num_steps"] == TRAINING_PRESETS["smoke"]().num_steps
+    assert "renders.resolution" in trilight(["presets", "pretrain-256"]).stdout
+    assert "did you mean tiny?" in trilight(["presets", "tny"]).mistake
 
 
 def test_a_digest_is_on_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -307,7 +307,7 @@ def test_training_is_launched_by_torchrun_where_there_are_several_processes() ->
 
 def test_the_form_has_every_run_and_every_setting() -> None:
     schema = train_model.parameters.model_dump()
-    assert schema["properties"]["run"]["enum"] == list(TRAINING_PRESETS)
+    assert schema["properties"]["run"]["enum"] == ["tiny", *TRAINING_PRESETS]
     groups = schema["definitions"]
     settings = groups["TrainSettingsChanges"]["properties"]
     assert set(settings) == {field.name for field in dataclasses.fields(TrainSettings)}
@@ -362,9 +362,7 @@ def test_a_second_stage_begins_with_the_first() -> None:
             )
             going_on = {"resume": True, "changes": None, "decisions": {"learning_rate": 1e-5}}
             command = train_options(_parameters(**going_on)).command()
-            assert (
-                " ".join(command[4:]) == "smoke --data a --resume --change learning_rate=1e-05"
-            )
+            assert " ".join(command[4:]) == "smoke --data a --resume --change learning_rate=1e-05"
             again = TrainOptions(run=run, resume=True).command()
             assert "--resume" in again and "--from" not in again
 

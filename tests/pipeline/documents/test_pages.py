@@ -91,7 +91,7 @@ def test_a_page_without_objects_or_without_failures() -> None:
     text = text_of(tags)
     assert "0 objects accepted, 0 of them repaired" in text
     assert "0 watertight; 2 rejected" in text
-    assert "Licences: none" in text and "Rejected" in text
+    assert "Licenses: none" in text and "Rejected" in text
     assert "img" not in tags.tags
     tags = quality_page([row("a", method="meshoptimizer")], [])
     assert tags.tags.count("img") == 1

@@ -108,7 +108,14 @@ def test_secrets_are_refused_before_a_run_exists(source: str) -> None:
     for parameter, given in (("data", [source]), ("begin_with", source), ("lpips", source)):
         with pytest.raises(ParameterTypeError, match=parameter):
             train_model.validate_parameters({parameter: given})
-    known = ("builtin:500", "https://host/folder", "s3://b/f", "env:TRILIGHT_SOURCE_A", "a/b c")
+    known = (
+        "builtin:500",
+        "procedural:5",
+        "https://host/folder",
+        "s3://b/f",
+        "env:TRILIGHT_SOURCE_A",
+        "a/b c",
+    )
     for harmless in (*known, None):
         generate_scenes.validate_parameters({"objects": harmless})
 

@@ -365,7 +365,7 @@ UNREAD: dict[str, Callable[[GltfWriter], None]] = {
         "materials", [{"extensions": {"KHR_materials_volume": {}}}]
     ),
     "extension 'OTHER_thing' of the file": _set("extensionsUsed", ["OTHER_thing"]),
-    "extras of nodes": _set("nodes/0/extras", {"children": [7]}),
+    "data of other programs (extras) of nodes": _set("nodes/0/extras", {"children": [7]}),
     "key 'instances' of nodes": _set("nodes/0/instances", 3),
     "attribute '_WIND' of primitives": _set(f"{PRIMITIVE}/attributes/_WIND", 0),
     "attribute 'COLOR_1' of primitives": _set(f"{PRIMITIVE}/attributes/COLOR_1", 0),
