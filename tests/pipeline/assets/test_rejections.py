@@ -79,7 +79,9 @@ def test_bad_numbers(tmp_path: Path, name: str) -> None:
 
 def test_an_offset_is_judged_by_the_precision_of_the_format(tmp_path: Path) -> None:
     far = moved(BALL, 1.0, 1e6)
-    assert reason_of(write_stl(tmp_path / "a.stl", far)) == "offset_precision"
+    for size in (1.0, 1e-3):  # what counts is how many of its sizes an object is away
+        away = moved(BALL, size, 1e6 * size)
+        assert reason_of(write_stl(tmp_path / "a.stl", away)) == "offset_precision"
     near = prepare(write_obj(tmp_path / "a.obj", BALL))
     exact = prepare(write_obj(tmp_path / "b.obj", far))
     # Text keeps 17 digits: at 1e6 the ball is still known to 1e-10, far below the grid of 1e-6.
