@@ -25,6 +25,7 @@ from pipeline.exchange.usd.held_materials import (
     restore_stated,
 )
 from pipeline.exchange.usd.prim_names import added_column
+from pipeline.exchange.usd.read_exact_scene import read_written_rows
 from pipeline.foreign.part import Part, drop_empty, unit_normals
 from pipeline.foreign.usd.materials import MeshMaterials
 from pipeline.foreign.usd.object_stage import UsdStage
@@ -165,6 +166,7 @@ class StageSurfaces:
         self._lost = stage.opened.lost
         self._opened = stage.opened
         self._licence = licence
+        self._written = read_written_rows(self._opened)
         self._converter = PartConverter(self._lost)
         self._extras: list[_Extras] = []
         self._looks = MeshMaterials(
@@ -217,7 +219,7 @@ class StageSurfaces:
 
     def _read(self, material: Any) -> StatedMaterial | None:
         """Return the inputs of a material; None, with a note, where none are understood."""
-        held = read_held_material(material, self._time)
+        held = read_held_material(material, self._time, self._opened, self._written)
         known = () if held is None else ("specular",)  # Blender writes its specular level there
         stated = read_material(material, self._time, self._opened, known)
         exact = None
@@ -249,7 +251,7 @@ class StageSurfaces:
                 f"{held.where}: became a metal since Trilight wrote it; read as any other material"
             )
             return stated, None
-        return stated, find_exact(held, stated, self._lost)
+        return find_exact(held, stated, self._lost)
 
 
 def _read_added_columns(

@@ -1,5 +1,6 @@
 """Builds a `Scene` from the placed prims of a USD stage."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -22,6 +23,9 @@ from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import EMISSION
 from storage.records.scene import Scene, SceneObject
+
+_MOST_NOTED = 200
+"""Maximum characters of all notes in the message on a stage without light."""
 
 
 def build_stage_scene(stage: Any, time: Any, opened: OpenedStage, licence: str) -> Scene:
@@ -53,15 +57,26 @@ def build_stage_scene(stage: Any, time: Any, opened: OpenedStage, licence: str) 
     sky = _read_environment(placed, time, opened, licence)
     is_lit = sky is not None and sky.radiance_rgb.any()
     if not is_lit and not parts.has_emitters:
-        unread = "; ".join(note for note in opened.lost if "light" in note.lower())
         raise TrilightError(
-            f"no light that can be carried over ({unread or 'none is seen':.200}); expected an "
+            f"no light that can be carried over ({_name_lights(opened.notes)}); expected an "
             "emissive material, or a rectangle, disk, sphere, cylinder, mesh or dome light."
         )
     code = time.GetValue() if time.IsNumeric() and not time.IsEarliestTime() else None
     provenance = {"template": "usd", "file": opened.path.name, "time_code": code}
     usable = [camera for camera in cameras if camera is not None]
     return parts.build(usable, sky, provenance, opened.lost)
+
+
+def _name_lights(notes: Sequence[str]) -> str:
+    """Return the notes on lights, as many whole ones as are short enough."""
+    unread = [note for note in notes if "light" in note.replace("Trilight", "").lower()]
+    listed = [
+        note
+        for note, length in zip(unread, itertools.accumulate(map(len, unread)), strict=True)
+        if length <= _MOST_NOTED
+    ]
+    more = len(unread) - len(listed)
+    return "; ".join([*listed, f"{more} more of lights"] if more else listed) or "none is seen"
 
 
 def _read_row(each: PlacedPrim) -> float:

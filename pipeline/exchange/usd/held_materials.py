@@ -1,8 +1,10 @@
 """Reads the exact material values that Trilight wrote and another program has kept.
 
-Blender keeps the exact values of a material in addition to its shader. A column that the shader
-still shows as Trilight wrote it gets its exact value; a changed column is read from the shader,
-with a note. Blender writes no specular albedo, so that the exact one stays.
+A column stands in attributes, in the preview shader and, without textures, in the OpenPBR shader.
+Where none was changed since Trilight wrote it, it gets its exact value. The place that was changed
+counts, with a note; of several the first. What was written is known by the scene's digest, or else
+by two places that agree. Where neither tells, as in a file of Blender, the preview counts: users
+edit it there. Blender writes no specular albedo, so that the exact one stays.
 """
 
 import dataclasses
@@ -22,18 +24,22 @@ from pipeline.exchange.linear_maps import (
 )
 from pipeline.exchange.pictures import MAX_BYTES, MAX_PIXELS
 from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles
+from pipeline.exchange.usd.openpbr import read_openpbr, written_columns
 from pipeline.exchange.usd.prim_names import (
     ADDED_COLUMNS,
+    DIGEST,
     MATERIAL_ATTRIBUTES,
     column_attribute,
     texture_attribute,
 )
-from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, decode_texture
+from pipeline.exchange.usd.write_materials import PREVIEW_INPUTS
+from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, OPENPBR, decode_texture
 from pipeline.foreign.picture import decode_image
 from pipeline.foreign.usd.shaders import (
     DEFAULTS,
     IOR_OF_CONSTANT_ALBEDOS,
     StatedMaterial,
+    parse_color,
     surface_shader,
 )
 from pipeline.foreign.usd.stage import OpenedStage
@@ -46,16 +52,18 @@ from pipeline.foreign.usd.texture_nodes import (
 )
 from storage.errors import Rejected
 from storage.records.exr import MAGIC
-from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, declared_column
+from storage.records.material import (
+    DIFFUSE,
+    EMISSION,
+    ROUGHNESS,
+    SPECULAR,
+    declared_column,
+    laid_out,
+)
 from storage.records.texture import TEXTURED, MapSource, Texture
 
-_INPUTS = {
-    "diffuse": "diffuseColor",
-    "specular": "specularColor",
-    "roughness": "roughness",
-    "emission": "emissiveColor",
-}
-"""Input of the preview for each published column."""
+_OPENPBR = f"its shader {OPENPBR}"
+"""Words for the shader, for notes."""
 
 _EXCESS = 1e-6
 """Tolerance for the rounding of two float32 albedos that add up to 1."""
@@ -76,10 +84,28 @@ class HeldMaterial:
     """Value of each published column by name."""
     maps: Mapping[str, tuple[str, MapSource]]
     """Digest and source of the texture of each textured column."""
+    is_marked: bool
+    """True where the scene still has Trilight's marks: no program has written it anew."""
+    openpbr: Mapping[str, NDArray[np.float64]]
+    """Columns [3] that its OpenPBR shader states; none without the marks."""
+    written: Mapping[str, NDArray[np.float32]]
+    """Value of each published column when Trilight wrote it; empty where that is not known."""
 
 
-def read_held_material(material: Any, time: Any) -> HeldMaterial | None:
-    """Read the exact values of a material; return None where one is missing."""
+def read_held_material(
+    material: Any,
+    time: Any,
+    opened: OpenedStage,
+    rows: Mapping[str, NDArray[np.float32]],
+) -> HeldMaterial | None:
+    """Read the exact values of a material; return None where one is missing.
+
+    Args:
+        material: the UsdShade.Material.
+        time: time of the values.
+        opened: the file, which receives notes.
+        rows: material rows as Trilight wrote them, by the paths of their prims, where known.
+    """
     prim = material.GetPrim()
     columns = dict[str, NDArray[np.float32]]()
     for name, attribute in MATERIAL_ATTRIBUTES.items():
@@ -87,6 +113,11 @@ def read_held_material(material: Any, time: Any) -> HeldMaterial | None:
         column = declared_column(name)
         stated = parse_numbers(value.Get(time) if value else None)
         if len(stated) != column.width or not np.all(column.within.holds(stated)):
+            if value and value.HasAuthoredValue():
+                opened.lost.append(
+                    f"{value.GetPath()}: expected {column.width} numbers {column.within}; the "
+                    "material is read as any other"
+                )
             return None
         columns[name] = stated.astype(np.float32)
     maps = {}
@@ -95,7 +126,18 @@ def read_held_material(material: Any, time: Any) -> HeldMaterial | None:
         held = parse_map_text(text.Get(time) if text else None)
         if held is not None:
             maps[name] = held
-    return HeldMaterial(where=str(prim.GetPath()), columns=columns, maps=maps)
+    where = str(prim.GetPath())
+    root = prim.GetParent().GetParent()
+    is_marked = bool(root) and root.HasAttribute(DIGEST)
+    parts = {column.name: part for column, part in laid_out()}
+    return HeldMaterial(
+        where=where,
+        columns=columns,
+        maps=maps,
+        is_marked=is_marked,
+        openpbr=read_openpbr(material, time, opened) if is_marked else {},
+        written={name: rows[where][parts[name]] for name in columns} if where in rows else {},
+    )
 
 
 def parse_map_text(text: Any) -> tuple[str, MapSource] | None:
@@ -122,7 +164,12 @@ def restore_stated(
 
     textures = dict(stated.textures)
     constants = {**stated.constants, **_WORKFLOW}
+    if stated.has_strength and "emissiveColor" not in {*stated.textures, *stated.primvars}:
+        constants["emissiveColor"] = constants["emissiveColor"] * constants["strength"]
+        stated = dataclasses.replace(stated, has_strength=False)
     sources = find_sources(surface_shader(material), COAT_ROUGHNESS.removeprefix("inputs:"))
+    if held.is_marked:
+        _note_unused(held, stated, surface_shader(material), time, opened.lost)
     if "specular" in held.maps and sources and is_output(sources[0]):
         node = UsdShade.Shader(sources[0].GetPrim())
         if "specularColor" not in textures and node.GetShaderId() == "UsdUVTexture":
@@ -136,9 +183,25 @@ def restore_stated(
     return dataclasses.replace(stated, constants=constants, textures=textures)
 
 
+def _note_unused(
+    held: HeldMaterial, stated: StatedMaterial, shader: Any, time: Any, lost: list[str]
+) -> None:
+    """Note changes that have no effect: of constants below textures, and of the workflow."""
+    for column, name in PREVIEW_INPUTS.items():
+        constant = parse_color(shader.GetInput(name).Get(time)) if name in stated.textures else None
+        if constant is not None and not np.allclose(constant, held.columns[column], _SAME_VALUE, 0):
+            lost.append(
+                f"{held.where}: {column} has a texture, which is used, not its changed constant; "
+                "disconnect the texture to use that"
+            )
+    for name, value in _WORKFLOW.items():
+        if shader.GetInput(name) and (stated.constants[name] != value).any():
+            lost.append(f"{stated.where}.{name}: has no place here")
+
+
 def as_stated(held: HeldMaterial) -> StatedMaterial:
     """Return a material of the values that Trilight wrote, for one that has lost its shader."""
-    values = {name: _fill(held.columns[column]) for column, name in _INPUTS.items()}
+    values = {name: _fill(held.columns[column]) for column, name in PREVIEW_INPUTS.items()}
     return StatedMaterial(
         name=held.where.rpartition("/")[2],
         where=held.where,
@@ -155,29 +218,73 @@ def as_stated(held: HeldMaterial) -> StatedMaterial:
     )
 
 
-def find_exact(held: HeldMaterial, stated: StatedMaterial, lost: list[str]) -> dict[str, Texture]:
-    """Return the columns that the shader still shows as Trilight wrote them; note the others.
+def find_exact(
+    held: HeldMaterial, stated: StatedMaterial, lost: list[str]
+) -> tuple[StatedMaterial, dict[str, Texture]]:
+    """Return the inputs with the values that count, and the columns as Trilight wrote them.
 
-    A constant, such as emission, is a texture of one texel.
+    Each other column gets a note. A constant, such as emission, is a texture of one texel.
     """
     exact = {}
-    for column, name in _INPUTS.items():
+    constants = dict(stated.constants)
+    for column, name in PREVIEW_INPUTS.items():
         node = stated.textures.get(name)
-        value = held.columns[column]
         texture = None
+        place = _name_shader(stated)
+        unused = list[str]()
         if name in stated.primvars:
             pass
         elif node is not None:
             texture = _read_exact_texture(held, column, node, stated.textures.values())
-        elif np.allclose(stated.constants[name], value, rtol=_SAME_VALUE, atol=0):
-            texture = Texture(texels=constant_map(value))
+        elif changed := _find_changed(held, stated, column):
+            (place, value), *rest = changed.items()
+            unused = [word for word, each in rest if not np.allclose(each, value, rtol=1e-3)]
+            constants[name] = _fill(value)
+        else:
+            texture = Texture(texels=constant_map(held.columns[column]))
         if texture is not None:
             exact[column] = texture
             continue
-        lost.append(
-            f"{held.where}: {column} was changed since Trilight wrote it; the new value is used"
-        )
-    return exact
+        text = f"{column} was changed since Trilight wrote it; the value of {place} is used"
+        if unused:
+            text += f", not of {' or '.join(unused)}; make them equal to choose"
+        lost.append(f"{held.where}: {text}")
+    return dataclasses.replace(stated, constants=constants), exact
+
+
+def _find_changed(
+    held: HeldMaterial, stated: StatedMaterial, column: str
+) -> dict[str, NDArray[Any]]:
+    """Return the changed values of a constant column by their places, the one that counts first.
+
+    Where it is not known which of them was changed, all are returned.
+    """
+    of_preview = {each: stated.constants[name] for each, name in PREVIEW_INPUTS.items()}
+    places: dict[str, NDArray[Any]] = {
+        column_attribute(column): held.columns[column],
+        _name_shader(stated): of_preview[column],
+    }
+    if column in held.openpbr:
+        places[_OPENPBR] = held.openpbr[column]
+    for written in [held.written] if held.written else [of_preview, held.columns]:
+        openpbr = written_columns(written)
+        changed = {
+            place: value
+            for place, value in places.items()
+            if not np.allclose(
+                value,
+                (openpbr if place == _OPENPBR else written)[column],
+                rtol=_SAME_VALUE,
+                atol=0,
+            )
+        }
+        if held.written or len(changed) <= len(places) - 2:
+            return changed
+    return places if held.openpbr else dict(reversed(places.items()))
+
+
+def _name_shader(stated: StatedMaterial) -> str:
+    return f"its shader {stated.where.rpartition('/')[2]}"
 
 
 def _read_exact_texture(

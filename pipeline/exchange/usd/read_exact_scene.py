@@ -7,6 +7,7 @@ it. Where anything differs, it returns None and the file is read as a foreign on
 module mean that a layer is not as export writes it.
 """
 
+import dataclasses
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,8 +20,15 @@ from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.textured_triangles import MAX_ROWS
 from pipeline.exchange.usd import prim_names as names
 from pipeline.exchange.usd.dome import read_exact_dome
+from pipeline.exchange.usd.write_materials import PREVIEW_INPUTS
 from pipeline.exchange.usd.write_meshes import CENTER, sum_positions
-from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, SHADERS, ST, decode_texture
+from pipeline.exchange.usd.write_textures import (
+    COAT_ROUGHNESS,
+    PREVIEW,
+    SHADERS,
+    ST,
+    decode_texture,
+)
 from pipeline.exchange.usd.write_usd import ENVIRONMENT, author_scene, new_layer
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import asset_bytes
@@ -91,6 +99,33 @@ def read_exact(opened: OpenedStage, key: str | None = None) -> Scene | None:
     except (_Changed, LookupError, TypeError, ValueError, AttributeError):
         return None
     return scene
+
+
+def read_written_rows(opened: OpenedStage) -> dict[str, NDArray[np.float32]]:
+    """Return the material rows that Trilight wrote, by the paths of their prims; else none.
+
+    The digest of the scene tells whether the attributes still are what was written, or the preview
+    shaders. It cannot where the meshes were changed too.
+    """
+    root = _find_root(opened.root, None)
+    if root is None:
+        return {}
+    try:
+        scene = _read_scene(root, opened)
+        prims = _list_by_row(root.nameChildren["Materials"], names.material_name)
+        of_preview = scene.materials.copy()
+        for row, prim in enumerate(prims):
+            inputs = prim.nameChildren[PREVIEW].attributes
+            for column, part in laid_out():
+                if column.name in PREVIEW_INPUTS:
+                    of_preview[row, part] = inputs[f"inputs:{PREVIEW_INPUTS[column.name]}"].default
+        for rows in (scene.materials, of_preview):
+            digest = scene_digest(dataclasses.replace(scene, materials=rows))
+            if digest == root.attributes[names.DIGEST].default:
+                return {str(prim.path): rows[row] for row, prim in enumerate(prims)}
+    except (_Changed, UndeclaredColumn, LookupError, TypeError, ValueError, AttributeError):
+        pass
+    return {}
 
 
 def _find_root(layer: Any, key: str | None) -> Any:

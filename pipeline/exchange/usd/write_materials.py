@@ -3,15 +3,13 @@
 The BRDF of a scene is Lambert + specular x GGX without a Fresnel term. UsdPreviewSurface in its
 specular workflow has the same albedos and roughness, but its specular albedo rises to 1 at grazing
 angles. Blender multiplies that albedo by the head-on reflectance of the index of refraction, which
-other programs ignore; so the written index reflects almost everything. OpenPBR's base has one index
-of refraction: it is set so that the strongest channel reflects the specular albedo head-on, and the
-tint gives the other channels. Both shaders look similar and neither is equal; the attributes hold
-the exact values. Textures are connected to the preview (pipeline.exchange.usd.write_textures).
+other programs ignore; so the written index reflects almost everything. OpenPBR
+(pipeline.exchange.usd.openpbr) looks similar too. Neither is equal; the attributes hold the exact
+values. Textures are connected to the preview (pipeline.exchange.usd.write_textures).
 
-OpenPBR counts emission in nits and UsdPreviewSurface as a plain color: both get the radiance.
+UsdPreviewSurface counts emission as a plain color: it gets the radiance.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -25,6 +23,7 @@ from pipeline.exchange.usd.authoring import (
     add_prim,
     usd_value,
 )
+from pipeline.exchange.usd.openpbr import Color, openpbr_inputs
 from pipeline.exchange.usd.prim_names import (
     ADDED_COLUMNS,
     MATERIAL_ATTRIBUTES,
@@ -51,10 +50,13 @@ from storage.records.material import (
 )
 from storage.records.scene import Scene
 
-Color = tuple[float, float, float]
-
-_MOST_REFLECTING = 0.98
-"""Maximum head-on reflectance that sets the index of refraction: 0.98 needs 199."""
+PREVIEW_INPUTS = {
+    "diffuse": "diffuseColor",
+    "specular": "specularColor",
+    "roughness": "roughness",
+    "emission": "emissiveColor",
+}
+"""Input of the preview for each published column."""
 
 
 def add_materials(layer: Any, folder: str, scene: Scene) -> None:
@@ -110,25 +112,7 @@ def material_tables(
     if used:
         tables[""] = {**tables[""], **build_source_table(used)}
         return {**tables, **texture_tables(used)}
-    return {**tables, f"/{OPENPBR}": _openpbr(diffuse, specular, roughness, emission)}
-
-
-def _openpbr(diffuse: Color, specular: Color, roughness: float, emission: Color) -> Attributes:
-    max_specular = max(specular)
-    max_emission = max(emission)
-    root = math.sqrt(min(max_specular, _MOST_REFLECTING))
-    return {
-        "info:id": ("uniform token", "ND_open_pbr_surface_surfaceshader"),
-        "inputs:base_color": ("color3f", diffuse),
-        "inputs:base_weight": ("float", 1.0),
-        "inputs:base_diffuse_roughness": ("float", 0.0),
-        "inputs:specular_weight": ("float", 1.0 if max_specular > 0 else 0.0),
-        "inputs:specular_color": ("color3f", _divide_by_largest(specular, max_specular)),
-        "inputs:specular_roughness": ("float", roughness),
-        "inputs:specular_ior": ("float", _round_to_float32((1 + root) / (1 - root))),
-        "inputs:emission_luminance": ("float", max_emission),
-        "inputs:emission_color": ("color3f", _divide_by_largest(emission, max_emission)),
-    }
+    return {**tables, f"/{OPENPBR}": openpbr_inputs(diffuse, specular, roughness, emission)}
 
 
 def _exact_attributes(values: NDArray[np.float32], columns: Sequence[str]) -> Attributes:
@@ -161,15 +145,3 @@ def _add_material(
 def _rgb(values: NDArray[np.float32]) -> Color:
     red, green, blue = (float(value) for value in values)
     return red, green, blue
-
-
-def _divide_by_largest(rgb: Color, largest: float) -> Color:
-    """Return a color divided by its largest channel; white for black."""
-    if largest <= 0:
-        return 1.0, 1.0, 1.0
-    red, green, blue = (_round_to_float32(value / largest) for value in rgb)
-    return red, green, blue
-
-
-def _round_to_float32(value: float) -> float:
-    return float(np.float32(value))

@@ -242,8 +242,7 @@ def read_material(
     constants["diffuseColor"] = constants["diffuseColor"] * reader.weight()
     if material.GetDisplacementOutput().HasConnectedSource():
         opened.lost.append(f"{material.GetPath()}: its displacement has no place here")
-    lost = tuple(name for name in reader.list_unsupported() if name not in known)
-    opened.lost += [f"{shader.GetPath()}.{name}: has no place here" for name in lost]
+    lost = reader.note_unsupported(known)
     return StatedMaterial(
         name=str(material.GetPrim().GetName()),
         where=str(shader.GetPath()),
@@ -254,6 +253,11 @@ def read_material(
         lost=lost,
         has_networks=has_networks,
     )
+
+
+def note_unsupported(shader: Any, time: Any, opened: OpenedStage, known: Collection[str]) -> None:
+    """Note the unsupported inputs of a supported shader that have an effect, but for known ones."""
+    _Reader(shader, time, opened).note_unsupported(known)
 
 
 class _Reader:
@@ -324,8 +328,8 @@ class _Reader:
                 product = product * value
         return product
 
-    def list_unsupported(self) -> list[str]:
-        """Return names of unsupported inputs that have an effect, unknown ones included."""
+    def note_unsupported(self, known: Collection[str]) -> tuple[str, ...]:
+        """Note unsupported inputs that have an effect, but for known ones; return their names."""
         read = {*(self._names.get(name, name) for name in DEFAULTS), *_WEIGHTS, *self.textures}
         names = []
         for each in self._shader.GetInputs():
@@ -339,9 +343,11 @@ class _Reader:
                 is_lost = each.HasConnectedSource() or (
                     name != "normal" and each.GetAttr().HasAuthoredValue()
                 )
-            if is_lost:
+            if is_lost and name not in known:
                 names.append(name)
-        return names
+        where = self._shader.GetPath()
+        self._opened.lost += [f"{where}.{name}: has no place here" for name in names]
+        return tuple(names)
 
     def _value(self, name: str, default: float) -> NDArray[np.float32] | None:
         """Return the value [3] of an input; None for a network, or a value that is no color."""

@@ -120,6 +120,15 @@ def test_light_is_that_of_the_stages_units_and_temperature(shared: Path) -> None
     assert sky.radiance_rgb[0, 0] == pytest.approx(np.array(expected), rel=1e-5)
 
 
+def test_our_own_file_whose_light_is_gone_says_nothing_else(tmp_path: Path) -> None:
+    write_usd(tmp_path / "a.usda", tiny_scene())
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    stage.RemovePrim("/Scene/Objects/light")
+    stage.GetRootLayer().Export(str(tmp_path / "b.usda"))
+    with pytest.raises(TrilightError, match=r"carried over \(none is seen\); expected an emissive"):
+        read(tmp_path / "b.usda")
+
+
 def test_our_own_files_read_as_a_stranger_does_hold_the_same_light(tmp_path: Path) -> None:
     """Every word of USD that we write means to our own reader what the exact attributes say."""
     write_usd(tmp_path / "a.usda", tiny_scene())
@@ -167,6 +176,13 @@ def test_a_stage_without_light_or_camera(tmp_path: Path) -> None:
     stage.GetRootLayer().Export(str(tmp_path / "a.usda"))
     with pytest.raises(
         TrilightError, match="/None: a light without an area; /Below: negative radiance"
+    ):
+        read(tmp_path / "a.usda")
+    stage.RemovePrim("/Below")
+    UsdLux.SphereLight.Define(stage, f"/{'Below' * 50}").CreateIntensityAttr(-1.0)
+    stage.GetRootLayer().Export(str(tmp_path / "a.usda"))
+    with pytest.raises(
+        TrilightError, match=r"\(/None: a light without an area; 1 more of lights\)"
     ):
         read(tmp_path / "a.usda")
     lamps[0].CreateRadiusAttr(1.0)
