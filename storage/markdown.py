@@ -36,6 +36,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, numbers: int
     """Return a table of Markdown cells, the last `numbers` columns aligned to the right."""
     marks = ["---"] * (len(head) - numbers) + ["---:"] * numbers
     lines = [head, marks, *rows]
+    assert {len(line) for line in lines} == {len(head)}, head
     return "\n".join(f"| {' | '.join(str(cell) for cell in line)} |" for line in lines)
 
 
