@@ -57,6 +57,10 @@ class Rejected(Exception):
         return f"{self.reason}: {self.message}"
 
 
+OF_EXTENSION = "an extension's by --extend FILE"
+"""Ends the list of names to which extensions may add."""
+
+
 def expected_one_of(name: str, known: Iterable[str]) -> str:
     """Return the end of a message about an unknown name, with what was probably meant.
 

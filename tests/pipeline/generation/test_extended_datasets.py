@@ -26,6 +26,7 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.extensions import load_extension, mistake_in_extension
 from storage.removed import removal_message
+from tests.command_line import trilight
 from tests.extensions_kit import EXAMPLES, loaded, parts_of, room_for_extensions, written
 from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import edit_manifest
@@ -196,8 +197,50 @@ def test_families_are_chosen_by_name() -> None:
         preset_settings("smoke", changes={"scenes.families": []})
 
 
+@for_each(
+    ("old", "new", "said"),
+    [
+        ("object_scale=", "object_size=", "object_size does not exist; did you mean object_scale?"),
+        ("(1, 2)", "(4, 3)", "num_objects is (4, 3); expected two whole numbers"),
+        (
+            'template="corridor"',
+            'template="coridor"',
+            "'coridor' is unknown; did you mean corridor",
+        ),
+        ("square_share=", "square=", "square does not exist; did you mean square_share?"),
+    ],
+)
+def test_a_wrong_family_names_file_line_and_family(
+    tmp_path: Path, old: str, new: str, said: str
+) -> None:
+    text = TEMPLATE.read_text()
+    assert old in text
+    with loaded(written(tmp_path, text.replace(old, new))), pytest.raises(TrilightError) as caught:
+        preset_settings("smoke", changes={"scenes.families": "corridor"})
+    place = r"^extension own\.py, line \d\d, scenes\.families 'corridor': "
+    assert re.match(f"{place}.*{re.escape(said)}", str(caught.value))
+
+
+def test_an_extension_that_is_left_out_is_asked_for(tmp_path: Path) -> None:
+    """Of a dataset that has objects, by its file; else as something that may be missing."""
+    words = ["generate", "smoke", "--set", "scenes.families=corridor", "--out", str(tmp_path)]
+    with loaded(TEMPLATE):
+        _begin(tmp_path)
+    said = trilight(words).mistake
+    assert "setting 'scenes.families' is 'corridor'" in said
+    assert "alone, an extension's by --extend FILE, or one of its settings by name" in said
+    manifest = read_manifest(tmp_path / "manifest.json")
+    begun = dataclasses.replace(manifest, objects_lock_sha256="0" * 64)
+    write_manifest(tmp_path / "manifest.json", begun)
+    said = "begun with the extension template.py, which is not given; add --extend template.py"
+    assert said in trilight(words).mistake
+    assert "or an extension's by --extend FILE" in trilight(["generate", "corridor"]).mistake
+
+
 def test_a_build_of_ones_own_has_a_name_of_its_own(tmp_path: Path) -> None:
     text = """
+from pipeline.presets.registry import DATASET_PRESETS
+from pipeline.presets.settings import DatasetPreset
 from pipeline.presets.training import smoke
 import dataclasses
 
@@ -209,6 +252,11 @@ def posing():
 
 def nothing():
     pass
+
+def wrong():
+    return dataclasses.replace(smoke(), seeed=1)
+
+DATASET_PRESETS.register("late", DatasetPreset(settings=wrong, num_scenes=1))
 """
     path = written(tmp_path, text)
     with room_for_extensions():
@@ -222,6 +270,10 @@ def nothing():
             preset_settings(resolve_dataset_preset(f"{path}:posing"))
         with pytest.raises(TrilightError, match=r"own\.py: it returned a NoneType; expected Data"):
             resolve_dataset_preset(f"{path}:nothing")
+        with pytest.raises(
+            TrilightError, match=r"^extension own\.py, line 17, dataset preset 'late'"
+        ):
+            preset_settings("late")
     assert name not in DATASET_PRESETS
 
 
