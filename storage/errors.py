@@ -68,5 +68,6 @@ def expected_one_of(name: str, known: Iterable[str]) -> str:
     """
     names = list(known)
     listed = f"xpected one of {', '.join(names)}"
-    close = get_close_matches(name, names, n=1)
+    swapped = (near for near in names if sorted(near) == sorted(name))  # such as tyni
+    close = get_close_matches(name, names, n=1) or list(swapped)
     return f"did you mean {close[0]}? E{listed}" if close else f"e{listed}"

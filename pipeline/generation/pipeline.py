@@ -124,7 +124,7 @@ def _begin_run(options: GenerateOptions) -> Iterator[Run]:
         requested = options.shard_range()
         if requested is not None and requested.start >= writer.num_shards:
             raise TrilightError(
-                f"shards is {options.shards!r}; expected one that begins below "
+                f"--range is {options.shards!r}; expected one that begins below "
                 f"{writer.num_shards}, the shards of {writer.manifest.num_scenes} scenes."
             )
         if listed or options.revisits:
