@@ -12,6 +12,7 @@ from infra.repair import repair
 from pipeline.exchange.reader import file_child
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
+from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, make_task, prepare_dataset
 from pipeline.isolation import call_with_retries
@@ -307,6 +308,24 @@ def test_what_was_only_begun_is_begun_anew(tmp_path: Path, monkeypatch: pytest.M
     run = prepare_dataset(tiny_order(out=str(folder.root), scenes=4, seed=7))
     assert run.publication.manifest.settings["seed"] == 7
     assert run.publication.manifest.num_scenes == 4
+
+
+def test_the_command_is_there_while_objects_are_prepared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that status prints it; one whose objects may be refused does not replace it."""
+    without_rendering(monkeypatch)
+    place = str(tmp_path / "set")
+    asked: list[list[str] | None] = []
+
+    def look(lock: ObjectLock) -> None:
+        asked.append(read_asked(open_dataset(place)))
+
+    monkeypatch.setattr(ObjectLock, "prepare", look)
+    for objects in ("builtin:9", "builtin:8"):
+        prepare_dataset(tiny_order(build="tiny", out=place, scenes=4, objects=objects))
+    assert asked[0] is not None and asked[0][:4] == ["generate", "tiny", "--objects", "builtin:9"]
+    assert asked[1] == asked[0]
 
 
 def test_what_has_objects_or_scenes_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
