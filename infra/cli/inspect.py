@@ -100,9 +100,8 @@ def _inspect_run(root: Path, *, json: bool) -> None:
         return
     suggest_look(f"Curves and pictures: {tensorboard_command(root)}")
     if not facts["finished"]:
-        place = str(root)
-        preset = name_for_people(str(facts["run"]), PRESET_ALIASES)
-        words = ("train", preset, "--like", place, "--out", place, "--resume")
+        preset = name_for_people(facts["run"], PRESET_ALIASES)
+        words = ("train", preset, "--like", str(root), "--out", str(root), "--resume")
         suggest_look(f"To resume: {command_line(words)}, with the same --data as before.")
 
 

@@ -47,7 +47,7 @@ def hold_dataset_lock(folder: DatasetFolder) -> contextlib.AbstractContextManage
 def require_its_extensions(folder: DatasetFolder) -> None:
     """Refuse other extensions than a dataset has, before settings name what those add.
 
-    One without frozen objects binds nobody, and what a bucket holds is known only later.
+    A dataset without frozen objects may begin again, and what a bucket holds is known only later.
 
     Raises:
         TrilightError: they differ, or the manifest cannot be read.

@@ -159,9 +159,9 @@ def _complaint(
         field: the field whose value alone was read.
         display_name: what is shown of that field.
     """
-    found = error.errors(include_url=False)
+    mistakes = error.errors(include_url=False)
     # a name that is unknown says more than the one that lacks then
-    first = next((each for each in found if each["type"] in _UNKNOWN), found[0])
+    first = next((each for each in mistakes if each["type"] in _UNKNOWN), mistakes[0])
     law = first.get("ctx", {}).get("error")
     if isinstance(law, TrilightError):
         return law

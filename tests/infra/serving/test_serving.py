@@ -362,7 +362,9 @@ def test_a_second_stage_begins_with_the_first() -> None:
             )
             going_on = {"resume": True, "changes": None, "decisions": {"learning_rate": 1e-5}}
             command = train_options(_parameters(**going_on)).command()
-            assert " ".join(command[4:]) == "smoke --data a --resume --change learning_rate=1e-05"
+            assert (
+                " ".join(command[4:]) == "smoke --data a --resume --change learning_rate=1e-05"
+            )
             again = TrainOptions(run=run, resume=True).command()
             assert "--resume" in again and "--from" not in again
 
