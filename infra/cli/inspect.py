@@ -106,10 +106,10 @@ def _inspect_run(root: Path, *, json: bool) -> None:
 
 
 def _fact_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    return [(name.replace("_", " "), _shown(value)) for name, value in facts.items()]
+    return [(name.replace("_", " "), _fact_text(value)) for name, value in facts.items()]
 
 
-def _shown(value: Any) -> str:
+def _fact_text(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:.4g}" if isinstance(value, float) and abs(value) < 1e4 else str(value)

@@ -53,9 +53,9 @@ def require_its_extensions(folder: DatasetFolder) -> None:
         TrilightError: they differ, or the manifest cannot be read.
     """
     if not folder.bucket and folder.manifest.exists():
-        begun = read_head(folder.manifest)
-        if begun.objects_lock_sha256:
-            _require_extendable(folder, begun)
+        manifest = read_head(folder.manifest)
+        if manifest.objects_lock_sha256:
+            _require_extendable(folder, manifest)
 
 
 def _require_extendable(folder: DatasetFolder, manifest: Manifest) -> None:

@@ -124,12 +124,14 @@ def choose_variant(default: Device = "cpu", *, device: Device | None = None) -> 
 
 def _refused_gpu(device: Device | None, said: str) -> TrilightError:
     """Return the complaint of a GPU that an option, TRILIGHT_VARIANT or a dataset asks for."""
-    asked, step = "the dataset was begun on a GPU", "Choose --device cpu"
+    reason = "the dataset was begun on a GPU"
+    step = "Choose --device cpu"
     if device is not None:
-        asked = f"--device is {device}"
+        reason = f"--device is {device}"
     elif named_device():
-        asked, step = f"{_ASK} is {_GPU.name}", f"Unset {_ASK}"
-    return TrilightError(f"{asked}, and {said}; expected a GPU with CUDA and OptiX. {step}.")
+        reason = f"{_ASK} is {_GPU.name}"
+        step = f"Unset {_ASK}"
+    return TrilightError(f"{reason}, and {said}; expected a GPU with CUDA and OptiX. {step}.")
 
 
 def _on_processor() -> Variant:
