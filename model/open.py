@@ -155,8 +155,8 @@ def _weights_file(source: str, path: Path) -> Path:
         is_path = path.suffix in (*_PICKLES, ".safetensors") or source.startswith("runs/")
         if is_path or not _HUB_NAME.fullmatch(source):
             raise TrilightError(
-                f"checkpoint {source}: no such file or folder; expected one, or a published name "
-                f"such as {PUBLISHED[0]}."
+                f"checkpoint {source}: no such file or folder; expected one, default (the included "
+                f"network), or a published name such as {PUBLISHED[0]}."
             )
         path = _download(source)
     weights = path / WEIGHTS_NAME if path.is_dir() else path

@@ -39,9 +39,7 @@ class Family:
     """Share of objects and shell parts with interpolated normals; the others are flat shaded."""
 
     def __post_init__(self) -> None:
-        known = ", ".join(TEMPLATES)
-        require(self.template in TEMPLATES, "template", self.template, f"one of {known}")
-        has_room = bool(TEMPLATES[self.template].parts) or self.num_objects == (1, 1)
+        has_room = bool(TEMPLATES.find(self.template).parts) or self.num_objects == (1, 1)
         expected = f"(1, 1) for {self.template}, which has no room to place more in"
         require(has_room, "num_objects", self.num_objects, expected)
 

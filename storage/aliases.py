@@ -12,6 +12,11 @@ NETWORKS = {"default": "builtin:"}
 """Networks that Trilight ships."""
 
 
+def name_for_people(stored: str, names: Mapping[str, str]) -> str:
+    """Return the alias of a stored name, or the name itself where it has none."""
+    return next((alias for alias, name in names.items() if name == stored), stored)
+
+
 def stored_name(typed: str, names: Mapping[str, str]) -> str:
     """Return the stored name of a typed one; a name that is no alias stands for itself."""
     for alias, stored in names.items():

@@ -114,6 +114,10 @@ def write_error(path: Path, error: OSError) -> TrilightError:
     step = "choose"
     with contextlib.suppress(TrilightError):  # there may be no cache
         step = "set TRILIGHT_CACHE to" if path.is_relative_to(cache_folder("")) else step
+    if error.errno in (errno.ENOTDIR, errno.EEXIST):
+        place = next(above for above in path.parents if above.exists())
+        if not place.is_dir():
+            return TrilightError(f"{place} is a file; expected a folder: {step} another place.")
     return kind(
         f"{path.parent}: cannot write {path.name} ({error.strerror}). What was finished is safe: "
         f"{step} a writable folder or fix its permissions, and run the same command again."

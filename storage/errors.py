@@ -57,6 +57,10 @@ class Rejected(Exception):
         return f"{self.reason}: {self.message}"
 
 
+OF_EXTENSION = "an extension's by --extend FILE"
+"""Ends the list of names to which extensions may add."""
+
+
 def expected_one_of(name: str, known: Iterable[str]) -> str:
     """Return the end of a message about an unknown name, with what was probably meant.
 
@@ -64,5 +68,6 @@ def expected_one_of(name: str, known: Iterable[str]) -> str:
     """
     names = list(known)
     listed = f"xpected one of {', '.join(names)}"
-    close = get_close_matches(name, names, n=1)
+    swapped = (near for near in names if sorted(near) == sorted(name))  # such as tyni
+    close = get_close_matches(name, names, n=1) or list(swapped)
     return f"did you mean {close[0]}? E{listed}" if close else f"e{listed}"

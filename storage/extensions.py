@@ -265,19 +265,35 @@ def _mistakes_of(path: Path) -> Iterator[None]:
         raise mistake_in_extension(error) or _mistake(path.name, None, error) from error
 
 
-def mistake_in_extension(error: BaseException) -> TrilightError | None:
+@contextmanager
+def mistakes_of_entry(entry: str) -> Iterator[None]:
+    """Turn what an extension's entry, such as a family, raises into one line with its place.
+
+    Raises:
+        TrilightError: the code raised something; other code's errors are raised as they are.
+    """
+    try:
+        yield
+    except Exception as error:
+        its_author = mistake_in_extension(error, entry)
+        if its_author is None:
+            raise
+        raise its_author from error
+
+
+def mistake_in_extension(error: BaseException, entry: str = "") -> TrilightError | None:
     """Return what code of an extension raised as its author's mistake, which names file and line.
 
-    None where no line of an extension took part.
+    None where no line of an extension took part. `entry` names what the code was to make.
     """
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         path = Path(frame.filename)
         if path.name in _loaded and _loaded[path.name].path == path:
-            return _mistake(path.name, frame.lineno, error)
+            return _mistake(path.name, frame.lineno, error, entry)
     return None
 
 
-def _mistake(name: str, line: int | None, error: BaseException) -> TrilightError:
+def _mistake(name: str, line: int | None, error: BaseException, entry: str = "") -> TrilightError:
     if isinstance(error, SyntaxError):
         line = error.lineno
         said = error.msg
@@ -285,4 +301,5 @@ def _mistake(name: str, line: int | None, error: BaseException) -> TrilightError
         said = str(error)
     kind = "" if isinstance(error, TrilightError) else f"{type(error).__name__}: "
     text = " ".join(f"{kind}{said}".split()).rstrip(".:")
-    return TrilightError(f"extension {name}{f', line {line}' if line else ''}: {text}.")
+    place = f"{name}{f', line {line}' if line else ''}{f', {entry}' if entry else ''}"
+    return TrilightError(f"extension {place}: {text}.")

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
-from storage.errors import TrilightError, expected_one_of
+from storage.errors import OF_EXTENSION, TrilightError, expected_one_of
 from storage.extensions import Decided, Extension, is_reference, load_reference, loading, short_name
 
 Entry = TypeVar("Entry")
@@ -111,7 +111,10 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """Return an entry; raises TrilightError for a name that is not registered."""
         if name not in self:
             known = [*self._aliases, *self._entries]
-            raise TrilightError(f"{self.what} {name!r} is unknown; {expected_one_of(name, known)}.")
+            raise TrilightError(
+                f"{self.what} {name!r} is unknown; {expected_one_of(name, known)}, or "
+                f"{OF_EXTENSION}."
+            )
         return self[name]
 
     def is_ours(self, name: str) -> bool:

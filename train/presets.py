@@ -20,6 +20,7 @@ from model.config import large as large_model
 from model.config import smoke as smoke_model
 from storage.aliases import PRESET_ALIASES
 from storage.errors import TrilightError
+from storage.extensions import mistakes_of_entry
 from storage.registry import Registry
 from storage.settings.overrides import apply_overrides
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
@@ -305,7 +306,8 @@ def training_preset(name: str) -> TrainSettings:
     Raises:
         TrilightError: the name is unknown, or a user's preset has the name of one of ours.
     """
-    preset = TRAINING_PRESETS.find(name)()
+    with mistakes_of_entry(f"training preset {name!r}"):
+        preset = TRAINING_PRESETS.find(name)()
     if not TRAINING_PRESETS.is_ours(name) and TRAINING_PRESETS.is_ours(preset.run):
         raise TrilightError(
             f"training preset {name!r}: its settings say run={preset.run!r}, which is one of "

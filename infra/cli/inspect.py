@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from infra.cli.console import (
+    command_line,
     first_words,
     print_json,
     print_result,
@@ -20,6 +21,7 @@ from infra.cli.console import (
 )
 from infra.cli.options import OutputOptions, command
 from infra.run_record import is_run, run_facts, tensorboard_command
+from storage.aliases import PRESET_ALIASES, name_for_people
 from storage.dataset.dataset import Dataset, RemoteDatasetFiles, open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.sampled import described_shards
@@ -94,12 +96,23 @@ def _inspect_run(root: Path, *, json: bool) -> None:
     """Print the progress of a training run."""
     facts = run_facts(root)
     print_result(str(root), _fact_rows(facts), facts, as_json=json)
-    if not json:
-        suggest_look(f"Curves and pictures: {tensorboard_command(root)}")
+    if json:
+        return
+    suggest_look(f"Curves and pictures: {tensorboard_command(root)}")
+    if not facts["finished"]:
+        preset = name_for_people(facts["run"], PRESET_ALIASES)
+        words = ("train", preset, "--like", str(root), "--out", str(root), "--resume")
+        suggest_look(f"To resume: {command_line(words)}, with the same --data as before.")
 
 
 def _fact_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    return [(name.replace("_", " "), str(value)) for name, value in facts.items()]
+    return [(name.replace("_", " "), _fact_text(value)) for name, value in facts.items()]
+
+
+def _fact_text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.4g}" if isinstance(value, float) and abs(value) < 1e4 else str(value)
 
 
 def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | None:

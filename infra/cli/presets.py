@@ -7,7 +7,7 @@ from typing import Any
 
 from infra.cli.console import console, print_json, print_rows, print_table
 from infra.cli.options import OutputOptions, command
-from storage.aliases import NETWORKS, OBJECTS, PRESET_ALIASES
+from storage.aliases import NETWORKS, OBJECTS, PRESET_ALIASES, name_for_people
 from storage.settings.described import checked
 
 
@@ -75,8 +75,8 @@ def _values(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 def _name_for_people(name: str, aliases: Mapping[str, str]) -> str:
     """Return the name for people of a stored one, and the stored one where it is another."""
-    alias = next((alias for alias, stored in aliases.items() if stored == name), None)
-    return name if alias is None else f"{alias} (stored: {name})"
+    alias = name_for_people(name, aliases)
+    return name if alias == name else f"{alias} (stored: {name})"
 
 
 def _datasets() -> list[dict[str, Any]]:

@@ -15,6 +15,7 @@ from infra.cli.console import (
 )
 from infra.cli.options import OutputOptions, command
 from pipeline.generation.price import CorePrice
+from storage.aliases import PRESET_ALIASES, name_for_people
 from storage.dataset.progress import DatasetStatus, missing_shards, read_status
 from storage.errors import TrilightError
 from storage.number_ranges import number_ranges
@@ -71,8 +72,8 @@ def status(options: StatusOptions, core: CorePrice, output: OutputOptions) -> No
     ]
     if cost is not None:
         rows.append(("cost so far", f"{progress.core_hours:.2f} core-hours, {cost:.2f} USD"))
-    title = "finished" if progress.finished else "unfinished"
-    print_rows(f"{progress.display_name}: {progress.build}, {title}", rows)
+    preset = name_for_people(progress.build, PRESET_ALIASES)
+    print_rows(f"{progress.display_name}: {preset}, {_state(progress)}", rows)
     if progress.next_words:
         next_step(progress.next_words, recorded=progress.extensions)
     else:
@@ -102,9 +103,16 @@ def _next(progress: DatasetStatus) -> str:
     if progress.next_words:
         return command_line(progress.next_words, progress.extensions)
     return (
-        f"To resume: trilight generate {progress.build} --scenes {progress.scenes_planned}, with "
-        "the same other options as before."
+        f"To resume: trilight generate {name_for_people(progress.build, PRESET_ALIASES)} --scenes "
+        f"{progress.scenes_planned}, with the same other options as before."
     )
+
+
+def _state(progress: DatasetStatus) -> str:
+    if not progress.finished:
+        return "unfinished; a process is making it now" if progress.at_work else "unfinished"
+    lost = progress.shards_lost
+    return f"finished; {lost} shard{'s' * (lost > 1)} missing" if lost else "finished"
 
 
 def _rate_rows(progress: DatasetStatus) -> list[tuple[str, str]]:

@@ -46,7 +46,7 @@ class SceneReader:
             TrilightError: the file is unusable, or holds no scene.
         """
         self._child.allow_files(reach_of(source))
-        keys = self._call(source.name, source_keys, source)
+        keys = self._read(source_keys, source)
         if not keys:
             raise TrilightError(f"{source.name}: holds no scene.")
         return [dataclasses.replace(source, key=key) for key in keys]
@@ -55,12 +55,12 @@ class SceneReader:
         """Read one scene; see `pipeline.exchange.open_scene.load_source`."""
         source = dataclasses.replace(source, albedo_over_one=self._over_one)
         self._child.allow_files(reach_of(source))
-        return self._call(source.name, _load_with_pictures if pictures else load_source, source)
+        return self._read(_load_with_pictures if pictures else load_source, source)
 
     def cameras(self, source: SceneSource) -> Cameras:
         """Read poses and angles; see `pipeline.exchange.open_scene.load_cameras`."""
         self._child.allow_files(reach_of(source))
-        return self._call(source.name, load_cameras, source)
+        return self._read(load_cameras, source)
 
     def mesh(self, path: Path, licence: str) -> LoadedMesh:
         """Read the mesh of an object file; log the parts of the file that are ignored.
@@ -88,6 +88,19 @@ class SceneReader:
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+    def _read(self, function: Callable[[SceneSource], Result], source: SceneSource) -> Result:
+        """Call a function of a source; a complaint about its file names the path as it was given.
+
+        Readers say the name alone, since others write what they say into datasets.
+        """
+        try:
+            return self._call(source.name, function, source)
+        except TrilightError as error:
+            name = source.path.name
+            if not str(error).startswith(name):
+                raise
+            raise type(error)(f"{source.path}{str(error).removeprefix(name)}") from error
 
     def _call(self, name: str, function: Callable[..., Result], *args: Any) -> Result:
         try:

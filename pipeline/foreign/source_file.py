@@ -189,9 +189,9 @@ def _read_regular(path: Path, max_bytes: int) -> bytes:
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            raise Rejected("missing_file", "the path is not a regular file")
+            raise Rejected("missing_file", f"{path.name!r} is not a regular file")
         if status.st_size > max_bytes:
             raise Rejected("too_large_bytes", f"{status.st_size} bytes; expected <= {max_bytes}")
         return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise Rejected("missing_file", "there is no such file") from error
+        raise Rejected("missing_file", f"there is no file {path.name!r}") from error

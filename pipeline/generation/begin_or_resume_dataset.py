@@ -44,6 +44,30 @@ def hold_dataset_lock(folder: DatasetFolder) -> contextlib.AbstractContextManage
     )
 
 
+def require_its_extensions(folder: DatasetFolder) -> None:
+    """Refuse other extensions than a dataset has, before settings name what those add.
+
+    A dataset without frozen objects may begin again, and what a bucket holds is known only later.
+
+    Raises:
+        TrilightError: they differ, or the manifest cannot be read.
+    """
+    if not folder.bucket and folder.manifest.exists():
+        manifest = read_head(folder.manifest)
+        if manifest.objects_lock_sha256:
+            _require_extendable(folder, manifest)
+
+
+def _require_extendable(folder: DatasetFolder, manifest: Manifest) -> None:
+    if derivation := derivation_of(manifest.settings):
+        raise TrilightError(
+            f"{folder.display_name}: this dataset was made by `trilight shards "
+            f"{derivation.operation}` "
+            "and cannot grow; extend its sources and make it again, or choose another --out."
+        )
+    require_same_extensions(folder.display_name, manifest.extensions, extension_digests("data"))
+
+
 def _forget_unused(folder: DatasetFolder) -> None:
     """Delete the manifest of a dataset without any frozen object, scene or shard.
 
@@ -146,13 +170,7 @@ def _require_same_dataset(
     environment: Mapping[str, Any],
     accept_environment: bool,
 ) -> None:
-    if derivation := derivation_of(manifest.settings):
-        raise TrilightError(
-            f"{folder.display_name}: this dataset was made by `trilight shards "
-            f"{derivation.operation}` "
-            "and cannot grow; extend its sources and make it again, or choose another --out."
-        )
-    require_same_extensions(folder.display_name, manifest.extensions, extension_digests("data"))
+    _require_extendable(folder, manifest)
     stored = from_record(DatasetSettings, manifest.settings).as_json()  # fields may come later
     _require_same(folder, "setting", stored, settings.as_json(), "choose another --out")
     if not accept_environment:

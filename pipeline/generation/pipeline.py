@@ -62,6 +62,7 @@ from pipeline.generation.tasks import FIRST_PAUSE_S, Piece, TaskCutter, wait_for
 from pipeline.generation.unfinished_shard import UnfinishedShard
 from pipeline.isolation import ChildFailed, IsolatedChild, with_retries
 from pipeline.presets.registry import DATASET_PRESETS, object_source
+from pipeline.presets.settings import DatasetSettings
 from storage.dataset.asked import write_asked
 from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import ShardEntry
@@ -124,9 +125,11 @@ def _begin_run(options: GenerateOptions) -> Iterator[Run]:
         requested = options.shard_range()
         if requested is not None and requested.start >= writer.num_shards:
             raise TrilightError(
-                f"shards is {options.shards!r}; expected one that begins below "
+                f"--range is {options.shards!r}; expected one that begins below "
                 f"{writer.num_shards}, the shards of {writer.manifest.num_scenes} scenes."
             )
+        if not writer.manifest.objects_lock_sha256:  # else other objects may be refused yet
+            _write_command(options, settings, writer)
         if listed or options.revisits:
             with folder.mutex("objects"):
                 writer.refresh()
@@ -144,10 +147,7 @@ def _begin_run(options: GenerateOptions) -> Iterator[Run]:
                 workers=available_cores(),
                 user_folders=user_folders,
             ).accept()
-        repeated_options = options
-        if keeps_scenes(writer.manifest.num_scenes, options.scenes, settings.splits):
-            repeated_options = replace(options, scenes=writer.manifest.num_scenes)
-        write_asked(folder, generate_words(repeated_options))
+        _write_command(options, settings, writer)
         yield Run(
             options=options,
             settings=settings,
@@ -156,6 +156,16 @@ def _begin_run(options: GenerateOptions) -> Iterator[Run]:
             accepted=accepted,
             device=variant.device,
         )
+
+
+def _write_command(
+    options: GenerateOptions, settings: DatasetSettings, writer: DatasetWriter
+) -> None:
+    """Write down the command that makes the dataset, with the scenes that it keeps."""
+    num_scenes = writer.manifest.num_scenes
+    if keeps_scenes(num_scenes, options.scenes, settings.splits):
+        options = replace(options, scenes=num_scenes)
+    write_asked(writer.folder, generate_words(options))
 
 
 def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:

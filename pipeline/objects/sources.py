@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 
-from pipeline.objects.generated import PREFIX as BUILTIN
 from pipeline.objects.generated import generate_objects, num_builtin
 from pipeline.objects.licences import (
     check_allowed,
@@ -332,6 +331,6 @@ def _query_source(
         raise TrilightError(
             f"objects {printable(safe_url(source))!r} holds no object; expected "
             f"{' '.join(SUFFIXES)} files, or a catalogue (objects.jsonl or objects.csv) that lists "
-            f"some. Name {BUILTIN} for built-in objects."
+            "some. Name procedural: for built-in objects."
         )
     return listing

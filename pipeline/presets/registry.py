@@ -14,6 +14,7 @@ from pipeline.renders.settings import NoiseTargets
 from storage.aliases import OBJECTS, PRESET_ALIASES, stored_name
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
+from storage.extensions import mistakes_of_entry
 from storage.registry import Registry
 from storage.remote.safe_url import safe_url
 from storage.settings.overrides import apply_overrides
@@ -74,7 +75,8 @@ def preset_settings(
     Raises:
         TrilightError: the name is unknown, or values contradict each other.
     """
-    settings = DATASET_PRESETS.find(name).settings()
+    with mistakes_of_entry(f"dataset preset {name!r}"):
+        settings = DATASET_PRESETS.find(name).settings()
     if not DATASET_PRESETS.is_ours(name) and DATASET_PRESETS.is_ours(settings.build):
         raise TrilightError(
             f"dataset preset {name!r}: its settings say build={settings.build!r}, which is one of "

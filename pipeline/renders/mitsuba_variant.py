@@ -108,6 +108,8 @@ def choose_variant(default: Device = "cpu", *, device: Device | None = None) -> 
     chosen = device or named_device() or default
     if chosen == "cpu" or (chosen == "auto" and not visible_gpus()):
         return _on_processor()
+    if not visible_gpus():
+        raise _refused_gpu(device, "no NVIDIA GPU is visible here")
     probed = _remembered_probe(_GPU, _gpu_identity(), retry_failed=chosen == "gpu")
     if not probed.problem:
         note = (
@@ -117,10 +119,19 @@ def choose_variant(default: Device = "cpu", *, device: Device | None = None) -> 
     if chosen == "auto":
         note = f"the GPU renders no right picture ({probed.problem}), so the CPU renders"
         return dataclasses.replace(_on_processor(), note=note)
-    raise TrilightError(
-        f"rendering on a GPU: no right picture could be rendered with it here ({probed.problem}); "
-        f"expected one of CUDA with OptiX. Choose --device cpu, or unset {_ASK}."
-    )
+    raise _refused_gpu(device, f"the GPU renders no right picture ({probed.problem})")
+
+
+def _refused_gpu(device: Device | None, said: str) -> TrilightError:
+    """Return the complaint of a GPU that an option, TRILIGHT_VARIANT or a dataset asks for."""
+    reason = "the dataset was begun on a GPU"
+    step = "Choose --device cpu"
+    if device is not None:
+        reason = f"--device is {device}"
+    elif named_device():
+        reason = f"{_ASK} is {_GPU.name}"
+        step = f"Unset {_ASK}"
+    return TrilightError(f"{reason}, and {said}; expected a GPU with CUDA and OptiX. {step}.")
 
 
 def _on_processor() -> Variant:

@@ -12,7 +12,7 @@ from typing import BinaryIO, TypeVar
 
 from storage.conventions import SPLITS
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest
+from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest, missing_manifest
 from storage.dataset.shard import ShardContents, contents_of, samples_of
 from storage.digests import sha256_of_stream
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
@@ -385,9 +385,7 @@ def read_beside(files: DatasetFiles, decode: Callable[[BinaryIO, str], Manifest]
     """Return what `decode` finds in the manifest; raises as `open_dataset`."""
     stream = files.open_beside("manifest.json")
     if stream is None:
-        raise TrilightError(
-            f"{files.shown}: no manifest.json here; expected a dataset, as `trilight generate ... "
-            "--out` makes it."
-        )
+        is_there = not isinstance(files, LocalFiles) or files.root.exists()
+        raise missing_manifest(files.shown, is_there=is_there)
     with stream:
         return decode(stream, f"{files.shown}/manifest.json")

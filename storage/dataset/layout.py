@@ -23,7 +23,7 @@ from storage.atomic import remove_leftovers
 from storage.cache import cache_folder
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.file_locks import hold_lock, open_lock, take_lock
+from storage.file_locks import hold_lock, is_locked, open_lock, take_lock
 from storage.remote.safe_url import printable, safe_url
 from storage.remote.store import WRITABLE, BucketStore, LocalStore, Store
 from storage.remote.url import RemoteUrl, parse_url
@@ -186,6 +186,11 @@ class DatasetFolder:
     def shard_files(self) -> list[Path]:
         """Return every file that is called like a shard, listed in the manifest or not."""
         return sorted(self.root / name for name in shard_names_in(self.root))
+
+    @property
+    def is_at_work(self) -> bool:
+        """True while a process of this machine, or one whose locks reach here, works on it."""
+        return is_locked(self._lock)
 
     @contextlib.contextmanager
     def hold_exclusive_lock(self) -> Iterator[None]:

@@ -241,12 +241,17 @@ def _read(path: Path, decode: Callable[[BinaryIO, str], Manifest]) -> Manifest:
         with open_plain(path) as stream:
             return decode(stream, str(path))
     except FileNotFoundError as error:
-        raise TrilightError(
-            f"{path.parent}: no manifest.json here; expected the folder of a dataset, as "
-            "`trilight generate ... --out` makes it."
-        ) from error
+        raise missing_manifest(str(path.parent), is_there=path.parent.exists()) from error
     except OSError as error:
         raise TrilightError(f"{path}: not a readable manifest ({error}).") from error
+
+
+def missing_manifest(place: str, *, is_there: bool) -> TrilightError:
+    """Return the complaint about a folder or URL without a manifest, or one that is not there."""
+    lacks = "no manifest.json here" if is_there else "no such folder"
+    return TrilightError(
+        f"{place}: {lacks}; expected a dataset, as `trilight generate ... --out` makes it."
+    )
 
 
 def decode_manifest(stream: BinaryIO, place: str) -> Manifest:

@@ -251,6 +251,8 @@ class DatasetStatus:
     """Finished shards, listed in the manifest or not."""
     shards_planned: int
     """Shards of the finished dataset."""
+    shards_lost: int
+    """Shards that a finished dataset lists, and that are not there; of a bucket, 0."""
     scenes_done: int
     """Scenes in shards or waiting for theirs."""
     scenes_given_up: int
@@ -264,9 +266,11 @@ class DatasetStatus:
     num_views: int
     finished: bool
     """Every shard is listed, and the documents are there."""
+    at_work: bool
+    """A process is making it now, as far as its locks reach; of a bucket, False."""
     views_per_hour: float | None
     """Rate over the last scenes; of a remote dataset over all scenes, pauses included. None without
-    enough log rows."""
+    enough log rows, and of a finished dataset."""
     remaining_s: float | None
     """Time until all scenes are made at that rate."""
     core_hours: float | None
@@ -289,7 +293,7 @@ class DatasetStatus:
     def next_words(self) -> Sequence[str] | None:
         """The words of the command to run next, if it is known."""
         if self.finished:
-            return ("verify", self.display_name)
+            return ("verify", self.display_name, *(["--repair"] if self.shards_lost else []))
         return None if self.asked is None else (*self.asked, "--out", self.display_name)
 
 
@@ -312,26 +316,30 @@ def read_status(url: str) -> DatasetStatus:
     looked, share = (sample_logs(local), 1.0) if local else _sampled_logs(dataset)
     last = looked.last
     core_s = looked.core_s
-    scenes_left = manifest.num_scenes - done - given_up
+    finished = _is_finished(dataset)
+    listed = [entry.name for entry in manifest.shards]
+    scenes_left = 0 if finished else manifest.num_scenes - done - given_up
     views_per_hour, remaining_s = _rate(last, share, manifest, scenes_left)
     return DatasetStatus(
         display_name=dataset.display_name,
         build=manifest.build,
         shards_done=len(names),
         shards_planned=len(planned),
+        shards_lost=len(listed) - len(_finished_names(dataset, listed)) if finished else 0,
         scenes_done=done,
         scenes_given_up=given_up,
         scenes_planned=manifest.num_scenes,
         objects_done=objects.objects_done if objects else 0,
         objects_planned=objects.objects_planned if objects else 0,
         num_views=manifest.num_views,
-        finished=_is_finished(dataset),
+        finished=finished,
+        at_work=local is not None and local.is_at_work,
         views_per_hour=views_per_hour,
         remaining_s=remaining_s,
         core_hours=None if core_s is None else core_s / 3600,
         last_scene_unix_s=last[-1].finished_unix_s if last else None,
         failures=count_by_reason([*dataset.failures(), *(_noted_failures(local) if local else ())]),
-        digest=dataset.digest if _is_finished(dataset) else "",
+        digest=dataset.digest if finished else "",
         extensions=manifest.extensions,
         asked=read_asked(dataset),
     )

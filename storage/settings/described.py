@@ -41,6 +41,9 @@ _RULES = pydantic.ConfigDict(
     arbitrary_types_allowed=True,
 )
 
+_UNKNOWN = ("unexpected_keyword_argument", "unexpected_property")
+"""Types of pydantic's errors of a name that is no field."""
+
 _SHORT = reprlib.Repr()
 """Shows wrong values, the long and deep ones in part."""
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 200
@@ -156,7 +159,9 @@ def _complaint(
         field: the field whose value alone was read.
         display_name: what is shown of that field.
     """
-    first = error.errors(include_url=False)[0]
+    mistakes = error.errors(include_url=False)
+    # a name that is unknown says more than the one that lacks then
+    first = next((each for each in mistakes if each["type"] in _UNKNOWN), mistakes[0])
     law = first.get("ctx", {}).get("error")
     if isinstance(law, TrilightError):
         return law
@@ -167,7 +172,7 @@ def _complaint(
     where = f"{called}: {place}" if called else place
     if first["type"] == "json_invalid":
         return TrilightError(f"{where} is not JSON ({law}); expected it as it was written.")
-    if first["type"] in ("unexpected_keyword_argument", "unexpected_property"):
+    if first["type"] in _UNKNOWN:
         if steps[-1] in getattr(holder, "REMOVED", ()):
             return TrilightError(removal_message(where))
         known = [each.name for each in describe_fields(holder)]

@@ -13,7 +13,8 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
-from storage.errors import TrilightError, expected_one_of
+from storage.errors import OF_EXTENSION, TrilightError, expected_one_of
+from storage.extensions import mistakes_of_entry
 from storage.removed import removal_message
 from storage.settings.described import field_value, settings_record
 from storage.settings.fields import describe_fields, shown_name
@@ -149,13 +150,16 @@ def _without_presets(new: Any, old: Any, name: str) -> Any:
         return new
     presets: Mapping[str, Callable[[], Any]] = getattr(first, "PRESETS", {})
     entries = new if many and isinstance(new, list) else [new]
-    records = [
-        settings_record(presets[each]()) if isinstance(each, str) and each in presets else each
-        for each in entries
-    ]
+    records = []
+    for each in entries:
+        if isinstance(each, str) and each in presets:
+            with mistakes_of_entry(f"{name} {each!r}"):
+                each = settings_record(presets[each]())
+        records.append(each)
     for each in records:
         if not isinstance(each, Mapping):
-            choices = f"{expected_one_of(str(each), presets)}, or" if presets else "expected"
+            known = f"{expected_one_of(str(each), presets)}, {OF_EXTENSION}, or"
+            choices = known if presets else "expected"
             raise _no_group(new, name, first, choices)
     return records if many else records[0]
 

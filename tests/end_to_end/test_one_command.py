@@ -44,14 +44,20 @@ BAD_INPUT = [
     (("generate", "smoke", "--runner", "dask"), "--address is None"),
     (("generate", "smoke", "--address", "tcp://127.0.0.1:9"), "--runner is threads"),
     (("generate", "smoke", "--shards", "7"), "--range is '7'"),
-    (("generate", "smoke", "--scenes", "8", "--shards", "2:4"), "one that begins below 2"),
+    (
+        ("generate", "smoke", "--scenes", "8", "--shards", "2:4"),
+        "--range is '2:4'; expected one that begins below 2",
+    ),
+    (("generate", "smoke", "--out", "broken/torn.stl"), "torn.stl is a file; expected a folder"),
     (
         ("generate", "smoke", "--objects", "env:TRILIGHT_SOURCE_X"),
         "'TRILIGHT_SOURCE_X' is not set",
     ),
     (("verify", "empty"), "no manifest.json"),
     (("verify", "http://127.0.0.1:1/set", "--repair"), "cannot be read"),
+    (("verify", "nowhere"), "nowhere: no such folder; expected a dataset"),
     (("train", "smoke", "--data", "empty"), "no manifest.json"),
+    (("train", "tyni"), "training preset 'tyni' is unknown; did you mean tiny?"),
     (("shards", "select", "empty", "--out", "c", "--split", "no"), "--split is 'no'"),
 ]
 

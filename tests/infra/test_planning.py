@@ -266,7 +266,7 @@ def test_a_gpu_is_well_or_says_what_it_lacks(note: str, monkeypatch: pytest.Monk
 
 
 def test_a_gpu_that_renders_nothing_right_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
     monkeypatch.setattr(doctor, "query_gpus", lambda fields: ["NVIDIA H200, 580.95"])
     finding = doctor._accelerator()
     assert finding.state == "slower" and "no right picture" in finding.found

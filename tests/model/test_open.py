@@ -199,7 +199,8 @@ def _no_route(*words: Any, **named: Any) -> None:
 def test_a_name_that_is_plainly_a_path_asks_no_hub(monkeypatch: pytest.MonkeyPatch) -> None:
     _stand_in_hub(monkeypatch, pytest.fail, pytest.fail)
     for name in ("runs/nosuch", "mine/model.safetensors", "/nowhere", "weights.pt"):
-        with pytest.raises(TrilightError, match=f"checkpoint {name}: no such file or folder"):
+        said = rf"checkpoint {name}: no such file or folder; expected one, default \("
+        with pytest.raises(TrilightError, match=said):
             find_network(name)
 
 

@@ -16,6 +16,7 @@ from infra.run_record import is_run, run_facts
 from pipeline.generation.generate_options import GenerateOptions
 from storage.dataset.asked import write_asked
 from storage.dataset.dataset import open_dataset
+from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import write_manifest
 from storage.dataset.progress import announce_objects
 from storage.dataset.scene_logs import log_scene
@@ -62,6 +63,13 @@ def test_a_run_is_summed_up_and_the_command_that_shows_it_named(tmp_path: Path) 
     printed = inspect(tmp_path / "my run")
     assert f"tensorboard --logdir '{tmp_path}/my run'" in printed and "steps planned" in printed
     assert json.loads(inspect(tmp_path / "my run", "--json"))["steps"] == 12
+    rows = [line.split() for line in printed.splitlines()]
+    assert ["finished", "no"] in rows and ["training", "loss", "0.08333"] in rows
+    place = f"'{tmp_path}/my run'"
+    resume = f"To resume: trilight train tiny --like {place} --out {place} --resume, with the same"
+    assert f"{resume} --data as before." in printed
+    (tmp_path / "my run/summary.json").write_text("{}")
+    assert "To resume" not in inspect(tmp_path / "my run")
 
 
 def test_a_dataset_that_is_read_only_stays_as_it_is(
@@ -247,7 +255,30 @@ def test_status_says_how_far_and_what_next(tmp_path: Path) -> None:
     assert (row["shards_done"], row["scenes_planned"], row["finished"]) == (1, 12, False)
     assert row["cost_usd"] == 0.5
     announce_objects(publication.folder, 7)
-    assert "0 of 7" in trilight(["status", str(tmp_path)], env=WIDE).output
+    said = _status(tmp_path)
+    assert "tiny, unfinished objects 0 of 7" in said
+    assert "To resume: trilight generate tiny --scenes 12" in said
+    with publication.folder.hold_shared_lock():
+        assert "tiny, unfinished; a process is making it now objects" in _status(tmp_path)
+
+
+def _status(place: Path) -> str:
+    """Return what status prints, with each blank and line break as one blank."""
+    return " ".join(trilight(["status", str(place)], env=WIDE).output.split())
+
+
+def test_a_finished_copy_that_lacks_a_shard_says_how_to_mend_it(tmp_path: Path) -> None:
+    place = finished(tmp_path / "a", scenes(0))
+    folder = DatasetFolder(place)
+    folder.card.touch()
+    for scene in range(2):
+        log_scene(folder, "x", scene, seconds=10.0, cores=2, num_rejected=0)
+    whole = _status(place)
+    assert ", finished shards" in whole and whole.endswith(f"Next: trilight verify {place}")
+    (place / "train-000000.tar").unlink()
+    said = _status(place)
+    assert ", finished; 1 shard missing shards" in said and "left at that rate" not in said
+    assert said.endswith(f"Next: trilight verify {place} --repair")
 
 
 def test_objects_of_one_split_limit_the_scenes_to_that_split() -> None:

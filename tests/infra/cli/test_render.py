@@ -26,6 +26,7 @@ from infra.render.preview_table import (
 )
 from model.inference import NeuralRenderer
 from pipeline.exchange.open_scene import load_source, scene_source
+from pipeline.exchange.reader import SceneReader
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from pipeline.exchange.usd.write_usd import write_usd
 from pipeline.renders.mitsuba_variant import choose_variant
@@ -461,7 +462,7 @@ REFUSED = {
     "--error 99": "--error is 99; expected at most",
     "--error 30 --resolution 20": "expected a multiple of 8",
     "--out x.png": "--out is",
-    "--out /dev/null/x.exr": "cannot write x.exr",
+    "--out /dev/null/x.exr": "/dev/null is a file; expected a folder: choose another place",
     "--out all --cameras none.json": "none.json: no such file",
     "--out all --orbit 2 --view 9": "--view is 9",
     "https://h/{0..1}.h5 --out all": "only files of this machine",
@@ -522,6 +523,9 @@ def test_a_bad_source_is_one_line(
             load_source(scene_source(source))
         assert "\n" not in str(caught.value), source
         assert "secret" not in str(caught.value), source
+    Path("set/x.usda").write_text('def "A" {')
+    with SceneReader() as reader, pytest.raises(TrilightError, match=r"^set/x\.usda: not readable"):
+        reader.load(scene_source("set/x.usda"))
 
 
 def test_no_engine_takes_a_vertex_beyond_the_farthest_position(

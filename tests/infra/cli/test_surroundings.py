@@ -58,12 +58,12 @@ def test_what_a_shell_leaves_a_run_is_one_sentence_or_works(tmp_path: Path) -> N
     cases = {
         f"{program} --version <&- >&- 2>&-": (0, ""),
         f"{program} --version > /dev/full": (1, "what is printed cannot be written (No space"),
-        f"{program} verify none <&- >&-": (1, "none: no manifest.json here"),
+        f"{program} verify none <&- >&-": (1, "none: no such folder"),
         f"cd a; rmdir ../a; {program} doctor": (1, "the working folder cannot be used (No such"),
         f"{program} verify $(printf '\\377')": (1, r"the name '\udcff' is no text in utf-8;"),
         f"ln -s l l; {program} generate smoke --out l": (1, "l/.staging: cannot write lock (Too"),
         f"TRILIGHT_CACHE=/dev/null/x {program} generate smoke --out o": (1, "'/dev/null' is no"),
-        f"{program} verify \"$(printf 'e\\033]0')\"": (1, r"e\x1b]0: no manifest.json here"),
+        f"{program} verify \"$(printf 'e\\033]0')\"": (1, r"e\x1b]0: no such folder"),
         f"COLUMNS=0 MPLBACKEND=none PYTHONIOENCODING=ascii {program} convert s.json ö.glb | "
         r"grep -q '\\xf6.glb'": (0, ""),
         f"SOURCE_DATE_EPOCH=abc {program} assets m --out n": (0, ""),

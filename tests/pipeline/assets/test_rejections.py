@@ -221,7 +221,8 @@ def test_what_is_no_file_and_odd_names_of_what_is_one(tmp_path: Path) -> None:
     }
     for name, make in makes.items():
         make(tmp_path / f"{name}.obj")
-        assert reason_of(tmp_path / f"{name}.obj") == "missing_file", name
+        with pytest.raises(Rejected, match=f"^missing_file: .*'{name}.obj'"):
+            prepare(tmp_path / f"{name}.obj")
     for odd in (b"line\nbreak.obj", b"not-utf8-\xff\xfe.obj", b"'; --.obj"):
         path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + odd))
         assert prepare(write_obj(path, BALL)).levels, odd

@@ -12,6 +12,7 @@ from infra.repair import repair
 from pipeline.exchange.reader import file_child
 from pipeline.executors.threads import ThreadRunner
 from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
+from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, make_task, prepare_dataset
 from pipeline.isolation import call_with_retries
@@ -26,6 +27,7 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.extensions import load_extension, mistake_in_extension
 from storage.removed import removal_message
+from tests.command_line import trilight
 from tests.extensions_kit import EXAMPLES, loaded, parts_of, room_for_extensions, written
 from tests.for_each import for_each
 from tests.pipeline.documents.dataset_by_hand import edit_manifest
@@ -196,8 +198,50 @@ def test_families_are_chosen_by_name() -> None:
         preset_settings("smoke", changes={"scenes.families": []})
 
 
+@for_each(
+    ("old", "new", "said"),
+    [
+        ("object_scale=", "object_size=", "object_size does not exist; did you mean object_scale?"),
+        ("(1, 2)", "(4, 3)", "num_objects is (4, 3); expected two whole numbers"),
+        (
+            'template="corridor"',
+            'template="coridor"',
+            "'coridor' is unknown; did you mean corridor",
+        ),
+        ("square_share=", "square=", "square does not exist; did you mean square_share?"),
+    ],
+)
+def test_a_wrong_family_names_file_line_and_family(
+    tmp_path: Path, old: str, new: str, said: str
+) -> None:
+    text = TEMPLATE.read_text()
+    assert old in text
+    with loaded(written(tmp_path, text.replace(old, new))), pytest.raises(TrilightError) as caught:
+        preset_settings("smoke", changes={"scenes.families": "corridor"})
+    place = r"^extension own\.py, line \d\d, scenes\.families 'corridor': "
+    assert re.match(f"{place}.*{re.escape(said)}", str(caught.value))
+
+
+def test_an_extension_that_is_left_out_is_asked_for(tmp_path: Path) -> None:
+    """Of a dataset that has objects, by its file; else as something that may be missing."""
+    words = ["generate", "smoke", "--set", "scenes.families=corridor", "--out", str(tmp_path)]
+    with loaded(TEMPLATE):
+        _begin(tmp_path)
+    said = trilight(words).mistake
+    assert "setting 'scenes.families' is 'corridor'" in said
+    assert "alone, an extension's by --extend FILE, or one of its settings by name" in said
+    manifest = read_manifest(tmp_path / "manifest.json")
+    begun = dataclasses.replace(manifest, objects_lock_sha256="0" * 64)
+    write_manifest(tmp_path / "manifest.json", begun)
+    said = "begun with the extension template.py, which is not given; add --extend template.py"
+    assert said in trilight(words).mistake
+    assert "or an extension's by --extend FILE" in trilight(["generate", "corridor"]).mistake
+
+
 def test_a_build_of_ones_own_has_a_name_of_its_own(tmp_path: Path) -> None:
     text = """
+from pipeline.presets.registry import DATASET_PRESETS
+from pipeline.presets.settings import DatasetPreset
 from pipeline.presets.training import smoke
 import dataclasses
 
@@ -209,6 +253,11 @@ def posing():
 
 def nothing():
     pass
+
+def wrong():
+    return dataclasses.replace(smoke(), seeed=1)
+
+DATASET_PRESETS.register("late", DatasetPreset(settings=wrong, num_scenes=1))
 """
     path = written(tmp_path, text)
     with room_for_extensions():
@@ -222,6 +271,10 @@ def nothing():
             preset_settings(resolve_dataset_preset(f"{path}:posing"))
         with pytest.raises(TrilightError, match=r"own\.py: it returned a NoneType; expected Data"):
             resolve_dataset_preset(f"{path}:nothing")
+        with pytest.raises(
+            TrilightError, match=r"^extension own\.py, line 17, dataset preset 'late'"
+        ):
+            preset_settings("late")
     assert name not in DATASET_PRESETS
 
 
@@ -255,6 +308,24 @@ def test_what_was_only_begun_is_begun_anew(tmp_path: Path, monkeypatch: pytest.M
     run = prepare_dataset(tiny_order(out=str(folder.root), scenes=4, seed=7))
     assert run.publication.manifest.settings["seed"] == 7
     assert run.publication.manifest.num_scenes == 4
+
+
+def test_the_command_is_there_while_objects_are_prepared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that status prints it; one whose objects may be refused does not replace it."""
+    without_rendering(monkeypatch)
+    place = str(tmp_path / "set")
+    asked: list[list[str] | None] = []
+
+    def look(lock: ObjectLock) -> None:
+        asked.append(read_asked(open_dataset(place)))
+
+    monkeypatch.setattr(ObjectLock, "prepare", look)
+    for objects in ("builtin:9", "builtin:8"):
+        prepare_dataset(tiny_order(build="tiny", out=place, scenes=4, objects=objects))
+    assert asked[0] is not None and asked[0][:4] == ["generate", "tiny", "--objects", "builtin:9"]
+    assert asked[1] == asked[0]
 
 
 def test_what_has_objects_or_scenes_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -228,6 +228,7 @@ def test_a_gpu_is_used_by_what_its_probe_says(
     ended = subprocess.CompletedProcess([], 0, stdout=printed, stderr=said)
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path))
     monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
     monkeypatch.setattr(variant_module.subprocess, "run", lambda *_, **__: ended)
     if refused:
         with pytest.raises(TrilightError, match=refused):
@@ -239,12 +240,24 @@ def test_a_gpu_is_used_by_what_its_probe_says(
     assert ("denoiser_device" in environment(chosen)) == (not printed)
 
 
-def test_a_gpu_is_used_only_after_a_probe(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
+def test_a_gpu_that_is_asked_for_and_missing_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # hides the GPUs of a machine that has some
-    refusal = r"no right picture could be rendered with it here \(.+\)"
-    with pytest.raises(TrilightError, match=refusal):
-        choose_variant()
+    monkeypatch.delenv("TRILIGHT_VARIANT", raising=False)
+    expected = "{}, and no NVIDIA GPU is visible here; expected a GPU with CUDA and OptiX. {}."
+
+    def refused(default: Device, device: Device | None = None) -> str:
+        with pytest.raises(TrilightError) as caught:
+            choose_variant(default, device=device)
+        return str(caught.value)
+
+    cpu = "Choose --device cpu"
+    assert refused("cpu", "gpu") == expected.format("--device is gpu", cpu)
+    assert refused("gpu") == expected.format("the dataset was begun on a GPU", cpu)
+    monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
+    unset = expected.format("TRILIGHT_VARIANT is cuda_ad_rgb", "Unset TRILIGHT_VARIANT")
+    assert refused("cpu") == unset
 
 
 def test_a_process_denoises_where_its_variant_says(variant: Variant) -> None:
