@@ -17,11 +17,12 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT
-from tests.mutants.draw import Source
+from tests.mutants.draw import PACKAGES, Source
 
 LIST = Path(__file__).parent / "mutants.jsonl"
 LIBRARIES = ("numpy", "scipy.sparse", "torch", "trimesh")
 """They are imported once, before processes are forked; no mutant changes them."""
+OURS = ("tests", *PACKAGES)
 OPTIONS = ("-x", "-m", "", "-p", "no:cacheprovider", "-o", "timeout=300")  # no end: it noticed
 
 
@@ -61,8 +62,8 @@ def begin_tests(tree: Path, tests: list[str]) -> int:
     try:
         os.chdir(tree)
         os.environ["PYTHONPATH"] = sys.path[0] = str(tree)
-        for name in [each for each in sys.modules if each.partition(".")[0] == "tests"]:
-            del sys.modules[name]
+        for name in [each for each in sys.modules if each.partition(".")[0] in OURS]:
+            del sys.modules[name]  # what this program imported is not the copy's
         for stream in (sys.stdout, sys.stderr):
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         os._exit(pytest.main([*OPTIONS, *tests]))

@@ -214,6 +214,7 @@ def test_the_command_prints_json_and_nothing_else(few: Path, tmp_path: Path) -> 
 def test_where_nothing_can_be_used_the_command_says_so(few: Path, tmp_path: Path) -> None:
     result = trilight(["assets", str(few / "bad"), "--out", str(tmp_path / "out")])
     assert result.exit_code == 1 and "No object can be used" in result.stdout
+    assert "object outcome triangles p99 method or reason" in " ".join(result.stdout.split())
     assert "Next:" not in result.stdout
 
 

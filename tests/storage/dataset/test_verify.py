@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from storage.dataset import verify
 from storage.dataset.dataset import Dataset, open_dataset, reading
 from storage.dataset.manifest import index_shard, read_manifest, write_manifest
 from storage.dataset.shard import write_shard
@@ -58,7 +59,10 @@ def rewrite(
     return verify_dataset(dataset.folder.root)
 
 
-def test_a_whole_dataset_has_no_fault_and_every_shard_is_looked_at(dataset: Dataset) -> None:
+def test_a_whole_dataset_has_no_fault_and_every_shard_is_looked_at(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(verify, "_AHEAD", 1)
     for fast in (False, True):
         looked: list[str] = []
         found = verify_dataset(dataset.folder.root, fast=fast, shard_done=looked.append)

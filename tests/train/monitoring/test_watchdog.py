@@ -360,6 +360,9 @@ def test_a_bound_is_median_and_deviations_and_neither_a_breath_nor_infinity_spik
     assert watch.add(102, replace(REPORT, loss=1.5), ["k"]) == [
         Spike(step=102, what="loss", value=1.5, bound=1.16, keys=("k",))
     ]
+    black = SpikeDetector(8.0)  # nothing is left to learn: its bound is 0 too
+    for step in range(100):
+        assert black.add(step, replace(REPORT, loss=0.0, grad_norm=0.0), []) == []
 
 
 @pytest.fixture
