@@ -26,7 +26,7 @@ help:  ## these lines
 SCENES := 24
 
 dataset: setup  ## scenes of built-in objects, verified: 24, or SCENES=N
-	trilight generate smoke --objects builtin: --out data/smoke --scenes $(SCENES)
+	trilight generate tiny --objects procedural: --out data/smoke --scenes $(SCENES)
 	trilight verify data/smoke
 
 # three workers on two cores: some of the time is waiting, and each worker imports all tests
@@ -43,7 +43,7 @@ test-elsewhere: setup-all  ## the most telling ones, as other processors would r
 	python -m tests.elsewhere
 
 train: setup-all  ## the smoke model on what `make dataset` made
-	trilight train smoke --data data/smoke --out runs/smoke $(if $(wildcard runs/smoke/checkpoints/*),--resume)
+	trilight train tiny --data data/smoke --out runs/smoke $(if $(wildcard runs/smoke/checkpoints/*),--resume)
 
 RELEASE := data/release
 RELEASE_SCENES := 1024
@@ -52,7 +52,7 @@ RELEASE_SHARD := 32
 
 # beside them: the bill of materials and the licenses of what is installed
 release: setup-all  ## dataset, network and pictures to publish, in $(RELEASE); an hour or two of two cores, goes on where it stopped
-	trilight generate smoke --objects builtin: --out '$(RELEASE)/dataset' --scenes $(RELEASE_SCENES) --resolution $(RELEASE_PIXELS) \
+	trilight generate tiny --objects procedural: --out '$(RELEASE)/dataset' --scenes $(RELEASE_SCENES) --resolution $(RELEASE_PIXELS) \
 		--set splits.scenes_per_shard=$(RELEASE_SHARD) --set 'storage.passes=[depth,normal,object]'
 	python -m infra.release '$(RELEASE)'
 	cyclonedx-py environment --output-reproducible --of JSON -o '$(RELEASE)/sbom.cdx.json'

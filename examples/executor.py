@@ -1,6 +1,6 @@
 """An executor of your own: a process for each shard, started by a command.
 
-    trilight generate smoke --extend executor.py --runner commands --workers 4 --out data/smoke
+    trilight generate tiny --extend executor.py --runner commands --workers 4 --out data/smoke
 
 Put `srun`, `ssh` or `docker run` in front of the command, and the same lines use other machines:
 all that they must share is the folder, or the bucket, that `--out` names. Who makes which shard

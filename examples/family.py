@@ -1,6 +1,6 @@
 """A family of your own: a layout that exists, filled in another way.
 
-    trilight generate smoke --extend family.py --set 'scenes.families=["crowd", "plane-single"]'
+    trilight generate tiny --extend family.py --set 'scenes.families=["crowd", "plane-single"]'
 
 No preset asks for all families there are: a preset of your own lists this one (see
 dataset_preset.py), or `--set scenes.families` names it in place of the preset's.

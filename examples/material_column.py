@@ -1,7 +1,7 @@
 """A material column of your own: the weight of a clear coat on each surface.
 
-    trilight generate smoke --extend material_column.py --scenes 8 --out data/coated
-    trilight train smoke --extend material_column.py --set model=coated --data data/coated
+    trilight generate tiny --extend material_column.py --scenes 8 --out data/coated
+    trilight train tiny --extend material_column.py --set model=coated --data data/coated
 
 Scenes, shards, streams, symmetries, networks and USD carry the column; what a file of another form
 cannot hold is named when one is converted. The path tracer reads the four published columns alone,

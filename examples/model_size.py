@@ -1,7 +1,7 @@
 """A size of the network of your own: all of its numbers, under a name.
 
     trilight model nano --extend model_size.py
-    trilight train smoke --extend model_size.py --set model=nano --data data/smoke --out runs/nano
+    trilight train tiny --extend model_size.py --set model=nano --data data/smoke --out runs/nano
 
 A checkpoint holds the numbers and not the name, so that it opens where this file is unknown. What
 a size cannot change, and what each number means, stands in model/config.py.

@@ -1,6 +1,6 @@
 """An object source of your own: `dice:N`, boxes of N different shapes.
 
-    trilight generate smoke --extend object_source.py --objects dice:40 --out data/dice
+    trilight generate tiny --extend object_source.py --objects dice:40 --out data/dice
 
 A source returns a record for each object, with its licence: what states none is not used. It may
 write files, as here, or leave them where they are; what is far away is fetched later, and only what

@@ -1,6 +1,6 @@
 """A sky of your own: a ring of light around the horizon, as in a lamp-lit stadium.
 
-    trilight generate smoke --extend sky.py --settings ring.yaml --out data/ring
+    trilight generate tiny --extend sky.py --settings ring.yaml --out data/ring
 
 with ring.yaml, or `--set` with each of its lines:
 

@@ -1,6 +1,6 @@
 """A surface of your own: polka dots, in two paints.
 
-    trilight generate smoke --extend surface.py --settings dots.yaml --out data/polka
+    trilight generate tiny --extend surface.py --settings dots.yaml --out data/polka
 
 with dots.yaml, or `--set` with each of its lines:
 

@@ -1,6 +1,6 @@
 """A layout of your own: a corridor, of a floor and two walls that face each other.
 
-    trilight generate smoke --extend template.py --set scenes.families=corridor --out data/corridor
+    trilight generate tiny --extend template.py --set scenes.families=corridor --out data/corridor
 
 A template is data: which sides of the room it has, from where it is seen, and from where it is lit.
 A family draws from it: how the room is placed, how many objects of which size it holds.

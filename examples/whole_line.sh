@@ -33,7 +33,7 @@ trilight assets "$OBJECTS" --epsilon 0.5% --out "$DATA/meshes"
 # 3. Meshes to scenes, scenes to path-traced pictures, pictures to shards. In every cycle of eight
 #    shards the third is validation and the sixth is test, so that with one scene a shard eight
 #    scenes have all three splits.
-trilight generate smoke --objects "$DATA/meshes" --scenes "$SCENES" --resolution "$RESOLUTION" \
+trilight generate tiny --objects "$DATA/meshes" --scenes "$SCENES" --resolution "$RESOLUTION" \
     --noise-floor "$NOISE_FLOOR" --set splits.scenes_per_shard="$SCENES_PER_SHARD" --out "$DATA/set"
 
 # 4. Every hash, member and law; then what a person looks at: report.html, contact_sheet.png.
@@ -42,7 +42,7 @@ trilight inspect "$DATA/set"
 
 # 5. Train. A run that was interrupted goes on from its newest checkpoint, to the bit.
 if [ -d "$RUN/checkpoints" ]; then resume=--resume; else resume=; fi
-trilight train smoke --data "$DATA/set" --steps "$STEPS" --out "$RUN" $resume
+trilight train tiny --data "$DATA/set" --steps "$STEPS" --out "$RUN" $resume
 
 # 6. Judge: view by view beside each view's own stated error, and beside two baselines that have
 #    learned nothing (the median picture, and the nearest training view).
