@@ -99,7 +99,7 @@ def test_a_range_beyond_the_end_is_refused_and_one_that_reaches_beyond_makes_wha
     for shards in ("2:3", "99999999999999999999:100000000000000000000"):
         order = tiny_order(out=str(tmp_path / "set"), scenes=8, shards=shards)
         expected = (
-            f"^shards is '{shards}'; expected one that begins below 2, the shards of 8 scenes"
+            f"^--range is '{shards}'; expected one that begins below 2, the shards of 8 scenes"
         )
         with pytest.raises(TrilightError, match=expected):
             make_dataset(order, Undocumented())

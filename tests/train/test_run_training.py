@@ -522,6 +522,6 @@ def test_a_second_trainer_is_refused_and_changes_nothing(dataset: Dataset, tmp_p
     (out / "train.claim").write_text("as a process leaves it that is killed")
     trained(tiny_run(), dataset, out, resume=True)
     assert not (out / "train.claim").exists()
-    with pytest.raises(TrilightError, match="no manifest.json here"):
+    with pytest.raises(TrilightError, match="none: no such folder"):
         trained(tiny_run(), [str(tmp_path / "none")], tmp_path / "a" / "b")
     assert not (tmp_path / "a").exists()

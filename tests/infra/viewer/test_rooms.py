@@ -203,7 +203,7 @@ def test_each_file_tells_what_it_holds_and_shows_it(folder_asker: Asker) -> None
     traced = Image.open(io.BytesIO(folder_asker.ask("api/thumbnail/2")[1]))
     assert traced.size == (THUMBNAIL_PX, THUMBNAIL_PX) and np.unique(np.asarray(traced)).size > 10
     status, said, _ = folder_asker.ask("api/about/1")
-    assert status == 422 and said["error"].startswith("notes.json: ")
+    assert status == 422 and "notes.json: " in said["error"]
     for wrong in ("3", "-1", "x", "../0", "%D9%A3", "0/1"):
         assert folder_asker.ask(f"api/about/{wrong}")[0] == 404, wrong
 

@@ -465,7 +465,7 @@ def test_damage_and_what_is_not_finished_are_refused(tmp_path: Path) -> None:
     assert "missing" in refused(out, reshard, a)
     (a / "objects.lock.jsonl").write_bytes(b"")
     assert "objects.lock.jsonl" in refused(out, reshard, a)
-    assert "no manifest.json" in refused(out, reshard, tmp_path / "nowhere")
+    assert "no such folder" in refused(out, reshard, tmp_path / "nowhere")
     assert "on this machine" in refused(out, reshard, "https://u:secret@example.org/a?token=x")
     assert "secret" not in refused(out, reshard, "https://u:secret@example.org/a?token=x")
 
