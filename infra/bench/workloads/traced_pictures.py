@@ -4,7 +4,7 @@ CPU seconds of ours are those of sampling, guide pictures, measuring the stated 
 denoise. Loading the scene is not counted; kernels are warm.
 
 The other setup is that of a user of plain Mitsuba: the stock `path` integrator with its defaults,
-one of its samplers, and Open Image Denoise once. Material and emitters are those of
+one of its samplers, and Open Image Denoise once or not at all. Material and emitters are those of
 tests/oracle/plugin_scene.py, which only a checkout has: without its one texture rough metals would
 lose light, and no number of samples would give the right picture. Emitters are sampled by their
 power, which is not Mitsuba's default, and the denoiser reads Trilight's guide pictures: both favor
@@ -88,10 +88,10 @@ _PASS_SPP = 256
 
 def render_levels(
     scene: Scene, resolution: int, levels_spp: tuple[int, ...], seed: int, sampler: str
-) -> list[Image]:
-    """Render a scene's first view with each number of samples.
+) -> list[tuple[Image, Image]]:
+    """Render a scene's first view with each number of samples; return it raw and denoised.
 
-    CPU seconds are those of the samples, the guide pictures, and one denoise.
+    CPU seconds are those of the samples; of the guide pictures and one denoise where denoised.
 
     Args:
         resolution: width in pixels.
@@ -108,9 +108,15 @@ def render_levels(
     for spp in levels_spp:
         started = time.process_time()
         raw = plain.radiance(camera, seed_for(seed, "plain", spp), spp)
+        sampled_core_s = time.process_time() - started
         picture = denoise(raw, features, "high")
         core_s = features_core_s + time.process_time() - started
-        levels.append(Image(radiance_rgb=picture, samples=spp, cpu_seconds=core_s))
+        levels.append(
+            (
+                Image(radiance_rgb=raw, samples=spp, cpu_seconds=sampled_core_s),
+                Image(radiance_rgb=picture, samples=spp, cpu_seconds=core_s),
+            )
+        )
     return levels
 
 
