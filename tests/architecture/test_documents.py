@@ -116,6 +116,7 @@ SPECIAL = {
 
 TABLES = [
     ("error-against-cost.md", "| target |", "frontier.jsonl", "trilight {}"),
+    ("error-against-cost.md", "| target, both", "frontier-samplers.jsonl", "trilight {}"),
     ("which-network.md", "| 64 pixels |", "rungs-64.jsonl", "{}"),
     ("which-network.md", "| 256 pixels |", "rungs-256.jsonl", "{}"),
     ("beside-cycles.md", "| Trilight's image |", "agreement.jsonl", "stated {}"),
