@@ -194,5 +194,5 @@ def _caveats(renderer: Renderer, finished: Sequence[FinishedShot]) -> list[str]:
     elif any(
         int(facts["spp"]) < FIRST_SPP and "expected_error_db" not in facts for facts in sampled
     ):
-        notes.append(f"below {FIRST_SPP} samples the measured stated error may flatter")
+        notes.append(f"below {FIRST_SPP} samples the stated error may flatter")
     return [*notes, *renderer.notes]
