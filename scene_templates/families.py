@@ -8,8 +8,7 @@ from functools import partial
 from typing import Annotated, ClassVar
 
 from scene_templates.checks import SIZE, Counts, Range, require
-from scene_templates.rooms import SharedRoom
-from scene_templates.separate_sides import SeparateSides
+from scene_templates.rooms import SeparateSides, SharedRoom
 from scene_templates.templates import TEMPLATES
 from storage.registry import Registry
 from storage.settings.described import checked

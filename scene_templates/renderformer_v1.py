@@ -14,14 +14,14 @@ has and their ranges, object counts, and most object sizes. Not known, and chose
   (-0.25 to -0.15) into the +-0.25 that both policies have here;
 - `thin` objects: published as a list of their own; here from the pool.
 
-The two background policies are those of `separate_sides`; both public stages use `de-biased`.
+The two background policies are those of `SeparateSides`; both public stages use `de-biased`.
 """
 
 from typing import Literal
 
 from scene_templates.checks import Range
 from scene_templates.families import Family
-from scene_templates.separate_sides import SeparateSides, SideRanges
+from scene_templates.rooms import SeparateSides, SideRanges
 
 Policy = Literal["original", "de-biased"]
 

@@ -14,10 +14,9 @@ import numpy as np
 from scene_templates.families import Family
 from scene_templates.layout import Layout, ObjectPlacement, ShellPart, SurfaceLook
 from scene_templates.placement import ObjectSpace, PlaceableShape, place_objects
-from scene_templates.rooms import PATCH_FACES, SIDES, patch, plane_of
+from scene_templates.rooms import PATCH_FACES, SIDES, SeparateSides, patch, plane_of
 from scene_templates.sample_emitters import sample_emitters
 from scene_templates.sample_material import sample_material
-from scene_templates.separate_sides import SeparateSides
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.seeds import rng_for

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.checks import Range
-from scene_templates.surfaces.draw import SurfaceMapSettings, draw_surface
 from scene_templates.surfaces.maps import SurfaceMaps
+from scene_templates.surfaces.procedural_textures import SurfaceMapSettings, draw_surface
 from scene_templates.user_maps import UserMap, UserTexture, draw_user_map
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within

@@ -43,7 +43,7 @@ class Features:
     """[R, R, 3] the diffuse and the specular albedo by these names, where lobes are apart."""
 
     def of_part(self, name: str) -> "Features":
-        """Return what guides the denoiser of a part (storage.records.parts), by its name.
+        """Return what guides the denoiser of a part (storage.records.lights), by its name.
 
         A lobe is guided by its own albedo, and by no normal where it has none: there it is black.
         """

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.exact import cosine, sine
-from scene_templates.skies.draw import draw_sky
-from scene_templates.skies.settings import SkySettings
+from scene_templates.skies.procedural_skies import SkySettings, draw_sky
 from scene_templates.user_maps import UserMap, draw_user_map
 from storage.records.environment import Environment
 from storage.records.texture import MapSource

@@ -16,8 +16,8 @@ from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest, miss
 from storage.dataset.shard import ShardContents, contents_of, samples_of
 from storage.digests import sha256_of_stream
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
-from storage.records.held_maps import HeldMaps
 from storage.records.objects import Failure, LockedObject, decode_failures, decode_objects_lock
+from storage.records.packed_maps import HeldMaps
 from storage.records.safe_read import open_plain
 from storage.records.sample import (
     Sample,

@@ -6,6 +6,7 @@ Any process may read it. The rate is that of the logs (storage.dataset.scene_log
 import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 import os
 import time
@@ -14,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from storage.atomic import write_atomically, write_error
-from storage.dataset.asked import read_asked
 from storage.dataset.dataset import Dataset, LocalFiles, open_listed
 from storage.dataset.layout import DatasetFolder, numbered_path, shard_names_in
 from storage.dataset.manifest import Manifest, read_manifest
@@ -28,10 +28,45 @@ from storage.dataset.scene_logs import (
 )
 from storage.dataset.shard_notes import note_of, noted_names, noted_shard
 from storage.errors import TrilightError
+from storage.extensions import is_reference
 from storage.records.objects import Failure, count_by_reason
 from storage.records.safe_read import read_plain
 from storage.remote.store import WRITABLE, BucketStore
 from storage.typed_json import T, read_json
+
+_NAME = "logs/asked.json"
+"""The words of the command that makes a dataset, so that it can be repeated. The file is no part of
+the dataset's identity, names no folder of the dataset, and may be missing."""
+
+
+def write_asked(folder: DatasetFolder, words: Sequence[str]) -> None:
+    """Write down the words after `trilight`, without where the dataset is."""
+    write_atomically(folder.root / _NAME, (json.dumps(list(words)) + "\n").encode())
+
+
+def read_asked(dataset: Dataset) -> list[str] | None:
+    """Return what was written down; None where nothing is, or nothing that may be shown.
+
+    The file may come from the dataset's publisher: only words of `generate` that print come back,
+    and none that would run a file when they are repeated.
+    """
+    try:
+        words = read_json(dataset.files.read(_NAME) or b"[]", list[str], _NAME)
+    except TrilightError:
+        return None
+    if words[:1] != ["generate"]:
+        return None
+    harmless = all(
+        word.isprintable() and not (is_reference(word) or word.startswith("--extend"))
+        for word in words
+    )
+    return words if harmless else None
+
+
+def value_of(words: Sequence[str], option: str) -> str | None:
+    """Return the word after an option; None where the option is missing."""
+    return next((value for name, value in itertools.pairwise(words) if name == option), None)
+
 
 _AT_WORK_S = 600.0
 """Older notes on unfinished views were left by a kill: a pass of samples takes less time."""

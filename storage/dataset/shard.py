@@ -20,7 +20,7 @@ from typing import BinaryIO, TypeVar
 
 from storage.atomic import atomic_writer
 from storage.errors import ShardMissing, TrilightError
-from storage.records.map_references import MAP_NAME, referenced_maps
+from storage.records.packed_maps import MAP_NAME, referenced_maps
 from storage.records.safe_read import open_plain
 
 Place = TypeVar("Place")

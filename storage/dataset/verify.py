@@ -27,11 +27,10 @@ from storage.digests import seal_of, sha256_hex
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.licences import mixed_share_alike
 from storage.machine import available_cores
-from storage.records.held_maps import HeldMaps
-from storage.records.lights import sum_of_lights
+from storage.records.lights import part_names, sum_of_lights, sum_of_parts
 from storage.records.objects import LockedObject, decode_objects_lock, locked_uids
-from storage.records.parts import part_names, sum_of_parts
-from storage.records.passes.stored import decode_passes_exr, passes_in_file, picture_passes
+from storage.records.packed_maps import HeldMaps
+from storage.records.passes.pictures import decode_passes_exr, passes_in_file, picture_passes
 from storage.records.sample import Sample, decode_sample
 from storage.remote.fetch import download
 from storage.remote.retries import TransferFailed

@@ -1,6 +1,6 @@
 """First hits of a camera's pixels: triangle, object, depth, position, normals, material.
 
-Embree finds the triangle, in single precision (storage.raycast.embree); where on it, is then
+Embree finds the triangle, in single precision (storage.raycast.caster); where on it, is then
 computed in double precision from the triangle's stored corners. Emitters are hidden from cameras,
 so rays pass through them. Each quantity is computed on first use.
 """
@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
-from storage.raycast.caster import MISS
-from storage.raycast.embree import Surfaces
-from storage.records.lookup import normal_texels, textured_rows
-from storage.records.normal_map import mapped_normals, u_directions
+from storage.raycast.caster import MISS, Surfaces
+from storage.records.lookup import mapped_normals, normal_texels, textured_rows, u_directions
 from storage.records.scene import Scene
 
 

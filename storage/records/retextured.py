@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from storage.records.lookup import FLAT
 from storage.records.material import laid_out
-from storage.records.normal_map import FLAT
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
 if TYPE_CHECKING:

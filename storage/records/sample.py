@@ -4,8 +4,8 @@
     000000123.json                schema version, objects, provenance, one record per view
     000000123.0.exr ...           linear radiance of each view, half-float RGB OpenEXR
     000000123.0.lights.exr ...    optional: each light's part of it (storage.records.lights)
-    000000123.0.parts.exr ...     optional: direct, indirect, ... light (storage.records.parts)
-    000000123.0.passes.exr ...    optional: what its pixels see (storage.records.passes.stored)
+    000000123.0.parts.exr ...     optional: direct, indirect, ... light (storage.records.lights)
+    000000123.0.passes.exr ...    optional: what its pixels see (storage.records.passes.pictures)
     __map-<sha256>__ ...          textures and environment map, where the scene has any: once in a
                                   shard, before the first sample (storage.records.packed_maps)
 
@@ -28,12 +28,18 @@ from storage.conventions import require_readable
 from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.raycast.first_hits import require_row
-from storage.records.exr import decode_exr
-from storage.records.held_maps import HeldMaps
-from storage.records.lights import decode_lights_exr, encode_lights_exr, num_light_pictures
-from storage.records.packed_maps import packed_maps, unpacked_maps
-from storage.records.parts import KNOWN_PARTS, Parts, decode_parts_exr, encode_parts_exr
-from storage.records.passes.stored import picture_passes
+from storage.records.exr import FIRST_ILLEGAL, Stored, decode_exr, decode_stored, to_float32
+from storage.records.lights import (
+    KNOWN_PARTS,
+    Parts,
+    decode_lights_exr,
+    decode_parts_exr,
+    encode_lights_exr,
+    encode_parts_exr,
+    num_light_pictures,
+)
+from storage.records.packed_maps import HeldMaps, packed_maps, unpacked_maps
+from storage.records.passes.pictures import picture_passes
 from storage.records.profiles import Profile, pack_arrays, pack_picture, unpack_arrays
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene
@@ -89,7 +95,7 @@ class ViewRecord:
     """Errors that are as often better as worse, where the stated errors are calibrated bounds; a
     record whose floors are bounds by estimate and allowances is written without this field."""
     parts: Mapping[str, PartFloor] | None = None
-    """Floors of the parts that are stored, by name (storage.records.parts); a record that has none
+    """Floors of the parts that are stored, by name (storage.records.lights); a record that has none
     is written without this field."""
     lights: tuple[PartFloor, ...] | None = None
     """Floors of the lights that are stored, in their order (storage.records.lights); absent where
@@ -125,7 +131,7 @@ class Sample(SceneRecord):
     preset keeps lights together."""
     parts_rgb: Parts | None = None
     """[C, R, R, 3] radiance of each part by its name, or [C, L, R, R, 3] where lights are apart;
-    their sum is the picture, or that of the light (storage.records.parts). None where the preset
+    their sum is the picture, or that of the light (storage.records.lights). None where the preset
     keeps all light together."""
     passes_exr: tuple[bytes, ...] | None = None
     """OpenEXR files of the passes that the preset stores, one per camera; `view_passes` reads them.
@@ -386,3 +392,78 @@ def check_lights(key: str, lights_rgb: NDArray[np.float32], *, first_view: int =
     """Check lights [C, L, R, R, 3] as `check_radiance` does."""
     for light, radiance_rgb in enumerate(np.moveaxis(lights_rgb, 1, 0)):
         check_radiance(key, f" light {light}", radiance_rgb, first_view=first_view)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StoredSample(SceneRecord):
+    """One scene, which passes `Scene.check`, whose pictures stay packed until they are asked for.
+
+    A training step looks at two of a scene's four views or more, and unpacking a picture takes
+    longer than all else that is done to it. What is asked for obeys the same laws as a whole
+    sample's (`Sample.check`); of the other pictures nothing is said.
+    """
+
+    members: Mapping[str, bytes]
+    """Bytes of the sample's members in the shard, by suffix."""
+
+    def pictures(self, views: Sequence[int]) -> Stored:
+        """Return the pictures of some views [V, R, R, 3], at least one, as they are stored.
+
+        Bits of half floats, uint16, each below FIRST_ILLEGAL; float32 where one is stored so.
+
+        Raises:
+            TrilightError: one is missing, unreadable, not square, of another size than the others,
+                or holds a radiance that is not finite or below 0.
+        """
+        with name_errors(self.key):
+            pictures = [decode_stored(self.members[f"{view}.exr"]) for view in views]
+        if any(picture.dtype == np.float32 for picture in pictures):
+            pictures = [to_float32(picture) for picture in pictures]
+        shapes = {picture.shape for picture in pictures}
+        if len(shapes) > 1 or any(height != width for height, width, _ in shapes):
+            sizes = ", ".join(sorted(f"{height} x {width}" for height, width, _ in shapes))
+            raise TrilightError(
+                f"sample {self.key}: pictures of {sizes} pixels; expected squares of one size."
+            )
+        for view, picture in zip(views, pictures, strict=True):
+            if picture.dtype == np.float32 or picture.max() >= FIRST_ILLEGAL:
+                check_radiance(self.key, "", to_float32(picture)[None], first_view=view)
+        stacked: NDArray = np.stack(pictures)
+        if stacked.dtype == np.uint16:  # the only legal one that is not below it is -0
+            stacked[stacked >= FIRST_ILLEGAL] = 0
+        return stacked
+
+    def lights_rgb(self, views: Sequence[int], resolution: int) -> NDArray[np.float32] | None:
+        """Return radiance of each light alone [V, L, R, R, 3]; None where they are together.
+
+        Args:
+            views: at least one.
+            resolution: R, that of `pictures`.
+
+        Raises:
+            TrilightError: as `pictures`.
+        """
+        with name_errors(self.key):
+            size = (resolution, resolution)
+            lights_rgb = decode_lights(self.scene, views, size, self.members)
+        if lights_rgb is not None:
+            for view, lights in zip(views, lights_rgb, strict=True):
+                check_lights(self.key, lights[None], first_view=view)
+        return lights_rgb
+
+
+def stored_sample(
+    key: str, members: Mapping[str, bytes], held: HeldMaps | None = None
+) -> StoredSample:
+    """Return the sample of its members; `held` as `decode_scene`.
+
+    Raises:
+        TrilightError: its scene or record is missing, unreadable or breaks a law, or it has not as
+            many records of views, and pictures, as cameras.
+    """
+    record = decode_scene(key, members, held)
+    require_lawful(record)
+    suffixes = (f"{view}.exr" for view in range(len(record.views)))
+    if missing := [suffix for suffix in suffixes if suffix not in members]:
+        raise TrilightError(f"sample {key}: {missing[0]!r} is missing.")
+    return StoredSample(**vars(record), members=members)

@@ -114,7 +114,7 @@ class Scene:
     """[M, 3] rows of `textures` that stand for diffuse, specular and roughness of each material, or
     -1 where its own column does; None where nothing is textured."""
     normal_textures: Annotated[NDArray[np.int32], Within(CONSTANT, MAX_TEXTURES - 1)] | None = None
-    """[M] rows of `textures` that are the normal map of each material (storage.records.normal_map),
+    """[M] rows of `textures` that are the normal map of each material (storage.records.lookup),
     or -1 for none; None where no material has one."""
     environment: Environment | None = None
     """Light from far away; None where there is none."""

@@ -24,18 +24,19 @@ from safetensors.numpy import save
 from storage.conventions import MAPS_VERSION, SCHEMA_VERSION
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
-from storage.records.map_references import (
+from storage.records.material import chosen_columns, completed_rows, stored_columns, stored_names
+from storage.records.packed_maps import (
     checked_environment,
     checked_texture,
     described_environment,
     described_texture,
     environment_entries,
+    held_values,
     maps_digest,
     maps_record,
+    stored_values,
     texture_entries,
 )
-from storage.records.material import chosen_columns, completed_rows, stored_columns, stored_names
-from storage.records.packed_maps import held_values, stored_values
 from storage.records.retextured import without_constant_textures
 from storage.records.safe_read import read_safetensors
 from storage.records.scene import ARRAY_FIELDS, OBJECT_KINDS, Scene, SceneObject
@@ -81,7 +82,7 @@ def decode_arrays(data: bytes, maps: Any = None) -> dict[str, NDArray]:
 
     Args:
         data: the bytes.
-        maps: what the record of the scene says of its maps (storage.records.map_references).
+        maps: what the record of the scene says of its maps (storage.records.packed_maps).
 
     Raises:
         TrilightError: damaged, an array is missing, a material column is not declared here, or the

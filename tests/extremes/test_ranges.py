@@ -32,15 +32,13 @@ from pipeline.renders.settings import MAX_SPP, RenderSettings
 from scene_templates.families import Family
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH
 from scene_templates.placement import PlacementSettings
-from scene_templates.rooms import SharedRoom
+from scene_templates.rooms import SharedRoom, SideRanges
 from scene_templates.sample_camera import CameraSettings
 from scene_templates.sample_emitters import LightSettings
 from scene_templates.sample_material import MaterialSettings
-from scene_templates.separate_sides import SideRanges
 from scene_templates.settings import MAX_TRIANGLES, Excursion, SceneSettings, ViewLaws
-from scene_templates.skies.draw import SkyMapSettings
-from scene_templates.skies.settings import SkySettings
-from scene_templates.surfaces.draw import SurfaceMapSettings
+from scene_templates.skies.procedural_skies import SkyMapSettings, SkySettings
+from scene_templates.surfaces.procedural_textures import SurfaceMapSettings
 from scene_templates.textures import TextureSettings
 from storage.array_hints import array_scalar
 from storage.dataset.settings import ListedShard, SplitSettings

@@ -25,7 +25,7 @@ from pipeline.renders.vector_tracer import VectorTracer
 from storage.conventions import camera_rays
 from storage.errors import Rejected
 from storage.records.exr import decode_exr, encode_exr
-from storage.records.parts import sum_of_parts
+from storage.records.lights import sum_of_parts
 from storage.records.scene import Scene
 from tests.for_each import case
 from tests.pipeline.renders.guided_scenes import FLOOR as GUIDED_FLOOR

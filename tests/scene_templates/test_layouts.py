@@ -19,13 +19,13 @@ from scene_templates.rooms import (
     PATCH_FACES,
     SIDES,
     Room,
+    SeparateSides,
     SharedRoom,
     patch,
     plane_of,
 )
 from scene_templates.sample_layout import sample_layout, scene_plan
 from scene_templates.sample_material import MaterialSettings, sample_material
-from scene_templates.separate_sides import SeparateSides
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected

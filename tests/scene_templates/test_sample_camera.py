@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scene_templates.families import Family, alone
 from scene_templates.sample_camera import CameraPath, CameraSettings, path_position, sample_camera
 from scene_templates.settings import SceneSettings
-from scene_templates.skies.settings import SkySettings
+from scene_templates.skies.procedural_skies import SkySettings
 from scene_templates.templates import ALONE, CORNER
 from storage.errors import TrilightError
 from storage.settings.described import from_record, settings_record

@@ -21,9 +21,8 @@ from pipeline.foreign.source_file import SourceFile
 from pipeline.foreign.textured_mesh import TexturedMesh
 from pipeline.foreign.usd.materials import usd_textured_mesh
 from storage.errors import Rejected, TrilightError
-from storage.records.asset import Level
+from storage.records.asset import Level, LevelSkin, OwnMaterials, SkinQuality
 from storage.records.packed_maps import pack_texture
-from storage.records.skin import LevelSkin, OwnMaterials, SkinQuality
 from storage.records.texture import TEXTURED, Texture
 
 _LEAST_REACH = 1e-3

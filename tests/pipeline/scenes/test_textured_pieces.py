@@ -30,19 +30,18 @@ from scene_templates.layout import Emitter, Layout, ObjectPlacement, Pose, Shell
 from scene_templates.rooms import PATCH_FACES, SIDES, patch
 from scene_templates.rotations import rotate_points
 from scene_templates.settings import SceneSettings
-from scene_templates.surfaces.draw import SurfaceMapSettings
+from scene_templates.surfaces.procedural_textures import SurfaceMapSettings
 from scene_templates.textures import TextureSettings
 from storage.errors import Rejected
-from storage.records.asset import Level
+from storage.records.asset import Level, LevelSkin, SkinQuality
 from storage.records.lookup import texture_values
-from storage.records.map_facts import texture_families
 from storage.records.material import EMISSION, default_rows
 from storage.records.objects import locked_uids
 from storage.records.packed_maps import pack_texture
 from storage.records.retextured import without_normal_maps
 from storage.records.scene import Scene, SceneObject
+from storage.records.scene_facts import texture_families
 from storage.records.scene_file import scene_digest
-from storage.records.skin import LevelSkin, SkinQuality
 from storage.records.texture import Texture
 from storage.seeds import SceneKey
 from storage.settings.overrides import apply_overrides

@@ -7,11 +7,17 @@ import numpy as np
 import pytest
 
 from pipeline.presets.registry import preset_settings
-from scene_templates.skies.draw import SkyMapSettings, draw_sky
 from scene_templates.skies.drawn_scene import SceneSky, lamp_irradiance, scene_sky
-from scene_templates.skies.draws import COOLEST_MIRED, WARMEST_MIRED, planckian_rgb
-from scene_templates.skies.procedural_skies import OUR_SKIES, SKIES
-from scene_templates.skies.settings import SkySettings
+from scene_templates.skies.procedural_skies import (
+    COOLEST_MIRED,
+    OUR_SKIES,
+    SKIES,
+    WARMEST_MIRED,
+    SkyMapSettings,
+    SkySettings,
+    draw_sky,
+    planckian_rgb,
+)
 from scene_templates.skies.texels import SkyTexels
 from storage.records.scene import Scene
 from storage.seeds import SceneKey, rng_for

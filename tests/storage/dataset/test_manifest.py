@@ -23,7 +23,6 @@ from hypothesis import strategies as st
 
 from storage.conventions import SPLITS
 from storage.dataset import progress, scene_logs
-from storage.dataset.asked import write_asked
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import (
@@ -43,6 +42,7 @@ from storage.dataset.progress import (
     read_progress,
     read_status,
     tell_views,
+    write_asked,
 )
 from storage.dataset.scene_logs import SceneLog, log_scene, sample_logs
 from storage.dataset.settings import SplitSettings

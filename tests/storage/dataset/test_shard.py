@@ -24,7 +24,6 @@ from storage.atomic import atomic_writer, remove_leftovers
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import index_shard
-from storage.dataset.mixed_data import open_mixture
 from storage.dataset.settings import SplitSettings
 from storage.dataset.shard import (
     contents_of,
@@ -33,12 +32,12 @@ from storage.dataset.shard import (
     scan_members,
     write_shard,
 )
-from storage.dataset.shard_places import expand_pattern, listed_shards
+from storage.dataset.shard_set import expand_pattern, listed_shards
 from storage.dataset.splits import shard_name
-from storage.dataset.training_data import open_training_data
+from storage.dataset.training_data import open_mixture, open_training_data
 from storage.digests import sha256_of_file
 from storage.errors import TrilightError
-from storage.records.map_references import MAP_NAME, map_member
+from storage.records.packed_maps import MAP_NAME, map_member
 from storage.records.profiles import PROFILES, Profile, keeps_law
 from storage.records.sample import Sample, decode_scene, encode_sample, sample_key
 from storage.records.scene_file import encode_arrays

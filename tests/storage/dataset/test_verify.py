@@ -17,8 +17,7 @@ from storage.dataset.shard import write_shard
 from storage.dataset.verify import Verification, verify_dataset
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError, Unreadable
-from storage.records.map_references import map_member
-from storage.records.packed_maps import pack_environment
+from storage.records.packed_maps import map_member, pack_environment
 from storage.records.sample import encode_sample, sample_key
 from storage.seeds import rng_for
 from tests.for_each import for_each

@@ -16,9 +16,8 @@ from storage.licences import (
     share_alike_camp,
     union_of_duties,
 )
-from storage.records.lock_rows import LockRows
 from storage.records.object_index import IndexedObject, ObjectIndex, write_object_index
-from storage.records.objects import LockedObject, write_objects_lock
+from storage.records.objects import LockedObject, LockRows, write_objects_lock
 from tests.for_each import for_each
 
 LICENCES = ("CC0-1.0", "CC-BY-SA-4.0", "MIT", "CC-BY-SA-3.0")

@@ -17,9 +17,13 @@ from storage.conventions import MAPS_VERSION, SCHEMA_VERSION
 from storage.errors import TrilightError
 from storage.records import packed_maps
 from storage.records.environment import Environment
-from storage.records.held_maps import HeldMaps, with_same_content
-from storage.records.map_references import map_member
-from storage.records.packed_maps import pack_environment, pack_texture
+from storage.records.packed_maps import (
+    HeldMaps,
+    map_member,
+    pack_environment,
+    pack_texture,
+    with_same_content,
+)
 from storage.records.profiles import PROFILES, Profile
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene

@@ -16,19 +16,17 @@ from storage.dataset.verify import check_sample
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_exr
 from storage.records.lights import (
+    KNOWN_PARTS,
     MAX_LIGHTS,
     decode_lights_exr,
+    decode_parts_exr,
     encode_lights_exr,
+    encode_parts_exr,
     num_light_pictures,
     num_lights,
+    part_names,
     rounded_to_half,
     sum_of_lights,
-)
-from storage.records.parts import (
-    KNOWN_PARTS,
-    decode_parts_exr,
-    encode_parts_exr,
-    part_names,
     sum_of_parts,
 )
 from storage.records.sample import PartFloor, Sample, decode_sample, decode_scene, encode_sample

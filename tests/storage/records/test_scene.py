@@ -20,8 +20,7 @@ from pipeline.objects.ply import encode_ply
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.asset import Asset, Level, LevelRecord, decode_asset, encode_asset
-from storage.records.map_facts import textured_objects
-from storage.records.normal_map import FLAT
+from storage.records.lookup import FLAT
 from storage.records.retextured import (
     NEW,
     chosen_maps,
@@ -32,6 +31,7 @@ from storage.records.retextured import (
 )
 from storage.records.sample import encode_sample
 from storage.records.scene import ARRAY_FIELDS, Scene, SceneObject
+from storage.records.scene_facts import textured_objects
 from storage.records.scene_file import (
     MAX_FILE_BYTES,
     decode_arrays,

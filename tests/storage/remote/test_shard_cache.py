@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.shard_places import listed_shards
+from storage.dataset.shard_set import listed_shards
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.remote import retries

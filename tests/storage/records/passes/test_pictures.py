@@ -18,14 +18,14 @@ from storage.raycast.first_hits import first_hits
 from storage.records.exr import channel_names, decode_channels, encode_channels
 from storage.records.lookup import texture_values
 from storage.records.material import default_rows
-from storage.records.passes import pictures, stored
+from storage.records.passes import pictures
 from storage.records.passes.declared import MOTION, PASSES, declared_passes, pass_names
-from storage.records.passes.pictures import view_passes
-from storage.records.passes.stored import (
+from storage.records.passes.pictures import (
     decode_passes_exr,
     passes_exr,
     passes_in_file,
     picture_passes,
+    view_passes,
 )
 from storage.records.sample import Sample, decode_sample, encode_sample
 from storage.records.scene import Scene
@@ -359,7 +359,7 @@ def test_a_sample_gives_the_same_numbers_stored_or_not() -> None:
 
 def test_stored_passes_are_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
     sample = with_passes(("triangle",))
-    monkeypatch.setattr(stored, "view_passes", None)
+    monkeypatch.setattr(pictures, "view_passes", None)
     assert sample.view_passes(["triangle"])["triangle"].shape == (16, 16)
 
 
@@ -398,7 +398,7 @@ def test_words_mean_passes() -> None:
 
 
 def test_more_triangles_than_float32_counts_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stored, "MOST_IDS", 2)
+    monkeypatch.setattr(pictures, "MOST_IDS", 2)
     with pytest.raises(TrilightError, match="3 triangles; expected at most 2"):
         with_passes(("triangle",))
 
