@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from storage.records.scene_laws import broken_law, require_law
+from storage.records.scene_laws import broken_law, require_array, require_law
 from storage.records.texture import MAX_SIDE, MapSource, content_digest
 
 MAX_RADIANCE = 1e9
@@ -51,9 +51,8 @@ class Environment:
         """Raise TrilightError at the first broken law."""
         radiance = self.radiance_rgb
         name = "environment.radiance_rgb"
-        if radiance.dtype != np.float32:
-            broken_law(f"{name} has dtype {radiance.dtype}", "float32")
-        if radiance.ndim != 3 or radiance.shape[1:] != (2 * radiance.shape[0], 3):
+        require_array(radiance, name, np.float32, (None, None, 3))
+        if radiance.shape[1] != 2 * radiance.shape[0]:
             broken_law(f"{name} has shape {radiance.shape}", "(height, twice the height, 3)")
         if not 1 <= radiance.shape[0] <= MAX_SIDE // 2:
             broken_law(f"{name} has shape {radiance.shape}", f"sides of 1 to {MAX_SIDE} texels")
@@ -61,10 +60,7 @@ class Environment:
             lawful = (radiance >= 0) & (radiance <= MAX_RADIANCE)
             require_law(lawful, name, radiance, f"finite values from 0 to {MAX_RADIANCE:g}")
         rotation = self.rotation
-        if rotation.dtype != np.float32 or rotation.shape != (3, 3):
-            broken_law(
-                f"environment.rotation is {rotation.dtype} {rotation.shape}", "float32 (3, 3)"
-            )
+        require_array(rotation, "environment.rotation", np.float32, (3, 3))
         rotation64 = rotation.astype(np.float64)
         deviation = abs(rotation64 @ rotation64.T - np.eye(3)).max()
         if not (deviation <= ROTATION_TOLERANCE and np.linalg.det(rotation64) > 0):

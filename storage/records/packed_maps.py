@@ -15,7 +15,7 @@ import threading
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NoReturn, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.safe_read import read_safetensors, safetensors_header
 from storage.records.scene import Scene
+from storage.records.scene_laws import require_fields, wrong_value
 from storage.records.scene_maps import MAX_TEXTURES
 from storage.records.texture import MAX_MAPS_BYTES, MapSource, Texture
 
@@ -33,10 +34,21 @@ HELD_BYTES = 1 << 26
 """Most bytes that the maps of all open shards of a set take: 40 skies of 512 x 256 texels in
 float32, or 340 colours of 256 x 256 in 8 bits."""
 
+MAP_NAME = re.compile(r"__map-([0-9a-f]{64})__")
+"""Name of a map among the members of a shard."""
+
 Map = TypeVar("Map", Texture, Environment)
 
-_Key = tuple[type, str, str]
-"""What a map is said to be and to hold, and the digest of the bytes that it was unpacked from."""
+Entry = Mapping[str, Any]
+"""What a record says of one map."""
+
+_SOURCE_FIELDS = tuple(field.name for field in dataclasses.fields(MapSource))
+_ARRAY = "values"
+_FORM = "form"
+_FORMS: Mapping[type, Sequence[str]] = {Texture: ("srgb", "linear"), Environment: ("environment",)}
+_DTYPES = {"U8": np.uint8, "F16": np.float16, "F32": np.float32}
+_MOST_HEADER = 1 << 10
+_GZIP = 31
 
 
 class HeldMaps:
@@ -48,13 +60,9 @@ class HeldMaps:
     """
 
     def __init__(self, most_bytes: int = HELD_BYTES) -> None:
-        """Hold nothing yet.
-
-        Args:
-            most_bytes: of all maps together; a larger map is not held.
-        """
+        """Hold nothing yet, and at most these bytes; a larger map is not held."""
         self._most = most_bytes
-        self._maps: OrderedDict[_Key, Any] = OrderedDict()
+        self._maps: OrderedDict[tuple[type, str, str], Any] = OrderedDict()
         self._lock = threading.Lock()
         self.num_bytes = 0
         """Of the arrays that are held."""
@@ -79,23 +87,19 @@ class HeldMaps:
                 known: Map = self._maps[key]
                 return known
         made = unpack()
-        _array(made).flags.writeable = False
+        array = _array(made)
+        array.flags.writeable = False
         with self._lock:
-            self._hold(key, made)
+            if array.nbytes <= self._most and key not in self._maps:
+                while self.num_bytes + array.nbytes > self._most:
+                    _, oldest = self._maps.popitem(last=False)
+                    self.num_bytes -= _array(oldest).nbytes
+                self._maps[key] = made
+                self.num_bytes += array.nbytes
         return made
 
-    def _hold(self, key: _Key, made: Texture | Environment) -> None:
-        num_bytes = _array(made).nbytes
-        if num_bytes > self._most or key in self._maps:
-            return
-        while self.num_bytes + num_bytes > self._most:
-            _, oldest = self._maps.popitem(last=False)
-            self.num_bytes -= _array(oldest).nbytes
-        self._maps[key] = made
-        self.num_bytes += num_bytes
 
-
-def _array(one: Texture | Environment) -> Any:
+def _array(one: Texture | Environment) -> NDArray:
     return one.texels if isinstance(one, Texture) else one.radiance_rgb
 
 
@@ -104,12 +108,6 @@ def with_same_content(one: Map, **changes: Any) -> Map:
     other = dataclasses.replace(one, **changes)
     vars(other).update({**vars(one), **vars(other)})
     return other
-
-
-MAP_NAME = re.compile(r"__map-([0-9a-f]{64})__")
-"""Name of a map among the members of a shard."""
-
-_SOURCE_FIELDS = tuple(field.name for field in dataclasses.fields(MapSource))
 
 
 def map_member(sha256: str) -> str:
@@ -140,13 +138,10 @@ def maps_digest(record: Mapping[str, Any]) -> NDArray[np.uint8]:
 
     It stands among the arrays of the scene, whose digest so covers what its surfaces look like.
     """
+    sky = record.get("environment", {})
     identity = {
         "textures": [entry["sha256"] for entry in record.get("textures", ())],
-        "environment": {
-            name: value
-            for name, value in record.get("environment", {}).items()
-            if name not in _SOURCE_FIELDS
-        },
+        "environment": {name: sky[name] for name in sky if name not in _SOURCE_FIELDS},
     }
     return np.frombuffer(bytes.fromhex(sha256_hex(canonical_json(identity))), np.uint8)
 
@@ -159,147 +154,100 @@ def referenced_maps(record: Any) -> list[str]:
     """
     if not isinstance(record, Mapping) or "maps" not in record:
         return []
-    entries = [*texture_entries(record["maps"]), *environment_entries(record["maps"])]
-    return list(dict.fromkeys(map_member(entry["sha256"]) for entry in entries))
+    textures, skies = map_entries(record["maps"])
+    return list(dict.fromkeys(map_member(entry["sha256"]) for entry in (*textures, *skies)))
 
 
-def checked_texture(entry: Mapping[str, Any], texels: NDArray, *, is_srgb: bool) -> Texture:
-    """Return the texture of some texels; raises where it is not what an entry names."""
-    texture = Texture(texels=texels, is_srgb=is_srgb, source=_source(entry))
-    texture.check(f"texture {entry['sha256']}")
-    _require_content(texture.sha256, entry)
-    return texture
+def map_entries(maps: Any) -> tuple[Sequence[Entry], Sequence[Entry]]:
+    """Return what a record says of its textures, and of its environment, if there is one.
+
+    Raises:
+        TrilightError: as `referenced_maps`.
+    """
+    if not isinstance(maps, Mapping) or not set(maps) <= {"textures", "environment"}:
+        wrong_value("maps", maps, "textures, environment, or both")
+    entries = maps.get("textures", [])
+    if not isinstance(entries, list) or len(entries) > MAX_TEXTURES:
+        wrong_value("maps.textures", entries, f"a list of at most {MAX_TEXTURES}")
+    for row, entry in enumerate(entries):
+        _check_entry(entry, f"maps.textures[{row}]", {})
+    if "environment" not in maps:
+        return entries, ()
+    sky = maps["environment"]
+    _check_entry(sky, "maps.environment", {"rotation": list, "is_seen": bool})
+    rows = [row if isinstance(row, list) else [] for row in sky["rotation"]]
+    if [len(row) for row in rows] != [3, 3, 3] or not all(
+        type(number) in (int, float) and abs(number) < 2 for row in rows for number in row
+    ):
+        wrong_value("maps.environment.rotation", sky["rotation"], "three rows of three numbers")
+    return entries, (sky,)
 
 
-def checked_environment(entry: Mapping[str, Any], radiance_rgb: NDArray) -> Environment:
-    """Return an unturned environment; raises where its map is not what an entry names."""
-    environment = Environment(radiance_rgb=radiance_rgb)
-    environment.check()
-    _require_content(environment.sha256, entry)
-    return environment
+def _check_entry(entry: Any, name: str, more: Mapping[str, type]) -> None:
+    require_fields(entry, name, {"sha256": str, **dict.fromkeys(_SOURCE_FIELDS, str), **more})
+    if not MAP_NAME.fullmatch(map_member(entry["sha256"])):
+        wrong_value(f"{name}.sha256", entry["sha256"], "64 hexadecimal digits")
 
 
-def described_texture(entry: Mapping[str, Any], texture: Texture) -> Texture:
-    """Return a texture with the name and rights that an entry of `maps_record` says."""
-    source = _source(entry)
-    return texture if texture.source == source else with_same_content(texture, source=source)
+def checked_map(kind: type[Map], entry: Entry, values: NDArray, *, is_srgb: bool = False) -> Map:
+    """Return the unturned map of some values; raises where it is not what an entry names."""
+    made: Any
+    if kind is Texture:
+        made = Texture(texels=values, is_srgb=is_srgb)
+        made.check(f"texture {entry['sha256']}")
+    else:
+        made = Environment(radiance_rgb=values)
+        made.check()
+    if made.sha256 != entry["sha256"]:
+        raise TrilightError(
+            f"scene: map {entry['sha256']} has the content {made.sha256}; expected that of its "
+            "name. Run `trilight verify`."
+        )
+    result: Map = made
+    return result
 
 
-def described_environment(entry: Mapping[str, Any], sky: Environment) -> Environment:
-    """Return an environment as an entry of `maps_record` names and turns it.
+def described_map(entry: Entry, one: Map) -> Map:
+    """Return a map with the name, rights and turn that an entry of `maps_record` says.
 
     Raises:
         TrilightError: the turn is no rotation.
     """
-    environment = with_same_content(
-        sky,
-        rotation=np.array(entry["rotation"], np.float64).astype(np.float32),
-        is_seen=entry["is_seen"],
-        source=_source(entry),
-    )
-    environment.check()
-    return environment
-
-
-def texture_entries(maps: Any) -> Sequence[Mapping[str, Any]]:
-    """Return what a record says of its textures; raises as `referenced_maps`."""
-    if not isinstance(maps, Mapping) or not set(maps) <= {"textures", "environment"}:
-        wrong_map("maps", maps, "textures, environment, or both")
-    entries = maps.get("textures", [])
-    if not isinstance(entries, list) or len(entries) > MAX_TEXTURES:
-        wrong_map("maps.textures", entries, f"a list of at most {MAX_TEXTURES}")
-    for row, entry in enumerate(entries):
-        _check_entry(entry, f"maps.textures[{row}]", ())
-    return entries
-
-
-def environment_entries(maps: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
-    """Return the entry of the environment, or none; raises as `referenced_maps`."""
-    if "environment" not in maps:
-        return ()
-    entry = maps["environment"]
-    _check_entry(entry, "maps.environment", ("rotation", "is_seen"))
-    rotation = entry["rotation"]
-    is_seen = entry["is_seen"]
-    if type(is_seen) is not bool:
-        wrong_map("maps.environment.is_seen", is_seen, "true or false")
-    rows = rotation if isinstance(rotation, list) else []
-    numbers = [number for row in rows if isinstance(row, list) for number in row]
-    if [len(row) for row in rows if isinstance(row, list)] != [3, 3, 3] or not all(
-        type(number) in (int, float) and abs(number) < 2 for number in numbers
-    ):
-        wrong_map("maps.environment.rotation", rotation, "three rows of three numbers")
-    return (entry,)
-
-
-def _check_entry(entry: Any, name: str, more: Sequence[str]) -> None:
-    fields = {"sha256", *_SOURCE_FIELDS, *more}
-    if not isinstance(entry, Mapping) or set(entry) != fields:
-        wrong_map(name, entry, f"exactly the fields {', '.join(sorted(fields))}")
-    for field in ("sha256", *_SOURCE_FIELDS):
-        if not isinstance(entry[field], str):
-            wrong_map(f"{name}.{field}", entry[field], "text")
-    if not MAP_NAME.fullmatch(map_member(entry["sha256"])):
-        wrong_map(f"{name}.sha256", entry["sha256"], "64 hexadecimal digits")
-
-
-def _source(entry: Mapping[str, Any]) -> MapSource:
-    return MapSource(**{name: entry[name] for name in _SOURCE_FIELDS})
-
-
-def _require_content(sha256: str, entry: Mapping[str, Any]) -> None:
-    if sha256 != entry["sha256"]:
-        raise TrilightError(
-            f"scene: map {entry['sha256']} has the content {sha256}; expected that of its name. "
-            "Run `trilight verify`."
-        )
-
-
-def wrong_map(name: str, got: Any, expected: str) -> NoReturn:
-    """Raise TrilightError for something of a map."""
-    raise TrilightError(f"scene: {name} is {got!r:.80}; expected {expected}.")
-
-
-_ARRAY = "values"
-_FORM = "form"
-_SRGB = "srgb"
-_LINEAR = "linear"
-_ENVIRONMENT = "environment"
-_DTYPES = {"U8": np.uint8, "F16": np.float16, "F32": np.float32}
-_MOST_HEADER = 1 << 10
-_GZIP = 31
+    source = MapSource(**{name: entry[name] for name in _SOURCE_FIELDS})
+    if isinstance(one, Texture):
+        return with_same_content(one, source=source)
+    rotation = np.array(entry["rotation"], np.float64).astype(np.float32)
+    sky = with_same_content(one, rotation=rotation, is_seen=entry["is_seen"], source=source)
+    sky.check()
+    return sky
 
 
 def packed_maps(scene: Scene) -> dict[str, bytes]:
     """Return the bytes of a scene's maps by the names of their members."""
-    packed = {map_member(texture.sha256): pack_texture(texture) for texture in scene.textures}
-    if scene.environment is not None:
-        packed[map_member(scene.environment.sha256)] = pack_environment(scene.environment)
-    return packed
+    skies = () if scene.environment is None else (scene.environment,)
+    return {map_member(one.sha256): pack_map(one) for one in (*scene.textures, *skies)}
 
 
-def pack_texture(texture: Texture) -> bytes:
-    """Return the bytes of a texture."""
-    return _pack(stored_values(texture.texels), _SRGB if texture.is_srgb else _LINEAR)
+def pack_map(one: Texture | Environment) -> bytes:
+    """Return the bytes of a texture, or of an environment's map, however it is turned."""
+    form = _FORMS[type(one)][isinstance(one, Texture) and not one.is_srgb]
+    data = save({_ARRAY: np.ascontiguousarray(stored_values(_array(one)))}, {_FORM: form})
+    packer = zlib.compressobj(level=6, wbits=_GZIP)
+    return packer.compress(data) + packer.flush()
 
 
 def unpack_texture(data: bytes, name: str) -> Texture:
-    """Return the texture of `pack_texture`, called `name` in messages.
+    """Return the texture of `pack_map`, called `name` in messages.
 
     Raises:
         TrilightError: no texture, damaged, or larger than MAX_MAPS_BYTES.
     """
     packed_map = _PackedMap(data, name)
-    if packed_map.form not in (_SRGB, _LINEAR) or packed_map.num_bytes_held > MAX_MAPS_BYTES:
-        wrong_map(name, packed_map.form, f"a texture of at most {MAX_MAPS_BYTES} bytes")
-    texture = Texture(texels=packed_map.values(), is_srgb=packed_map.form == _SRGB)
+    if packed_map.form not in _FORMS[Texture] or packed_map.num_bytes_held > MAX_MAPS_BYTES:
+        wrong_value(name, packed_map.form, f"a texture of at most {MAX_MAPS_BYTES} bytes")
+    texture = Texture(texels=packed_map.values(), is_srgb=packed_map.form == "srgb")
     texture.check(name)
     return texture
-
-
-def pack_environment(environment: Environment) -> bytes:
-    """Return the bytes of an environment's map, however it is turned."""
-    return _pack(stored_values(environment.radiance_rgb), _ENVIRONMENT)
 
 
 def stored_values(values: NDArray) -> NDArray:
@@ -330,10 +278,9 @@ def unpacked_maps(
         TrilightError: not of that form, a map is missing or damaged, all of them take more than
             MAX_MAPS_BYTES, or one has another content than its name says.
     """
-    entries = texture_entries(maps)
-    skies = environment_entries(maps)
+    textures, skies = map_entries(maps)
     packed: dict[str, bytes] = {}
-    for entry in (*entries, *skies):
+    for entry in (*textures, *skies):
         if (name := map_member(entry["sha256"])) not in members:
             raise TrilightError(
                 f"scene: map {entry['sha256']} is missing; expected a member {name} before the "
@@ -342,49 +289,27 @@ def unpacked_maps(
         packed[name] = members[name]
     total = sum(_PackedMap(data, name).num_bytes_held for name, data in packed.items())
     if total > MAX_MAPS_BYTES:
-        wrong_map("maps", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
+        wrong_value("maps", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
     held = HeldMaps() if held is None else held
     fields: dict[str, Any] = {}
-    if entries:
-        fields["textures"] = tuple(
-            described_texture(entry, _load_map(Texture, entry, packed, held, _texture))
-            for entry in entries
-        )
     for entry in skies:
-        sky = _load_map(Environment, entry, packed, held, _environment)
-        fields["environment"] = described_environment(entry, sky)
+        fields["environment"] = _load_map(Environment, entry, packed, held)
+    if textures:
+        fields["textures"] = tuple(_load_map(Texture, each, packed, held) for each in textures)
     return fields
 
 
-def _load_map(
-    kind: type[Map],
-    entry: Mapping[str, Any],
-    packed: Mapping[str, bytes],
-    held: HeldMaps,
-    unpack: Callable[[Mapping[str, Any], bytes], Map],
-) -> Map:
+def _load_map(kind: type[Map], entry: Entry, packed: Mapping[str, bytes], held: HeldMaps) -> Map:
     data = packed[map_member(entry["sha256"])]
-    return held.get_or_unpack(kind, entry["sha256"], data, lambda: unpack(entry, data))
 
+    def unpack() -> Map:
+        packed_map = _PackedMap(data, f"map {entry['sha256']}")
+        if packed_map.form not in _FORMS[kind]:
+            expected = "a texture" if kind is Texture else "an environment map"
+            wrong_value(packed_map.name, packed_map.form, expected)
+        return checked_map(kind, entry, packed_map.values(), is_srgb=packed_map.form == "srgb")
 
-def _texture(entry: Mapping[str, Any], packed: bytes) -> Texture:
-    packed_map = _PackedMap(packed, f"map {entry['sha256']}")
-    if packed_map.form not in (_SRGB, _LINEAR):
-        wrong_map(packed_map.name, packed_map.form, "a texture")
-    return checked_texture(entry, packed_map.values(), is_srgb=packed_map.form == _SRGB)
-
-
-def _environment(entry: Mapping[str, Any], packed: bytes) -> Environment:
-    packed_map = _PackedMap(packed, f"map {entry['sha256']}")
-    if packed_map.form != _ENVIRONMENT:
-        wrong_map(packed_map.name, packed_map.form, "an environment map")
-    return checked_environment(entry, packed_map.values())
-
-
-def _pack(values: NDArray, form: str) -> bytes:
-    packer = zlib.compressobj(level=6, wbits=_GZIP)
-    data = save({_ARRAY: np.ascontiguousarray(values)}, {_FORM: form})
-    return packer.compress(data) + packer.flush()
+    return described_map(entry, held.get_or_unpack(kind, entry["sha256"], data, unpack))
 
 
 class _PackedMap:
@@ -397,7 +322,7 @@ class _PackedMap:
         entry = header.get(_ARRAY)
         metadata = header.get("__metadata__")
         if set(header) != {_ARRAY, "__metadata__"} or not isinstance(entry, Mapping):
-            wrong_map(name, sorted(header), f"one array {_ARRAY}")
+            wrong_value(name, sorted(header), f"one array {_ARRAY}")
         shape = entry.get("shape")
         dtype = entry.get("dtype")
         if (
@@ -406,7 +331,7 @@ class _PackedMap:
             or not all(type(side) is int and 0 < side <= MAX_MAPS_BYTES for side in shape)
             or dtype not in _DTYPES
         ):
-            wrong_map(name, [dtype, shape], "a picture of 8 bits or floats")
+            wrong_value(name, [dtype, shape], "a picture of 8 bits or floats")
         self.form = str(metadata.get(_FORM)) if isinstance(metadata, Mapping) else ""
         count = shape[0] * shape[1] * shape[2]
         self.num_bytes_held = count * (1 if dtype == "U8" else 4)

@@ -15,7 +15,7 @@ import json
 import stat
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,24 +24,25 @@ from safetensors.numpy import save
 from storage.conventions import MAPS_VERSION, SCHEMA_VERSION
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
+from storage.records.environment import Environment
 from storage.records.material import chosen_columns, completed_rows, stored_columns, stored_names
 from storage.records.packed_maps import (
-    checked_environment,
-    checked_texture,
-    described_environment,
-    described_texture,
-    environment_entries,
+    Entry,
+    Map,
+    checked_map,
+    described_map,
     held_values,
+    map_entries,
     maps_digest,
     maps_record,
     stored_values,
-    texture_entries,
 )
 from storage.records.retextured import without_constant_textures
 from storage.records.safe_read import read_safetensors
 from storage.records.scene import ARRAY_FIELDS, OBJECT_KINDS, Scene, SceneObject
+from storage.records.scene_laws import require_fields, wrong_value
 from storage.records.scene_maps import MAP_ARRAYS, MAX_TEXTURES
-from storage.records.texture import MAX_MAPS_BYTES
+from storage.records.texture import MAX_MAPS_BYTES, Texture
 
 MAX_FILE_BYTES = (256 << 20) + MAX_MAPS_BYTES
 """A million triangles with three vertices each take 90 MB."""
@@ -214,8 +215,14 @@ def scene_objects(value: Any) -> tuple[SceneObject, ...]:
         TrilightError: no list, a field too many or too few, no text, or an unknown kind.
     """
     if not isinstance(value, list):
-        _broken("objects", value, "a list")
-    return tuple(_object(entry, row) for row, entry in enumerate(value))
+        wrong_value("objects", value, "a list")
+    fields = dict.fromkeys((field.name for field in dataclasses.fields(SceneObject)), str)
+    for row, entry in enumerate(value):
+        require_fields(entry, f"objects[{row}]", fields)
+        if entry["kind"] not in OBJECT_KINDS:
+            expected = f"one of {', '.join(OBJECT_KINDS)}"
+            wrong_value(f"objects[{row}].kind", entry["kind"], expected)
+    return tuple(SceneObject(**entry) for entry in value)
 
 
 def scene_provenance(value: Any) -> Mapping[str, Any]:
@@ -225,32 +232,17 @@ def scene_provenance(value: Any) -> Mapping[str, Any]:
         TrilightError: it is no object, or its template or excursion is malformed.
     """
     if not isinstance(value, dict):
-        _broken("provenance", value, "a JSON object")
+        wrong_value("provenance", value, "a JSON object")
     if not isinstance(value.get("template", ""), str):
-        _broken("provenance.template", value["template"], "text")
+        wrong_value("provenance.template", value["template"], "text")
     excursion = value.get("excursion")
     if excursion and not (
         isinstance(excursion, dict)
         and isinstance(excursion.get("axis"), str)
         and isinstance(excursion.get("value"), int | float)
     ):
-        _broken("provenance.excursion", excursion, "an axis and a value")
+        wrong_value("provenance.excursion", excursion, "an axis and a value")
     return value
-
-
-_OBJECT_FIELDS = frozenset(field.name for field in dataclasses.fields(SceneObject))
-
-
-def _object(value: Any, row: int) -> SceneObject:
-    if not isinstance(value, dict) or value.keys() != _OBJECT_FIELDS:
-        fields = ", ".join(sorted(_OBJECT_FIELDS))
-        _broken(f"objects[{row}]", value, f"exactly the fields {fields}")
-    for name, text in value.items():
-        if not isinstance(text, str):
-            _broken(f"objects[{row}].{name}", text, "text")
-    if value["kind"] not in OBJECT_KINDS:
-        _broken(f"objects[{row}].kind", value["kind"], f"one of {', '.join(OBJECT_KINDS)}")
-    return SceneObject(**value)
 
 
 def _arrays(scene: Scene) -> dict[str, NDArray]:
@@ -266,28 +258,25 @@ def _maps(record: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> dict[str,
     """Return the fields `textures` and `environment` of what a file says, where it has any."""
     if _MAPS not in record:
         return {}
-    entries = texture_entries(record[_MAPS])
-    fields = dict[str, Any]()
+    textures, skies = map_entries(record[_MAPS])
     is_srgb = record.get(_IS_SRGB, [])
-    if not isinstance(is_srgb, list) or [type(each) for each in is_srgb] != [bool] * len(entries):
-        _broken(_IS_SRGB, is_srgb, "true or false for each texture")
+    if not isinstance(is_srgb, list) or [type(each) for each in is_srgb] != [bool] * len(textures):
+        wrong_value(_IS_SRGB, is_srgb, "true or false for each texture")
+
+    def load(kind: type[Map], name: str, entry: Entry, *, is_srgb: bool = False) -> Map:
+        if name not in arrays:
+            raise TrilightError(f"scene: the array {name} is missing.")
+        made = checked_map(kind, entry, held_values(arrays[name]), is_srgb=is_srgb)
+        return described_map(entry, made)
+
+    fields: dict[str, Any] = {}
+    for sky in skies:
+        fields[_ENVIRONMENT] = load(Environment, _ENVIRONMENT, sky)
     fields["textures"] = tuple(
-        described_texture(
-            entry,
-            checked_texture(entry, _map_values(arrays, f"{_TEXTURE}{row}"), is_srgb=is_srgb[row]),
-        )
-        for row, entry in enumerate(entries)
+        load(Texture, f"{_TEXTURE}{row}", entry, is_srgb=is_srgb[row])
+        for row, entry in enumerate(textures)
     )
-    for entry in environment_entries(record[_MAPS]):
-        sky = checked_environment(entry, _map_values(arrays, _ENVIRONMENT))
-        fields["environment"] = described_environment(entry, sky)
     return fields
-
-
-def _map_values(arrays: Mapping[str, NDArray], name: str) -> NDArray:
-    if name not in arrays:
-        raise TrilightError(f"scene: the array {name} is missing.")
-    return held_values(arrays[name])
 
 
 def _check_names(arrays: Mapping[str, NDArray]) -> None:
@@ -300,7 +289,7 @@ def _check_names(arrays: Mapping[str, NDArray]) -> None:
     # half floats take twice their size in memory
     total = sum(arrays[name].size * (1 if arrays[name].dtype == np.uint8 else 4) for name in maps)
     if total > MAX_MAPS_BYTES:
-        _broken("textures and environment", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
+        wrong_value("textures and environment", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
 
 
 def _metadata_record(metadata: Mapping[str, str]) -> dict[str, Any]:
@@ -323,7 +312,3 @@ def _metadata_record(metadata: Mapping[str, str]) -> dict[str, Any]:
 
 def _refused_constant(text: str) -> float:
     raise TrilightError(f"{text} is no JSON number")
-
-
-def _broken(name: str, got: Any, expected: str) -> NoReturn:
-    raise TrilightError(f"scene: {name} is {got!r:.80}; expected {expected}.")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from storage.records.lookup import texture_values
 from storage.records.material import laid_out
-from storage.records.scene_laws import broken_law, require_law
+from storage.records.scene_laws import broken_law, require_array, require_law
 from storage.records.texture import CONSTANT, MAX_MAPS_BYTES, TEXTURED, Texture
 
 if TYPE_CHECKING:
@@ -63,10 +63,10 @@ def check_maps(scene: "Scene") -> None:
     if scene.normal_textures is not None and not scene.textures:
         broken_law("normal_textures is there without textures", "both, or no normal_textures")
     if scene.textures:
-        _require_shape(scene, "uv", 3 * scene.num_triangles)
-        _require_shape(scene, "material_textures", len(scene.materials))
-        if scene.normal_textures is not None:
-            _require_shape(scene, "normal_textures", len(scene.materials))
+        for name, (dtype, (_, *widths)) in MAP_ARRAYS.items():
+            length = 3 * scene.num_triangles if name == "uv" else len(scene.materials)
+            if (array := getattr(scene, name)) is not None:
+                require_array(array, name, dtype, (length, *widths))
         _check_textures(scene)
         for row, diffuse, specular in _albedos(scene):
             _check_sum(row, diffuse, specular)
@@ -98,14 +98,6 @@ def _check_textures(scene: "Scene") -> None:
         if texture.channels != 3 or texture.is_srgb:
             got = f"{texture.channels} channels{', sRGB-encoded' if texture.is_srgb else ''}"
             broken_law(f"textures[{row}] has {got}", "3 linear channels, as a normal map has")
-
-
-def _require_shape(scene: "Scene", name: str, length: int) -> None:
-    array: NDArray = getattr(scene, name)
-    dtype, (_, *widths) = MAP_ARRAYS[name]
-    shape = (length, *widths)
-    if array.dtype != dtype or array.shape != shape:
-        broken_law(f"{name} is {array.dtype} of shape {array.shape}", f"{np.dtype(dtype)} {shape}")
 
 
 Reflecting = Texture | NDArray[np.float32]

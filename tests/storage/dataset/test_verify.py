@@ -17,7 +17,7 @@ from storage.dataset.shard import write_shard
 from storage.dataset.verify import Verification, verify_dataset
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError, Unreadable
-from storage.records.packed_maps import map_member, pack_environment
+from storage.records.packed_maps import map_member, pack_map
 from storage.records.sample import encode_sample, sample_key
 from storage.seeds import rng_for
 from tests.for_each import for_each
@@ -230,7 +230,7 @@ def _with_sky(value: float) -> Change:
     def change(_: str, members: dict[str, bytes]) -> None:
         if members.pop(SKY, None) is not None:
             members["json"] = members["json"].replace(sky().sha256.encode(), other.sha256.encode())
-            members[map_member(other.sha256)] = pack_environment(other)
+            members[map_member(other.sha256)] = pack_map(other)
 
     return change
 
