@@ -161,17 +161,17 @@ def number_of_shard(shard: ShardEntry) -> int:
 
 
 def index_shard(path: Path) -> ShardEntry:
-    """Return the manifest entry of a shard file by reading it.
-
-    Raises:
-        TrilightError: the name is not a shard's, or the file is not a whole shard.
-    """
+    """Return the manifest entry of a shard file by reading it; raises as `index_stream`."""
     with open_plain(path) as stream:
         return index_stream(stream, path.name)
 
 
 def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
-    """Return the manifest entry of an open shard; raises as `index_shard` does."""
+    """Return the manifest entry of an open shard.
+
+    Raises:
+        TrilightError: the name is not a shard's, or the file is not a whole shard.
+    """
     match = SHARD_NAME.fullmatch(name)
     if match is None:
         raise TrilightError(f"{name}: not a shard; expected a name like train-000003.tar.")
@@ -218,8 +218,7 @@ def _encode_rows(manifest: Manifest, seal: str) -> Iterator[bytes]:
 
 def shard_row(shard: ShardEntry) -> dict[str, Any]:
     """Return the JSON values of an entry."""
-    row = {field.name: getattr(shard, field.name) for field in dataclasses.fields(shard)}
-    return {name: value for name, value in row.items() if name != "members"}
+    return {name: value for name, value in vars(shard).items() if name != "members"}
 
 
 def read_manifest(path: Path) -> Manifest:
@@ -255,15 +254,7 @@ def missing_manifest(place: str, *, is_there: bool) -> TrilightError:
 
 
 def decode_manifest(stream: BinaryIO, place: str) -> Manifest:
-    """Return the manifest of an open file.
-
-    Args:
-        stream: the file.
-        place: where it is, for messages.
-
-    Raises:
-        TrilightError: as `read_manifest`.
-    """
+    """Return the manifest of an open file, called `place`; raises as `read_manifest`."""
     return _manifest(stream.read(MAX_FILE_BYTES), place)
 
 
