@@ -139,13 +139,8 @@ def function_name(name: str) -> str:
 def load_reference(reference: str) -> Iterator[Any]:
     """Provide what the function of FILE.py:FUNCTION returns, while its file may register it.
 
-    What is no function stands for itself.
-
-    Args:
-        reference: for which `is_reference` holds; typed by the person whose computer this is.
-
-    Raises:
-        TrilightError: as `load_extension`, or the file does not define it, or it raises something.
+    What is no function stands for itself. The reference is one of `is_reference`, typed by the
+    person whose computer this is. It raises as `load_extension`, and as the function.
     """
     match = _REFERENCE.fullmatch(reference)
     assert match is not None, reference
@@ -183,14 +178,9 @@ def extension_digests(part: Decided) -> dict[str, str]:
 
 
 def require_same_extensions(what: str, before: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Refuse to go on with other extensions than something was begun with.
+    """Raise TrilightError where extensions are not those that `what` was begun with.
 
-    Args:
-        what: was begun, as messages name it.
-        before, now: as `extension_digests` returns them.
-
-    Raises:
-        TrilightError: one is missing, new, or another file; the message names it.
+    `before` and `now` are of `extension_digests`; the message names the first that differs.
     """
     for name in sorted({*before, *now}):
         if before.get(name) == now.get(name):
@@ -254,11 +244,7 @@ def _as_loading(extension: Extension) -> Iterator[None]:
 
 @contextmanager
 def _mistakes_of(path: Path) -> Iterator[None]:
-    """Turn what code of an extension raises into one line with the line of the file.
-
-    Raises:
-        TrilightError: the code raised something.
-    """
+    """Turn what code of an extension raises into a TrilightError with the line of the file."""
     try:
         yield
     except (Exception, SystemExit) as error:
@@ -267,10 +253,9 @@ def _mistakes_of(path: Path) -> Iterator[None]:
 
 @contextmanager
 def mistakes_of_entry(entry: str) -> Iterator[None]:
-    """Turn what an extension's entry, such as a family, raises into one line with its place.
+    """Turn what an extension's entry, such as a family, raises into a TrilightError with its place.
 
-    Raises:
-        TrilightError: the code raised something; other code's errors are raised as they are.
+    Errors of other code are raised as they are.
     """
     try:
         yield

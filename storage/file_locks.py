@@ -40,12 +40,8 @@ _unlocked = itertools.count()
 def hold_lock(path: Path, *, wait: bool = False) -> Iterator[bool]:
     """Hold the lock of a file, a claim, for the block; yield whether it is ours.
 
-    Args:
-        path: the file of the claim; it is created here, and its holder may delete it.
-        wait: until the claim is free, so that it always becomes ours.
-
-    Raises:
-        TrilightError: the folder cannot be written.
+    The file is created here, and its holder may delete it. With `wait`, the claim always becomes
+    ours. It raises TrilightError where the folder cannot be written.
     """
     descriptor = _acquire_lock(path, wait)
     try:
@@ -56,11 +52,7 @@ def hold_lock(path: Path, *, wait: bool = False) -> Iterator[bool]:
 
 
 def open_lock(path: Path) -> int:
-    """Return the descriptor of a lock's file, which is created where it is missing.
-
-    Raises:
-        TrilightError: the folder cannot be written.
-    """
+    """Return the descriptor of a lock's file, which is made where it is missing; as `hold_lock`."""
     tries = 0
     while True:
         try:

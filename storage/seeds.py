@@ -11,15 +11,14 @@ import numpy as np
 
 
 def rng_for(seed: int, purpose: str, *indices: int) -> np.random.Generator:
-    """Return the generator that belongs to one purpose.
+    """Return the independent PCG64 generator that belongs to one purpose.
+
+    Equal arguments always give equal streams.
 
     Args:
         seed: the seed of the whole dataset, any integer from 0.
         purpose: what the numbers are for, such as "scene" or "camera".
         indices: what tells this use from others, such as scene index and attempt.
-
-    Returns:
-        An independent PCG64 generator; equal arguments always give equal streams.
     """
     return np.random.default_rng(np.frombuffer(_name_digest(seed, purpose, indices), np.uint32))
 

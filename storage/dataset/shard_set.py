@@ -76,9 +76,8 @@ class ShardPlace:
 def listed_shards(patterns: Sequence[str]) -> list[ShardPlace]:
     """Return the shards that patterns name, in their order.
 
-    Args:
-        patterns: paths or URLs; `{000000..000007}` stands for each number of a range, as wide as
-            its first end, and `{a,b}` for each of several texts.
+    Patterns are paths or URLs; `{000000..000007}` stands for each number of a range, as wide as its
+    first end, and `{a,b}` for each of several texts.
 
     Raises:
         TrilightError: a URL is refused (storage.remote.url), a pattern is not closed or names more
@@ -146,10 +145,7 @@ class OpenShard:
     def __init__(self, name: str, stream: BinaryIO, held: HeldMaps) -> None:
         """Look at the headers; raises TrilightError as `storage.dataset.shard`.
 
-        Args:
-            name: for messages.
-            stream: the file.
-            held: maps of this shard and others that were unpacked already.
+        `held` has maps of this shard and others that were unpacked already.
         """
         self.name = name
         self._stream = stream
@@ -185,22 +181,14 @@ class OpenShard:
         return data
 
     def sample(self, row: int) -> Sample:
-        """Return a sample that passes `Sample.check`.
-
-        Raises:
-            TrilightError: it is not whole, not readable or breaks a law; names shard and sample.
-        """
+        """Return a sample that passes `Sample.check`; a TrilightError names shard and sample."""
         with self._name_errors():
             sample = decode_sample(self._samples[row][0], self.members(row), self._held)
             sample.check()
             return sample
 
     def stored_sample(self, row: int) -> StoredSample:
-        """Return a sample whose pictures are unpacked when they are asked for.
-
-        Raises:
-            TrilightError: its scene is not readable or breaks a law; names shard and sample.
-        """
+        """Return a sample whose pictures are unpacked when they are asked for; as `sample`."""
         with self._name_errors():
             return stored_sample(self._samples[row][0], self.members(row), self._held)
 
@@ -233,11 +221,7 @@ class ShardSet(ABC):
 
     @abstractmethod
     def open(self, number: int) -> OpenShard:
-        """Open a shard, fetched and checked.
-
-        Raises:
-            TrilightError: it cannot be read, or is not what it should be; the message names it.
-        """
+        """Open a shard, fetched and checked; else a TrilightError names it."""
 
 
 class ManifestShards(ShardSet):

@@ -112,8 +112,7 @@ class Statistics:
 def dataset_statistics(dataset: Dataset) -> Statistics:
     """Read samples but their pictures, through the headers of the shards: all, or a sample of them.
 
-    Raises:
-        TrilightError: a shard is missing or damaged.
+    It raises TrilightError where a shard is missing or damaged.
     """
     tally = _Tally()
     for shard in (read := described_shards(dataset)):

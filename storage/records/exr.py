@@ -84,13 +84,10 @@ def encode_exr(
     *,
     attributes: Attributes | None = None,
 ) -> bytes:
-    """Return the OpenEXR file of a picture, rounded to half floats; one thread.
+    """Return the OpenEXR file of a picture [R, R, 3], rounded to half floats; one thread.
 
-    Args:
-        radiance_rgb: [R, R, 3] linear radiance, finite, in [0, 65504].
-        codec: how to pack it. A lossy one may leave values below 0, or infinite ones where the
-            brightest rounds up: callers look at what comes back.
-        attributes: more entries of the header, by name.
+    A lossy codec may leave values below 0, or infinite ones where the brightest rounds up: callers
+    look at what comes back.
 
     Raises:
         TrilightError: a value is not finite, negative, or too large for a half float.
@@ -118,9 +115,8 @@ def encode_channels(
 ) -> bytes:
     """Return the OpenEXR file of named channels, [H, W] each or [H, W, 3] under the name RGB.
 
-    Raises:
-        TrilightError: a number among the attributes that a header cannot hold: integers end at
-            2^31 - 1, and floats with float32.
+    It raises TrilightError for an attribute that a header cannot hold: integers end at 2^31 - 1,
+    and floats with float32.
     """
     for name, value in (attributes or {}).items():
         _require_held(name, value)
@@ -147,11 +143,7 @@ def _require_held(name: str, value: str | int | float) -> None:
 
 
 def channel_names(data: bytes) -> list[str]:
-    """Return the names of the channels of an OpenEXR file of one part; reads no pixel.
-
-    Raises:
-        TrilightError: not an EXR file, truncated, or of several parts.
-    """
+    """Return the names of the channels of an OpenEXR file; raises as `read_header`."""
     return [str(channel.name) for channel in read_header(data)["channels"]]
 
 
@@ -178,9 +170,6 @@ def decode_stored(data: bytes) -> Stored:
     """Return the picture [H, W, 3] of `decode_exr` as the file holds it.
 
     A function of half floats, such as their logarithm, can be looked up by these bits.
-
-    Raises:
-        TrilightError: as `decode_exr`.
     """
     header: dict[str, Any] = {}
     pixels = decode_channels(data, "RGB", header.update)["RGB"]
@@ -234,7 +223,7 @@ def decode_channels(
 
 
 def read_header(data: bytes) -> Header:
-    """Return the header of an OpenEXR file of one part; raises TrilightError as `channel_names`."""
+    """Return the header of an OpenEXR file; raises TrilightError for others, and several parts."""
     with _readable():
         find_header_end(data)
         parts = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).parts
@@ -247,8 +236,7 @@ def read_header(data: bytes) -> Header:
 def find_header_end(data: bytes) -> int:
     """Return where the headers of an OpenEXR file end, found without the library.
 
-    Raises:
-        TrilightError: they have more attributes, channels or bytes than are read.
+    It raises TrilightError where they have more attributes, channels or bytes than are read.
     """
     is_many = int.from_bytes(data[4:8], "little") & MANY_PARTS
     at = 8

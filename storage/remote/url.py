@@ -113,8 +113,7 @@ def parse_local_path(text: str) -> Path:
 def open_driver(url: RemoteUrl) -> Any:
     """Return the fsspec file system that reads a folder; it keeps no listings.
 
-    Raises:
-        TrilightError: its package is not installed; names the package.
+    It raises TrilightError, which names the package, where that is not installed.
     """
     package = PACKAGES[url.scheme]
     try:
