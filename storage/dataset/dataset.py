@@ -136,7 +136,7 @@ class RemoteDatasetFiles(_Files):
         return None
 
     def num_bytes(self, shard: ShardEntry) -> int | None:
-        """Return the size of a shard, or None where its server does not state it; as `LocalFiles`."""
+        """Return the size of a shard, or None where its server does not state it."""
         url = self.url.child(shard.name)
         try:
             return facts_of(url).num_bytes

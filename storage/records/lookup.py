@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from storage.conventions import latlong_uv
 from storage.records.environment import Environment
-from storage.records.material import laid_out
+from storage.records.material import column_places
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
 FLAT = (0.5, 0.5, 1.0)
@@ -125,7 +125,7 @@ def textured_rows(
     rows = scene.materials[material_index]
     if scene.material_textures is None:
         return rows
-    places = {column.name: part for column, part in laid_out()}
+    places = column_places()
     for name, textures_N in zip(TEXTURED, scene.material_textures[material_index].T, strict=True):
         for texture in np.unique(textures_N[textures_N != CONSTANT]):
             chosen = textures_N == texture

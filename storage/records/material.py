@@ -13,6 +13,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,35 +69,23 @@ class MaterialColumn:
             _wrong(self.name, f"the range {self.within}", "one from 0, since networks read its log")
 
 
+_colour = partial(MaterialColumn, width=3, is_colour=True)
+
 _OURS = {
     column.name: column
     for column in (
-        MaterialColumn(
-            name="diffuse",
-            means="Albedo of the diffuse lobe.",
-            width=3,
-            within=Within(0, 1),
-            is_colour=True,
-        ),
-        MaterialColumn(
-            name="specular",
-            means="Albedo of the specular lobe.",
-            width=3,
-            within=Within(0, 1),
-            is_colour=True,
-        ),
+        _colour(name="diffuse", means="Albedo of the diffuse lobe.", within=Within(0, 1)),
+        _colour(name="specular", means="Albedo of the specular lobe.", within=Within(0, 1)),
         MaterialColumn(
             name="roughness",
             means="Roughness of the specular lobe; its GGX width is the square.",
             width=1,
             within=Within(0, 1),
         ),
-        MaterialColumn(
+        _colour(
             name="emission",
             means="Emitted radiance; a material that emits is a light.",
-            width=3,
             within=Within(0, FLOAT32_MAX),
-            is_colour=True,
             is_radiance=True,
             is_log_encoded=True,
         ),
@@ -171,9 +160,14 @@ def stored_columns(materials: NDArray[np.float32]) -> tuple[str, ...]:
     return (*PUBLISHED_COLUMNS, *unread_columns(materials, PUBLISHED_COLUMNS))
 
 
+def column_places() -> dict[str, slice]:
+    """Return where the numbers of each declared column stand in the material rows of a scene."""
+    return {column.name: part for column, part in laid_out()}
+
+
 def chosen_columns(materials: NDArray[np.float32], names: Sequence[str]) -> NDArray[np.float32]:
     """Return rows [M, width of `names`] with these columns of rows that have all, in this order."""
-    places = {column.name: part for column, part in laid_out()}
+    places = column_places()
     return np.concatenate([materials[:, places[name]] for name in names], axis=1)
 
 
@@ -203,7 +197,7 @@ def completed_rows(stored: NDArray[np.float32], stated: str | None) -> NDArray[n
     if names == tuple(COLUMNS):
         return stored
     rows = default_rows(len(stored))
-    places = {column.name: part for column, part in laid_out()}
+    places = column_places()
     for column, part in laid_out(names):
         rows[:, places[column.name]] = stored[:, part]
     return rows
@@ -231,7 +225,7 @@ def _wrong(name: str, got: str, expected: str) -> None:
     raise TrilightError(f"material column {name!r:.60} has {got}; expected {expected}.")
 
 
-_PLACES = {column.name: part for column, part in laid_out()}
+_PLACES = column_places()
 
 DIFFUSE, SPECULAR, EMISSION = (_PLACES[name] for name in ("diffuse", "specular", "emission"))
 """Places of the published columns in a material row, for code that means exactly them."""

@@ -203,7 +203,7 @@ def checked_map(kind: type[Map], entry: Entry, values: NDArray, *, is_srgb: bool
 
 
 def described_map(entry: Entry, one: Map) -> Map:
-    """Return a map as an entry of `maps_record` calls and turns it; raises for what is no rotation."""
+    """Return a map as an entry of `maps_record` calls and turns it, by a rotation or an error."""
     source = MapSource(**{name: entry[name] for name in _SOURCE_FIELDS})
     if isinstance(one, Texture):
         return with_same_content(one, source=source)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.records.lookup import FLAT
-from storage.records.material import laid_out
+from storage.records.material import column_places
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def without_constant_textures(scene: AnyScene) -> AnyScene:
         return scene
     materials = scene.materials.copy()
     index = scene.material_textures.copy()
-    places = {column.name: part for column, part in laid_out()}
+    places = column_places()
     normals = scene.normal_textures
     if normals is not None:
         flat = [row for row, value in constants.items() if np.array_equal(value, FLAT)]
@@ -143,7 +143,7 @@ def _with_means(
     material_textures: NDArray[np.int32],
 ) -> NDArray[np.float32]:
     rows = materials.copy()
-    places = {column.name: part for column, part in laid_out()}
+    places = column_places()
     for place, name in enumerate(TEXTURED):
         for row in np.flatnonzero(material_textures[:, place] != CONSTANT):
             rows[row, places[name]] = textures[material_textures[row, place]].mean

@@ -131,7 +131,7 @@ def encode_scene(scene: Scene) -> bytes:
 
 
 def read_scene_file(path: Path) -> Scene:
-    """Return the scene of a `.safetensors` file, after a look at its size; as `decode_scene_file`."""
+    """Return the scene of a `.safetensors` file; raises as `decode_scene_file`."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_FILE_BYTES:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.records.lookup import texture_values
-from storage.records.material import laid_out
+from storage.records.material import column_places, laid_out
 from storage.records.scene_laws import broken_law, require_array, require_law
 from storage.records.texture import CONSTANT, MAX_MAPS_BYTES, TEXTURED, Texture
 
@@ -107,7 +107,7 @@ Reflecting = Texture | NDArray[np.float32]
 def _albedos(scene: "Scene") -> Iterator[tuple[int, Reflecting, Reflecting]]:
     """Yield the diffuse and the specular albedo of the material rows in which one is textured."""
     assert scene.material_textures is not None
-    places = {column.name: part for column, part in laid_out()}
+    places = column_places()
     index = scene.material_textures[:, [_DIFFUSE, _SPECULAR]]
     for row in np.flatnonzero((index != CONSTANT).any(axis=1)):
         diffuse, specular = (

@@ -199,7 +199,7 @@ class BucketStore(Store):
         return self._list_paths(folder, list_files)
 
     def list_all(self) -> set[str]:
-        """Return the names of all files, however deep; a thousand are a request; as `get` raises."""
+        """Return the names of all files, however deep; a thousand are a request."""
         return self._list_paths("", lambda driver, place: driver.find(place))
 
     def _list_paths(self, folder: str, find: Callable[[Any, str], Iterable[str]]) -> set[str]:
