@@ -71,7 +71,6 @@ class ObjectSpace:
     parts: tuple[str, ...]
     """The shell parts that exist, the floor first."""
     planes: tuple[Plane, ...]
-    """The plane of each shell part."""
 
     @property
     def floor(self) -> Plane:

@@ -17,6 +17,7 @@ has and their ranges, object counts, and most object sizes. Not known, and chose
 The two background policies are those of `SeparateSides`; both public stages use `de-biased`.
 """
 
+from dataclasses import replace
 from typing import Literal
 
 from scene_templates.checks import Range
@@ -124,49 +125,42 @@ def _family(
     )
 
 
-def _open_shell(policy: Policy, *, floor_z: Range, wall: bool) -> SeparateSides:
+def _shell(
+    *,
+    floor: SideRanges,
+    wall0: SideRanges = _STILL,
+    wall1: SideRanges = _STILL,
+    wall2: SideRanges = _STILL,
+    wall2_faces_out: bool = False,
+) -> SeparateSides:
     return SeparateSides(
-        floor=_side(policy, z=floor_z),
-        wall0=_STILL,
-        wall1=_side(policy, y=_FAR) if wall else _STILL,
-        wall2=_STILL,
-        wall2_faces_out=False,
+        floor=floor, wall0=wall0, wall1=wall1, wall2=wall2, wall2_faces_out=wall2_faces_out
     )
+
+
+def _open_shell(policy: Policy, *, floor_z: Range, wall: bool) -> SeparateSides:
+    wall1 = _side(policy, y=_FAR) if wall else _STILL
+    return _shell(floor=_side(policy, z=floor_z), wall1=wall1)
 
 
 def _corner_shell(policy: Policy) -> SeparateSides:
-    return SeparateSides(
-        floor=_side(policy),
-        wall0=_side(policy, y=_FAR),
-        wall1=_side(policy, x=_FAR),
-        wall2=_STILL,
-        wall2_faces_out=False,
-    )
+    return _shell(floor=_side(policy), wall0=_side(policy, y=_FAR), wall1=_side(policy, x=_FAR))
 
 
 def _box_shell(policy: Policy) -> SeparateSides:
-    side = SideRanges(
-        spin_deg=180.0 if policy == "de-biased" else 0.5,
-        tilt_deg=3.0 if policy == "de-biased" else 0.5,
+    original = policy == "original"
+    side = replace(
+        _side(policy),
+        spin_deg=0.5 if original else 180.0,
+        tilt_deg=0.5 if original else 3.0,
         scale=(1.0, 1.35),
-        shift_x=_NEAR,
-        shift_y=_NEAR,
-        shift_z=_NEAR,
     )
-    return SeparateSides(
-        floor=side, wall0=side, wall1=side, wall2=side, wall2_faces_out=policy == "original"
-    )
+    return _shell(floor=side, wall0=side, wall1=side, wall2=side, wall2_faces_out=original)
 
 
 def _exact_shell(policy: Policy) -> SeparateSides:
     """Return the unturned Cornell-like box; a spin of exactly 0 stays 0 in both policies."""
-    return SeparateSides(
-        floor=_STILL,
-        wall0=_STILL,
-        wall1=_STILL,
-        wall2=_STILL,
-        wall2_faces_out=policy == "original",
-    )
+    return _shell(floor=_STILL, wall2_faces_out=policy == "original")
 
 
 def _side(policy: Policy, *, x: Range = _NEAR, y: Range = _NEAR, z: Range = _NEAR) -> SideRanges:

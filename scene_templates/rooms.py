@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,7 @@ QUADS = 8
 """Quads per side of a patch: 8 x 8 x 2 = 128 triangles."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Side:
+class Side(NamedTuple):
     """One side of the nominal room, the cube [-1, 1]^3 before halving."""
 
     axis: int

@@ -27,7 +27,6 @@ class UserMap(Generic[Made]):
     source: MapSource
     """Title, URL and license."""
     load: Callable[[], Made]
-    """Function that reads the map."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

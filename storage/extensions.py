@@ -36,9 +36,7 @@ class Extension:
 
     path: Path
     sha256: str
-    """Hexadecimal digest of the file's bytes."""
     module: ModuleType
-    """Module that the file became."""
     decides: set[Decided] = field(default_factory=set)
     """Results that depend on the tables to which it added entries."""
     undo: list[Callable[[], None]] = field(default_factory=list)

@@ -66,7 +66,6 @@ class Image:
     """CPU seconds of this picture, where they were spent, without the scene's loading; None for a
     stored picture."""
     facts: Facts = field(default_factory=dict)
-    """Further facts of the picture."""
     layers_rgb: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     """[R, R, 3] linear radiance of layers by name, whose sum is the picture; may be empty."""
     remark: str = ""

@@ -38,7 +38,6 @@ class SceneKey:
     """The numbers that a composed scene follows from, beside settings and objects."""
 
     seed: int
-    """Seed of the dataset, from 0."""
     index: int
     """Index of the scene in the dataset, from 0."""
     attempt: int = 0

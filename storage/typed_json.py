@@ -22,7 +22,6 @@ class Spelled:
     pattern: str
     """Regular expression that matches all of it."""
     expected: str
-    """Description of valid texts, for error messages."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Let pydantic check the spelling with the type."""
@@ -36,7 +35,6 @@ class Finite:
     """Law of any JSON value: no NaN and no infinity in it."""
 
     expected: str = "JSON values with finite numbers"
-    """Description of valid values, for error messages."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Let pydantic look for such numbers after the type."""

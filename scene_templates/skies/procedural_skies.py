@@ -29,10 +29,6 @@ PALE_BLUE = (0.75, 0.97, 1.28)
 """Colours, of mean 1, of a clean and of a hazy sky: bluer than any black body is."""
 
 
-WARMEST_MIRED = 500.0
-COOLEST_MIRED = 40.0
-"""2,000 and 25,000 kelvin: colours of the Planckian locus that Rec.709 can show, by its fit."""
-
 _TO_REC709 = (
     (3.2404542, -1.5371385, -0.4985314),
     (-0.9692660, 1.8760108, 0.0415560),
@@ -298,22 +294,17 @@ def window_wall(draws: SkyDraws, texels: SkyTexels) -> Numbers:
 
 SkyFamily = Callable[[SkyDraws, SkyTexels], Numbers]
 
-_OURS: dict[str, SkyFamily] = {
-    "sun_and_sky": sun_and_sky,
-    "clouds": clouds,
-    "night": night,
-    "softboxes": softboxes,
-    "window_wall": window_wall,
-    "lobes": lobes,
-    "gradient": gradient,
-    "constant": constant,
-}
+_OURS: tuple[SkyFamily, ...] = (
+    sun_and_sky, clouds, night, softboxes, window_wall, lobes, gradient, constant,
+)  # fmt: skip
 
-OUR_SKIES = tuple(_OURS)
+OUR_SKIES = tuple(make.__name__ for make in _OURS)
 """What skies are drawn from unless the settings say otherwise; registering another does not change
 it."""
 
-SKIES: Registry[SkyFamily] = Registry("sky", Callable, _OURS, decides=("data",))
+SKIES: Registry[SkyFamily] = Registry(
+    "sky", Callable, dict(zip(OUR_SKIES, _OURS, strict=True)), decides=("data",)
+)
 """Every name that `SkyMapSettings.families` admits."""
 
 
@@ -322,7 +313,6 @@ class SkyMap:
     """A latitude-longitude map of linear radiance; scene_templates.skies.texels orients it."""
 
     family: str
-    """Name of the family that it was drawn from."""
     radiance_rgb: NDArray[np.float32]
     """[H, 2H, 3], the top row first, the middle of the picture +X, a quarter from the left +Y."""
     parameters: Mapping[str, tuple[Any, ...]]

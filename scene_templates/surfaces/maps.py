@@ -122,9 +122,7 @@ class GlossRanges(TypedDict):
     """Ranges that several finishes share."""
 
     specular: tuple[float, float]
-    """Range of the specular albedo, from low to high."""
     roughness: tuple[float, float]
-    """Range of the roughness, from low to high."""
 
 
 LEAST_TINT = 0.88

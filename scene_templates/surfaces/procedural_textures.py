@@ -426,29 +426,18 @@ def camouflage(draws: SurfaceDraws, texels: Texels) -> Finish:
 
 SurfaceFamily = Callable[[SurfaceDraws, Texels], Finish]
 
-_OURS: dict[str, SurfaceFamily] = {
-    "checker": checker,
-    "stripes": stripes,
-    "bricks": bricks,
-    "tiles": tiles,
-    "hexagons": hexagons,
-    "planks": planks,
-    "wood": wood,
-    "marble": marble,
-    "terrazzo": terrazzo,
-    "cobbles": cobbles,
-    "concrete": concrete,
-    "rust": rust,
-    "brushed_metal": brushed_metal,
-    "fabric": fabric,
-    "camouflage": camouflage,
-}
+_OURS: tuple[SurfaceFamily, ...] = (
+    checker, stripes, bricks, tiles, hexagons, planks, wood, marble, terrazzo, cobbles,
+    concrete, rust, brushed_metal, fabric, camouflage,
+)  # fmt: skip
 
-OUR_SURFACES = tuple(_OURS)
+OUR_SURFACES = tuple(make.__name__ for make in _OURS)
 """What surfaces are drawn from unless the settings say otherwise; registering another does not
 change it."""
 
-SURFACES: Registry[SurfaceFamily] = Registry("surface", Callable, _OURS, decides=("data",))
+SURFACES: Registry[SurfaceFamily] = Registry(
+    "surface", Callable, dict(zip(OUR_SURFACES, _OURS, strict=True)), decides=("data",)
+)
 """Every name that `SurfaceMapSettings.families` admits."""
 
 

@@ -22,7 +22,6 @@ class Derivation:
     operation: str
     """One of merge, select and reshard."""
     arguments: Mapping[str, Any]
-    """Options of the command, by name."""
     sources: Sequence[Mapping[str, Any]]
     """Per source: build, num_scenes, digest, key_offset, settings."""
 

@@ -59,9 +59,7 @@ class ShardEntry:
     """train, validation or test."""
     num_samples: Scenes
     num_bytes: Bytes
-    """Size of the file in bytes."""
     sha256: Sha256
-    """Hexadecimal digest of the file's bytes."""
     members: Annotated[None, DROPPED] = dataclasses.field(default=None, compare=False, repr=False)
     """An index of its members in rows of before version 5, which is not kept."""
 
@@ -71,7 +69,6 @@ class _Fields:
     """Fields of a manifest, and of its file."""
 
     build: ShortText
-    """Name of the dataset preset."""
     settings: Annotated[Mapping[str, Any], FINITE]
     """All settings of the preset; a dataset keeps them for life."""
     environment: Annotated[Mapping[str, Any], FINITE]
@@ -108,9 +105,7 @@ class StoredManifest(_Fields):
     """File of a manifest."""
 
     dataset_digest: Sha256
-    """The dataset digest as it was written."""
     totals: Totals | None = None
-    """Sums as they were written."""
     manifest_sha256: Sha256 | None = None
     """Seal of the file (storage.digests.seal_of); older manifests have none."""
 

@@ -85,7 +85,6 @@ class _Counts:
     scenes_given_up: int
     """Scenes that no attempt could save; of a bucket, known once it is finished."""
     scenes_planned: int
-    """Scenes of the finished dataset."""
     num_views: int
 
 
@@ -291,11 +290,9 @@ class DatasetStatus(_Counts):
     display_name: str
     """Path or URL without secrets."""
     build: str
-    """Name of the dataset preset."""
     shards_done: int
     """Finished shards, listed in the manifest or not."""
     shards_planned: int
-    """Shards of the finished dataset."""
     shards_lost: int
     """Shards that a finished dataset lists, and that are not there; of a bucket, 0."""
     finished: bool
@@ -311,7 +308,6 @@ class DatasetStatus(_Counts):
     """Core hours spent on finished scenes; killed workers are not counted. Of very many logs, some
     stand for all. None without logs."""
     last_scene_unix_s: float | None
-    """When the last scene was made."""
     failures: Sequence[tuple[str, str, int]]
     """Stage, reason and number of rejections, the most frequent first. While a dataset is made,
     those of a folder's last shards alone where there are very many (MOST_NOTES)."""

@@ -40,7 +40,6 @@ class ShardNote:
     """Contents of the note on a finished shard."""
 
     shard: ShardEntry
-    """The shard's row of the manifest."""
     failures: tuple[Failure, ...]
     """Scenes that were given up, and rejected attempts."""
     scenes: Scenes | None = None

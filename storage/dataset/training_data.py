@@ -36,9 +36,7 @@ class DataSource:
     name: str
     """Name of the dataset preset, or the display name of a list of shards."""
     digest: str
-    """Same as `TrainingData.digest`."""
     num_views: int | None
-    """Pictures per scene, where a manifest says it."""
 
 
 @dataclass(frozen=True, kw_only=True)

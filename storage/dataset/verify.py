@@ -52,11 +52,9 @@ class Verification:
     """Result of a check of a dataset."""
 
     manifest: Manifest
-    """The manifest that was checked."""
     problems: Sequence[str]
     """One line per fault, naming shard and sample; empty where the dataset is whole."""
     num_samples: int
-    """Number of samples that were checked."""
     bad_shards: Sequence[str]
     """Names of the shards that are missing, or were read and are not what they should be."""
     num_shards_planned: int

@@ -42,7 +42,6 @@ class SkinQuality:
     """Mean difference of the linear diffuse colour between points spread evenly over the source and
     the nearest points of the level, over all channels."""
     colour_error_p95: float
-    """95th percentile of the same error."""
     missed_cells: float
     """Share of the texels for which the source has no surface nearby that faces the same way: they
     show its nearest point."""
@@ -60,7 +59,6 @@ class OwnMaterials:
     reason: str = ""
     """Stable code of why the object goes without them; empty where it has them."""
     message: str = ""
-    """One sentence for a person."""
     lost: tuple[str, ...] = ()
     """Properties of the source that this renderer cannot show, such as `emission`."""
 
@@ -81,7 +79,6 @@ class LevelSkin:
     packed_normal: bytes | None = None
     """Encoded bytes of the normal map; None where the source has none, or it was not requested."""
     quality: SkinQuality
-    """Errors measured against the source."""
     emission: NDArray[np.float32] | None = None
     """[F, 3] what each face emits, in the units of the source; None where nothing does, or
     where it was not requested."""
@@ -141,7 +138,6 @@ class SourceFacts:
     num_faces_turned: int
     """Triangles whose winding was reversed to face outward."""
     num_parts: int
-    """Number of connected mesh components."""
     open_edges: int
     """Edges with one face; 0 for a surface without border."""
     nonmanifold_edges: int
@@ -169,11 +165,9 @@ class LevelQuality:
     """
 
     error_mean: float
-    """Mean distance."""
     error_p99: float
     """99th percentile of the distance: what bounds refer to."""
     error_max: float
-    """Largest distance of any sample point."""
     normal_error_deg: float
     """Mean angle between the normals of the source and of the level, 0 to 90."""
     area_ratio: float
@@ -187,7 +181,6 @@ class LevelQuality:
     min_angle_p5_deg: float
     """5th percentile of the triangles' smallest angles."""
     open_edges: int
-    """Number of edges with only one face."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,7 +215,6 @@ class Asset:
     geometry_sha256: str
     """Digest of the cleaned source geometry: equal for copies, whatever their names."""
     source_sha256: str
-    """Digest of the source file."""
     recipe: str
     """Name and version of the recipe and of the libraries that made it."""
     source: SourceFacts
@@ -309,7 +301,6 @@ class AssetRow(NamedObject):
     method: str
     """How it was made; `source` where nothing had to be left out."""
     quality: LevelQuality
-    """How it compares with the source."""
     source: SourceFacts
     materials: OwnMaterials | None = None
     """Result of reading the source's materials; None where they were not requested."""

@@ -35,7 +35,6 @@ class Environment:
     is_seen: bool = False
     """True: cameras see the map. It lights the scene in any case."""
     source: MapSource = field(default_factory=MapSource)
-    """Name, URL and rights of the map."""
 
     @cached_property
     def sha256(self) -> str:

@@ -37,9 +37,7 @@ class MaterialColumn:
     name: str
     """Lower case letters, digits and underscores; files and networks name the column so."""
     means: str
-    """One sentence that documents the column."""
     width: int
-    """Number of values a material has in it."""
     within: Within
     """Range of each number; both ends are finite."""
     default: float = 0.0

@@ -65,9 +65,7 @@ class SplitRows:
     """The rows of one split."""
 
     start: int
-    """Index of the first row."""
     stop: int
-    """Index after the last row."""
     camps: Mapping[str, CampSizes]
     """Sizes by camp; "" is that of objects without one."""
 
@@ -77,9 +75,7 @@ class IndexFacts:
     """Identity and contents of an index of objects."""
 
     lock_sha256: str
-    """Hexadecimal digest of the lock's bytes."""
     lock_bytes: int
-    """Size of the lock in bytes."""
     asked: str
     """Digest of the query to the source; a change of it lists the source again."""
     num_found: int
@@ -89,9 +85,7 @@ class IndexFacts:
     camps: tuple[str, ...]
     """Camps by their number in the column."""
     splits: Mapping[str, SplitRows]
-    """Range of index rows of each split."""
     format: int = _FORMAT
-    """Version of the file's form."""
 
     @property
     def num_objects(self) -> int:

@@ -34,7 +34,6 @@ class NamedObject:
     attribution: str
     """Author to credit, as the source states it."""
     source_url: str
-    """Where the object came from."""
 
     @property
     def identity(self) -> dict[str, str]:
@@ -102,7 +101,6 @@ class Failure:
     reason: str
     """Stable reason code in snake_case."""
     message: str
-    """One sentence for a person."""
     attempt: int = 0
     """Number of the attempt at the item, from 0."""
 

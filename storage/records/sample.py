@@ -88,7 +88,6 @@ class ViewRecord:
     at_cap: bool
     """True: sampling hit the sample limit before the target error."""
     seed: int
-    """Seed of the view's samples."""
     camera_attempt: int
     """Number of cameras that were rejected before this one."""
     expected: PartFloor | None = None

@@ -68,7 +68,6 @@ class SceneObject:
     attribution: str = ""
     """Author to credit, as the source states it."""
     source_url: str = ""
-    """Where the object came from."""
 
     @property
     def is_lamp(self) -> bool:

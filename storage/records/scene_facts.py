@@ -94,7 +94,6 @@ class SurfaceFacts:
     albedo_sum: float
     """The same of both together."""
     roughness: float
-    """Mean roughness over the triangles."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,11 +129,9 @@ class CameraFacts:
     distance: float
     """Distance from the origin in world units."""
     elevation_deg: float
-    """Angle above the horizon in degrees."""
     azimuth_deg: float
     """Angle from +X towards +Y in degrees, in [0, 360)."""
     fov_deg: float
-    """Full field of view in degrees."""
 
 
 def surfaces(scene: Scene) -> list[SurfaceFacts]:

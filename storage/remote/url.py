@@ -40,13 +40,11 @@ class RemoteUrl:
     what: str = field(compare=False)
     """Name of the resource in messages, such as `objects`."""
     scheme: str
-    """URL scheme, a key of PACKAGES."""
     root: str
     """Path as the driver takes it: no secrets, query or final slash."""
     query: tuple[tuple[str, str], ...] = field(default=(), repr=False)
     """Sent with every request, since it may hold the key; http and https only."""
     user: str = field(default="", repr=False)
-    """Sent with every request; http and https only."""
     password: str = field(default="", repr=False)
     """Sent with every request; http and https only."""
 

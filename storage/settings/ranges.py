@@ -18,9 +18,7 @@ class Within:
     """Lowest and highest value; both are admitted unless that end is open."""
 
     low: float
-    """Least value; see `low_open`."""
     high: float
-    """Greatest value; see `high_open`."""
     low_open: bool = False
     """True: `low` itself is refused."""
     high_open: bool = False

@@ -23,7 +23,6 @@ class Later:
     scene: Scene
     """Has the same triangles with their corners in the same order, possibly elsewhere."""
     view: int
-    """Camera index in the later scene."""
 
     @cached_property
     def corners(self) -> NDArray[np.float64]:
@@ -81,7 +80,6 @@ class Pass:
     name: str
     """Lower case letters and underscores, with the unit where there is one."""
     means: str
-    """One sentence that documents the pass."""
     of: Callable[[PassRays], NDArray] = field(compare=False, repr=False)
     """Returns the values at rays, [...] or [..., channels]."""
     averaging: Averaging
