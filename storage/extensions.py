@@ -55,9 +55,7 @@ _loading: list[Extension] = []
 def load_extension(file: str | Path, *, sha256: str | None = None) -> Extension:
     """Load a file, once in this process, and name it to the processes that start from here.
 
-    Args:
-        file: its path.
-        sha256: what its bytes must be, where another process has loaded it before.
+    `sha256` is what its bytes must be, where another process has loaded it before.
 
     Raises:
         TrilightError: there is no such file, it is not Python or raises something, it registers a

@@ -124,11 +124,7 @@ class Renderer(Protocol):
         """Everything but scene and camera that decides a picture, as JSON values."""
 
     def load(self, scene: Scene, name: str) -> ReadyScene:
-        """Load a scene, which messages call `name`.
-
-        Args:
-            scene: a scene that passes `Scene.check`.
-            name: name of the scene.
+        """Load a scene that passes `Scene.check`, which messages call `name`.
 
         Raises:
             Unrenderable: the scene cannot be rendered.

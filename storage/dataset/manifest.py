@@ -162,11 +162,7 @@ def index_shard(path: Path) -> ShardEntry:
 
 
 def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
-    """Return the manifest entry of an open shard.
-
-    Raises:
-        TrilightError: the name is not a shard's, or the file is not a whole shard.
-    """
+    """Return the manifest entry of an open shard; raises TrilightError where it is not whole."""
     match = SHARD_NAME.fullmatch(name)
     if match is None:
         raise TrilightError(f"{name}: not a shard; expected a name like train-000003.tar.")
@@ -219,8 +215,7 @@ def shard_row(shard: ShardEntry) -> dict[str, Any]:
 def read_manifest(path: Path) -> Manifest:
     """Return the manifest of a file, as far as it is listed.
 
-    Raises:
-        TrilightError: missing, not JSON, another schema version, or a shard name that is none.
+    It raises TrilightError where it is missing, no JSON, or of another schema version or form.
     """
     return _read(path, decode_manifest)
 

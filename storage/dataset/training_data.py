@@ -74,11 +74,9 @@ class TrainingData:
 
 
 def open_training_data(data: Sequence[str]) -> TrainingData:
-    """Open what `--data` names.
+    """Open what `--data` names: one root of a dataset, or any number of shards that end in `.tar`.
 
-    Args:
-        data: one root of a dataset, or any number of paths, URLs and brace patterns that end in
-            `.tar`.
+    Shards are paths, URLs and brace patterns.
 
     Raises:
         TrilightError: nothing is named, roots and shards are mixed, a URL is refused, or there is

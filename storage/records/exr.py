@@ -194,15 +194,8 @@ def decode_channels(
     """Return the channels of an OpenEXR file by name, R, G and B as one unless `separate`.
 
     The library takes memory for all that a file's headers speak of, and small files can speak of
-    much: no pixel is read before the headers are what is expected.
-
-    Args:
-        data: the file.
-        names: of the channels that it must have.
-        check: called with the header before any pixel is read; raises TrilightError.
-        size: height and width as they must be; None for any.
-        what: the file in messages about its size.
-        separate: keep R, G and B apart.
+    much: no pixel is read before the headers are what is expected. `check` is called with the
+    header before that. Height and width are any, or of `size`; messages about it say `what`.
 
     Raises:
         TrilightError: not an EXR file, truncated, of several parts, with other channels, larger

@@ -19,10 +19,9 @@ MAX_HEADER_BYTES = 1 << 20
 
 
 def open_plain(path: Path) -> BinaryIO:
-    """Open a regular file for reading.
+    """Open a regular file for reading; raises OSError as `open`, and for all else.
 
-    Raises:
-        OSError: as `open`, or it is something else: opening a FIFO would block forever.
+    Opening a FIFO would block forever.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # of regular files, it changes nothing
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -42,9 +41,8 @@ def read_safetensors(
 ) -> tuple[dict[str, NDArray], dict[str, str]]:
     """Return arrays and metadata of a safetensors file held in memory.
 
-    Raises:
-        TrilightError: as `safetensors_header`, or the library refuses the bytes (it checks every
-            offset against the length of `data`).
+    It raises as `safetensors_header`, and where the library refuses the bytes: it checks every
+    offset against the length of `data`.
     """
     header = safetensors_header(data, max_header_bytes, name=name)
     try:
@@ -61,9 +59,8 @@ def safetensors_header(
 ) -> dict[str, Any]:
     """Return the header of a safetensors file held in memory, or of as much as a header may take.
 
-    Raises:
-        TrilightError: the bytes are truncated, the header is larger than `max_header_bytes`, or it
-            is no JSON object; `name` is the file in messages.
+    It raises TrilightError, with `name`, for bytes that are truncated, a longer header, or no JSON
+    object.
     """
     length = int.from_bytes(data[:8], "little")
     if len(data) < 8 or length > min(max_header_bytes, len(data) - 8):

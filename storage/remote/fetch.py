@@ -60,13 +60,7 @@ def version_of(facts: Mapping[str, Any]) -> dict[str, str]:
 
 
 def download(url: RemoteUrl, stream: BinaryIO, *, num_bytes: int | None, max_bytes: int) -> None:
-    """Write all bytes of a file to an open one, from its start.
-
-    Args:
-        url: the file.
-        stream: where they go.
-        num_bytes: how many there must be, where that is known.
-        max_bytes: how many there may be, where it is not.
+    """Write all bytes of a file to an open one, from its start: exactly, or at most, so many.
 
     Raises:
         TransferFailed: as `facts_of`, it has another size than `num_bytes`, it breaks off again and

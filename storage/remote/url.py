@@ -66,11 +66,7 @@ class RemoteUrl:
 
 
 def parse_url(source: str, *, what: str) -> RemoteUrl | Path:
-    """Return where something is: on this machine, or on a server.
-
-    Args:
-        source: a path, or a URL.
-        what: begins every message, such as `objects`.
+    """Return where a path or URL is: on this machine, or on a server; messages begin with `what`.
 
     Raises:
         TrilightError: the URL is chained (`::`), runs a program (`pipe:`), has a scheme that is not
