@@ -11,7 +11,7 @@ import os
 import re
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -151,9 +151,11 @@ class OpenShard:
         self._stream = stream
         self._held = held
         self._maps: dict[str, Member] = {}
-        self._samples: list[tuple[str, Mapping[str, Member]]] = list(
-            scan_samples(stream, name, self._maps)
-        )
+        try:
+            self._samples = list(scan_samples(stream, name, self._maps))
+        except BaseException:
+            stream.close()
+            raise
 
     @property
     def keys(self) -> Sequence[str]:
@@ -238,7 +240,7 @@ class ManifestShards(ShardSet):
 
     def open(self, number: int) -> OpenShard:
         entry = self._entries[number]
-        shard = _open_or_close(entry.name, self._files.open(entry, checked=True), self._held)
+        shard = OpenShard(entry.name, self._files.open(entry, checked=True), self._held)
         if len(shard.keys) != entry.num_samples:
             shard.close()
             raise TrilightError(
@@ -275,14 +277,6 @@ class KeysSeen:
             self._shards.add(shard)
 
 
-def _open_or_close(name: str, stream: BinaryIO, held: HeldMaps) -> OpenShard:
-    try:
-        return OpenShard(name, stream, held)
-    except BaseException:
-        stream.close()
-        raise
-
-
 class ListedShards(ShardSet):
     """Shards of a list: nothing is known of one before it was opened, and nothing is checked."""
 
@@ -300,7 +294,7 @@ class ListedShards(ShardSet):
 
     def open(self, number: int) -> OpenShard:
         place = self._places[number]
-        shard = _open_or_close(place.display_name, place.open(), self._held)
+        shard = OpenShard(place.display_name, place.open(), self._held)
         try:
             self._seen.add(place.display_name, shard.keys)
         except TrilightError:

@@ -209,8 +209,8 @@ class Level:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Asset:
-    """A clean object at falling budgets."""
+class _Facts:
+    """Facts of an asset, and of the metadata of its file."""
 
     geometry_sha256: str
     """Digest of the cleaned source geometry: equal for copies, whatever their names."""
@@ -218,10 +218,23 @@ class Asset:
     recipe: str
     """Name and version of the recipe and of the libraries that made it."""
     source: SourceFacts
-    levels: tuple[Level, ...]
-    """Levels of detail, the largest triangle budget first."""
     materials: OwnMaterials | None = None
     """Result of reading the source's materials; None where they were not requested."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Asset(_Facts):
+    """A clean object at falling budgets."""
+
+    levels: tuple[Level, ...]
+    """Levels of detail, the largest triangle budget first."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Header(_Facts):
+    levels: tuple[LevelRecord, ...]
+    skins: Mapping[str, SkinQuality] = dataclasses.field(default_factory=dict)
+    """Quality of the skin of each level that has one, by its budget."""
 
 
 def encode_asset(asset: Asset) -> bytes:
@@ -258,25 +271,10 @@ def decode_asset(data: bytes) -> Asset:
     except (KeyError, TrilightError) as error:
         raise TrilightError(
             f"asset: a safetensors file with arrays {', '.join(arrays) or 'none'} does not hold "
-            f"one ({error}); expected a file of the asset store. Delete "
-            "it, and it is made again."
+            f"one ({error}); expected a file of the asset store. Delete it: it is made again."
         ) from error
     fields = {name: value for name, value in vars(header).items() if name != "skins"}
     return Asset(**{**fields, "levels": levels})
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Header:
-    """Metadata of the file; the fields are those of `Asset`."""
-
-    geometry_sha256: str
-    source_sha256: str
-    recipe: str
-    source: SourceFacts
-    levels: tuple[LevelRecord, ...]
-    materials: OwnMaterials | None = None
-    skins: Mapping[str, SkinQuality] = dataclasses.field(default_factory=dict)
-    """Quality of the skin of each level that has one, by its budget."""
 
 
 def _level(

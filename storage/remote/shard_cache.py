@@ -88,8 +88,7 @@ class ShardCache:
                 return
         raise TrilightError(
             f"{url.what} {url.display_url!r}: the bytes are not those of the manifest (sha256 "
-            "differs, "
-            f"{_ARRIVALS} times); expected {sha256}. Mend the file on the server."
+            f"differs, {_ARRIVALS} times); expected {sha256}. Fix the file on the server."
         )
 
     def _make_room(self, num_bytes: int) -> None:

@@ -251,10 +251,9 @@ class BucketStore(Store):
         if self.create_if_absent(_PROBE, b"\n") and self.create_if_absent(_PROBE, b"\n"):
             raise TrilightError(
                 f"{self.url.what} {self.url.display_url!r}: the server does not know conditional "
-                "writes "
-                "(If-None-Match, or ifGenerationMatch), so two workers could replace each other's "
-                "files; expected one that refuses to create a file twice. Use another server, or "
-                "a folder."
+                "writes (If-None-Match, or ifGenerationMatch), so two workers could replace each "
+                "other's files; expected one that refuses to create a file twice. Use another "
+                "server, or a folder."
             )
 
     def _upload(self, name: str, content: Path | bytes, *, mode: str) -> None:
@@ -280,9 +279,8 @@ class BucketStore(Store):
             kind = TrilightError if lasting else EnvironmentFailure
             raise kind(
                 f"{self.url.what} {self.url.display_url!r}: cannot be {what} ({error.message}); "
-                "expected "
-                "a bucket that exists, and access that lets you list, read and write there. What "
-                "was finished is safe: fix it and run the same command again."
+                "expected a bucket that exists, and access that lets you list, read and write "
+                "there. What was finished is safe: fix it and run the same command again."
             ) from error
 
 
