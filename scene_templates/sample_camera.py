@@ -3,16 +3,15 @@
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-import pydantic
 from numpy.typing import NDArray
 
 from scene_templates.checks import OFFSET, SIZE, Range, require
 from scene_templates.layout import CameraPose
 from storage.conventions import look_at_c2w
-from storage.settings.described import checked
+from storage.settings.described import checked, leaves_out
 from storage.settings.ranges import Within
 
 
@@ -63,9 +62,6 @@ of golden angles. `orbit`: equal steps of azimuth at one elevation, which is dra
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
 
-_LATER: dict[str, Any] = {"path": "random", "elevation_deg": None}
-"""Settings that no record holds at these values, so that digests of earlier presets stay."""
-
 
 @checked("scene settings")
 class CameraSettings:
@@ -85,11 +81,7 @@ class CameraSettings:
     is replaced by a random one."""
     elevation_deg: Annotated[Range | None, Within(-89, 89, unit="degrees")] = None
     """Range of the cameras' elevations in place of that of the layout."""
-
-    @pydantic.model_serializer(mode="wrap")
-    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        record: dict[str, Any] = as_usual(self)
-        return {k: value for k, value in record.items() if k not in _LATER or value != _LATER[k]}
+    _record = leaves_out("path", "elevation_deg")
 
 
 def path_position(

@@ -18,7 +18,7 @@ from storage.digests import sha256_of_stream
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.records.objects import Failure, LockedObject, decode_failures, decode_objects_lock
 from storage.records.packed_maps import HeldMaps
-from storage.records.safe_read import open_plain
+from storage.records.safe_read import open_if_there, open_plain
 from storage.records.sample import (
     Sample,
     SceneRecord,
@@ -68,14 +68,7 @@ class LocalFiles(_Files):
         self._checked: dict[str, tuple[int, ...]] = {}
 
     def open_beside(self, name: str) -> BinaryIO | None:
-        try:
-            return open_plain(self.root / name)
-        except (FileNotFoundError, NotADirectoryError):
-            return None
-        except OSError as error:
-            raise TrilightError(
-                f"{self.root / name}: cannot be read ({error.strerror})."
-            ) from error
+        return open_if_there(self.root / name)
 
     def num_bytes(self, shard: ShardEntry) -> int | None:
         """Return the size of a shard; raises ShardMissing, or Unreadable."""

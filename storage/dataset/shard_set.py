@@ -7,6 +7,7 @@ of its members, and of a whole set as many unpacked maps as storage.records.pack
 
 import contextlib
 import itertools
+import math
 import os
 import re
 import threading
@@ -110,18 +111,15 @@ def expand_pattern(pattern: str, what: str = "shards") -> list[str]:
             f"{named}: a brace is not closed, or stands within another; expected such as "
             "train-{000000..000007}.tar."
         )
-    count = 1
-    for group in groups:
-        count *= len(group)
-        if count > MAX_SHARDS:
-            raise TrilightError(
-                f"{named}: stands for more than {MAX_SHARDS} names; expected at most that many."
-            )
-    return [_join_groups(fixed, chosen) for chosen in itertools.product(*groups)]
-
-
-def _join_groups(fixed: Sequence[str], chosen: Sequence[str]) -> str:
-    return "".join(text for pair in zip(fixed, [*chosen, ""], strict=True) for text in pair)
+    count = math.prod(map(len, groups))
+    if count > MAX_SHARDS:
+        raise TrilightError(
+            f"{named}: stands for more than {MAX_SHARDS} names; expected at most that many."
+        )
+    return [
+        "".join(text for pair in zip(fixed, [*chosen, ""], strict=True) for text in pair)
+        for chosen in itertools.product(*groups)
+    ]
 
 
 def _alternatives(group: str, named: str) -> Sequence[str]:

@@ -101,21 +101,18 @@ class LevelSkin:
         return self.uv.nbytes + sum(map(len, (*self.packed, self.packed_normal or b""))) + glow
 
 
-def skin_arrays(skin: LevelSkin, name: str) -> dict[str, NDArray]:
-    """Return the arrays of a skin for the file of its asset; `name` ends the name of each."""
-    maps: dict[str, NDArray] = {
-        f"{column}_{name}": np.frombuffer(data, np.uint8)
-        for column, data in zip(TEXTURED, skin.packed, strict=True)
-    }
-    if skin.packed_normal is not None:
-        maps[f"{NORMAL}_{name}"] = np.frombuffer(skin.packed_normal, np.uint8)
+def _skin_arrays(skin: LevelSkin, name: str) -> dict[str, NDArray]:
+    arrays = {f"uv_{name}": np.ascontiguousarray(skin.uv)}
+    packed = (*skin.packed, skin.packed_normal)
+    for column, data in zip((*TEXTURED, NORMAL), packed, strict=True):
+        if data is not None:
+            arrays[f"{column}_{name}"] = np.frombuffer(data, np.uint8)
     if skin.emission is not None:
-        maps[f"emission_{name}"] = np.ascontiguousarray(skin.emission)
-    return {f"uv_{name}": np.ascontiguousarray(skin.uv), **maps}
+        arrays[f"emission_{name}"] = np.ascontiguousarray(skin.emission)
+    return arrays
 
 
-def read_skin(arrays: Mapping[str, NDArray], quality: SkinQuality, name: str) -> LevelSkin:
-    """Return the skin of `skin_arrays`; raises KeyError where there is none."""
+def _read_skin(arrays: Mapping[str, NDArray], quality: SkinQuality, name: str) -> LevelSkin:
     first, second, third = (arrays[f"{column}_{name}"].tobytes() for column in TEXTURED)
     normal = arrays.get(f"{NORMAL}_{name}")
     return LevelSkin(
@@ -241,10 +238,11 @@ def encode_asset(asset: Asset) -> bytes:
     """Return the file of an asset; equal assets give equal bytes."""
     arrays: dict[str, NDArray] = {}
     for level in asset.levels:
-        arrays[f"positions_{level.record.budget}"] = np.ascontiguousarray(level.positions)
-        arrays[f"faces_{level.record.budget}"] = np.ascontiguousarray(level.faces)
+        name = str(level.record.budget)
+        arrays[f"positions_{name}"] = np.ascontiguousarray(level.positions)
+        arrays[f"faces_{name}"] = np.ascontiguousarray(level.faces)
         if level.skin is not None:
-            arrays |= skin_arrays(level.skin, str(level.record.budget))
+            arrays |= _skin_arrays(level.skin, name)
     header: dict[str, Any] = {
         "geometry_sha256": asset.geometry_sha256,
         "source_sha256": asset.source_sha256,
@@ -285,7 +283,7 @@ def _level(
         record=record,
         positions=arrays[f"positions_{name}"],
         faces=arrays[f"faces_{name}"],
-        skin=read_skin(arrays, skins[name], name) if name in skins else None,
+        skin=_read_skin(arrays, skins[name], name) if name in skins else None,
     )
 
 

@@ -30,6 +30,16 @@ def open_plain(path: Path) -> BinaryIO:
     return os.fdopen(descriptor, "rb")
 
 
+def open_if_there(path: Path) -> BinaryIO | None:
+    """Open as `open_plain`; None for no file, and TrilightError for one that cannot be read."""
+    try:
+        return open_plain(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
+
+
 def read_plain(path: Path) -> bytes:
     """Return the bytes of a regular file; raises OSError as `open_plain`."""
     with open_plain(path) as stream:

@@ -63,26 +63,23 @@ class PartFloor:
     """Errors of a picture, of one layer of it for all lights together, or of one light."""
 
     noise_floor_db: Plausible
-    """Error in dB, as psnr_log_db."""
-    noise_floor_linear_db: Plausible
-    """The same error as psnr_linear_db."""
-    object_noise_floor_db: Plausible
-    """The same error as object_psnr_log_db."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewRecord:
-    """Sampling and stated errors of one picture."""
-
-    spp: int
-    """Samples per pixel that were spent; on each light where they are apart."""
-    noise_floor_db: Plausible
-    """Measured error of the picture as psnr_log_db (storage.metrics), before it was packed; the
-    profile `compact` adds at most a tenth to its mean square (storage.records.profiles)."""
+    """Error in dB, as psnr_log_db (storage.metrics)."""
     noise_floor_linear_db: Plausible
     """The same error as psnr_linear_db."""
     object_noise_floor_db: Plausible
     """The same error as object_psnr_log_db: over pixels that show geometry."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewRecord(PartFloor):
+    """Sampling and stated errors of one picture.
+
+    They are measured before it is packed; the profile `compact` adds at most a tenth to their mean
+    square (storage.records.profiles).
+    """
+
+    spp: int
+    """Samples per pixel that were spent; on each light where they are apart."""
     coverage: Plausible
     """Share of the picture in which an object is seen first, from a coarse grid of rays."""
     at_cap: bool
@@ -204,10 +201,11 @@ def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, by
         ValueError: pictures and view records differ in number.
     """
     scene = without_constant_textures(sample.scene)
-    record = {
-        **scene_record(scene),
-        "views": [_view_record(view) for view in sample.views],
-    }
+    views = [
+        {name: value for name, value in dataclasses.asdict(view).items() if value is not None}
+        for view in sample.views
+    ]
+    record = {**scene_record(scene), "views": views}
     members = pack_arrays(encode_arrays(scene), profile) | {"json": canonical_json(record)}
     together = sample.lights_rgb is None and sample.parts_rgb is None
     of_pictures = profile if together else "lossless"
@@ -235,16 +233,14 @@ def decode_sample(key: str, members: Mapping[str, bytes], held: HeldMaps | None 
     with name_errors(key):
         pictures = [decode_exr(members[f"{view}.exr"]) for view in range(len(record.views))]
         radiance_rgb = np.stack(pictures)
-        lights_rgb = decode_lights(record.scene, range(len(pictures)), pictures[0].shape, members)
-        parts_rgb = _decode_parts(record, radiance_rgb, members)
-        passes_exr = _of_views("passes", range(len(pictures)), members)
-    return Sample(
-        **vars(record),
-        radiance_rgb=radiance_rgb,
-        lights_rgb=lights_rgb,
-        parts_rgb=parts_rgb,
-        passes_exr=passes_exr,
-    )
+        every = range(len(pictures))
+        return Sample(
+            **vars(record),
+            radiance_rgb=radiance_rgb,
+            lights_rgb=decode_lights(record.scene, every, pictures[0].shape, members),
+            parts_rgb=_decode_parts(record, radiance_rgb, members),
+            passes_exr=_of_views("passes", every, members),
+        )
 
 
 def _of_views(
@@ -295,7 +291,12 @@ def decode_scene(
     """
     if "json" not in members:
         raise TrilightError(f"sample {key}: member {key}.json is missing.")
-    record = _decode_record(key, members["json"])
+    try:
+        record = json.loads(members["json"])
+    except (ValueError, RecursionError) as error:
+        raise TrilightError(f"sample {key}: member {key}.json is not JSON ({error}).") from error
+    version = record.get("schema_version") if isinstance(record, dict) else None
+    require_readable(version, f"sample {key}")
     with name_errors(key):
         views = _views(record["views"])
         objects = scene_objects(record["objects"])
@@ -306,21 +307,6 @@ def decode_scene(
         provenance = scene_provenance(record["provenance"])
         scene = Scene(objects=objects, provenance=provenance, **fields)
     return SceneRecord(key=key, scene=scene, views=views)
-
-
-def _decode_record(key: str, data: bytes) -> dict[str, Any]:
-    try:
-        record = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise TrilightError(f"sample {key}: member {key}.json is not JSON ({error}).") from error
-    version = record.get("schema_version") if isinstance(record, dict) else None
-    require_readable(version, f"sample {key}")
-    return record
-
-
-def _view_record(view: ViewRecord) -> dict[str, Any]:
-    record = dataclasses.asdict(view)
-    return {name: value for name, value in record.items() if value is not None}
 
 
 @dataclass(frozen=True, kw_only=True)

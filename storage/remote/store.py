@@ -95,17 +95,13 @@ class LocalStore(Store):
         self.root = root
 
     def get(self, name: str, num_bytes: int | None = None) -> bytes | None:
-        from storage.records.safe_read import open_plain  # slow, and most names need no file
+        from storage.records.safe_read import open_if_there  # slow, and most names need no file
 
-        try:
-            with open_plain(self.root / name) as stream:
-                return stream.read(-1 if num_bytes is None else num_bytes)
-        except (FileNotFoundError, NotADirectoryError):
+        stream = open_if_there(self.root / name)
+        if stream is None:
             return None
-        except OSError as error:
-            raise TrilightError(
-                f"{self.root / name}: cannot be read ({error.strerror})."
-            ) from error
+        with stream:
+            return stream.read(-1 if num_bytes is None else num_bytes)
 
     def put(self, name: str, content: Path | bytes) -> None:
         self._write(name, content, replace=True)

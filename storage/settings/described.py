@@ -11,6 +11,7 @@ and the records in manifests and checkpoints. Laws between fields stay in `__pos
 streams shards does not import this file: tests/architecture/test_light_imports.py.
 """
 
+import dataclasses
 import functools
 import json
 import reprlib
@@ -75,6 +76,21 @@ def checked(called: str = "") -> Callable[[type[Settings]], type[Settings]]:
         return typing.cast(type[Settings], group)
 
     return decorate
+
+
+def leaves_out(*names: str) -> Any:
+    """Return the serializer of a class whose record lacks later fields at their defaults.
+
+    Digests of earlier presets stay so. It works as an attribute of the class, whatever its name.
+    """
+
+    @pydantic.model_serializer(mode="wrap")
+    def record(self: Any, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        later = {each.name: each.default for each in dataclasses.fields(self) if each.name in names}
+        usual: dict[str, Any] = as_usual(self)
+        return {k: v for k, v in usual.items() if k not in later or getattr(self, k) != later[k]}
+
+    return record
 
 
 def settings_record(group: Any, *, stated: bool = False) -> dict[str, Any]:
