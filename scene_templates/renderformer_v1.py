@@ -42,6 +42,9 @@ _STILL = SideRanges(
     shift_y=_EXACT,
     shift_z=_EXACT,
 )
+_UNTURNED = SeparateSides(
+    floor=_STILL, wall0=_STILL, wall1=_STILL, wall2=_STILL, wall2_faces_out=False
+)
 
 
 def stage_1_families(policy: Policy) -> tuple[Family, ...]:
@@ -125,26 +128,19 @@ def _family(
     )
 
 
-def _shell(
-    *,
-    floor: SideRanges,
-    wall0: SideRanges = _STILL,
-    wall1: SideRanges = _STILL,
-    wall2: SideRanges = _STILL,
-    wall2_faces_out: bool = False,
-) -> SeparateSides:
-    return SeparateSides(
-        floor=floor, wall0=wall0, wall1=wall1, wall2=wall2, wall2_faces_out=wall2_faces_out
-    )
-
-
 def _open_shell(policy: Policy, *, floor_z: Range, wall: bool) -> SeparateSides:
     wall1 = _side(policy, y=_FAR) if wall else _STILL
-    return _shell(floor=_side(policy, z=floor_z), wall1=wall1)
+    return replace(_UNTURNED, floor=_side(policy, z=floor_z), wall1=wall1)
 
 
 def _corner_shell(policy: Policy) -> SeparateSides:
-    return _shell(floor=_side(policy), wall0=_side(policy, y=_FAR), wall1=_side(policy, x=_FAR))
+    floor = _side(policy)
+    return replace(
+        _UNTURNED,
+        floor=floor,
+        wall0=replace(floor, shift_y=_FAR),
+        wall1=replace(floor, shift_x=_FAR),
+    )
 
 
 def _box_shell(policy: Policy) -> SeparateSides:
@@ -155,20 +151,20 @@ def _box_shell(policy: Policy) -> SeparateSides:
         tilt_deg=0.5 if original else 3.0,
         scale=(1.0, 1.35),
     )
-    return _shell(floor=side, wall0=side, wall1=side, wall2=side, wall2_faces_out=original)
+    return SeparateSides(floor=side, wall0=side, wall1=side, wall2=side, wall2_faces_out=original)
 
 
 def _exact_shell(policy: Policy) -> SeparateSides:
     """Return the unturned Cornell-like box; a spin of exactly 0 stays 0 in both policies."""
-    return _shell(floor=_STILL, wall2_faces_out=policy == "original")
+    return replace(_UNTURNED, wall2_faces_out=policy == "original")
 
 
-def _side(policy: Policy, *, x: Range = _NEAR, y: Range = _NEAR, z: Range = _NEAR) -> SideRanges:
+def _side(policy: Policy, *, y: Range = _NEAR, z: Range = _NEAR) -> SideRanges:
     return SideRanges(
         spin_deg=180.0 if policy == "de-biased" else 10.0,
         tilt_deg=10.0,
         scale=(0.9, 1.35),
-        shift_x=x,
+        shift_x=_NEAR,
         shift_y=y,
         shift_z=z,
     )

@@ -65,14 +65,11 @@ ALONG_THE_VIEW = 1e-9
 
 
 def look_at_c2w(*, eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> NDArray[np.float64]:
-    """Return the pose of a camera at `eye` that looks at `target`.
+    """Return the pose of a camera at `eye` that looks at `target`, float64 [4, 4] camera to world.
 
-    Args:
-        eye, target, up: [3] in world units; `up` need not be unit or orthogonal.
-
-    Returns:
-        c2w, float64 [4, 4]. Undefined (not finite) where the view direction is parallel to `up`
-        within ALONG_THE_VIEW, or one of them has no length: callers choose other vectors.
+    All are [3] in world units; `up` need not be unit or orthogonal. The pose is not finite where
+    the view direction is parallel to `up` within ALONG_THE_VIEW, or one of them has no length:
+    callers choose other vectors.
     """
     eye64 = np.asarray(eye, np.float64)
     up64 = np.asarray(up, np.float64)
@@ -99,10 +96,8 @@ def camera_rays(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the rays through the pixel centres of one camera, in world space.
 
-    The camera has a pose [4, 4] and a square picture, of which all rows are meant by default.
-
-    Returns:
-        origin [3] and unit directions [rows, resolution, 3] (row 0 on top), float64.
+    The camera has a pose [4, 4] and a square picture, of which all rows are meant by default. The
+    rays are an origin [3] and unit directions [rows, resolution, 3] (row 0 on top), float64.
     """
     pose = np.asarray(c2w, np.float64)
     offset = np.arange(resolution) + 0.5 - 0.5 * resolution
@@ -125,10 +120,9 @@ def pixel_places(
 ) -> NDArray[np.float64]:
     """Return where a camera's picture shows world positions [..., 3]: the inverse of `camera_rays`.
 
-    Returns:
-        x from the left and y from the top [..., 2] in pixels, float64, where the centre of pixel
-        (i, j) is (j + 0.5, i + 0.5). Places may lie outside the picture; what is not before the
-        camera has NaN.
+    Places are x from the left and y from the top [..., 2] in pixels, float64; the centre of pixel
+    (i, j) is (j + 0.5, i + 0.5). They may lie outside the picture; what is not before the camera
+    has NaN.
     """
     local = in_camera(positions, c2w)
     with np.errstate(invalid="ignore"):

@@ -86,10 +86,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """Return the name of an entry that was typed on a command line; it may be unknown.
 
         FILE.py:FUNCTION runs a file of their own and registers what the function returns, as
-        `as_entry` makes an entry of it, as `FILE.py:FUNCTION` without the folder.
-
-        Raises:
-            TrilightError: the file cannot be loaded (storage.extensions), or does not define it.
+        `as_entry` makes an entry of it, as `FILE.py:FUNCTION` without the folder. It raises
+        TrilightError where the file cannot be loaded (storage.extensions), or does not define it.
         """
         if not is_reference(reference):
             return reference

@@ -98,9 +98,8 @@ class ReadyScene(Protocol):
     def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Image:
         """Return the picture of a camera.
 
-        Raises:
-            Unrenderable: there is no such picture of this scene.
-            TrilightError: the renderer is unusable.
+        It raises Unrenderable where there is none of this scene, and TrilightError where the
+        renderer is unusable.
         """
 
 
@@ -126,9 +125,8 @@ class Renderer(Protocol):
     def load(self, scene: Scene, name: str) -> ReadyScene:
         """Load a scene that passes `Scene.check`, which messages call `name`.
 
-        Raises:
-            Unrenderable: the scene cannot be rendered.
-            TrilightError: the renderer is unusable, or cannot make pictures of its width.
+        It raises Unrenderable where the scene cannot be rendered, and TrilightError where the
+        renderer is unusable, or cannot make pictures of its width.
         """
 
     def close(self) -> None:

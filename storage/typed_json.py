@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar, cast
 
 from storage.errors import TrilightError
+from storage.settings.ranges import Law
 
 T = TypeVar("T")
 
@@ -31,18 +32,12 @@ class Spelled:
 
 
 @dataclass(frozen=True)
-class Finite:
+class Finite(Law):
     """Law of any JSON value: no NaN and no infinity in it."""
 
     expected: str = "JSON values with finite numbers"
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Let pydantic look for such numbers after the type."""
-        from pydantic_core import core_schema
-
-        return core_schema.no_info_after_validator_function(self._require, handler(source))
-
-    def _require(self, value: Any) -> Any:
+    def require(self, value: Any) -> Any:
         json.dumps(value, allow_nan=False)
         return value
 

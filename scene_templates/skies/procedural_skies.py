@@ -39,11 +39,9 @@ _TO_REC709 = (
 def planckian_rgb(mired: float) -> Numbers:
     """Return the linear colour [3], of mean 1, of a black body.
 
-    By the cubic fit of Kim et al. (2002) to the chromaticities, which is polynomials alone.
-
-    Args:
-        mired: a million over the temperature in kelvin: 500 is a candle, 154 daylight, 40 blue sky.
-            Equal steps look equal, as equal steps in kelvin do not.
+    By the cubic fit of Kim et al. (2002) to the chromaticities, which is polynomials alone. A mired
+    is a million over the temperature in kelvin: 500 is a candle, 154 daylight, 40 blue sky. Equal
+    steps look equal, as equal steps in kelvin do not.
     """
     t = mired / 1000
     if mired > 250:  # below 4,000 K

@@ -84,14 +84,11 @@ class SkyTexels:
         panes: tuple[int, int] = (1, 1),
         bars: float = 0.0,
     ) -> Numbers:
-        """Return how much of each texel [H, 2H] a rectangle covers.
+        """Return how much of each texel [H, 2H] a rectangle covers, whose middle is `towards` [3].
 
-        Args:
-            towards: [3] its middle.
-            half_sizes: half of its width and height, at distance 1.
-            roll_rad: by which it is turned about its middle.
-            panes: how many columns and rows of panes it is divided into.
-            bars: width of the bars between and around them, as a share of a pane.
+        It has half of its width and height at distance 1, is turned about its middle, and divided
+        into columns and rows of panes. The width of the bars between and around them is a share of
+        a pane.
         """
         right, up = _axes(towards, roll_rad)
         ahead = dot(self.directions, towards)

@@ -48,11 +48,9 @@ class Texels:
     ) -> Numbers:
         """Return periodic gradient noise with mean 0, each octave of twice the cells and half.
 
-        Args:
-            rng: a stream of its own; the same one gives the same noise at every size.
-            cells: of the first octave, in u and in v.
-            octaves: how many, as far as texels can show them.
-            moved: what is added to u and v before the look-up.
+        The first octave has `cells` in u and in v; there are as many octaves as texels can show.
+        The same `rng`, a stream of its own, gives the same noise at every size. `moved` is added to
+        u and v before the look-up.
         """
         u, v = (self.u, self.v) if moved is None else (self.u + moved[0], self.v + moved[1])
         total = np.zeros((self.size, self.size))

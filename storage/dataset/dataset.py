@@ -245,8 +245,8 @@ class Dataset:
     def read_shard(self, shard: ShardEntry) -> Iterator[Sample]:
         """Yield the samples of a shard in the order of the file, after checking its digest.
 
-        Raises:
-            TrilightError: the file is missing or its bytes are not those of the manifest.
+        It raises TrilightError where the file is missing or its bytes are not those of the
+        manifest.
         """
         held = HeldMaps()
         with self.files.open(shard, checked=True) as stream:

@@ -115,6 +115,9 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
     It raises TrilightError where a shard is missing or damaged.
     """
     tally = _Tally()
+    by_split = Counter[str]()
+    for shard in dataset.manifest.shards:
+        by_split[shard.split] += shard.num_samples
     for shard in (read := described_shards(dataset)):
         with (
             dataset.files.open(shard, checked=False) as stream,
@@ -123,32 +126,31 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
             _require_whole(dataset, shard)
             _count_shard(stream, shard, tally)
     is_complete = len(read) == len(dataset.manifest.shards)
+    views = len(tally.views["spp"])
+    has_parts = all(len(column) == views for column in tally.parts.values())
     return Statistics(
         num_scenes=dataset.manifest.num_samples,
-        scenes_by_split=_by_split(dataset),
+        scenes_by_split=+by_split,
         num_scenes_read=sum(shard.num_samples for shard in read),
         scenes_by_template=tally.templates,
         scenes_by_excursion=tally.excursions,
         scene_digest=digest_of_scenes(tally.scene_members) if is_complete else "",
         num_bytes=dataset.manifest.num_bytes,
-        spp=np.asarray(tally.views["spp"], np.int64),
-        noise_floor_db=np.asarray(tally.views["noise_floor_db"]),
-        noise_floor_linear_db=np.asarray(tally.views["noise_floor_linear_db"]),
-        object_noise_floor_db=np.asarray(tally.views["object_noise_floor_db"]),
-        at_cap=np.asarray(tally.views["at_cap"], np.bool_),
-        expected_error_db=np.asarray(tally.expected) if tally.expects_all() else None,
-        part_noise_floor_db=tally.parts_of_all(),
+        **{name: np.asarray(tally.views[name], kind) for name, kind in _OF_VIEWS.items()},
+        expected_error_db=np.asarray(tally.expected) if 0 < len(tally.expected) == views else None,
+        part_noise_floor_db={
+            name: np.asarray(column) for name, column in sorted(tally.parts.items()) if has_parts
+        },
     )
 
 
-def _by_split(dataset: Dataset) -> Mapping[str, int]:
-    counts: Counter[str] = Counter()
-    for shard in dataset.manifest.shards:
-        counts[shard.split] += shard.num_samples
-    return {split: count for split, count in counts.items() if count}
-
-
-_OF_VIEWS = ("spp", "noise_floor_db", "noise_floor_linear_db", "object_noise_floor_db", "at_cap")
+_OF_VIEWS: Mapping[str, Any] = {
+    "spp": np.int64,
+    "noise_floor_db": np.float64,
+    "noise_floor_linear_db": np.float64,
+    "object_noise_floor_db": np.float64,
+    "at_cap": np.bool_,
+}
 
 
 @dataclass(kw_only=True, eq=False)
@@ -173,17 +175,6 @@ class _Tally:
                 self.expected.append(view["expected"]["noise_floor_db"])
             for name, part in view.get("parts", {}).items():
                 self.parts.setdefault(name, array("d")).append(part["noise_floor_db"])
-
-    def expects_all(self) -> bool:
-        """Return whether every view states an expected error, and there is a view."""
-        return 0 < len(self.expected) == len(self.views["spp"])
-
-    def parts_of_all(self) -> dict[str, NDArray[np.float64]]:
-        """Return the floors of the parts, where every view has all of them."""
-        num_views = len(self.views["spp"])
-        if any(len(column) != num_views for column in self.parts.values()):
-            return {}
-        return {name: np.asarray(column) for name, column in sorted(self.parts.items())}
 
 
 def _count_shard(stream: BinaryIO, shard: ShardEntry, tally: _Tally) -> None:

@@ -79,16 +79,12 @@ def verify_dataset(
     fast: bool = False,
     shard_done: Callable[[str], None] = lambda name: None,
 ) -> Verification:
-    """Check a dataset, in a folder or on a server, against its manifest.
+    """Check a dataset, opened or by its path or URL, against its manifest.
 
     Several shards are checked at once in threads: hashing and unpacking release Python's lock.
-    Shards of a server are fetched again, past the cache, and not kept.
-
-    Args:
-        root: the dataset, opened, or its path or URL.
-        fast: compare only sizes, and in a folder also the headers of the members; reads no
-            picture. A changed byte is not seen.
-        shard_done: called with the name of each checked shard.
+    Shards of a server are fetched again, past the cache, and not kept. `shard_done` is called with
+    the name of each. With `fast`, only sizes are compared, and in a folder also the headers of the
+    members; no picture is read, and a changed byte is not seen.
 
     Raises:
         TrilightError: there is no readable manifest, so there is nothing to check against; a shard
@@ -98,7 +94,8 @@ def verify_dataset(
     manifest = dataset.manifest
     lock = dataset.lock_bytes()
     problems = list(_check_lock(lock, dataset))
-    locked = None if problems else _by_uid(lock or b"")
+    rows = [] if problems else decode_objects_lock(lock or b"", "objects.lock.jsonl")
+    locked = None if problems else {row.uid: row for row in rows}
     problems += _check_manifest(dataset)
     problems += [f"{name}: not in the manifest" for name in _list_unlisted(dataset)]
     where: dict[str, str] = {}
@@ -110,7 +107,11 @@ def verify_dataset(
         )
         try:
             for shard, findings in checks:
-                faults = [*findings.faults, *_twice(findings.keys, shard, where)]
+                faults = findings.faults + [
+                    f"sample {key} occurs twice in the dataset, first in {where[key]}"
+                    for key in findings.keys
+                    if where.setdefault(key, shard.name) != shard.name
+                ]
                 bad += [shard.name] if faults else []
                 problems += [
                     f"{shard.name}: {fault.removeprefix(f'{shard.name}: ')}"
@@ -160,10 +161,6 @@ def _list_unlisted(dataset: Dataset) -> list[str]:
     return [name for name in names if name not in listed]
 
 
-def _by_uid(lock: bytes) -> dict[str, LockedObject]:
-    return {entry.uid: entry for entry in decode_objects_lock(lock, "objects.lock.jsonl")}
-
-
 def _check_lock(lock: bytes | None, dataset: Dataset) -> Iterator[str]:
     manifest = dataset.manifest
     if not manifest.objects_lock_sha256:  # a kill may leave it out until the shards are listed
@@ -201,12 +198,6 @@ def _check_manifest(dataset: Dataset) -> Iterator[str]:
             yield f"{document}: missing"
         elif sha256_hex(content) != sha256:
             yield f"{document}: edited since it was written (sha256 differs from the manifest)"
-
-
-def _twice(keys: Sequence[str], shard: ShardEntry, where: dict[str, str]) -> Iterator[str]:
-    for key in keys:
-        if (other := where.setdefault(key, shard.name)) != shard.name:
-            yield f"sample {key} occurs twice in the dataset, first in {other}"
 
 
 def _check_shard(
@@ -374,11 +365,8 @@ def _check_passes(sample: Sample, names: Sequence[str]) -> Iterator[str]:
             has = f"view {view} has the passes {', '.join(sorted(stored))}"
             yield f"{has}; expected {', '.join(sorted(expected))}"
         for name, picture in stored.items():
-            if (share := _fraction_that_differs(picture, computed[name])) > MOST_DIFFERENT:
+            same = np.isclose(picture, computed[name], rtol=1e-4, atol=1e-4, equal_nan=True)
+            share = 1 - float(np.mean(same if same.ndim == 2 else same.all(axis=-1)))
+            if share > MOST_DIFFERENT:
                 what = f"view {view}: pass {name} is not what the scene says"
                 yield f"{what} in {share:.1%} of the pixels"
-
-
-def _fraction_that_differs(stored: NDArray, expected: NDArray) -> float:
-    same = np.isclose(stored, expected, rtol=1e-4, atol=1e-4, equal_nan=True)
-    return 1 - float(np.mean(same if same.ndim == 2 else same.all(axis=-1)))

@@ -193,16 +193,9 @@ def first_hits(
 ) -> FirstHits:
     """Return the first hits of a camera of a scene, in all pixels of its picture or in one.
 
-    Rays go through the centers of pixels, as those of the renderer's own `hits`.
-
-    Args:
-        scene: passes `Scene.check`.
-        view: row of `scene.c2w`.
-        resolution: width and height of the picture in pixels.
-        pixel: row from the top and column from the left of the only one that is computed.
-
-    Raises:
-        TrilightError: there is no such view or pixel.
+    Rays go through the centers of pixels, as those of the renderer's own `hits`. The scene passes
+    `Scene.check`; `view` is a row of `scene.c2w`, and `pixel` the row from the top and the column
+    from the left. It raises TrilightError where there is no such view or pixel.
     """
     require_row("view", view, scene.num_views)
     origin, directions = camera_rays(scene.c2w[view], float(scene.fov_deg[view]), resolution)

@@ -87,10 +87,8 @@ def encode_exr(
     """Return the OpenEXR file of a picture [R, R, 3], rounded to half floats; one thread.
 
     A lossy codec may leave values below 0, or infinite ones where the brightest rounds up: callers
-    look at what comes back.
-
-    Raises:
-        TrilightError: a value is not finite, negative, or too large for a half float.
+    look at what comes back. It raises TrilightError for a value that is not finite, negative, or
+    too large for a half float.
     """
     return encode_channels({"RGB": to_half(radiance_rgb)}, codec, attributes=attributes)
 
@@ -148,13 +146,9 @@ def channel_names(data: bytes) -> list[str]:
 
 
 def decode_exr(data: bytes) -> NDArray[np.float32]:
-    """Return the picture of an OpenEXR file as float32 [H, W, 3].
+    """Return the picture of an OpenEXR file as float32 [H, W, 3]; raises as `decode_channels`.
 
     Where the file is packed with losses, what they took below 0 is 0 again.
-
-    Raises:
-        TrilightError: not an EXR file, truncated, larger than MAX_RESOLUTION, or with other
-            channels than R, G and B.
     """
     return to_float32(decode_stored(data))
 

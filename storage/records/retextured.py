@@ -66,14 +66,11 @@ def with_textures(
     material_textures: NDArray[np.int32],
     normal_textures: NDArray[np.int32] | None = None,
 ) -> AnyScene:
-    """Return the same scene with textures, whose columns hold their means.
+    """Return the same scene with textures, whose columns hold their means; its own ones go.
 
-    Args:
-        scene: any; its own textures go.
-        uv: [3T, 2] of each corner of each triangle.
-        textures: each used, and each content once.
-        material_textures: [M, 3] rows of `textures`, or CONSTANT, in the order of TEXTURED.
-        normal_textures: [M] rows of `textures` that are normal maps, or CONSTANT; none by default.
+    Each corner of each triangle has its `uv` [3T, 2]. Each texture is used, and each content is
+    there once. `material_textures` [M, 3], in the order of TEXTURED, and `normal_textures` [M] are
+    rows of `textures`, or CONSTANT.
     """
     return dataclasses.replace(
         scene,

@@ -138,11 +138,8 @@ class Sample(SceneRecord):
     def view_passes(self, names: Sequence[str], *, view: int = 0) -> dict[str, NDArray]:
         """Return passes of one view by name, at the resolution of its picture, one ray a pixel.
 
-        Those that are stored are read, others are computed; the numbers are the same.
-
-        Args:
-            names: of passes (storage.records.passes.declared), other than `motion_px`.
-            view: row of the cameras.
+        Those that are stored are read, others are computed; the numbers are the same. Names are
+        those of storage.records.passes.declared, other than `motion_px`.
 
         Returns:
             for each name a picture [R, R], or [R, R, K] where the pass has K channels, row 0 on
@@ -194,11 +191,8 @@ def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, by
 
     A sample that was read from the profile `compact` and is packed so again loses once more: what
     is to stay goes into `kept_members`. Where lights or parts are apart, pictures stay exact in
-    every profile: they are the sum of these.
-
-    Raises:
-        TrilightError: a picture holds what half floats cannot (storage.records.exr).
-        ValueError: pictures and view records differ in number.
+    every profile: they are the sum of these. It raises TrilightError for a picture that half floats
+    cannot hold (storage.records.exr).
     """
     scene = without_constant_textures(sample.scene)
     views = [

@@ -204,8 +204,7 @@ def cameras(scene: Scene) -> list[CameraFacts]:
 def scene_values(record: SceneRecord) -> Mapping[str, Values]:
     """Return the values that one scene adds to each distribution (storage.records.quantities).
 
-    Raises:
-        TypeError, ValueError: a view's record holds something that is not a number.
+    It raises TypeError or ValueError where a view's record holds something that is not a number.
     """
     scene = record.scene
     reflecting = surfaces(scene)

@@ -25,12 +25,7 @@ _MAY_PASS_STATUS = (408, 409, 425, 429)
 
 
 class TransferFailed(Exception):
-    """A permanent transfer failure.
-
-    Attributes:
-        reason: a stable code in snake_case.
-        message: a sentence without secrets.
-    """
+    """A permanent transfer failure: a stable code in snake_case, and a sentence without secrets."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(reason, message)

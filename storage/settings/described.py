@@ -159,12 +159,9 @@ def _complaint(
 ) -> TrilightError:
     """Return what is wrong first: the place, the value and what was expected.
 
-    Args:
-        error: what pydantic found.
-        kind: the class whose values were read.
-        called: begins the complaint.
-        option: returns what a dotted place is called where people write it.
-        field, display_name: the field whose value alone was read, and what is shown of it.
+    Values of `kind` were read, or of its `field` alone, which is shown as `display_name`. The
+    complaint begins with `called`, and `option` returns what a dotted place is called where people
+    write it.
     """
     mistakes = error.errors(include_url=False)
     # a name that is unknown says more than the one that lacks then

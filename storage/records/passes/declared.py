@@ -46,9 +46,8 @@ class PassRays:
 def motion_px(rays: PassRays) -> NDArray[np.float64]:
     """Return where the other camera shows the points that rays meet, less where this one does.
 
-    Returns:
-        x to the right and y down [..., 2] in pixels, NaN where nothing is met or where the point
-        lies behind the other camera.
+    That is x to the right and y down [..., 2] in pixels; NaN where nothing is met or where the
+    point lies behind the other camera.
     """
     if rays.later is None:
         raise TrilightError("motion_px: no other moment is given; expected `then` or `then_view`.")
