@@ -46,9 +46,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     def register(self, name: str, entry: Entry) -> None:
         """Add an entry; call this in a file that `--extend` names.
 
-        Raises:
-            TrilightError: the name is taken or no word, the entry is of another kind, or something
-                is made of it and no file is being loaded, so that nothing could record it.
+        It raises TrilightError where the name is taken or no word, the entry is of another kind, or
+        something is made of it and no file is being loaded, so that nothing could record it.
         """
         extension = loading()
         if extension is None and self._decides:

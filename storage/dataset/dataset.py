@@ -256,12 +256,10 @@ class Dataset:
     def read_scenes(self, shard: ShardEntry) -> Iterator[SceneRecord]:
         """Yield the samples of a shard without their pictures, through its headers.
 
-        Only what is needed is read, so that a large dataset can be browsed; the digest of the
-        shard is therefore not checked (`read_shard` and `trilight verify` do that).
-
-        Raises:
-            TrilightError: the shard is missing or damaged, or a scene in it is unreadable or breaks
-                a law.
+        Only what is needed is read, so that a large dataset can be browsed; the digest of the shard
+        is therefore not checked (`read_shard` and `trilight verify` do that). It raises
+        TrilightError where the shard is missing or damaged, or a scene in it is unreadable or
+        breaks a law.
         """
         yield from self._read(shard, None, decode_scene, lambda name: not name.endswith("exr"))
 
@@ -325,11 +323,8 @@ def open_dataset(url: str) -> Dataset:
     """Open the dataset in a local folder, or below a URL of http, https, s3, gs or hf.
 
     Of one that is still made, the shards that are noted so far count too, where the folder or
-    bucket can be listed.
-
-    Raises:
-        TrilightError: there is no readable manifest, the URL is refused, or the driver for it is
-            not installed.
+    bucket can be listed. It raises TrilightError where there is no readable manifest, the URL is
+    refused, or the driver for it is not installed.
     """
     dataset = open_listed(url)
     if not _may_be_growing(dataset.files):

@@ -250,11 +250,9 @@ def dataset_folder(out: str) -> DatasetFolder:
     """Return the folder of a dataset that is to be made in a folder, or below a URL of WRITABLE.
 
     For a bucket that is a folder of the cache, the same one whenever the same URL is named, with
-    the scenes that are not in a shard yet and a copy of the files next to the shards.
-
-    Raises:
-        TrilightError: the URL is refused (storage.remote.url), is none that can be written to only
-            once, or has a query.
+    the scenes that are not in a shard yet and a copy of the files next to the shards. It raises
+    TrilightError for a URL that is refused (storage.remote.url), cannot be written to only once, or
+    has a query.
     """
     place = parse_url(out, what="out")
     if isinstance(place, Path):

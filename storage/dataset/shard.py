@@ -88,11 +88,9 @@ class Member:
 def scan_members(stream: BinaryIO, name: str) -> Iterator[Member]:
     """Yield the members of an open shard in the order of the file, reading headers only.
 
-    The position of the stream may be moved between two members.
-
-    Raises:
-        TrilightError: the file is no complete tar, or holds a link, a folder, a path, an extended
-            header, or a member that is larger than MAX_MEMBER_BYTES.
+    The position of the stream may be moved between two members. It raises TrilightError where the
+    file is no complete tar, or holds a link, a folder, a path, an extended header, or a member that
+    is larger than MAX_MEMBER_BYTES.
     """
     end = stream.seek(0, 2)
     position = 0
@@ -116,10 +114,8 @@ def scan_samples(
     """Yield (key, members by suffix) of each sample of an open shard, reading headers only.
 
     Members of one sample must stand together, as WebDataset demands. `maps` takes up the maps by
-    their names: those before a sample are there when it is yielded, and all of them in the end.
-
-    Raises:
-        TrilightError: as `scan_members`, or a member, a map or a key occurs twice.
+    their names: those before a sample are there when it is yielded, and all of them in the end. It
+    raises as `scan_members`, and where a member, a map or a key occurs twice.
     """
     maps = {} if maps is None else maps
     seen: set[str] = set()

@@ -78,11 +78,9 @@ def listed_shards(patterns: Sequence[str]) -> list[ShardPlace]:
     """Return the shards that patterns name, in their order.
 
     Patterns are paths or URLs; `{000000..000007}` stands for each number of a range, as wide as its
-    first end, and `{a,b}` for each of several texts.
-
-    Raises:
-        TrilightError: a URL is refused (storage.remote.url), a pattern is not closed or names more
-            than MAX_SHARDS, a range runs backwards, or a shard is named twice.
+    first end, and `{a,b}` for each of several texts. It raises TrilightError where a URL is refused
+    (storage.remote.url), a pattern is not closed or names more than MAX_SHARDS, a range runs
+    backwards, or a shard is named twice.
     """
     texts = list(itertools.chain.from_iterable(expand_pattern(pattern) for pattern in patterns))
     places = [ShardPlace(place=parse_url(text, what=_WHAT)) for text in texts]

@@ -86,9 +86,8 @@ def verify_dataset(
     the name of each. With `fast`, only sizes are compared, and in a folder also the headers of the
     members; no picture is read, and a changed byte is not seen.
 
-    Raises:
-        TrilightError: there is no readable manifest, so there is nothing to check against; a shard
-            differs from one that was written since; or the disk is full.
+    It raises TrilightError where there is no readable manifest, so nothing to check against; a
+    shard differs from one that was written since; or the disk is full.
     """
     dataset = root if isinstance(root, Dataset) else open_dataset(str(root))
     manifest = dataset.manifest

@@ -189,11 +189,10 @@ def decode_channels(
 
     The library takes memory for all that a file's headers speak of, and small files can speak of
     much: no pixel is read before the headers are what is expected. `check` is called with the
-    header before that. Height and width are any, or of `size`; messages about it say `what`.
-
-    Raises:
-        TrilightError: not an EXR file, truncated, of several parts, with other channels, larger
-            than MAX_RESOLUTION, of more than 3 GiB, of another size, or refused by `check`.
+    header before that. Height and width are any, or of `size`; messages about it say `what`. It
+    raises TrilightError for another file, or one that is truncated, of several parts, with other
+    channels, larger than MAX_RESOLUTION, of more than 3 GiB, of another size, or refused by
+    `check`.
     """
     with _readable():
         header = read_header(data)

@@ -179,11 +179,9 @@ def stored_names(names: Sequence[str]) -> str | None:
 def completed_rows(stored: NDArray[np.float32], stated: str | None) -> NDArray[np.float32]:
     """Return rows with all declared columns of those that a file holds; others get defaults.
 
-    `stated` is what the file says of its columns (`stored_names`).
-
-    Raises:
-        TrilightError: a column is not declared here, or has another width; or `stated` is not of
-            this form or does not fit the array.
+    `stated` is what the file says of its columns (`stored_names`). It raises TrilightError where a
+    column is not declared here, or has another width, or `stated` is not of this form or does not
+    fit the array.
     """
     names = PUBLISHED_COLUMNS if stated is None else _names_of(stated)
     width = material_width(names)

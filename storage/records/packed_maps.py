@@ -252,11 +252,9 @@ def unpacked_maps(
     """Return the fields `textures` and `environment` of a scene, whose arrays are read-only.
 
     `maps` are those of `maps_record`, from outside. The bytes are among `members`, by name. Maps
-    that other samples hold are not unpacked again.
-
-    Raises:
-        TrilightError: not of that form, a map is missing or damaged, all of them take more than
-            MAX_MAPS_BYTES, or one has another content than its name says.
+    that other samples hold are not unpacked again. It raises TrilightError where they are not of
+    that form, a map is missing or damaged, all of them take more than MAX_MAPS_BYTES, or one has
+    another content than its name says.
     """
     textures, skies = map_entries(maps)
     packed: dict[str, bytes] = {}

@@ -381,11 +381,9 @@ class StoredSample(SceneRecord):
     def pictures(self, views: Sequence[int]) -> Stored:
         """Return the pictures of some views [V, R, R, 3], at least one, as they are stored.
 
-        Bits of half floats, uint16, each below FIRST_ILLEGAL; float32 where one is stored so.
-
-        Raises:
-            TrilightError: one is missing, unreadable, not square, of another size than the others,
-                or holds a radiance that is not finite or below 0.
+        Bits of half floats, uint16, each below FIRST_ILLEGAL; float32 where one is stored so. It
+        raises TrilightError where one is missing, unreadable, not square, of another size than the
+        others, or holds a radiance that is not finite or below 0.
         """
         with name_errors(self.key):
             pictures = [decode_stored(self.members[f"{view}.exr"]) for view in views]

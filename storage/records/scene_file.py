@@ -81,11 +81,9 @@ def encode_arrays(scene: Scene) -> bytes:
 def decode_arrays(data: bytes, maps: Any = None) -> dict[str, NDArray]:
     """Return the array fields of a scene from the bytes of `encode_arrays`.
 
-    `maps` is what the record of the scene says of its maps (storage.records.packed_maps).
-
-    Raises:
-        TrilightError: damaged, an array is missing, a material column is not declared here, or the
-            arrays are those of a scene with other maps.
+    `maps` is what the record of the scene says of its maps (storage.records.packed_maps). It raises
+    TrilightError where they are damaged, an array is missing, a material column is not declared
+    here, or the arrays are those of a scene with other maps.
     """
     arrays, metadata = read_safetensors(data)
     if missing := set(ARRAY_FIELDS) - set(arrays):
@@ -147,10 +145,9 @@ def read_scene_file(path: Path) -> Scene:
 def decode_scene_file(data: bytes, name: str) -> Scene:
     """Return the scene of a `.safetensors` file held in memory, called `name` in messages.
 
-    Raises:
-        TrilightError: larger than MAX_FILE_BYTES, damaged, an array too many, too few or of
-            another type or shape, metadata that are not a scene's, another schema version, or a
-            broken law.
+    It raises TrilightError where it is larger than MAX_FILE_BYTES or damaged, has an array too
+    many, too few or of another type or shape, metadata that are not a scene's or of another schema
+    version, or breaks a law.
     """
     if len(data) > MAX_FILE_BYTES:
         raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_FILE_BYTES}.")

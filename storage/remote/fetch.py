@@ -62,10 +62,9 @@ def version_of(facts: Mapping[str, Any]) -> dict[str, str]:
 def download(url: RemoteUrl, stream: BinaryIO, *, num_bytes: int | None, max_bytes: int) -> None:
     """Write all bytes of a file to an open one, from its start: exactly, or at most, so many.
 
-    Raises:
-        TransferFailed: as `facts_of`, it has another size than `num_bytes`, it breaks off again and
-            again without moving on, or comes too slowly (storage.remote.retries).
-        TrilightError: the driver's package is missing, or the disk is full.
+    It raises TransferFailed as `facts_of`, and where it has another size than `num_bytes`, breaks
+    off again and again without moving on, or comes too slowly (storage.remote.retries);
+    TrilightError where the driver's package is missing, or the disk is full.
     """
     driver = shared_driver(url)
     fill = _fill_http if url.is_http else _fill_bucket

@@ -44,10 +44,8 @@ def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) ->
     half and one and a half, so that many readers of one server do not come back all at once. Where
     the file of `pace` came at the least rate since the last error, tries are counted again from 1.
 
-    Raises:
-        TransferFailed: as the function raised it, or `download_failed` for any other exception, or
-            the file comes too slowly.
-        TrilightError: as the function raised it, or the disk is full (an EnvironmentFailure).
+    It raises TransferFailed, and TrilightError, as the function; `download_failed` for any other
+    exception, or a file that comes too slowly; an EnvironmentFailure where the disk is full.
     """
     from tenacity import Retrying, retry_if_exception, stop_after_attempt  # slow to import
 

@@ -68,9 +68,8 @@ class RemoteUrl:
 def parse_url(source: str, *, what: str) -> RemoteUrl | Path:
     """Return where a path or URL is: on this machine, or on a server; messages begin with `what`.
 
-    Raises:
-        TrilightError: the URL is chained (`::`), runs a program (`pipe:`), has a scheme that is not
-            admitted, names no host or bucket, or holds a password where none is read.
+    It raises TrilightError for a URL that is chained (`::`), runs a program (`pipe:`), has a scheme
+    that is not admitted, names no host or bucket, or holds a password where none is read.
     """
     url_text = printable(safe_text(source))
     if source.startswith("pipe:"):

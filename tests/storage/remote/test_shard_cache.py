@@ -461,13 +461,9 @@ def test_urls(url: str, shown: str) -> None:
 )
 def test_messages_lose_their_secrets(text: str) -> None:
     shown = safe_text(text)
-    assert "s3cret" not in shown
-    assert "ada" not in shown
-
-
-def test_plain_messages_stay() -> None:
-    for text in ("Connection reset by peer", "expected 12 bytes, got 7", "https://host/a: gone"):
-        assert safe_text(text) == text
+    assert "s3cret" not in shown and "ada" not in shown
+    for plain in ("Connection reset by peer", "expected 12 bytes, got 7", "https://host/a: gone"):
+        assert safe_text(plain) == plain
 
 
 @for_each(
