@@ -157,17 +157,12 @@ def _sample_pose(
     for _ in range(PLACE_TRIES):
         centre = rng.uniform(low, high)
         if rests:
-            centre = _set_down(centre, points, space.floor)
+            # until the lowest point touches; it need not be in balance
+            height = space.floor.height(points + centre).min()
+            centre = centre - height / space.floor.normal[2] * np.array([0, 0, 1.0])
         if settings.inside and not space.holds(points + centre):
             continue
         pose = Pose(centre=centre, radius=radius, rotation=rotation)
         if not any(shape.overlaps(pose, other, at) for other, at in obstacles):
             return pose
     return None
-
-
-def _set_down(
-    centre: NDArray[np.float64], points: NDArray[np.float64], floor: Plane
-) -> NDArray[np.float64]:
-    """Return the centre from which the lowest point touches; it need not be in balance."""
-    return centre - floor.height(points + centre).min() / floor.normal[2] * np.array([0, 0, 1.0])

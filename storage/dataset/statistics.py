@@ -123,7 +123,9 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
             dataset.files.open(shard, checked=False) as stream,
             reading(dataset.display_name, shard.name),
         ):
-            _require_whole(dataset, shard)
+            num_bytes = dataset.files.num_bytes(shard)
+            if num_bytes not in (None, shard.num_bytes):
+                raise TrilightError(f"{num_bytes} bytes; expected {shard.num_bytes}")
             _count_shard(stream, shard, tally)
     is_complete = len(read) == len(dataset.manifest.shards)
     views = len(tally.views["spp"])
@@ -192,12 +194,6 @@ def _count_shard(stream: BinaryIO, shard: ShardEntry, tally: _Tally) -> None:
         if excursion := provenance.get("excursion"):
             tally.excursions[excursion["axis"]] += 1
         tally.add_views(record["views"])
-
-
-def _require_whole(dataset: Dataset, shard: ShardEntry) -> None:
-    num_bytes = dataset.files.num_bytes(shard)
-    if num_bytes is not None and num_bytes != shard.num_bytes:
-        raise TrilightError(f"{num_bytes} bytes; expected {shard.num_bytes}")
 
 
 def digest_of_scenes(members: Mapping[str, str]) -> str:

@@ -20,17 +20,13 @@ ROTATION_TOLERANCE = 1e-4
 """How far a float32 rotation may be from orthonormal, as that of a camera."""
 
 
-def _identity_rotation() -> NDArray[np.float32]:
-    return np.eye(3, dtype=np.float32)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Environment:
     """A latitude-longitude map of radiance from infinitely far away."""
 
     radiance_rgb: NDArray[np.float32]
     """[H, 2H, 3] linear radiance; row 0 is the top (+Z of the map)."""
-    rotation: NDArray[np.float32] = field(default_factory=_identity_rotation)
+    rotation: NDArray[np.float32] = field(default_factory=lambda: np.eye(3, dtype=np.float32))
     """[3, 3] from the axes of the map to those of the world."""
     is_seen: bool = False
     """True: cameras see the map. It lights the scene in any case."""

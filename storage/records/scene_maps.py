@@ -89,10 +89,11 @@ def _check_textures(scene: "Scene") -> None:
     unused = np.setdiff1d(np.arange(count), np.append(index, normals))
     if len(unused):
         broken_law(f"textures[{unused[0]}] is used by no material", "textures that are used")
-    for place, (name, width) in enumerate(_widths().items()):
+    widths = {column.name: column.width for column, _ in laid_out()}
+    for place, name in enumerate(TEXTURED):
         for row in np.unique(index[:, place][index[:, place] != CONSTANT]):
-            if (got := scene.textures[row].channels) != width:
-                broken_law(f"textures[{row}] has {got} channels", f"{width}, as {name} has")
+            if (got := scene.textures[row].channels) != widths[name]:
+                broken_law(f"textures[{row}] has {got} channels", f"{widths[name]}, as {name} has")
     for row in np.unique(normals[normals != CONSTANT]):
         texture = scene.textures[row]
         if texture.channels != 3 or texture.is_srgb:
@@ -154,8 +155,3 @@ def _greatest_sum(one: Texture, other: Texture) -> NDArray[np.float64]:
         total = texture_values(one, uv) + texture_values(other, uv)
         greatest = np.maximum(greatest, total.max(axis=(0, 1)))
     return greatest
-
-
-def _widths() -> dict[str, int]:
-    widths = {column.name: column.width for column, _ in laid_out()}
-    return {name: widths[name] for name in TEXTURED}
