@@ -4,12 +4,12 @@ Trilight's own draw every layout equally often, with 1, 2 or 3 objects equally o
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, ClassVar
 
 from scene_templates.checks import SIZE, Counts, Range, require
-from scene_templates.rooms import SharedRoom
-from scene_templates.separate_sides import SeparateSides
+from scene_templates.rooms import SeparateSides, SharedRoom
 from scene_templates.templates import TEMPLATES
 from storage.registry import Registry
 from storage.settings.described import checked
@@ -53,25 +53,18 @@ LAYOUTS = ("plane", "wall", "corner", "open_box")
 """A template that is registered later joins a preset when its name is written here."""
 
 DEFAULT_FAMILIES = tuple(
-    family
+    Family(
+        name=f"{name}-{kind}",
+        template=name,
+        weight=weight,
+        shell=SharedRoom(),
+        num_objects=num_objects,
+        object_scale=object_scale,
+    )
     for name in LAYOUTS
-    for family in (
-        Family(
-            name=f"{name}-single",
-            template=name,
-            weight=1.0,
-            shell=SharedRoom(),
-            num_objects=(1, 1),
-            object_scale=(1.2, 2.2),
-        ),
-        Family(
-            name=f"{name}-multi",
-            template=name,
-            weight=2.0,
-            shell=SharedRoom(),
-            num_objects=(2, 3),
-            object_scale=(0.8, 1.8),
-        ),
+    for kind, weight, num_objects, object_scale in (
+        ("single", 1.0, (1, 1), (1.2, 2.2)),
+        ("multi", 2.0, (2, 3), (0.8, 1.8)),
     )
 )
 """The sizes are the published ones of most families."""
@@ -88,14 +81,10 @@ def alone() -> Family:
     )
 
 
-def _itself(family: Family) -> Family:
-    return family
-
-
 FAMILIES: Registry[Callable[[], Family]] = Registry(
     "family",
     Callable,
-    {**{family.name: partial(_itself, family) for family in DEFAULT_FAMILIES}, "alone": alone},
+    {**{family.name: partial(replace, family) for family in DEFAULT_FAMILIES}, "alone": alone},
     decides=("data",),
 )
 """Functions that return a family, by its name. A preset states its families in full and asks for no

@@ -12,9 +12,8 @@ from scene_templates.sample_camera import CameraSettings
 from scene_templates.sample_emitters import LightSettings
 from scene_templates.sample_material import MaterialSettings
 from scene_templates.settings import SceneSettings, ViewLaws
-from scene_templates.skies.draw import SkyMapSettings
-from scene_templates.skies.settings import SkySettings
-from scene_templates.surfaces.draw import SurfaceMapSettings
+from scene_templates.skies.procedural_skies import SkyMapSettings, SkySettings
+from scene_templates.surfaces.procedural_textures import SurfaceMapSettings
 from scene_templates.textures import TextureSettings
 
 _ROOM = SharedRoom(

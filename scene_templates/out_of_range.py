@@ -65,8 +65,14 @@ def out_of_range_settings(max_triangles: int) -> SceneSettings:
             *(_one("distance", v, "cameras.distance") for v in (1.0, 1.25, 2.5, 3.0, 4.0)),
             *(_one("lights", v, "lights.count") for v in (9, 16, 24, 32)),
             *(_excursion("lights_inside", v, {"lights.num_inside": v}) for v in (1, 2)),
-            *(_light_size(factor) for factor in (0.1, 0.3, 3.0, 10.0)),
-            *(_light_strength(factor) for factor in (0.1, 0.3, 3.0, 10.0)),
+            *(
+                _one(axis, factor, name, factor * median)
+                for axis, name, median in (
+                    ("light_size", "lights.scale", _MEDIAN_SIZE),
+                    ("light_strength", "lights.total_emission", _MEDIAN_EMISSION),
+                )
+                for factor in (0.1, 0.3, 3.0, 10.0)
+            ),
             *(_objects(count) for count in (4, 5, 6, 7, 8)),
             *(_one("roughness", v, "materials.roughness_clip") for v in (0.01, 0.02, 0.03, 0.04)),
         ),
@@ -107,23 +113,14 @@ def _excursion(axis: str, value: float, changes: dict[str, Any]) -> Excursion:
     return Excursion(axis=axis, value=value, changes=tuple(changes.items()))
 
 
-def _one(axis: str, value: float, name: str) -> Excursion:
-    """One setting, a range, at one value."""
-    return _excursion(axis, value, {name: (value, value)})
+def _one(axis: str, value: float, name: str, at: float | None = None) -> Excursion:
+    """One setting, a range, at one number: the value itself by default."""
+    return _excursion(axis, value, {name: _point(value if at is None else at)})
 
 
 def _triangles(count: int) -> Excursion:
     """Finer triangles of the same surfaces: a difference is the number's and not the shape's."""
     return _excursion("triangles", count, {"max_triangles": count, "fill_to": count})
-
-
-def _light_size(factor: float) -> Excursion:
-    return _excursion("light_size", factor, {"lights.scale": _point(factor * _MEDIAN_SIZE)})
-
-
-def _light_strength(factor: float) -> Excursion:
-    emission = _point(factor * _MEDIAN_EMISSION)
-    return _excursion("light_strength", factor, {"lights.total_emission": emission})
 
 
 def _objects(count: int) -> Excursion:

@@ -71,7 +71,6 @@ class ObjectSpace:
     parts: tuple[str, ...]
     """The shell parts that exist, the floor first."""
     planes: tuple[Plane, ...]
-    """The plane of each shell part."""
 
     @property
     def floor(self) -> Plane:
@@ -110,18 +109,10 @@ def place_objects(
     object_scale: Range,
     overlaps: bool,
 ) -> tuple[Pose, ...]:
-    """Draw a pose for each shape.
+    """Draw a pose for each shape; raises Rejected, "no_room", where no arrangement was found.
 
-    Args:
-        rng: where the numbers come from.
-        settings: how objects are placed.
-        space: where; without shell parts, in the middle of the world.
-        shapes: what they look like.
-        object_scale: range of the bounding spheres' diameters, before halving.
-        overlaps: whether objects may meet.
-
-    Raises:
-        Rejected: "no_room" if no arrangement was found.
+    Without shell parts, they are in the middle of the world. `object_scale` is the range of the
+    bounding spheres' diameters, before halving.
     """
     for _ in range(ARRANGEMENT_TRIES):
         # A recipe's size is a diameter in a room of side 2: half of it here, and half again.
@@ -166,17 +157,12 @@ def _sample_pose(
     for _ in range(PLACE_TRIES):
         centre = rng.uniform(low, high)
         if rests:
-            centre = _set_down(centre, points, space.floor)
+            # until the lowest point touches; it need not be in balance
+            height = space.floor.height(points + centre).min()
+            centre = centre - height / space.floor.normal[2] * np.array([0, 0, 1.0])
         if settings.inside and not space.holds(points + centre):
             continue
         pose = Pose(centre=centre, radius=radius, rotation=rotation)
         if not any(shape.overlaps(pose, other, at) for other, at in obstacles):
             return pose
     return None
-
-
-def _set_down(
-    centre: NDArray[np.float64], points: NDArray[np.float64], floor: Plane
-) -> NDArray[np.float64]:
-    """Return the centre from which the lowest point touches; it need not be in balance."""
-    return centre - floor.height(points + centre).min() / floor.normal[2] * np.array([0, 0, 1.0])

@@ -33,7 +33,18 @@ class RecordedDraw:
 
     def __str__(self) -> str:
         """Return the distribution as the end of a sentence."""
-        return _row(self)
+        if self.kind == "share":
+            return f"true with probability {self.stated:g}"
+        if self.kind == "choice":
+            return f"one of {', '.join(self.stated)}, equally likely"
+        low, high = self.stated
+        if self.kind in ("colour", "shade"):
+            one, other = (f"({' '.join(f'{c:g}' for c in end)})" for end in (low, high))
+            shape = "each channel uniform" if self.kind == "colour" else "uniform on the line"
+            return f"{shape} from {one} to {other}"
+        if self.kind == "direction":
+            return f"uniform by solid angle, elevation {low:g} to {high:g} degrees"
+        return f"{self.kind}, {low:g} to {high:g}"
 
 
 class RecordedSampler:
@@ -106,18 +117,3 @@ class RecordedSampler:
             raise ValueError(f"{name!r} is drawn from {stated} and from {draw.stated}")
         draw.values.append(value)
         return value
-
-
-def _row(draw: RecordedDraw) -> str:
-    if draw.kind == "share":
-        return f"true with probability {draw.stated:g}"
-    if draw.kind == "choice":
-        return f"one of {', '.join(draw.stated)}, equally likely"
-    low, high = draw.stated
-    if draw.kind in ("colour", "shade"):
-        one, other = (f"({' '.join(f'{c:g}' for c in end)})" for end in (low, high))
-        shape = "each channel uniform" if draw.kind == "colour" else "uniform on the line"
-        return f"{shape} from {one} to {other}"
-    if draw.kind == "direction":
-        return f"uniform by solid angle, elevation {low:g} to {high:g} degrees"
-    return f"{draw.kind}, {low:g} to {high:g}"

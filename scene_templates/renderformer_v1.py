@@ -14,14 +14,15 @@ has and their ranges, object counts, and most object sizes. Not known, and chose
   (-0.25 to -0.15) into the +-0.25 that both policies have here;
 - `thin` objects: published as a list of their own; here from the pool.
 
-The two background policies are those of `separate_sides`; both public stages use `de-biased`.
+The two background policies are those of `SeparateSides`; both public stages use `de-biased`.
 """
 
+from dataclasses import replace
 from typing import Literal
 
 from scene_templates.checks import Range
 from scene_templates.families import Family
-from scene_templates.separate_sides import SeparateSides, SideRanges
+from scene_templates.rooms import SeparateSides, SideRanges
 
 Policy = Literal["original", "de-biased"]
 
@@ -40,6 +41,9 @@ _STILL = SideRanges(
     shift_x=_EXACT,
     shift_y=_EXACT,
     shift_z=_EXACT,
+)
+_UNTURNED = SeparateSides(
+    floor=_STILL, wall0=_STILL, wall1=_STILL, wall2=_STILL, wall2_faces_out=False
 )
 
 
@@ -125,56 +129,42 @@ def _family(
 
 
 def _open_shell(policy: Policy, *, floor_z: Range, wall: bool) -> SeparateSides:
-    return SeparateSides(
-        floor=_side(policy, z=floor_z),
-        wall0=_STILL,
-        wall1=_side(policy, y=_FAR) if wall else _STILL,
-        wall2=_STILL,
-        wall2_faces_out=False,
-    )
+    wall1 = _side(policy, y=_FAR) if wall else _STILL
+    return replace(_UNTURNED, floor=_side(policy, z=floor_z), wall1=wall1)
 
 
 def _corner_shell(policy: Policy) -> SeparateSides:
-    return SeparateSides(
-        floor=_side(policy),
-        wall0=_side(policy, y=_FAR),
-        wall1=_side(policy, x=_FAR),
-        wall2=_STILL,
-        wall2_faces_out=False,
+    floor = _side(policy)
+    return replace(
+        _UNTURNED,
+        floor=floor,
+        wall0=replace(floor, shift_y=_FAR),
+        wall1=replace(floor, shift_x=_FAR),
     )
 
 
 def _box_shell(policy: Policy) -> SeparateSides:
-    side = SideRanges(
-        spin_deg=180.0 if policy == "de-biased" else 0.5,
-        tilt_deg=3.0 if policy == "de-biased" else 0.5,
+    original = policy == "original"
+    side = replace(
+        _side(policy),
+        spin_deg=0.5 if original else 180.0,
+        tilt_deg=0.5 if original else 3.0,
         scale=(1.0, 1.35),
-        shift_x=_NEAR,
-        shift_y=_NEAR,
-        shift_z=_NEAR,
     )
-    return SeparateSides(
-        floor=side, wall0=side, wall1=side, wall2=side, wall2_faces_out=policy == "original"
-    )
+    return SeparateSides(floor=side, wall0=side, wall1=side, wall2=side, wall2_faces_out=original)
 
 
 def _exact_shell(policy: Policy) -> SeparateSides:
     """Return the unturned Cornell-like box; a spin of exactly 0 stays 0 in both policies."""
-    return SeparateSides(
-        floor=_STILL,
-        wall0=_STILL,
-        wall1=_STILL,
-        wall2=_STILL,
-        wall2_faces_out=policy == "original",
-    )
+    return replace(_UNTURNED, wall2_faces_out=policy == "original")
 
 
-def _side(policy: Policy, *, x: Range = _NEAR, y: Range = _NEAR, z: Range = _NEAR) -> SideRanges:
+def _side(policy: Policy, *, y: Range = _NEAR, z: Range = _NEAR) -> SideRanges:
     return SideRanges(
         spin_deg=180.0 if policy == "de-biased" else 10.0,
         tilt_deg=10.0,
         scale=(0.9, 1.35),
-        shift_x=x,
+        shift_x=_NEAR,
         shift_y=y,
         shift_z=z,
     )

@@ -3,16 +3,15 @@
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-import pydantic
 from numpy.typing import NDArray
 
 from scene_templates.checks import OFFSET, SIZE, Range, require
 from scene_templates.layout import CameraPose
 from storage.conventions import look_at_c2w
-from storage.settings.described import checked
+from storage.settings.described import checked, leaves_out
 from storage.settings.ranges import Within
 
 
@@ -43,9 +42,7 @@ class Sector:
     def direction_at(self, across: float, up: float) -> NDArray[np.float64]:
         """Return the unit direction [3] of a position; equal areas of both are equal solid angles.
 
-        Args:
-            across: 0 to 1, from one side of the azimuth to the other.
-            up: 0 to 1, from the least elevation to the greatest.
+        Both are 0 to 1: from one side of the azimuth to the other, and from the least elevation up.
         """
         low, high = (math.sin(math.radians(angle)) for angle in self.elevation_deg)
         return self._direction(low + (high - low) * up, (2 * across - 1) * self.half_width_deg)
@@ -64,9 +61,6 @@ of golden angles. `orbit`: equal steps of azimuth at one elevation, which is dra
 """
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
-
-_LATER: dict[str, Any] = {"path": "random", "elevation_deg": None}
-"""Settings that no record holds at these values, so that digests of earlier presets stay."""
 
 
 @checked("scene settings")
@@ -87,11 +81,7 @@ class CameraSettings:
     is replaced by a random one."""
     elevation_deg: Annotated[Range | None, Within(-89, 89, unit="degrees")] = None
     """Range of the cameras' elevations in place of that of the layout."""
-
-    @pydantic.model_serializer(mode="wrap")
-    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        record: dict[str, Any] = as_usual(self)
-        return {k: value for k, value in record.items() if k not in _LATER or value != _LATER[k]}
+    _record = leaves_out("path", "elevation_deg")
 
 
 def path_position(
@@ -99,11 +89,8 @@ def path_position(
 ) -> tuple[float, float] | None:
     """Return the position of a view on a path (`Sector.direction_at`); None for `random`.
 
-    Args:
-        path: the path.
-        view: number of the view, from 0.
-        num_views: number of the scene's views.
-        rng: of the scene, the same for all of its views: it turns the path.
+    Views are counted from 0. `rng` is of the scene, the same for all of its views: it turns the
+    path.
     """
     azimuth_shift, height = rng.random(2).tolist()
     up = (view + 0.5) / num_views
@@ -128,11 +115,7 @@ def sample_camera(
 ) -> CameraPose:
     """Draw one camera pose by look-at. Whether it sees anything is for the caller to find out.
 
-    Args:
-        rng: where the numbers come from.
-        settings: the ranges.
-        sector: directions from which the layout is seen.
-        position: of the direction in the sector (`Sector.direction_at`); None to draw it.
+    `position` is that of the direction in the sector (`Sector.direction_at`); None to draw it.
     """
     if settings.elevation_deg is not None:
         sector = dataclasses.replace(sector, elevation_deg=settings.elevation_deg)

@@ -7,17 +7,16 @@ to compose are replaced by scenes of the same kind, so that rejection does not d
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
 
 import numpy as np
 
 from scene_templates.families import Family
-from scene_templates.layout import Layout, ObjectPlacement, ShellPart, SurfaceLook
+from scene_templates.layout import Layout, ObjectPlacement, ShellPart
 from scene_templates.placement import ObjectSpace, PlaceableShape, place_objects
-from scene_templates.rooms import PATCH_FACES, SIDES, patch, plane_of
+from scene_templates.rooms import PATCH_FACES, SIDES, SeparateSides, patch, plane_of
 from scene_templates.sample_emitters import sample_emitters
 from scene_templates.sample_material import sample_material
-from scene_templates.separate_sides import SeparateSides
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.seeds import rng_for
@@ -28,11 +27,9 @@ class ScenePlan:
     """The kind of a scene."""
 
     family: Family
-    """The layout, and what goes into it."""
     num_objects: int
     num_lights: int
     overlaps: bool
-    """True: objects may intersect."""
 
 
 def scene_plan(settings: SceneSettings, *, seed: int, scene_index: int) -> ScenePlan:
@@ -73,14 +70,8 @@ def sample_layout(
 ) -> Layout:
     """Draw a layout of the planned kind.
 
-    Args:
-        rng: where the numbers come from.
-        settings: the ranges; its families are ignored, since the plan has one.
-        plan: the family and the counts.
-        shapes: what the `plan.num_objects` objects look like.
-
-    Raises:
-        Rejected: "no_room" if the objects do not fit.
+    Families of the settings are ignored, since the plan has one; `shapes` are what its
+    `plan.num_objects` objects look like. It raises Rejected, "no_room", where they do not fit.
     """
     family = plan.family
     template = TEMPLATES[family.template]
@@ -96,11 +87,9 @@ def sample_layout(
         object_scale=family.object_scale,
         overlaps=plan.overlaps,
     )
-    surfaces = tuple(_sample_surface(rng, settings, family, "shell") for _ in template.parts)
-    objects = tuple(
-        ObjectPlacement(pose=pose, surface=_sample_surface(rng, settings, family, "object"))
-        for pose in poses
-    )
+    draw = partial(sample_material, rng, settings.materials, smooth_share=family.smooth_share)
+    surfaces = tuple(draw(kind="shell") for _ in template.parts)
+    objects = tuple(ObjectPlacement(pose=pose, surface=draw(kind="object")) for pose in poses)
     centres = [pose.centre for pose in poses]
     emitters = sample_emitters(rng, settings.lights, template.lights, plan.num_lights, centres)
     wall2_faces_out = isinstance(family.shell, SeparateSides) and family.shell.wall2_faces_out
@@ -114,12 +103,3 @@ def sample_layout(
         for name, vertices, surface in zip(template.parts, positions, surfaces, strict=True)
     )
     return Layout(shell=shell, objects=objects, emitters=emitters)
-
-
-def _sample_surface(
-    rng: np.random.Generator,
-    settings: SceneSettings,
-    family: Family,
-    kind: Literal["shell", "object"],
-) -> SurfaceLook:
-    return sample_material(rng, settings.materials, smooth_share=family.smooth_share, kind=kind)

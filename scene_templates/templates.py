@@ -4,13 +4,11 @@
 """
 
 from dataclasses import dataclass
-
-import numpy as np
+from functools import partial
 
 from scene_templates.checks import require
-from scene_templates.layout import CameraPose
 from scene_templates.rooms import PATCH_FACES, SIDES
-from scene_templates.sample_camera import CameraSettings, Sector, sample_camera
+from scene_templates.sample_camera import Sector
 from storage.registry import Registry
 
 
@@ -39,66 +37,54 @@ class Template:
         """Triangles of floor and walls: 128 each."""
         return len(PATCH_FACES) * len(self.parts)
 
-    def sample_camera(
-        self,
-        rng: np.random.Generator,
-        settings: CameraSettings,
-        position: tuple[float, float] | None = None,
-    ) -> CameraPose:
-        """Draw one camera; `position` as `sample_camera` takes it."""
-        return sample_camera(rng, settings, self.cameras, position)
 
+_around = partial(Sector, azimuth_deg=0, half_width_deg=180)
 
-PLANE = Template(
-    name="plane",
-    parts=("floor",),
-    cameras=Sector(azimuth_deg=0, half_width_deg=180, elevation_deg=(3, 87)),
-    # Below 10 degrees a light grazes the floor, and half of the emitters see it edge-on.
-    lights=Sector(azimuth_deg=0, half_width_deg=180, elevation_deg=(10, 90)),
+_OURS = (
+    # Objects over a floor, seen and lit from all around.
+    Template(
+        name="plane",
+        parts=("floor",),
+        cameras=_around(elevation_deg=(3, 87)),
+        # Below 10 degrees a light grazes the floor, and half of the emitters see it edge-on.
+        lights=_around(elevation_deg=(10, 90)),
+    ),
+    # A floor and one wall at +X, seen and lit from the -X half.
+    Template(
+        name="wall",
+        parts=("floor", "wall1"),
+        # Beyond 75 degrees to the side the wall is seen edge-on.
+        cameras=Sector(azimuth_deg=180, half_width_deg=75, elevation_deg=(3, 87)),
+        lights=Sector(azimuth_deg=180, half_width_deg=90, elevation_deg=(10, 90)),
+    ),
+    # A floor and two walls at +X and +Y, seen from the quarter opposite them.
+    Template(
+        name="corner",
+        parts=("floor", "wall0", "wall1"),
+        cameras=Sector(azimuth_deg=225, half_width_deg=45, elevation_deg=(3, 87)),
+        # A half-turn, as published: the outer lights graze one wall from behind and shine over it.
+        lights=Sector(azimuth_deg=225, half_width_deg=90, elevation_deg=(10, 90)),
+    ),
+    # A floor and three walls without a ceiling, seen and lit through the open front (-Y) and top.
+    Template(
+        name="open_box",
+        parts=("floor", "wall0", "wall1", "wall2"),
+        # Farther to the side, a camera would look at the back of the nearer wall.
+        cameras=Sector(azimuth_deg=270, half_width_deg=30, elevation_deg=(3, 87)),
+        # Lower, the side walls would keep an outer light from the floor.
+        lights=Sector(azimuth_deg=270, half_width_deg=75, elevation_deg=(15, 90)),
+    ),
+    # One object in the middle of nothing, seen and lit from everywhere. Nearer to a pole, +Z is no
+    # direction for a picture's top.
+    Template(
+        name="alone",
+        parts=(),
+        cameras=_around(elevation_deg=(-89, 89)),
+        lights=_around(elevation_deg=(-90, 90)),
+    ),
 )
-"""Objects over a floor, seen and lit from all around."""
-
-WALL = Template(
-    name="wall",
-    parts=("floor", "wall1"),
-    # Beyond 75 degrees to the side the wall is seen edge-on.
-    cameras=Sector(azimuth_deg=180, half_width_deg=75, elevation_deg=(3, 87)),
-    lights=Sector(azimuth_deg=180, half_width_deg=90, elevation_deg=(10, 90)),
-)
-"""A floor and one wall at +X, seen and lit from the -X half."""
-
-CORNER = Template(
-    name="corner",
-    parts=("floor", "wall0", "wall1"),
-    cameras=Sector(azimuth_deg=225, half_width_deg=45, elevation_deg=(3, 87)),
-    # A half-turn, as published: the outer lights graze one wall from behind and shine over it.
-    lights=Sector(azimuth_deg=225, half_width_deg=90, elevation_deg=(10, 90)),
-)
-"""A floor and two walls at +X and +Y, seen from the quarter opposite them."""
-
-OPEN_BOX = Template(
-    name="open_box",
-    parts=("floor", "wall0", "wall1", "wall2"),
-    # Farther to the side, a camera would look at the back of the nearer wall.
-    cameras=Sector(azimuth_deg=270, half_width_deg=30, elevation_deg=(3, 87)),
-    # Lower, the side walls would keep an outer light from the floor.
-    lights=Sector(azimuth_deg=270, half_width_deg=75, elevation_deg=(15, 90)),
-)
-"""A floor and three walls without a ceiling, seen and lit through the open front (-Y) and top."""
-
-ALONE = Template(
-    name="alone",
-    parts=(),
-    # Nearer to a pole, +Z is no direction for a picture's top.
-    cameras=Sector(azimuth_deg=0, half_width_deg=180, elevation_deg=(-89, 89)),
-    lights=Sector(azimuth_deg=0, half_width_deg=180, elevation_deg=(-90, 90)),
-)
-"""One object in the middle of nothing, seen and lit from everywhere."""
 
 TEMPLATES: Registry[Template] = Registry(
-    "template",
-    Template,
-    {template.name: template for template in (PLANE, WALL, CORNER, OPEN_BOX, ALONE)},
-    decides=("data",),
+    "template", Template, {template.name: template for template in _OURS}, decides=("data",)
 )
 """Every name that `Family.template` admits."""

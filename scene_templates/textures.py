@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.checks import Range
-from scene_templates.surfaces.draw import SurfaceMapSettings, draw_surface
 from scene_templates.surfaces.maps import SurfaceMaps
+from scene_templates.surfaces.procedural_textures import SurfaceMapSettings, draw_surface
 from scene_templates.user_maps import UserMap, UserTexture, draw_user_map
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
@@ -70,13 +70,8 @@ def draw_look(
 ) -> TexturedLook | None:
     """Return the texture of a surface, or None where it has none.
 
-    Whether it has one is drawn first: another `share` changes no texture that is there still.
-
-    Args:
-        rng: the stream of this surface.
-        settings: the shares and the ranges.
-        own: a user's own textures.
-        licences: of what is in the scene already.
+    Whether it has one is drawn first: another `share` changes no texture that is there still. The
+    licences are those of what is in the scene already.
     """
     if rng.random() >= settings.share:
         return None

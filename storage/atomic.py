@@ -22,14 +22,9 @@ def atomic_writer(path: Path, *, replace: bool = True) -> Iterator[BinaryIO]:
 
     A process that is killed inside the block leaves at most a `.part` file, which
     `remove_leftovers` clears away. Two writers of the same name do no harm, on one machine or on
-    two: each has a temporary name of its own.
-
-    Args:
-        path: the final name.
-        replace: the last writer wins; otherwise the first, and the others' bytes are dropped.
-
-    Raises:
-        TrilightError: the disk is full (an EnvironmentFailure), or the place cannot be written.
+    two: each has a temporary name of its own. With `replace` the last one wins; otherwise the
+    first, and the others' bytes are dropped. It raises TrilightError where the disk is full (an
+    EnvironmentFailure), or the place cannot be written.
     """
     unique_suffix = (
         f"{os.getpid()}-{os.urandom(4).hex()}"  # containers give all their processes number 1
@@ -60,16 +55,10 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def append_line(path: Path, line: str, *, durable: bool = False) -> None:
-    """Append a line to a file, whose folder may be missing.
+    """Append a line, without a line break, to a file, whose folder may be missing.
 
-    Args:
-        path: the file.
-        line: text without a line break.
-        durable: of a file with one writer, drop a last line that a kill has cut, and return only
-            when the new line is on the disk.
-
-    Raises:
-        TrilightError: the disk is full or the file cannot be written.
+    With `durable`, of a file with one writer: drop a last line that a kill has cut, and return only
+    when the new line is on the disk. It raises TrilightError where the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -90,10 +79,8 @@ def append_line(path: Path, line: str, *, durable: bool = False) -> None:
 def remove_leftovers(folder: Path, *, older_than_s: float = 0.0) -> None:
     """Delete what killed writers left below `folder`. Call only while holding its lock.
 
-    Args:
-        folder: where to look, however deep.
-        older_than_s: files that were written to more recently stay; for locks that may not reach
-            every machine that writes there.
+    Files that were written to in the last `older_than_s` stay: locks may not reach every machine
+    that writes there.
     """
     for place, _, names in os.walk(folder):  # a third of the time of rglob, of a million files
         for name in filter(lambda name: name.endswith(TEMPORARY_SUFFIX), names):

@@ -11,8 +11,7 @@ from storage.errors import TrilightError
 def cache_folder(name: str) -> Path:
     """Return a folder of the user's cache: below TRILIGHT_CACHE, or ~/.cache/trilight.
 
-    Raises:
-        TrilightError: there is no home directory, or something else is where the cache would be.
+    It raises TrilightError without a home directory, or where something else is at the place.
     """
     configured = os.environ.get("TRILIGHT_CACHE")
     try:
@@ -34,8 +33,7 @@ def cache_folder(name: str) -> Path:
 def private_folder(path: Path) -> Path:
     """Make a folder that only its user may enter, or make an existing one so, and return it.
 
-    Raises:
-        TrilightError: it cannot be made so, or is shared by all users, as /tmp is.
+    It raises TrilightError where that cannot be, or all users share it, as /tmp.
     """
     try:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -43,7 +43,7 @@ class Features:
     """[R, R, 3] the diffuse and the specular albedo by these names, where lobes are apart."""
 
     def of_part(self, name: str) -> "Features":
-        """Return what guides the denoiser of a part (storage.records.parts), by its name.
+        """Return what guides the denoiser of a part (storage.records.lights), by its name.
 
         A lobe is guided by its own albedo, and by no normal where it has none: there it is black.
         """
@@ -75,13 +75,9 @@ def denoise(
 ) -> NDArray[np.float32]:
     """Return the picture without noise, exactly black where no ray hit anything.
 
-    Args:
-        radiance_rgb: [R, R, 3] finite and at least 0. Values that are not finite vanish in the
-            filter without a trace: look for them before.
-        features: albedo and normal, [R, R, 3] each, free of noise themselves.
-        quality: of the network.
-        threads: of the processor; None is what `set_denoiser_threads` says.
-        device: of the filter; None is what `set_denoiser_device` says.
+    The picture and its features are [R, R, 3] each, the features free of noise themselves. Radiance
+    is finite and at least 0: other values vanish in the filter without a trace. Threads and device
+    are by default what `set_denoiser_threads` and `set_denoiser_device` say.
     """
     if not radiance_rgb.any():
         return np.zeros_like(radiance_rgb)  # the filter would paint the albedo, up to 0.003 bright
@@ -149,9 +145,7 @@ class Filter:
 def open_device(device: DenoiserDevice, threads: int = 0) -> Any:
     """Return a device of Open Image Denoise; raises RuntimeError where there is none.
 
-    Args:
-        device: CPU, or CUDA for the first GPU, on which Mitsuba renders too.
-        threads: of the processor; 0 is all cores.
+    CUDA is the first GPU, on which Mitsuba renders too; 0 threads of the processor are all cores.
     """
     oidn = load_oidn()
     opened = oidn.Device(getattr(oidn, f"OIDN_DEVICE_TYPE_{device}"))

@@ -30,8 +30,7 @@ def sha256_of_stream(stream: BinaryIO) -> str:
 def seal_of(data: bytes, sha256: str) -> str:
     """Return the sha256 of sealed bytes, which hold it: of all but its first 64 digits.
 
-    Raises:
-        ValueError: the digits are not there.
+    It raises ValueError where the digits are not there.
     """
     start = data.index(sha256.encode())
     view = memoryview(data)

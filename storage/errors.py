@@ -38,12 +38,9 @@ class ShardMissing(TrilightError):
 class Rejected(Exception):
     """An object, scene or view that breaks a law. It is data, not a failure of the program.
 
-    A rejection is deterministic: the same input is always rejected for the same reason, so the
-    run records it in `failures.jsonl` and goes on with the next attempt.
-
-    Attributes:
-        reason: a stable code in snake_case, such as `no_faces` or `black_view`.
-        message: one sentence for a person, with the value that was found.
+    A rejection is deterministic: the same input is always rejected for the same reason, so the run
+    records it in `failures.jsonl` and goes on with the next attempt. The reason is a stable code in
+    snake_case, such as `no_faces`; the message is one sentence for a person, with the value.
     """
 
     def __init__(self, reason: str, message: str) -> None:

@@ -36,9 +36,7 @@ class Extension:
 
     path: Path
     sha256: str
-    """Hexadecimal digest of the file's bytes."""
     module: ModuleType
-    """Module that the file became."""
     decides: set[Decided] = field(default_factory=set)
     """Results that depend on the tables to which it added entries."""
     undo: list[Callable[[], None]] = field(default_factory=list)
@@ -57,13 +55,9 @@ _loading: list[Extension] = []
 def load_extension(file: str | Path, *, sha256: str | None = None) -> Extension:
     """Load a file, once in this process, and name it to the processes that start from here.
 
-    Args:
-        file: its path.
-        sha256: what its bytes must be, where another process has loaded it before.
-
-    Raises:
-        TrilightError: there is no such file, it is not Python or raises something, it registers a
-            name that is taken, another one has its name, or it is not what was loaded before.
+    `sha256` is what its bytes must be, where another process has loaded it before. It raises
+    TrilightError where there is no such file, it is not Python or raises something, it registers a
+    name that is taken, another one has its name, or it is not what was loaded before.
     """
     path = Path(os.path.abspath(os.path.expanduser(file)))
     known = _loaded.get(path.name)
@@ -139,13 +133,8 @@ def function_name(name: str) -> str:
 def load_reference(reference: str) -> Iterator[Any]:
     """Provide what the function of FILE.py:FUNCTION returns, while its file may register it.
 
-    What is no function stands for itself.
-
-    Args:
-        reference: for which `is_reference` holds; typed by the person whose computer this is.
-
-    Raises:
-        TrilightError: as `load_extension`, or the file does not define it, or it raises something.
+    What is no function stands for itself. The reference is one of `is_reference`, typed by the
+    person whose computer this is. It raises as `load_extension`, and as the function.
     """
     match = _REFERENCE.fullmatch(reference)
     assert match is not None, reference
@@ -183,14 +172,9 @@ def extension_digests(part: Decided) -> dict[str, str]:
 
 
 def require_same_extensions(what: str, before: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Refuse to go on with other extensions than something was begun with.
+    """Raise TrilightError where extensions are not those that `what` was begun with.
 
-    Args:
-        what: was begun, as messages name it.
-        before, now: as `extension_digests` returns them.
-
-    Raises:
-        TrilightError: one is missing, new, or another file; the message names it.
+    `before` and `now` are of `extension_digests`; the message names the first that differs.
     """
     for name in sorted({*before, *now}):
         if before.get(name) == now.get(name):
@@ -254,11 +238,7 @@ def _as_loading(extension: Extension) -> Iterator[None]:
 
 @contextmanager
 def _mistakes_of(path: Path) -> Iterator[None]:
-    """Turn what code of an extension raises into one line with the line of the file.
-
-    Raises:
-        TrilightError: the code raised something.
-    """
+    """Turn what code of an extension raises into a TrilightError with the line of the file."""
     try:
         yield
     except (Exception, SystemExit) as error:
@@ -267,10 +247,9 @@ def _mistakes_of(path: Path) -> Iterator[None]:
 
 @contextmanager
 def mistakes_of_entry(entry: str) -> Iterator[None]:
-    """Turn what an extension's entry, such as a family, raises into one line with its place.
+    """Turn what an extension's entry, such as a family, raises into a TrilightError with its place.
 
-    Raises:
-        TrilightError: the code raised something; other code's errors are raised as they are.
+    Errors of other code are raised as they are.
     """
     try:
         yield

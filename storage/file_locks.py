@@ -40,12 +40,8 @@ _unlocked = itertools.count()
 def hold_lock(path: Path, *, wait: bool = False) -> Iterator[bool]:
     """Hold the lock of a file, a claim, for the block; yield whether it is ours.
 
-    Args:
-        path: the file of the claim; it is created here, and its holder may delete it.
-        wait: until the claim is free, so that it always becomes ours.
-
-    Raises:
-        TrilightError: the folder cannot be written.
+    The file is created here, and its holder may delete it. With `wait`, the claim always becomes
+    ours. It raises TrilightError where the folder cannot be written.
     """
     descriptor = _acquire_lock(path, wait)
     try:
@@ -56,11 +52,7 @@ def hold_lock(path: Path, *, wait: bool = False) -> Iterator[bool]:
 
 
 def open_lock(path: Path) -> int:
-    """Return the descriptor of a lock's file, which is created where it is missing.
-
-    Raises:
-        TrilightError: the folder cannot be written.
-    """
+    """Return the descriptor of a lock's file, which is made where it is missing; as `hold_lock`."""
     tries = 0
     while True:
         try:
@@ -80,12 +72,8 @@ def open_lock(path: Path) -> int:
 def take_lock(descriptor: int, *, shared: bool = False, wait: bool = False) -> bool:
     """Take the lock of an open file; return whether it is ours.
 
-    A file system that carries no locks grants every lock; the first time is a warning.
-
-    Args:
-        descriptor: of the file.
-        shared: together with other shared locks; otherwise it excludes every other lock.
-        wait: until it is free, so that it always becomes ours.
+    A file system that carries no locks grants every lock; the first time is a warning. A shared
+    lock is held together with other shared ones. With `wait`, it always becomes ours.
     """
     operation = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     try:

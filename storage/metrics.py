@@ -21,12 +21,9 @@ SEAM_TILES = 16
 def psnr_log_db(a: ArrayLike, b: ArrayLike) -> float:
     """Return -10 log10 mean((log10(1+a) - log10(1+b))^2), capped at MAX_DB.
 
-    The error is taken in the space of the network's output with peak 1, and nothing is clamped.
-    "Noise floor" always means this one. For scale: 36 dB linear is about 46 dB here.
-
-    Args:
-        a: linear radiance of at least 0, any shape.
-        b: the same shape.
+    Both are linear radiance of at least 0, of one shape. The error is taken in the space of the
+    network's output with peak 1, and nothing is clamped. "Noise floor" always means this one. For
+    scale: 36 dB linear is about 46 dB here.
     """
     return _db(_squared_log_error(a, b))
 
@@ -42,14 +39,9 @@ def psnr_linear_db(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def object_psnr_log_db(a: ArrayLike, b: ArrayLike, hits: NDArray[np.bool_]) -> float:
-    """Return psnr_log_db over the pixels whose camera ray hits geometry.
+    """Return psnr_log_db of [R, R, 3] over the pixels [R, R] whose camera ray hits geometry.
 
     Empty background earns nothing here. A picture without any hit scores MAX_DB.
-
-    Args:
-        a: [R, R, 3] linear radiance.
-        b: the same shape.
-        hits: [R, R] whether the pixel's ray hits geometry.
     """
     return _db(_squared_log_error(a, b)[hits])
 
@@ -57,13 +49,10 @@ def object_psnr_log_db(a: ArrayLike, b: ArrayLike, hits: NDArray[np.bool_]) -> f
 def flicker_log_db(before: ArrayLike, now: ArrayLike) -> float:
     """Return how calm an error is from one frame to the next, capped at MAX_DB; higher is calmer.
 
-    -10 log10 mean((E2 - E1)^2) of the errors E of log10(1 + radiance) of two frames in a row. What
-    the frames themselves show of motion is in both pictures of a frame, hence not in E. Errors that
-    have nothing to do with each other from frame to frame flicker 3 dB worse than they err.
-
-    Args:
-        before: log10(1 + radiance) of the frame before less that of its truth, any shape.
-        now: the same of this frame.
+    -10 log10 mean((E2 - E1)^2) of the errors E of two frames in a row: log10(1 + radiance) less
+    that of the truth, any shape. What the frames themselves show of motion is in both pictures of a
+    frame, hence not in E. Errors that have nothing to do with each other from frame to frame
+    flicker 3 dB worse than they err.
     """
     return _db(np.square(np.asarray(now, np.float64) - np.asarray(before, np.float64)))
 
@@ -71,12 +60,9 @@ def flicker_log_db(before: ArrayLike, now: ArrayLike) -> float:
 def pepper(a: ArrayLike, b: ArrayLike) -> float:
     """Return how much more a picture varies between neighboring pixels than its reference.
 
-    The mean, over squares of three by three pixels, of sqrt(max(0, var_a - var_b)) of
-    log10(1 + radiance). Noise raises it; a smooth or a blurred error does not.
-
-    Args:
-        a: [R, R, 3] linear radiance, R at least 3.
-        b: the same shape, without noise.
+    The mean, over squares of three by three pixels, of sqrt(max(0, var_a - var_b)) of log10(1 +
+    radiance). Noise raises it; a smooth or a blurred error does not. Both are [R, R, 3] linear
+    radiance with R of at least 3; `b` is without noise.
     """
     of_a, of_b = (
         sliding_window_view(_log(each), (3, 3), axis=(0, 1)).var(axis=(-2, -1)) for each in (a, b)
@@ -88,11 +74,8 @@ def seam(a: ArrayLike, b: ArrayLike) -> float:
     """Return how much steeper an error is between tiles of a picture than inside them; 1 is equal.
 
     The mean absolute difference of the error of log10(1 + radiance) from a pixel to the next, where
-    two of SEAM_TILES tiles a side meet, over that elsewhere. A picture without error has 1.
-
-    Args:
-        a: [R, R, 3] linear radiance, R at least 3. Tiles have two pixels or more.
-        b: the same shape.
+    two of SEAM_TILES tiles a side meet, over that elsewhere. A picture without error has 1. Both
+    are [R, R, 3] linear radiance with R of at least 3; tiles have two pixels or more.
     """
     error = _log(a) - _log(b)
     step = max(2, len(error) // math.gcd(len(error), SEAM_TILES))

@@ -21,11 +21,7 @@ def number_ranges(numbers: Iterable[int]) -> str:
 
 
 def numbers_of(ranges: str) -> list[int]:
-    """Return the numbers that `number_ranges` wrote; none of another text, or of too many.
-
-    Args:
-        ranges: numbers and ranges of them, between commas.
-    """
+    """Return the numbers that `number_ranges` wrote; none of another text, or of too many."""
     if not _RANGES.fullmatch(ranges):
         return []
     runs = [

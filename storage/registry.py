@@ -30,15 +30,11 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         decides: tuple[Decided, ...] = (),
         aliases: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        """Begin a table.
+        """Begin a table of our own entries, of which one is called `what` in messages.
 
-        Args:
-            what: one entry is called in messages, such as `template`.
-            kind: type of every entry, as isinstance takes it.
-            entries: our own.
-            decides: what depends on its entries. Extensions that add to a table that decides
-                nothing are not recorded: they change how something is done, not what it means.
-            aliases: further names of our own entries; no list shows them.
+        Every entry is a `kind`, as isinstance takes it. Extensions that add to a table that decides
+        nothing are not recorded: they change how something is done, not what it means. Aliases are
+        further names of our own entries; no list shows them.
         """
         self.what = what
         self._kind = kind
@@ -50,9 +46,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     def register(self, name: str, entry: Entry) -> None:
         """Add an entry; call this in a file that `--extend` names.
 
-        Raises:
-            TrilightError: the name is taken or no word, the entry is of another kind, or something
-                is made of it and no file is being loaded, so that nothing could record it.
+        It raises TrilightError where the name is taken or no word, the entry is of another kind, or
+        something is made of it and no file is being loaded, so that nothing could record it.
         """
         extension = loading()
         if extension is None and self._decides:
@@ -87,17 +82,11 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             extension.undo.append(lambda: self._remove(name))
 
     def resolve(self, reference: str, as_entry: Callable[[Any], Entry]) -> str:
-        """Return the name of an entry that was typed on a command line.
+        """Return the name of an entry that was typed on a command line; it may be unknown.
 
-        FILE.py:FUNCTION runs a file of their own and registers what the function returns as
-        `FILE.py:FUNCTION` without the folder.
-
-        Args:
-            typed: a name, which may be unknown, or FILE.py:FUNCTION.
-            as_entry: makes an entry of what the function returned, or raises TrilightError.
-
-        Raises:
-            TrilightError: the file cannot be loaded (storage.extensions), or does not define it.
+        FILE.py:FUNCTION runs a file of their own and registers what the function returns, as
+        `as_entry` makes an entry of it, as `FILE.py:FUNCTION` without the folder. It raises
+        TrilightError where the file cannot be loaded (storage.extensions), or does not define it.
         """
         if not is_reference(reference):
             return reference

@@ -66,7 +66,6 @@ class Image:
     """CPU seconds of this picture, where they were spent, without the scene's loading; None for a
     stored picture."""
     facts: Facts = field(default_factory=dict)
-    """Further facts of the picture."""
     layers_rgb: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     """[R, R, 3] linear radiance of layers by name, whose sum is the picture; may be empty."""
     remark: str = ""
@@ -99,9 +98,8 @@ class ReadyScene(Protocol):
     def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Image:
         """Return the picture of a camera.
 
-        Raises:
-            Unrenderable: there is no such picture of this scene.
-            TrilightError: the renderer is unusable.
+        It raises Unrenderable where there is none of this scene, and TrilightError where the
+        renderer is unusable.
         """
 
 
@@ -125,15 +123,10 @@ class Renderer(Protocol):
         """Everything but scene and camera that decides a picture, as JSON values."""
 
     def load(self, scene: Scene, name: str) -> ReadyScene:
-        """Load a scene, which messages call `name`.
+        """Load a scene that passes `Scene.check`, which messages call `name`.
 
-        Args:
-            scene: a scene that passes `Scene.check`.
-            name: name of the scene.
-
-        Raises:
-            Unrenderable: the scene cannot be rendered.
-            TrilightError: the renderer is unusable, or cannot make pictures of its width.
+        It raises Unrenderable where the scene cannot be rendered, and TrilightError where the
+        renderer is unusable, or cannot make pictures of its width.
         """
 
     def close(self) -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar, cast
 
 from storage.errors import TrilightError
+from storage.settings.ranges import Law
 
 T = TypeVar("T")
 
@@ -22,7 +23,6 @@ class Spelled:
     pattern: str
     """Regular expression that matches all of it."""
     expected: str
-    """Description of valid texts, for error messages."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Let pydantic check the spelling with the type."""
@@ -32,19 +32,12 @@ class Spelled:
 
 
 @dataclass(frozen=True)
-class Finite:
+class Finite(Law):
     """Law of any JSON value: no NaN and no infinity in it."""
 
     expected: str = "JSON values with finite numbers"
-    """Description of valid values, for error messages."""
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Let pydantic look for such numbers after the type."""
-        from pydantic_core import core_schema
-
-        return core_schema.no_info_after_validator_function(self._require, handler(source))
-
-    def _require(self, value: Any) -> Any:
+    def require(self, value: Any) -> Any:
         json.dumps(value, allow_nan=False)
         return value
 
@@ -66,16 +59,10 @@ ShortText = Annotated[str, Spelled(".{0,1000}", "a text of at most 1000 characte
 
 
 def read_json(data: bytes | str, kind: type[T], source: str) -> T:
-    """Return the value of a JSON text, checked strictly.
+    """Return the value of a JSON text, checked strictly; bytes are UTF-8.
 
-    Args:
-        data: the text; bytes are UTF-8.
-        kind: its type.
-        source: begins the complaint, such as the path of the file.
-
-    Raises:
-        TrilightError: other JSON than the type says; names source, field, value and what was
-            expected.
+    It raises TrilightError for other JSON than the type says; this names `source`, such as the path
+    of the file, the field, the value and what was expected.
     """
     from storage.settings.described import parse_strictly  # pydantic takes time to import
 
@@ -88,11 +75,7 @@ def read_json(data: bytes | str, kind: type[T], source: str) -> T:
 def read_json_lines(data: bytes, kind: type[T], source: str, *, torn_end: bool = False) -> list[T]:
     """Return the values of lines of JSON; raises as `read_json`, naming the line.
 
-    Args:
-        data: the lines.
-        kind: type of each.
-        source: the file, for messages.
-        torn_end: leave out a last line that a kill has cut, which no line break ends.
+    With `torn_end`, a last line that a kill has cut, which no line break ends, is left out.
     """
     lines = data[: data.rfind(b"\n") + 1 if torn_end else None].splitlines()
     return [read_json(line, kind, f"{source}:{row}") for row, line in enumerate(lines, start=1)]

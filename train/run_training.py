@@ -12,8 +12,7 @@ import torch
 from model.checkpoint_format import saved_steps
 from model.renderformer import count_parameters
 from model.scene_tensors import lit_sky, require_known_sky
-from storage.dataset.mixed_data import open_mixture
-from storage.dataset.training_data import TrainingData
+from storage.dataset.training_data import TrainingData, open_mixture
 from storage.errors import TrilightError
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.buckets import decodes_on_device, step_scenes
@@ -65,7 +64,7 @@ def train_run(
 
     Args:
         settings: the run; `train.presets.training_preset` returns those that have a name.
-        data: root of a dataset, or of several that are mixed (storage.dataset.mixed_data), or a
+        data: root of a dataset, or of several that are mixed (storage.dataset.training_data), or a
             list of shards (storage.dataset.training_data), with a train split; without a validation
             split nothing is evaluated.
         out: folder of the run (train.folder), new unless it resumes.

@@ -41,17 +41,17 @@ if TYPE_CHECKING:
     from pipeline.renders.settings import RenderSettings as RenderSettings
     from scene_templates.families import FAMILIES as FAMILIES
     from scene_templates.families import Family as Family
+    from scene_templates.rooms import SeparateSides as SeparateSides
     from scene_templates.rooms import SharedRoom as SharedRoom
+    from scene_templates.rooms import SideRanges as SideRanges
     from scene_templates.sample_camera import Sector as Sector
     from scene_templates.sample_emitters import LightSettings as LightSettings
-    from scene_templates.separate_sides import SeparateSides as SeparateSides
-    from scene_templates.separate_sides import SideRanges as SideRanges
     from scene_templates.settings import SceneSettings as SceneSettings
-    from scene_templates.skies.draws import SkyDraws as SkyDraws
     from scene_templates.skies.procedural_skies import SKIES as SKIES
+    from scene_templates.skies.procedural_skies import SkyDraws as SkyDraws
     from scene_templates.skies.texels import SkyTexels as SkyTexels
-    from scene_templates.surfaces.draws import SurfaceDraws as SurfaceDraws
     from scene_templates.surfaces.maps import Finish as Finish
+    from scene_templates.surfaces.maps import SurfaceDraws as SurfaceDraws
     from scene_templates.surfaces.procedural_textures import SURFACES as SURFACES
     from scene_templates.surfaces.texels import Texels as Texels
     from scene_templates.templates import TEMPLATES as TEMPLATES

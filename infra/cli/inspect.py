@@ -24,8 +24,7 @@ from infra.run_record import is_run, run_facts, tensorboard_command
 from storage.aliases import PRESET_ALIASES, name_for_people
 from storage.dataset.dataset import Dataset, RemoteDatasetFiles, open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.sampled import described_shards
-from storage.dataset.statistics import Statistics, dataset_statistics
+from storage.dataset.statistics import Statistics, dataset_statistics, described_shards
 from storage.errors import TrilightError
 from storage.records.objects import count_by_reason
 from storage.remote.safe_url import safe_url

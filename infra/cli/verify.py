@@ -11,9 +11,9 @@ from infra.cli.console import (
     suggest_look,
 )
 from infra.cli.options import OutputOptions, command
-from storage.dataset.asked import read_asked, value_of
 from storage.dataset.dataset import open_dataset
 from storage.dataset.derived import derivation_of
+from storage.dataset.progress import read_asked, value_of
 from storage.dataset.verify import Verification, verify_dataset
 from storage.remote.safe_url import safe_url
 from storage.remote.url import RemoteUrl, parse_url

@@ -23,8 +23,8 @@ from pipeline.renders.results import GrowingPicture, RenderedView
 from pipeline.renders.settings import FIRST_SPP, RenderSettings
 from storage.errors import Rejected, Unrenderable
 from storage.machine import available_cores
+from storage.records.lights import Parts
 from storage.records.material import PUBLISHED_COLUMNS, unread_columns
-from storage.records.parts import Parts
 from storage.records.scene import Scene
 from storage.renderer import Camera, Fact, Image, OnProgress, Sampling, ignore_progress
 from storage.settings.described import settings_record

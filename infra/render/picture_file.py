@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from storage.atomic import write_atomically
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
-from storage.records.exr import read_header
-from storage.records.exr_layers import decode_picture, encode_picture
+from storage.records.exr import decode_picture, encode_picture, read_header
 from storage.records.lights import rounded_to_half
 from storage.records.safe_read import read_plain
 from storage.renderer import Camera, Fact, Facts, Image, Renderer

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.exchange.formats import readable_suffixes
 from pipeline.exchange.open_scene import SceneSource, scene_source
 from pipeline.exchange.reader import SceneReader
-from storage.dataset.shard_places import expand_pattern
+from storage.dataset.shard_set import expand_pattern
 from storage.errors import TrilightError
 from storage.records.scene import Scene
 from storage.renderer import Camera

@@ -7,13 +7,16 @@ from infra.setup.command_line_page import command_line_page
 from infra.setup.settings_page import settings_page
 from pipeline.shards.expression import TEXTS
 from scene_templates.recorded_sampler import RecordedDraw
-from scene_templates.skies.draw import SkyMapSettings
-from scene_templates.skies.draws import PALEST, SkyDraws
-from scene_templates.skies.procedural_skies import OUR_SKIES, SKIES
+from scene_templates.skies.procedural_skies import (
+    OUR_SKIES,
+    PALEST,
+    SKIES,
+    SkyDraws,
+    SkyMapSettings,
+)
 from scene_templates.skies.texels import SkyTexels
-from scene_templates.surfaces.draw import SurfaceMapSettings
-from scene_templates.surfaces.draws import LEAST_TINT, SurfaceDraws
-from scene_templates.surfaces.procedural_textures import OUR_SURFACES, SURFACES
+from scene_templates.surfaces.maps import LEAST_TINT, SurfaceDraws
+from scene_templates.surfaces.procedural_textures import OUR_SURFACES, SURFACES, SurfaceMapSettings
 from scene_templates.surfaces.texels import Texels
 from storage.markdown import table
 from storage.records.passes.declared import MOTION, Pass, declared_passes

@@ -16,8 +16,7 @@ from model.hits.textures import DeviceTextures, SurfaceTextures
 from model.hits.vectors import Floats, as_rows, brightest, dot, unit
 from storage.optics.bsdf import bsdf_lobes
 from storage.optics.multiscatter import scattered_again
-from storage.raycast.caster import RayCaster, RayHits
-from storage.raycast.embree import Triangles
+from storage.raycast.caster import RayCaster, RayHits, Triangles
 from storage.records.environment import Environment
 from storage.records.material import EMISSION, ROUGHNESS
 

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from model.hits.vectors import Floats, as_rows
 from storage.conventions import latlong_uv
-from storage.records.environment import Environment
+from storage.records.environment import Environment, row_solid_angles, texel_means
 from storage.records.lookup import environment_values
-from storage.records.sky_texels import row_solid_angles, texel_means
 
 _BLURRED_ROWS = 16
 """Number of rows of the blurred map: 11 degrees each."""

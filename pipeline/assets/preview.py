@@ -14,9 +14,8 @@ from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
 from storage.conventions import srgb8
-from storage.records.asset import Level
+from storage.records.asset import Level, LevelSkin
 from storage.records.lookup import texture_values
-from storage.records.skin import LevelSkin
 
 _TOWARDS_CAMERA = np.array([0.62, -0.62, 0.48])
 _BACKGROUND = 1.0

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import Manifest
-from storage.dataset.sampled import described_shards, of_how_many
+from storage.dataset.statistics import described_shards, of_how_many
 from storage.errors import TrilightError
-from storage.records.map_facts import texture_families
 from storage.records.objects import OBJECT, Failure, LockedObject, locked_uids
 from storage.records.profiles import PACKED, PLAIN
 from storage.records.quantities import QUANTITIES, summary
 from storage.records.sample import SceneRecord
-from storage.records.scene_facts import Values, scene_values, surfaces
+from storage.records.scene_facts import Values, scene_values, surfaces, texture_families
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -178,8 +177,8 @@ def dataset_distributions(
 ) -> Distributions:
     """Read the scenes of a dataset, one at a time and without their pictures: all, or a sample.
 
-    Memory grows by about 200 bytes per read scene (storage.dataset.sampled chooses the sample). The
-    digests of the shards are not checked.
+    Memory grows by about 200 bytes per read scene (storage.dataset.statistics chooses the sample).
+    The digests of the shards are not checked.
 
     `shard_done` is called with the name of each shard that was read.
 

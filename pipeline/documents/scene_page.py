@@ -18,12 +18,11 @@ from pipeline.documents.scene_passes import (
 )
 from storage.conventions import preview_gain, preview_srgb8, srgb8
 from storage.records.environment import Environment
-from storage.records.map_facts import sky_facts
 from storage.records.material import DIFFUSE
 from storage.records.objects import Failure
 from storage.records.sample import PartFloor, Sample, error_text
 from storage.records.scene import Scene
-from storage.records.scene_facts import cameras, lights, surfaces
+from storage.records.scene_facts import cameras, lights, sky_facts, surfaces
 from storage.records.texture import NORMAL, TEXTURED, MapSource, Texture
 
 _PICTURE_PX = 384

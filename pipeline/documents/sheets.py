@@ -13,8 +13,7 @@ from storage.conventions import preview_gain, preview_srgb8
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry
-from storage.dataset.sampled import described_shards
-from storage.dataset.statistics import Statistics
+from storage.dataset.statistics import Statistics, described_shards
 from storage.records.sample import Sample, error_text
 
 _TILE_PX = 192

@@ -10,7 +10,7 @@ from pipeline.exchange.select_samples import is_dataset, select_samples
 from storage.atomic import write_atomically
 from storage.dataset.dataset import open_dataset
 from storage.raycast.first_hits import require_row
-from storage.records.passes.stored import passes_exr
+from storage.records.passes.pictures import passes_exr
 from storage.records.scene import Scene
 
 _RESOLUTION = 256

@@ -20,7 +20,7 @@ from pipeline.objects.sources import SOURCES
 from pipeline.presets.registry import DATASET_PRESETS
 from pipeline.presets.settings import DatasetSettings
 from storage.aliases import OBJECTS, PRESET_ALIASES
-from storage.dataset.shard_places import MAX_SHARDS
+from storage.dataset.shard_set import MAX_SHARDS
 from storage.errors import TrilightError
 from storage.settings.described import checked
 from storage.settings.fields import describe_fields

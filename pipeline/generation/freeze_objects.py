@@ -37,12 +37,12 @@ from storage.dataset.progress import announce_downloads, announce_objects, count
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.records.lock_rows import LockRows
 from storage.records.object_index import IndexedObject, ObjectIndex, write_object_index
 from storage.records.objects import (
     OBJECT,
     Failure,
     LockedObject,
+    LockRows,
     ObjectRecord,
     count_by_reason,
     read_objects_lock,

@@ -23,9 +23,8 @@ from scene_templates.user_maps import OwnMaps, UserMap, UserTexture
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.asset import decode_asset
-from storage.records.lock_rows import LockRows
 from storage.records.object_index import ObjectIndex
-from storage.records.objects import SKY, TEXTURE, LockedObject
+from storage.records.objects import SKY, TEXTURE, LockedObject, LockRows
 from storage.records.texture import MapSource
 
 _MOST_OPEN = 8

@@ -63,9 +63,9 @@ from pipeline.generation.unfinished_shard import UnfinishedShard
 from pipeline.isolation import ChildFailed, IsolatedChild, with_retries
 from pipeline.presets.registry import DATASET_PRESETS, object_source
 from pipeline.presets.settings import DatasetSettings
-from storage.dataset.asked import write_asked
 from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import ShardEntry
+from storage.dataset.progress import write_asked
 from storage.dataset.splits import keeps_scenes
 from storage.dataset.statistics import Statistics
 from storage.errors import Rejected, TrilightError

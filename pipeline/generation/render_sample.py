@@ -20,9 +20,9 @@ from pipeline.scenes.visibility import Visibility
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import forget_views, tell_views
 from storage.errors import Rejected
+from storage.records.lights import Parts
 from storage.records.objects import Failure
-from storage.records.parts import Parts
-from storage.records.passes.stored import passes_exr
+from storage.records.passes.pictures import passes_exr
 from storage.records.sample import PartFloor, Sample, ViewRecord
 from storage.records.scene import Scene
 from storage.renderer import Sampling

@@ -10,8 +10,7 @@ from pipeline.generation.prepare_isolated import asset_store, prepare_isolated
 from pipeline.objects.sources import ListedObjects, list_objects
 from storage.atomic import write_atomically
 from storage.digests import sha256_hex
-from storage.records.lock_rows import LockRows
-from storage.records.objects import ObjectRecord
+from storage.records.objects import LockRows, ObjectRecord
 from storage.remote.safe_url import safe_url
 
 

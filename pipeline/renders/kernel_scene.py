@@ -16,8 +16,7 @@ from pipeline.renders.guide_table import GuideTable
 from pipeline.renders.sky_table import SkyTable, sky_share
 from pipeline.renders.surface_table import SurfacePoint, surface_table
 from pipeline.renders.tracer import split_triangles
-from storage.records.lights import shining_sky
-from storage.records.parts import part_names
+from storage.records.lights import part_names, shining_sky
 from storage.records.scene import Scene
 
 MAX_SURVIVAL = 0.95
@@ -259,7 +258,7 @@ class KernelParts:
     """
 
     def __init__(self, *, bounces: bool, lobes: bool) -> None:
-        """Choose the sums, as `storage.records.parts.part_names`."""
+        """Choose the sums, as `storage.records.lights.part_names`."""
         self._bounces = bounces
         self._lobes = lobes
         self.count = max(1, len(part_names(bounces=bounces, lobes=lobes)))

@@ -37,12 +37,12 @@ from storage.conventions import HALF_FLOAT_MAX
 from storage.denoiser import set_denoiser_threads
 from storage.errors import Rejected
 from storage.records.lights import (
+    MAX_LIGHTS,
     light_rows,
     num_light_pictures,
     rounded_to_half,
     sum_of_lights,
 )
-from storage.records.parts import MAX_PICTURES
 from storage.records.scene import Scene
 from storage.renderer import Sampling
 
@@ -81,7 +81,7 @@ class SceneRenderer:
         Raises:
             Rejected: "unlit_scene" where no emitter has an area (with `per_light`: where one has
                 none), "no_surfaces" where all triangles emit (emitters are hidden, so every
-                picture would be black), "too_many_lights" where more than MAX_PICTURES would be
+                picture would be black), "too_many_lights" where more than MAX_LIGHTS would be
                 kept apart.
         """
         require_surfaces(scene)
@@ -101,7 +101,7 @@ class SceneRenderer:
             self._arithmetic = DevicePictures
         self._sees_sky = scene.environment is not None and scene.environment.is_seen
         if settings.per_light:
-            most = MAX_PICTURES // max(1, len(settings.part_names))
+            most = MAX_LIGHTS // max(1, len(settings.part_names))
             self._tracers = _tracers_of_lights(self._tracer, scene, most)
         self._light_seed = light_seed if settings.light_paths == "scene" else None
         if self._light_seed is not None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.noise_floor import MeasuredFloor
-from storage.records.parts import Parts
+from storage.records.lights import Parts
 from storage.renderer import Sampling
 
 Result = TypeVar("Result")
@@ -45,7 +45,7 @@ class RenderedView:
     `radiance_rgb` is their storage.records.lights.sum_of_lights in every bit."""
     parts_rgb: Parts | None = None
     """[R, R, 3] radiance of each part, with `split` or `split_lobes`; rounded to half floats. With
-    `per_light` [L, R, R, 3]. Their storage.records.parts.sum_of_parts is `radiance_rgb`, or
+    `per_light` [L, R, R, 3]. Their storage.records.lights.sum_of_parts is `radiance_rgb`, or
     `lights_rgb`, in every bit."""
     part_floors: Mapping[str, MeasuredFloor] | None = None
     """Measured error of each part, of all lights together."""

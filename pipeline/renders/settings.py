@@ -10,7 +10,7 @@ import pydantic
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.metrics import MAX_DB
-from storage.records.parts import part_names
+from storage.records.lights import part_names
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 
@@ -131,7 +131,7 @@ class RenderSettings:
     their sum (storage.records.lights). It takes about as many times as long as there are lights."""
     split: bool = False
     """Store direct light (lamp, surface, camera) and indirect light apart as well, each with its
-    floors, and make the picture their sum (storage.records.parts)."""
+    floors, and make the picture their sum (storage.records.lights)."""
     split_lobes: bool = False
     """Store what the diffuse and what the specular lobe of the visible surface reflects apart as
     well; with `split` there are four parts."""
@@ -180,7 +180,7 @@ class RenderSettings:
 
     @property
     def part_names(self) -> tuple[str, ...]:
-        """Names of the parts that are stored (storage.records.parts); empty where none are."""
+        """Names of the parts that are stored (storage.records.lights); empty where none are."""
         return part_names(bounces=self.split, lobes=self.split_lobes)
 
     @property

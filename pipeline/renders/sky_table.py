@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import opaque_vector, own_floats
 from pipeline.renders.emitter_table import ONE_MINUS_EPSILON, sample_alias
-from storage.records.environment import Environment
+from storage.records.environment import Environment, row_solid_angles, texel_means
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
-from storage.records.sky_texels import row_solid_angles, texel_means
 
 _TINY = 1e-30
 

@@ -17,7 +17,7 @@ from pipeline.renders.device_memory import own_floats, own_integers
 from pipeline.renders.ggx import KernelLobes
 from storage.optics.bsdf import MIN_ALPHA, bsdf_lobes
 from storage.optics.multiscatter import ROUGHNESS_STEPS, mean_albedo, scattered_again
-from storage.records.normal_map import LEAST_TANGENT_SQ, LEAST_Z, u_directions
+from storage.records.lookup import LEAST_TANGENT_SQ, LEAST_Z, u_directions
 from storage.records.scene import Scene
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
@@ -147,7 +147,7 @@ class KernelTextures:
         self._u_directions = own_floats(np.pad(u_directions(positions, corners), ((0, 0), (0, 1))))
 
     def mapped_normal(self, normal: Any, triangle: Any, barycentric: Any, active: Any) -> Any:
-        """Return the unit normal (Vector3f) of storage.records.normal_map; None without any map.
+        """Return the unit normal (Vector3f) of storage.records.lookup; None without any map.
 
         Args:
             normal: Vector3f, unit, unmapped.

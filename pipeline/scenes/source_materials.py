@@ -16,11 +16,10 @@ from pipeline.scenes.pieces import ScenePiece, Skin
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.sample_material import MaterialSettings
 from storage.errors import Rejected, TrilightError
-from storage.records.asset import Level
+from storage.records.asset import Level, LevelSkin
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, default_rows
 from storage.records.objects import LockedObject
 from storage.records.scene import SceneObject
-from storage.records.skin import LevelSkin
 from storage.records.texture import NORMAL, TEXTURED, MapSource
 from storage.seeds import SceneKey
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scenes.visibility import ViewFacts, Visibility
-from scene_templates.sample_camera import path_position
+from scene_templates.sample_camera import path_position, sample_camera
 from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
@@ -146,7 +146,7 @@ def _proposal(scene: Scene, settings: SceneSettings, view: int, attempt: int) ->
         of_path = rng_for(seed, f"{purpose} path", *names[:2])
         position = path_position(settings.cameras.path, view, settings.num_views, of_path)
     rng = rng_for(seed, purpose, *names)
-    pose = TEMPLATES[template].sample_camera(rng, settings.cameras, position)
+    pose = sample_camera(rng, settings.cameras, TEMPLATES[template].cameras, position)
     return ViewCamera(
         c2w=pose.c2w.astype(np.float32), fov_deg=np.float32(pose.fov_deg), attempt=attempt
     )

@@ -2,7 +2,7 @@
 
 A grid of 32 x 32 rays costs about a millisecond, and decides only if a picture is worth rendering:
 it may miss anything smaller than a grid cell. Everything is computed in the single precision of
-storage.raycast.embree: the cameras of a dataset depend on each bit of it.
+storage.raycast.caster: the cameras of a dataset depend on each bit of it.
 """
 
 from dataclasses import dataclass
@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.scene_checks import object_boxes
 from storage.conventions import camera_rays, latlong_direction
-from storage.raycast.caster import MISS
-from storage.raycast.embree import MetSurfaces, Surfaces
+from storage.raycast.caster import MISS, MetSurfaces, Surfaces
 from storage.records.scene import Scene
 
 SHADOW_OFFSET = 1e-4

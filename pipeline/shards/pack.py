@@ -26,8 +26,8 @@ from storage.dataset.shard_notes import (
 )
 from storage.dataset.staging import read_staged_scene, stage_members
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError
-from storage.records.map_references import MAP_NAME
 from storage.records.objects import Failure, write_failures
+from storage.records.packed_maps import MAP_NAME
 from storage.records.sample import sample_key
 
 

@@ -5,15 +5,99 @@ to a factor, which `draw_sky` chooses. All that it draws has a name and a stated
 noises take streams of their own, so that the same seed gives the same sky at every size.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scene_templates.checks import Range, require
 from scene_templates.exact import Numbers, dot, lerp, smoothstep
-from scene_templates.skies.draws import SkyDraws, planckian_rgb
+from scene_templates.recorded_sampler import RecordedSampler
 from scene_templates.skies.texels import SkyTexels
 from storage.registry import Registry
+from storage.settings.described import checked
+from storage.settings.ranges import Share, Within
+
+PALEST = 0.1
+"""Least channel of a coloured light before its mean is made 1: no light is quite monochrome."""
+
+
+DEEP_BLUE = (0.3, 0.75, 1.95)
+PALE_BLUE = (0.75, 0.97, 1.28)
+"""Colours, of mean 1, of a clean and of a hazy sky: bluer than any black body is."""
+
+
+_TO_REC709 = (
+    (3.2404542, -1.5371385, -0.4985314),
+    (-0.9692660, 1.8760108, 0.0415560),
+    (0.0556434, -0.2040259, 1.0572252),
+)
+
+
+def planckian_rgb(mired: float) -> Numbers:
+    """Return the linear colour [3], of mean 1, of a black body.
+
+    By the cubic fit of Kim et al. (2002) to the chromaticities, which is polynomials alone. A mired
+    is a million over the temperature in kelvin: 500 is a candle, 154 daylight, 40 blue sky. Equal
+    steps look equal, as equal steps in kelvin do not.
+    """
+    t = mired / 1000
+    if mired > 250:  # below 4,000 K
+        x = ((-0.2661239 * t - 0.2343589) * t + 0.8776956) * t + 0.179910
+    else:
+        x = ((-3.0258469 * t + 2.1070379) * t + 0.2226347) * t + 0.240390
+    if mired > 450:
+        y = ((-1.1063814 * x - 1.34811020) * x + 2.18555832) * x - 0.20219683
+    elif mired > 250:
+        y = ((-0.9549476 * x - 1.37418593) * x + 2.09137015) * x - 0.16748867
+    else:
+        y = ((3.0817580 * x - 5.87338670) * x + 3.75112997) * x - 0.37001483
+    xyz = (x / y, 1.0, (1 - x - y) / y)
+    linear = [row[0] * xyz[0] + row[1] * xyz[1] + row[2] * xyz[2] for row in _TO_REC709]
+    rgb = np.array([max(0.0, channel) for channel in linear])
+    result: Numbers = rgb / ((rgb[0] + rgb[1] + rgb[2]) / 3)
+    return result
+
+
+class SkyDraws(RecordedSampler):
+    """Draws by name, and colours of lights that follow the sky's own choice."""
+
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        *,
+        coloured_share: float,
+        sun_elevation_deg: tuple[float, float] = (2.0, 75.0),
+        sun_to_sky: tuple[float, float] = (0.5, 8.0),
+    ) -> None:
+        """Begin a sky, of which all lights have any colour with a probability of `coloured_share`.
+
+        The ranges are the sun's elevation, and the sun's irradiance over the sky's.
+        """
+        super().__init__(rng)
+        self._coloured = self.holds("coloured lights", coloured_share)
+        self.sun_elevation_deg = sun_elevation_deg
+        self.sun_to_sky = sun_to_sky
+
+    def light(self, name: str, *, mired: tuple[float, float]) -> Numbers:
+        """Return the colour [3], of mean 1, of a light, uniform in a range of `planckian_rgb`."""
+        if not self._coloured:
+            return planckian_rgb(self.uniform(f"{name}: mired", *mired))
+        return self._any_colour(name)
+
+    def blue(self, name: str) -> Numbers:
+        """Return the colour [3], of mean 1, of a sky that is blue where lights are natural."""
+        if not self._coloured:
+            return self.shade(f"{name}: colour", DEEP_BLUE, PALE_BLUE)
+        return self._any_colour(name)
+
+    def _any_colour(self, name: str) -> Numbers:
+        rgb = self.colour(f"{name}: any colour", (PALEST,) * 3, (1.0,) * 3)
+        result: Numbers = rgb / ((rgb[0] + rgb[1] + rgb[2]) / 3)
+        return result
+
 
 LOW_SUN_MIRED = 420.0
 HIGH_SUN_MIRED = 172.0
@@ -208,20 +292,97 @@ def window_wall(draws: SkyDraws, texels: SkyTexels) -> Numbers:
 
 SkyFamily = Callable[[SkyDraws, SkyTexels], Numbers]
 
-_OURS: dict[str, SkyFamily] = {
-    "sun_and_sky": sun_and_sky,
-    "clouds": clouds,
-    "night": night,
-    "softboxes": softboxes,
-    "window_wall": window_wall,
-    "lobes": lobes,
-    "gradient": gradient,
-    "constant": constant,
-}
+_OURS: tuple[SkyFamily, ...] = (
+    sun_and_sky, clouds, night, softboxes, window_wall, lobes, gradient, constant,
+)  # fmt: skip
 
-OUR_SKIES = tuple(_OURS)
+OUR_SKIES = tuple(make.__name__ for make in _OURS)
 """What skies are drawn from unless the settings say otherwise; registering another does not change
 it."""
 
-SKIES: Registry[SkyFamily] = Registry("sky", Callable, _OURS, decides=("data",))
+SKIES: Registry[SkyFamily] = Registry(
+    "sky", Callable, dict(zip(OUR_SKIES, _OURS, strict=True)), decides=("data",)
+)
 """Every name that `SkyMapSettings.families` admits."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SkyMap:
+    """A latitude-longitude map of linear radiance; scene_templates.skies.texels orients it."""
+
+    family: str
+    radiance_rgb: NDArray[np.float32]
+    """[H, 2H, 3], the top row first, the middle of the picture +X, a quarter from the left +Y."""
+    parameters: Mapping[str, tuple[Any, ...]]
+    """Drawn values; the names are those of the reference page of surfaces and skies."""
+
+
+@checked("sky settings")
+class SkyMapSettings:
+    """What procedural skies are drawn from."""
+
+    families: tuple[str, ...] = OUR_SKIES
+    """Families of skies, each equally likely; a name that stands twice is twice as likely."""
+    height: Annotated[int, Within(1, 1024, unit="rows")] = 256
+    """Rows of a map, which has twice as many columns. The same seed gives the same sky at every
+    height, and the same irradiance of its sun."""
+    mean_radiance: Annotated[Range, Within(0, 1e9)] = (0.2, 2.0)
+    """Range of the mean radiance over the sphere and the three channels. A white Lambert floor
+    under a constant sky has the radiance of the sky."""
+    coloured_share: Share = 0.1
+    """Share of the skies whose lights have any color; in the others, they are black bodies."""
+    sun_elevation_deg: Annotated[Range, Within(-90, 90, unit="degrees")] = (2.0, 75.0)
+    """Range of the elevation of a sun, uniform by solid angle."""
+    sun_to_sky: Annotated[Range, Within(0, 1e9)] = (0.5, 8.0)
+    """Range of the irradiance of a sun, on a plane that faces it, over the irradiance of the rest
+    of the upper half of the sky on a horizontal plane."""
+
+    def __post_init__(self) -> None:
+        require(len(self.families) > 0, "families", self.families, "at least one")
+        for name in self.families:
+            SKIES.find(name)
+
+
+def draw_sky(rng: np.random.Generator, settings: SkyMapSettings) -> SkyMap:
+    """Draw a sky of one of the families, of a generator such as `rng_for(seed, "sky", number)`.
+
+    Equal generators and settings give equal bytes on every processor with IEEE arithmetic
+    (scene_templates.exact). A sky of 256 rows takes 0.03 to 0.5 core-seconds.
+    """
+    name = settings.families[int(rng.integers(len(settings.families)))]
+    texels = SkyTexels(settings.height)
+    draws = SkyDraws(
+        rng,
+        coloured_share=settings.coloured_share,
+        sun_elevation_deg=settings.sun_elevation_deg,
+        sun_to_sky=settings.sun_to_sky,
+    )
+    mean = draws.uniform("mean radiance", *settings.mean_radiance)
+    shape = SKIES[name](draws, texels)
+    red, green, blue = texels.flux(shape)
+    scale = mean * 4 * np.pi * 3 / float(red + green + blue)
+    return SkyMap(
+        family=name,
+        radiance_rgb=(shape * scale).astype(np.float32),
+        parameters=draws.parameters(),
+    )
+
+
+@checked("scene settings")
+class SkySettings:
+    """Share and strength of the skies of scenes."""
+
+    share: Share = 0.0
+    """Share of the scenes that have a sky beside their emitters."""
+    own_share: Share = 0.0
+    """Share of those skies that are of your own folder (`--skies`), each equally likely; the others
+    are procedural, and so are all in a split to which none of the folder belongs."""
+    over_lamps_log: Annotated[Range, Within(1e-6, 1e6)] = (0.02, 1.0)
+    """Range, log-uniform, of the irradiance that a sky of constant radiance, the mean of the map,
+    has on a surface, over that of all emitters at the middle of the room on surfaces that face
+    them. It takes the place of `maps.mean_radiance`. In a scene without emitters it is the mean
+    radiance itself."""
+    seen_share: Share = 0.0
+    """Share of the skies that cameras see behind everything."""
+    maps: SkyMapSettings = field(default_factory=SkyMapSettings)
+    """What procedural maps are drawn from. The height holds for your own too, as the most rows."""

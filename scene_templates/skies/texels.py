@@ -84,14 +84,11 @@ class SkyTexels:
         panes: tuple[int, int] = (1, 1),
         bars: float = 0.0,
     ) -> Numbers:
-        """Return how much of each texel [H, 2H] a rectangle covers.
+        """Return how much of each texel [H, 2H] a rectangle covers, whose middle is `towards` [3].
 
-        Args:
-            towards: [3] its middle.
-            half_sizes: half of its width and height, at distance 1.
-            roll_rad: by which it is turned about its middle.
-            panes: how many columns and rows of panes it is divided into.
-            bars: width of the bars between and around them, as a share of a pane.
+        It has half of its width and height at distance 1, is turned about its middle, and divided
+        into columns and rows of panes. The width of the bars between and around them is a share of
+        a pane.
         """
         right, up = _axes(towards, roll_rad)
         ahead = dot(self.directions, towards)
@@ -107,12 +104,8 @@ class SkyTexels:
     def noise(self, rng: np.random.Generator, cells: float, *, octaves: int = 1) -> Numbers:
         """Return noise [H, 2H] of mean 0, the same everywhere on the sphere: no seam and no poles.
 
-        It is gradient noise in space, looked up on the sphere; each octave has half the amplitude.
-
-        Args:
-            rng: a stream of its own.
-            cells: of the first octave along a radius.
-            octaves: how many, as far as texels can show them.
+        It is gradient noise in space, looked up on the sphere, with `cells` of the first octave
+        along a radius. Each octave has half the amplitude; there are as many as texels can show.
         """
         total = np.zeros((self.height, 2 * self.height))
         gain = NOISE_SCALE

@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scene_templates.exact import Numbers, lerp
+from scene_templates.recorded_sampler import RecordedSampler
 from storage.records.texture import MapSource
 
 MOST_ALBEDO = 0.95
@@ -79,13 +80,10 @@ class Finish:
 
 
 def finish(base_rgb: ArrayLike, *, specular_share: float, roughness: float, metal: bool) -> Finish:
-    """Return the finish of a base colour.
+    """Return the finish of a base colour [3] in [0, MOST_ALBEDO].
 
-    Args:
-        base_rgb: [3] in [0, MOST_ALBEDO].
-        specular_share: of the light, what is reflected by the specular lobe.
-        roughness: of that lobe.
-        metal: whether the colour is that of the specular lobe; otherwise that is grey.
+    `specular_share` of the light is reflected by the specular lobe, of this roughness. Its colour
+    is that of a metal, or grey.
     """
     base = np.clip(np.asarray(base_rgb, np.float64), 0, MOST_ALBEDO)
     share = min(specular_share, MOST_ALBEDO)
@@ -114,3 +112,59 @@ def surface_maps(
         roughness=roughness.astype(np.float32),
         parameters=parameters,
     )
+
+
+RGB = tuple[float, float, float]
+"""Linear, Rec.709 primaries."""
+
+
+class GlossRanges(TypedDict):
+    """Ranges that several finishes share."""
+
+    specular: tuple[float, float]
+    roughness: tuple[float, float]
+
+
+LEAST_TINT = 0.88
+"""A natural colour is one between two, each channel times a number from this to 1."""
+
+
+class SurfaceDraws(RecordedSampler):
+    """Draws by name, and finishes whose colours follow the surface's own choice."""
+
+    def __init__(
+        self, rng: np.random.Generator, *, natural_share: float, albedo: tuple[float, float]
+    ) -> None:
+        """Begin a surface, in natural colours throughout with a probability of `natural_share`.
+
+        Otherwise each channel is in the range `albedo`.
+        """
+        super().__init__(rng)
+        self._natural = self.holds("natural colours", natural_share)
+        self._albedo = albedo
+
+    def finish(
+        self,
+        name: str,
+        *,
+        low: RGB,
+        high: RGB,
+        specular: tuple[float, float] = (0.02, 0.1),
+        roughness: tuple[float, float],
+        metal: bool = False,
+    ) -> Finish:
+        """Return a finish; natural base colours lie between `low` and `high`."""
+        return finish(
+            self._natural_colour(name, low, high) if self._natural else self._any_colour(name),
+            specular_share=self.uniform(f"{name}: specular share", *specular),
+            roughness=self.uniform(f"{name}: roughness", *roughness),
+            metal=metal,
+        )
+
+    def _natural_colour(self, name: str, low: RGB, high: RGB) -> NDArray[np.float64]:
+        tint = self.colour(f"{name}: tint", (LEAST_TINT,) * 3, (1.0,) * 3)
+        return tint * self.shade(f"{name}: colour", low, high)
+
+    def _any_colour(self, name: str) -> NDArray[np.float64]:
+        least, most = self._albedo
+        return self.colour(f"{name}: any colour", (least,) * 3, (most,) * 3)

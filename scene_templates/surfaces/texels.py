@@ -48,11 +48,9 @@ class Texels:
     ) -> Numbers:
         """Return periodic gradient noise with mean 0, each octave of twice the cells and half.
 
-        Args:
-            rng: a stream of its own; the same one gives the same noise at every size.
-            cells: of the first octave, in u and in v.
-            octaves: how many, as far as texels can show them.
-            moved: what is added to u and v before the look-up.
+        The first octave has `cells` in u and in v; there are as many octaves as texels can show.
+        The same `rng`, a stream of its own, gives the same noise at every size. `moved` is added to
+        u and v before the look-up.
         """
         u, v = (self.u, self.v) if moved is None else (self.u + moved[0], self.v + moved[1])
         total = np.zeros((self.size, self.size))
@@ -123,12 +121,8 @@ def stones(
 ) -> Stones:
     """Return the Voronoi cells of one point in each square of a lattice (Worley's noise).
 
-    Args:
-        texels: where to look.
-        rng: a stream of its own.
-        cells: squares per side.
-        jitter: how far the points leave the middle of their squares: 1 is anywhere in it.
-        moved: what is added to u and v before the look-up.
+    There are `cells` squares per side. `jitter` is how far the points leave the middle of their
+    squares: 1 is anywhere in it. `moved` is added to u and v before the look-up.
     """
     offsets = 0.5 + jitter * (rng.random((cells, cells, 2)) - 0.5)
     du, dv = moved if moved is not None else (0.0, 0.0)

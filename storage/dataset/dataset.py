@@ -16,9 +16,9 @@ from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest, miss
 from storage.dataset.shard import ShardContents, contents_of, samples_of
 from storage.digests import sha256_of_stream
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
-from storage.records.held_maps import HeldMaps
 from storage.records.objects import Failure, LockedObject, decode_failures, decode_objects_lock
-from storage.records.safe_read import open_plain
+from storage.records.packed_maps import HeldMaps
+from storage.records.safe_read import open_if_there, open_plain
 from storage.records.sample import (
     Sample,
     SceneRecord,
@@ -68,14 +68,7 @@ class LocalFiles(_Files):
         self._checked: dict[str, tuple[int, ...]] = {}
 
     def open_beside(self, name: str) -> BinaryIO | None:
-        try:
-            return open_plain(self.root / name)
-        except (FileNotFoundError, NotADirectoryError):
-            return None
-        except OSError as error:
-            raise TrilightError(
-                f"{self.root / name}: cannot be read ({error.strerror})."
-            ) from error
+        return open_if_there(self.root / name)
 
     def num_bytes(self, shard: ShardEntry) -> int | None:
         """Return the size of a shard; raises ShardMissing, or Unreadable."""
@@ -86,14 +79,10 @@ class LocalFiles(_Files):
             raise _open_error(path, error) from error
 
     def open(self, shard: ShardEntry, *, checked: bool) -> BinaryIO:
-        """Open a shard for reading.
+        """Open a shard for reading, after a check of its digest where `checked`.
 
-        Args:
-            shard: which one.
-            checked: check its digest first, once as long as the file stays unchanged.
-
-        Raises:
-            TrilightError: it is missing, or its bytes are not those of the manifest.
+        An unchanged file is checked once. It raises TrilightError where the shard is missing, or
+        its bytes are not those of the manifest.
         """
         path = self.root / shard.name
         try:
@@ -140,12 +129,7 @@ class RemoteDatasetFiles(_Files):
         return None
 
     def num_bytes(self, shard: ShardEntry) -> int | None:
-        """Return the size of a shard, or None where the server does not state it.
-
-        Raises:
-            ShardMissing: there is none.
-            Unreadable: the server gives no answer.
-        """
+        """Return the size of a shard, or None where its server does not state it."""
         url = self.url.child(shard.name)
         try:
             return facts_of(url).num_bytes
@@ -155,11 +139,7 @@ class RemoteDatasetFiles(_Files):
             raise unreadable(url, error) from error
 
     def open(self, shard: ShardEntry, *, checked: bool) -> BinaryIO:
-        """Open a shard for reading; its digest is always checked on arrival.
-
-        Raises:
-            TrilightError: as `storage.remote.shard_cache`.
-        """
+        """Open a shard of `storage.remote.shard_cache`; its digest is always checked on arrival."""
         url = self.url.child(shard.name)
         return shard_cache().open(url, num_bytes=shard.num_bytes, sha256=shard.sha256)
 
@@ -180,13 +160,7 @@ _OF_DAMAGED_BYTES = (ValueError, LookupError, TypeError, EOFError, RecursionErro
 def reading(dataset: str, shard: str) -> Iterator[None]:
     """Turn any error of reading a shard into one sentence with the next step.
 
-    Args:
-        dataset: its place, for messages.
-        shard: its name.
-
-    Raises:
-        TrilightError: the block raised one, or another error that damaged bytes cause; of what was
-            not read it says nothing more.
+    Only what damaged bytes cause is turned; of a shard that was not read it says nothing more.
     """
     try:
         yield
@@ -214,13 +188,10 @@ class Dataset:
         num_listed: int | None = None,
         noted: Sequence[Failure] = (),
     ) -> None:
-        """Name what is read.
+        """Name what is read, with every shard that may be read in the manifest.
 
-        Args:
-            files: where it is.
-            manifest: what it is, with every shard that may be read.
-            num_listed: how many of the shards the manifest on the disk lists; all by default.
-            noted: what was rejected on the way to the others.
+        Of these the manifest on the disk lists `num_listed`, all by default; `noted` is what was
+        rejected on the way to the others.
         """
         self.files = files
         self.manifest = manifest
@@ -274,8 +245,8 @@ class Dataset:
     def read_shard(self, shard: ShardEntry) -> Iterator[Sample]:
         """Yield the samples of a shard in the order of the file, after checking its digest.
 
-        Raises:
-            TrilightError: the file is missing or its bytes are not those of the manifest.
+        It raises TrilightError where the file is missing or its bytes are not those of the
+        manifest.
         """
         held = HeldMaps()
         with self.files.open(shard, checked=True) as stream:
@@ -285,12 +256,10 @@ class Dataset:
     def read_scenes(self, shard: ShardEntry) -> Iterator[SceneRecord]:
         """Yield the samples of a shard without their pictures, through its headers.
 
-        Only what is needed is read, so that a large dataset can be browsed; the digest of the
-        shard is therefore not checked (`read_shard` and `trilight verify` do that).
-
-        Raises:
-            TrilightError: the shard is missing or damaged, or a scene in it is unreadable or breaks
-                a law.
+        Only what is needed is read, so that a large dataset can be browsed; the digest of the shard
+        is therefore not checked (`read_shard` and `trilight verify` do that). It raises
+        TrilightError where the shard is missing or damaged, or a scene in it is unreadable or
+        breaks a law.
         """
         yield from self._read(shard, None, decode_scene, lambda name: not name.endswith("exr"))
 
@@ -354,11 +323,8 @@ def open_dataset(url: str) -> Dataset:
     """Open the dataset in a local folder, or below a URL of http, https, s3, gs or hf.
 
     Of one that is still made, the shards that are noted so far count too, where the folder or
-    bucket can be listed.
-
-    Raises:
-        TrilightError: there is no readable manifest, the URL is refused, or the driver for it is
-            not installed.
+    bucket can be listed. It raises TrilightError where there is no readable manifest, the URL is
+    refused, or the driver for it is not installed.
     """
     dataset = open_listed(url)
     if not _may_be_growing(dataset.files):

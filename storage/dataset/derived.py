@@ -22,7 +22,6 @@ class Derivation:
     operation: str
     """One of merge, select and reshard."""
     arguments: Mapping[str, Any]
-    """Options of the command, by name."""
     sources: Sequence[Mapping[str, Any]]
     """Per source: build, num_scenes, digest, key_offset, settings."""
 
@@ -30,8 +29,7 @@ class Derivation:
 def derivation_of(settings: Mapping[str, Any]) -> Derivation | None:
     """Return what the settings of a dataset say of its sources; None where it was generated.
 
-    Raises:
-        TrilightError: they say it in another way.
+    It raises TrilightError where they say it in another way.
     """
     if _GROUP not in settings:
         return None
@@ -57,12 +55,7 @@ def source_record(manifest: Manifest, *, key_offset: int) -> dict[str, Any]:
 
 
 def derived_settings(derivation: Derivation, *, scenes_per_shard: int | None) -> dict[str, Any]:
-    """Return the settings of a derived dataset.
-
-    Args:
-        derivation: how it was made.
-        scenes_per_shard: of its own shards, where they are not those of the sources.
-    """
+    """Return the settings of a derived dataset; shards of its own are not its sources'."""
     of_sources = [source["settings"] for source in derivation.sources]
     shared = common(of_sources)
     shared.pop(_GROUP, None)  # the one of a source stands in the record of that source

@@ -59,9 +59,7 @@ class ShardEntry:
     """train, validation or test."""
     num_samples: Scenes
     num_bytes: Bytes
-    """Size of the file in bytes."""
     sha256: Sha256
-    """Hexadecimal digest of the file's bytes."""
     members: Annotated[None, DROPPED] = dataclasses.field(default=None, compare=False, repr=False)
     """An index of its members in rows of before version 5, which is not kept."""
 
@@ -71,7 +69,6 @@ class _Fields:
     """Fields of a manifest, and of its file."""
 
     build: ShortText
-    """Name of the dataset preset."""
     settings: Annotated[Mapping[str, Any], FINITE]
     """All settings of the preset; a dataset keeps them for life."""
     environment: Annotated[Mapping[str, Any], FINITE]
@@ -108,9 +105,7 @@ class StoredManifest(_Fields):
     """File of a manifest."""
 
     dataset_digest: Sha256
-    """The dataset digest as it was written."""
     totals: Totals | None = None
-    """Sums as they were written."""
     manifest_sha256: Sha256 | None = None
     """Seal of the file (storage.digests.seal_of); older manifests have none."""
 
@@ -161,17 +156,13 @@ def number_of_shard(shard: ShardEntry) -> int:
 
 
 def index_shard(path: Path) -> ShardEntry:
-    """Return the manifest entry of a shard file by reading it.
-
-    Raises:
-        TrilightError: the name is not a shard's, or the file is not a whole shard.
-    """
+    """Return the manifest entry of a shard file by reading it; raises as `index_stream`."""
     with open_plain(path) as stream:
         return index_stream(stream, path.name)
 
 
 def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
-    """Return the manifest entry of an open shard; raises as `index_shard` does."""
+    """Return the manifest entry of an open shard; raises TrilightError where it is not whole."""
     match = SHARD_NAME.fullmatch(name)
     if match is None:
         raise TrilightError(f"{name}: not a shard; expected a name like train-000003.tar.")
@@ -218,15 +209,13 @@ def _encode_rows(manifest: Manifest, seal: str) -> Iterator[bytes]:
 
 def shard_row(shard: ShardEntry) -> dict[str, Any]:
     """Return the JSON values of an entry."""
-    row = {field.name: getattr(shard, field.name) for field in dataclasses.fields(shard)}
-    return {name: value for name, value in row.items() if name != "members"}
+    return {name: value for name, value in vars(shard).items() if name != "members"}
 
 
 def read_manifest(path: Path) -> Manifest:
     """Return the manifest of a file, as far as it is listed.
 
-    Raises:
-        TrilightError: missing, not JSON, another schema version, or a shard name that is none.
+    It raises TrilightError where it is missing, no JSON, or of another schema version or form.
     """
     return _read(path, decode_manifest)
 
@@ -255,15 +244,7 @@ def missing_manifest(place: str, *, is_there: bool) -> TrilightError:
 
 
 def decode_manifest(stream: BinaryIO, place: str) -> Manifest:
-    """Return the manifest of an open file.
-
-    Args:
-        stream: the file.
-        place: where it is, for messages.
-
-    Raises:
-        TrilightError: as `read_manifest`.
-    """
+    """Return the manifest of an open file, called `place`; raises as `read_manifest`."""
     return _manifest(stream.read(MAX_FILE_BYTES), place)
 
 

@@ -11,8 +11,7 @@ from storage.settings.described import from_record
 def planned_shards(manifest: Manifest) -> dict[str, int]:
     """Return the names of the shards of the finished dataset, with their numbers of scenes.
 
-    Raises:
-        TrilightError: the settings in the manifest do not say how the dataset is divided.
+    It raises TrilightError where the settings in the manifest do not say how it is divided.
     """
     if derivation_of(manifest.settings):  # it only ever appears whole
         return {entry.name: entry.num_samples for entry in manifest.shards}

@@ -6,6 +6,7 @@ Any process may read it. The rate is that of the logs (storage.dataset.scene_log
 import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 import os
 import time
@@ -14,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from storage.atomic import write_atomically, write_error
-from storage.dataset.asked import read_asked
 from storage.dataset.dataset import Dataset, LocalFiles, open_listed
 from storage.dataset.layout import DatasetFolder, numbered_path, shard_names_in
 from storage.dataset.manifest import Manifest, read_manifest
@@ -26,34 +26,76 @@ from storage.dataset.scene_logs import (
     log_name,
     sample_logs,
 )
-from storage.dataset.shard_notes import note_of, noted_names, noted_shard
+from storage.dataset.shard_notes import name_of_note, noted_names, noted_shard
 from storage.errors import TrilightError
+from storage.extensions import is_reference
 from storage.records.objects import Failure, count_by_reason
 from storage.records.safe_read import read_plain
 from storage.remote.store import WRITABLE, BucketStore
 from storage.typed_json import T, read_json
+
+_NAME = "logs/asked.json"
+"""The words of the command that makes a dataset, so that it can be repeated. The file is no part of
+the dataset's identity, names no folder of the dataset, and may be missing."""
+
+
+def write_asked(folder: DatasetFolder, words: Sequence[str]) -> None:
+    """Write down the words after `trilight`, without where the dataset is."""
+    write_atomically(folder.root / _NAME, (json.dumps(list(words)) + "\n").encode())
+
+
+def read_asked(dataset: Dataset) -> list[str] | None:
+    """Return what was written down; None where nothing is, or nothing that may be shown.
+
+    The file may come from the dataset's publisher: only words of `generate` that print come back,
+    and none that would run a file when they are repeated.
+    """
+    try:
+        words = read_json(dataset.files.read(_NAME) or b"[]", list[str], _NAME)
+    except TrilightError:
+        return None
+    if words[:1] != ["generate"]:
+        return None
+    harmless = all(
+        word.isprintable() and not (is_reference(word) or word.startswith("--extend"))
+        for word in words
+    )
+    return words if harmless else None
+
+
+def value_of(words: Sequence[str], option: str) -> str | None:
+    """Return the word after an option; None where the option is missing."""
+    return next((value for name, value in itertools.pairwise(words) if name == option), None)
+
 
 _AT_WORK_S = 600.0
 """Older notes on unfinished views were left by a kill: a pass of samples takes less time."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Progress:
+class _Counts:
     """Counts of what is finished and of what is planned; 0 planned where it is not known yet."""
+
+    objects_done: int
+    """Objects that are prepared or rejected; of a bucket, 0."""
+    objects_planned: int
+    """Objects to prepare; 0 before they are counted, and of a bucket."""
+    scenes_done: int
+    """Scenes in shards or waiting for theirs."""
+    scenes_given_up: int
+    """Scenes that no attempt could save; of a bucket, known once it is finished."""
+    scenes_planned: int
+    num_views: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress(_Counts):
+    """Progress of a dataset in a folder."""
 
     downloads_done: int
     """Object files that have come from a server, or failed to."""
     downloads_planned: int
     """Object files to fetch; 0 for sources on this machine."""
-    objects_done: int
-    """Objects that are prepared or rejected."""
-    objects_planned: int
-    scenes_done: int
-    """Scenes in shards or waiting for their shard."""
-    scenes_given_up: int
-    """Scenes that no attempt could save."""
-    scenes_planned: int
-    num_views: int
     views_done: float
     """Views of the finished scenes, and how far those of the scenes at work are."""
 
@@ -117,10 +159,8 @@ def read_progress(folder: DatasetFolder) -> Progress:
         manifest, expected = _plan_of(folder.manifest, facts.st_mtime_ns, facts.st_size)
         scenes_planned = manifest.num_scenes
         num_views = manifest.num_views
-        given_up = _scenes_given_up(folder, manifest)
-        packed = {name: each for name, each in expected.items() if name not in manifest.growing}
-        scenes_done = num_scenes_done(folder, packed) - given_up
-        given_up += max(scenes_planned - sum(expected.values()), 0)
+        finished = existing_shards(folder) & set(expected) - set(manifest.growing)
+        scenes_done, given_up = _count_scenes(manifest, expected, finished, folder)
     except (TrilightError, OSError):
         scenes_planned = num_views = scenes_done = given_up = 0
     objects = _read_counts(folder.staged_plan, dict[str, int], {"objects": 0})["objects"]
@@ -166,8 +206,8 @@ def _plan_of(path: Path, mtime_ns: int, num_bytes: int) -> tuple[Manifest, Mappi
 
 def existing_shards(folder: DatasetFolder) -> set[str]:
     """Return the names of the shards that are there under their final names, listed or not."""
-    local_names = set(shard_names_in(folder.root))
-    return local_names | set(shard_names_in(folder.staged_sent)) if folder.bucket else local_names
+    roots = (folder.root, folder.staged_sent) if folder.bucket else (folder.root,)
+    return {name for root in roots for name in shard_names_in(root)}
 
 
 def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
@@ -185,23 +225,17 @@ def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
         return listed
     with contextlib.suppress(TrilightError):  # it may be read and not listed
         names = BucketStore(dataset.files.url).list_all()
-        bucket_root = DatasetFolder(Path())
-        listed |= {
-            name for name in unlisted & names if note_of(bucket_root, name).as_posix() in names
-        }
+        listed |= {name for name in unlisted & names if name_of_note(name) in names}
     return listed
 
 
 def missing_shards(url: str, num_scenes: int = 0) -> list[int]:
     """Return the indices of the shards that a dataset of any folder or URL lacks.
 
-    Of more scenes than were planned so far, also what those need.
-
-    Where all are there and the dataset is still not finished, its first shard counts as missing:
-    the worker that makes it finishes the dataset.
-
-    Raises:
-        TrilightError: there is no readable manifest, or the URL is refused.
+    Of more scenes than were planned so far, also what those need. Where all are there and the
+    dataset is still not finished, its first shard counts as missing: the worker that makes it
+    finishes the dataset. It raises TrilightError without a readable manifest, or for a URL that is
+    refused.
     """
     dataset = open_listed(url)
     manifest = dataset.manifest
@@ -219,15 +253,22 @@ def _is_finished(dataset: Dataset) -> bool:
     return listed and dataset.files.read("README.md") is not None
 
 
-def num_scenes_done(folder: DatasetFolder, planned: Mapping[str, int]) -> int:
-    """Return how many scenes are in shards, listed or not, or wait for theirs.
+def _count_scenes(
+    manifest: Manifest,
+    expected: Mapping[str, int],
+    finished: Collection[str],
+    folder: DatasetFolder | None,
+) -> tuple[int, int]:
+    """Return how many scenes are in finished shards or wait for theirs, and how many are given up.
 
-    Args:
-        folder: of the dataset.
-        planned: its expected scenes, without the shards that grow.
+    Without a folder of this machine, what waits is not known.
     """
-    finished = existing_shards(folder) & planned.keys()
-    return sum(planned[name] for name in finished) + _num_waiting(folder)
+    done = sum(expected[name] for name in finished)
+    lacking = max(manifest.num_scenes - sum(expected.values()), 0)
+    if folder is None:
+        return done, lacking
+    given_up = _scenes_given_up(folder, manifest)
+    return done + _num_waiting(folder) - given_up, given_up + lacking
 
 
 def _num_waiting(folder: DatasetFolder) -> int:
@@ -240,30 +281,17 @@ _LOGS_READ = 64
 
 
 @dataclass(frozen=True, kw_only=True)
-class DatasetStatus:
+class DatasetStatus(_Counts):
     """Status of a dataset, finished or not."""
 
     display_name: str
     """Path or URL without secrets."""
     build: str
-    """Name of the dataset preset."""
     shards_done: int
     """Finished shards, listed in the manifest or not."""
     shards_planned: int
-    """Shards of the finished dataset."""
     shards_lost: int
     """Shards that a finished dataset lists, and that are not there; of a bucket, 0."""
-    scenes_done: int
-    """Scenes in shards or waiting for theirs."""
-    scenes_given_up: int
-    """Scenes that no attempt could save; of a bucket, known once it is finished."""
-    scenes_planned: int
-    """Scenes of the finished dataset."""
-    objects_done: int
-    """Objects that are prepared or rejected; of a bucket, 0."""
-    objects_planned: int
-    """Objects to prepare; 0 before they are counted, and of a bucket."""
-    num_views: int
     finished: bool
     """Every shard is listed, and the documents are there."""
     at_work: bool
@@ -277,13 +305,11 @@ class DatasetStatus:
     """Core hours spent on finished scenes; killed workers are not counted. Of very many logs, some
     stand for all. None without logs."""
     last_scene_unix_s: float | None
-    """When the last scene was made."""
     failures: Sequence[tuple[str, str, int]]
     """Stage, reason and number of rejections, the most frequent first. While a dataset is made,
     those of a folder's last shards alone where there are very many (MOST_NOTES)."""
     digest: str
     """The dataset digest; empty while it is made."""
-
     extensions: Mapping[str, str]
     """The sha256 of each extension that it was begun with, by its name."""
     asked: Sequence[str] | None
@@ -298,24 +324,16 @@ class DatasetStatus:
 
 
 def read_status(url: str) -> DatasetStatus:
-    """Return the status of a dataset.
-
-    Raises:
-        TrilightError: there is no readable manifest, or the URL is refused.
-    """
+    """Return the status of a dataset; raises as `missing_shards`."""
     dataset = open_listed(url)
     manifest = dataset.manifest
     local = DatasetFolder(dataset.files.root) if isinstance(dataset.files, LocalFiles) else None
     planned = expected_scenes(manifest)
     names = _finished_names(dataset, planned)
-    done = sum(planned[name] for name in names) + (_num_waiting(local) if local else 0)
-    given_up = _scenes_given_up(local, manifest) if local else 0
-    done -= given_up
-    given_up += max(manifest.num_scenes - sum(planned.values()), 0)
+    done, given_up = _count_scenes(manifest, planned, names, local)
     objects = read_progress(local) if local else None
     looked, share = (sample_logs(local), 1.0) if local else _sampled_logs(dataset)
     last = looked.last
-    core_s = looked.core_s
     finished = _is_finished(dataset)
     listed = [entry.name for entry in manifest.shards]
     scenes_left = 0 if finished else manifest.num_scenes - done - given_up
@@ -336,7 +354,7 @@ def read_status(url: str) -> DatasetStatus:
         at_work=local is not None and local.is_at_work,
         views_per_hour=views_per_hour,
         remaining_s=remaining_s,
-        core_hours=None if core_s is None else core_s / 3600,
+        core_hours=None if looked.core_s is None else looked.core_s / 3600,
         last_scene_unix_s=last[-1].finished_unix_s if last else None,
         failures=count_by_reason([*dataset.failures(), *(_noted_failures(local) if local else ())]),
         digest=dataset.digest if finished else "",

@@ -38,15 +38,11 @@ class SceneLog:
 
     scene: str = ""
     seconds: Seconds
-    """Wall time of the scene."""
     cores: Annotated[int, Within(0, 10**6, unit="cores")] = 1
     """Cores that the worker used for it; earlier versions did not say."""
     rejected_attempts: int = 0
-    """Attempts that were rejected before."""
     host: str = ""
-    """Name of the worker's machine."""
     pid: int = 0
-    """Process id of the worker."""
     finished_unix_s: Seconds
     """Time of completion by the worker's clock."""
 
@@ -60,11 +56,7 @@ def log_scene(
     cores: int,
     num_rejected: int,
 ) -> None:
-    """Append the row of a scene that is made.
-
-    Raises:
-        TrilightError: the disk is full or the folder cannot be written.
-    """
+    """Append the row of a scene that is made; raises as `append_line`."""
     row = SceneLog(
         scene=sample_key(scene_index),
         seconds=round(seconds, 3),

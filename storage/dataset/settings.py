@@ -5,17 +5,14 @@ They are apart from the code that reads shards, which does not import pydantic.
 
 import functools
 import itertools
-from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar
-
-import pydantic
+from typing import Annotated, ClassVar
 
 from storage.conventions import SPLITS
 from storage.dataset.splits import TEST_SLOT
 from storage.errors import TrilightError, expected_one_of
 from storage.records.passes.declared import pass_names
 from storage.records.profiles import Profile
-from storage.settings.described import checked
+from storage.settings.described import checked, leaves_out
 from storage.settings.ranges import Within
 
 MOST_SCENES = 1_000_000_000
@@ -58,9 +55,7 @@ class SplitSettings:
     """The shards, if the scenes are those of a finished dataset; by default there are none listed.
     The dataset cannot grow then."""
 
-    @pydantic.model_serializer(mode="wrap")
-    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return _without_empty(as_usual(self), "listed_shards")
+    _record = leaves_out("listed_shards")
 
     @functools.cached_property
     def first_scenes(self) -> tuple[int, ...]:
@@ -78,15 +73,7 @@ class StorageSettings:
     passes: tuple[str, ...] = ()
     """Passes to store beside each picture, such as [depth,normal,object]; by default none, since
     they can be computed from a stored scene at any time (reference page Passes)."""
+    _record = leaves_out("passes")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "passes", pass_names(self.passes))
-
-    @pydantic.model_serializer(mode="wrap")
-    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return _without_empty(as_usual(self), "passes")
-
-
-def _without_empty(record: Mapping[str, Any], field: str) -> dict[str, Any]:
-    """Leave a later field out where it holds nothing: digests of earlier presets stay."""
-    return {name: value for name, value in record.items() if name != field or value}

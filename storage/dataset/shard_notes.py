@@ -40,23 +40,18 @@ class ShardNote:
     """Contents of the note on a finished shard."""
 
     shard: ShardEntry
-    """The shard's row of the manifest."""
     failures: tuple[Failure, ...]
     """Scenes that were given up, and rejected attempts."""
-    scenes: int | None = None
+    scenes: Scenes | None = None
     """Scenes so far of a shard in a bucket that still grows; None for a full shard."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Note:
+class _Note(ShardNote):
     """File of a note."""
 
-    shard: ShardEntry
-    """The shard's row of the manifest."""
-    failures: str = ""
+    failures: str = ""  # type: ignore[assignment]
     """Lines as in failures.jsonl."""
-    scenes: Scenes | None = None
-    """Same as `ShardNote.scenes`."""
 
 
 def rejections_of_shard(folder: DatasetFolder, name: str) -> Path:
@@ -67,6 +62,11 @@ def rejections_of_shard(folder: DatasetFolder, name: str) -> Path:
 def note_of(folder: DatasetFolder, name: str) -> Path:
     """Return the file of the note on a shard."""
     return folder.staged_entries / f"{name}{_SUFFIX}"
+
+
+def name_of_note(name: str) -> str:
+    """Return the relative name of the note on a shard, in a folder or a bucket."""
+    return note_of(DatasetFolder(Path()), name).as_posix()
 
 
 def note_shard(folder: DatasetFolder, note: ShardNote) -> None:
@@ -93,10 +93,7 @@ def noted_shard(folder: DatasetFolder, name: str) -> ShardNote:
     """Return what is known of a shard that is there: its note, or else by reading the shard.
 
     A note that is older than the shard, or of another size, was of a shard before it. Of a shard
-    in a bucket the note alone is here.
-
-    Raises:
-        TrilightError: the file is not a whole shard.
+    in a bucket the note alone is here. It raises as `index_shard`.
     """
     path = note_of(folder, name)
     shard = folder.shard(name)
@@ -120,15 +117,10 @@ def noted_names(folder: DatasetFolder) -> Iterator[str]:
 def fetch_notes(
     read: Callable[[str], bytes | None], names: Iterable[str], dataset_name: str
 ) -> list[ShardNote]:
-    """Return notes that are on a server, many at a time.
+    """Return notes that are on a server, by the names of their files, many at a time.
 
-    Args:
-        read: returns a file of the dataset by its relative name; called in threads.
-        names: of the notes' files.
-        shown: the dataset, for messages.
-
-    Raises:
-        TrilightError: one of them is no note, or as `read`.
+    `read` returns a file of the dataset by its relative name, and is called in threads. It raises
+    TrilightError where one of them is no note, or as `read`.
     """
 
     def fetch_note(name: str) -> ShardNote:
@@ -148,11 +140,7 @@ def fetch_notes(
 
 
 def with_unlisted(dataset: Dataset) -> Dataset:
-    """Return a dataset with the shards that are finished and not listed, as far as is known here.
-
-    Raises:
-        TrilightError: a note is none.
-    """
+    """Return a dataset with the shards that are finished and not listed, as far as is known."""
     unlisted = _notes(dataset)
     if not unlisted:
         return dataset
@@ -176,9 +164,7 @@ def _notes(dataset: Dataset) -> list[ShardNote]:
         return []
     with contextlib.suppress(TrilightError):  # it may be read and not listed
         names = BucketStore(files.url).list_all()
-        bucket_root = DatasetFolder(Path())
         listed = {shard.name for shard in manifest.shards}
-        unlisted = sorted(filter(SHARD_NAME.fullmatch, names - listed))
-        notes = (note_of(bucket_root, name).as_posix() for name in unlisted)
+        notes = map(name_of_note, sorted(filter(SHARD_NAME.fullmatch, names - listed)))
         return fetch_notes(files.read, [name for name in notes if name in names], files.shown)
     return []

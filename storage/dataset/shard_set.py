@@ -2,28 +2,137 @@
 
 A set knows its shards by number and opens each when it is wanted. An open shard gives any of its
 samples, in any order and from several threads at once; nothing of it stays in memory but the names
-of its members, and of a whole set as many unpacked maps as storage.records.held_maps allows.
+of its members, and of a whole set as many unpacked maps as storage.records.packed_maps allows.
 """
 
 import contextlib
+import itertools
+import math
 import os
+import re
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.shard import Member, scan_samples, with_maps
-from storage.dataset.shard_places import ShardPlace
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.held_maps import HeldMaps
-from storage.records.sample import Sample, decode_sample
-from storage.records.stored_sample import StoredSample, stored_sample
+from storage.records.packed_maps import HeldMaps
+from storage.records.safe_read import open_plain
+from storage.records.sample import Sample, StoredSample, decode_sample, stored_sample
+from storage.remote.safe_url import printable, safe_text
+from storage.remote.shard_cache import shard_cache
+from storage.remote.url import RemoteUrl, parse_local_path, parse_url
+
+MAX_SHARDS = 100_000
+"""Maximum number of shards in a list, and of names that one brace pattern expands to."""
+
+_GROUP = re.compile(r"\{([^{}]*)\}")
+_RANGE = re.compile(r"(\d+)\.\.(\d+)")
+_WHAT = "shard"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShardPlace:
+    """The place of one shard."""
+
+    place: Path | RemoteUrl
+    """A file of this machine, or one on a server."""
+
+    @property
+    def display_name(self) -> str:
+        """The path or URL without secrets, for messages."""
+        if isinstance(self.place, RemoteUrl):
+            return self.place.display_url
+        return printable(str(self.place))
+
+    @property
+    def split(self) -> str:
+        """What its name begins with, if that is a split, and else train."""
+        name = self.display_name.rpartition("/")[2]
+        return next((split for split in SPLITS if name.startswith(f"{split}-")), "train")
+
+    def open(self) -> BinaryIO:
+        """Open the shard; raises TrilightError where it cannot be read."""
+        if isinstance(self.place, RemoteUrl):
+            return shard_cache().open(self.place, num_bytes=None, sha256=None)
+        try:
+            return open_plain(self.place)
+        except OSError as error:
+            raise TrilightError(
+                f"shard {self.display_name!r}: cannot be read ({error.strerror}); expected a file. "
+                "Check the list: a dataset numbers its shards over all splits."
+            ) from error
+
+
+def listed_shards(patterns: Sequence[str]) -> list[ShardPlace]:
+    """Return the shards that patterns name, in their order.
+
+    Patterns are paths or URLs; `{000000..000007}` stands for each number of a range, as wide as its
+    first end, and `{a,b}` for each of several texts. It raises TrilightError where a URL is refused
+    (storage.remote.url), a pattern is not closed or names more than MAX_SHARDS, a range runs
+    backwards, or a shard is named twice.
+    """
+    texts = list(itertools.chain.from_iterable(expand_pattern(pattern) for pattern in patterns))
+    places = [ShardPlace(place=parse_url(text, what=_WHAT)) for text in texts]
+    if len(places) > MAX_SHARDS:
+        raise TrilightError(f"the list names {len(places)} shards; expected at most {MAX_SHARDS}.")
+    seen: set[Path | RemoteUrl] = set()
+    for place in places:
+        if place.place in seen:
+            raise TrilightError(f"shard {place.display_name!r} is named twice; expected each once.")
+        seen.add(place.place)
+    return places
+
+
+def expand_pattern(pattern: str, what: str = "shards") -> list[str]:
+    """Return what a brace pattern of `what` stands for; raises as `listed_shards`.
+
+    A file or folder of that very name is no pattern.
+    """
+    if "://" not in pattern and os.path.exists(parse_local_path(pattern)):
+        return [pattern]
+    named = f"{what} {printable(safe_text(pattern))!r}"
+    groups = [_alternatives(group[1], named) for group in _GROUP.finditer(pattern)]
+    fixed = _GROUP.split(pattern)[::2]
+    if any("{" in text or "}" in text for text in fixed):
+        raise TrilightError(
+            f"{named}: a brace is not closed, or stands within another; expected such as "
+            "train-{000000..000007}.tar."
+        )
+    count = math.prod(map(len, groups))
+    if count > MAX_SHARDS:
+        raise TrilightError(
+            f"{named}: stands for more than {MAX_SHARDS} names; expected at most that many."
+        )
+    return [
+        "".join(text for pair in zip(fixed, [*chosen, ""], strict=True) for text in pair)
+        for chosen in itertools.product(*groups)
+    ]
+
+
+def _alternatives(group: str, named: str) -> Sequence[str]:
+    match = _RANGE.fullmatch(group)
+    if match is None:
+        return group.split(",")
+    first = int(match[1])
+    last = int(match[2])
+    if not first <= last <= first + MAX_SHARDS:
+        raise TrilightError(
+            f"{named}: the range {group} is backwards or longer than {MAX_SHARDS}; expected such "
+            "as 000000..000007."
+        )
+    width = len(match[1])
+    return [f"{number:0{width}d}" for number in range(first, last + 1)]
 
 
 class OpenShard:
@@ -32,18 +141,17 @@ class OpenShard:
     def __init__(self, name: str, stream: BinaryIO, held: HeldMaps) -> None:
         """Look at the headers; raises TrilightError as `storage.dataset.shard`.
 
-        Args:
-            name: for messages.
-            stream: the file.
-            held: maps of this shard and others that were unpacked already.
+        `held` has maps of this shard and others that were unpacked already.
         """
         self.name = name
         self._stream = stream
         self._held = held
         self._maps: dict[str, Member] = {}
-        self._samples: list[tuple[str, Mapping[str, Member]]] = list(
-            scan_samples(stream, name, self._maps)
-        )
+        try:
+            self._samples = list(scan_samples(stream, name, self._maps))
+        except BaseException:
+            stream.close()
+            raise
 
     @property
     def keys(self) -> Sequence[str]:
@@ -71,22 +179,14 @@ class OpenShard:
         return data
 
     def sample(self, row: int) -> Sample:
-        """Return a sample that passes `Sample.check`.
-
-        Raises:
-            TrilightError: it is not whole, not readable or breaks a law; names shard and sample.
-        """
+        """Return a sample that passes `Sample.check`; a TrilightError names shard and sample."""
         with self._name_errors():
             sample = decode_sample(self._samples[row][0], self.members(row), self._held)
             sample.check()
             return sample
 
     def stored_sample(self, row: int) -> StoredSample:
-        """Return a sample whose pictures are unpacked when they are asked for.
-
-        Raises:
-            TrilightError: its scene is not readable or breaks a law; names shard and sample.
-        """
+        """Return a sample whose pictures are unpacked when they are asked for; as `sample`."""
         with self._name_errors():
             return stored_sample(self._samples[row][0], self.members(row), self._held)
 
@@ -119,11 +219,7 @@ class ShardSet(ABC):
 
     @abstractmethod
     def open(self, number: int) -> OpenShard:
-        """Open a shard, fetched and checked.
-
-        Raises:
-            TrilightError: it cannot be read, or is not what it should be; the message names it.
-        """
+        """Open a shard, fetched and checked; else a TrilightError names it."""
 
 
 class ManifestShards(ShardSet):
@@ -140,7 +236,7 @@ class ManifestShards(ShardSet):
 
     def open(self, number: int) -> OpenShard:
         entry = self._entries[number]
-        shard = _open_or_close(entry.name, self._files.open(entry, checked=True), self._held)
+        shard = OpenShard(entry.name, self._files.open(entry, checked=True), self._held)
         if len(shard.keys) != entry.num_samples:
             shard.close()
             raise TrilightError(
@@ -177,14 +273,6 @@ class KeysSeen:
             self._shards.add(shard)
 
 
-def _open_or_close(name: str, stream: BinaryIO, held: HeldMaps) -> OpenShard:
-    try:
-        return OpenShard(name, stream, held)
-    except BaseException:
-        stream.close()
-        raise
-
-
 class ListedShards(ShardSet):
     """Shards of a list: nothing is known of one before it was opened, and nothing is checked."""
 
@@ -202,7 +290,7 @@ class ListedShards(ShardSet):
 
     def open(self, number: int) -> OpenShard:
         place = self._places[number]
-        shard = _open_or_close(place.display_name, place.open(), self._held)
+        shard = OpenShard(place.display_name, place.open(), self._held)
         try:
             self._seen.add(place.display_name, shard.keys)
         except TrilightError:

@@ -10,14 +10,37 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset, reading
 from storage.dataset.manifest import ShardEntry
-from storage.dataset.sampled import described_shards, of_how_many
 from storage.dataset.shard import read_member, scan_members
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
 from storage.records.scene_file import scene_provenance
+
+MOST_SCENES = 20_000
+"""Scenes that are read to describe a dataset: of a percentile over as many, chance moves less than
+half a point (binomial, 95 %), and they take minutes."""
+
+
+def described_shards(dataset: Dataset, most_scenes: int | None = None) -> list[ShardEntry]:
+    """Return the shards by which a dataset is described, in its order.
+
+    They are all where those hold no more than `most_scenes` (MOST_SCENES); else every n-th of each
+    split, its first one among them.
+    """
+    most_scenes = MOST_SCENES if most_scenes is None else most_scenes
+    every = -(-dataset.manifest.num_samples // most_scenes)
+    if every <= 1:
+        return list(dataset.manifest.shards)
+    chosen = {shard.name for split in SPLITS for shard in dataset.shards_of(split)[::every]}
+    return [shard for shard in dataset.manifest.shards if shard.name in chosen]
+
+
+def of_how_many(num_read: int, num_scenes: int) -> str:
+    """Return the remark that a sample of the scenes stands for all; else an empty text."""
+    return "" if num_read >= num_scenes else f"of a sample of {num_read} of {num_scenes} scenes"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,7 +54,7 @@ class Statistics:
     scenes_by_excursion: Mapping[str, int]
     """Likewise per axis along which they leave the usual range; empty where none does."""
     num_scenes_read: int
-    """Scenes of which the views are: all, or a sample (storage.dataset.sampled)."""
+    """Scenes of which the views are: all, or a sample (storage.dataset.statistics)."""
     scene_digest: str
     """sha256 over the keys and arrays of all scenes, without pictures: equal for equal scenes,
     whatever they were rendered and packed with; empty where a sample was read."""
@@ -89,44 +112,47 @@ class Statistics:
 def dataset_statistics(dataset: Dataset) -> Statistics:
     """Read samples but their pictures, through the headers of the shards: all, or a sample of them.
 
-    Raises:
-        TrilightError: a shard is missing or damaged.
+    It raises TrilightError where a shard is missing or damaged.
     """
     tally = _Tally()
+    by_split = Counter[str]()
+    for shard in dataset.manifest.shards:
+        by_split[shard.split] += shard.num_samples
     for shard in (read := described_shards(dataset)):
         with (
             dataset.files.open(shard, checked=False) as stream,
             reading(dataset.display_name, shard.name),
         ):
-            _require_whole(dataset, shard)
+            num_bytes = dataset.files.num_bytes(shard)
+            if num_bytes not in (None, shard.num_bytes):
+                raise TrilightError(f"{num_bytes} bytes; expected {shard.num_bytes}")
             _count_shard(stream, shard, tally)
     is_complete = len(read) == len(dataset.manifest.shards)
+    views = len(tally.views["spp"])
+    has_parts = all(len(column) == views for column in tally.parts.values())
     return Statistics(
         num_scenes=dataset.manifest.num_samples,
-        scenes_by_split=_by_split(dataset),
+        scenes_by_split=+by_split,
         num_scenes_read=sum(shard.num_samples for shard in read),
         scenes_by_template=tally.templates,
         scenes_by_excursion=tally.excursions,
         scene_digest=digest_of_scenes(tally.scene_members) if is_complete else "",
         num_bytes=dataset.manifest.num_bytes,
-        spp=np.asarray(tally.views["spp"], np.int64),
-        noise_floor_db=np.asarray(tally.views["noise_floor_db"]),
-        noise_floor_linear_db=np.asarray(tally.views["noise_floor_linear_db"]),
-        object_noise_floor_db=np.asarray(tally.views["object_noise_floor_db"]),
-        at_cap=np.asarray(tally.views["at_cap"], np.bool_),
-        expected_error_db=np.asarray(tally.expected) if tally.expects_all() else None,
-        part_noise_floor_db=tally.parts_of_all(),
+        **{name: np.asarray(tally.views[name], kind) for name, kind in _OF_VIEWS.items()},
+        expected_error_db=np.asarray(tally.expected) if 0 < len(tally.expected) == views else None,
+        part_noise_floor_db={
+            name: np.asarray(column) for name, column in sorted(tally.parts.items()) if has_parts
+        },
     )
 
 
-def _by_split(dataset: Dataset) -> Mapping[str, int]:
-    counts: Counter[str] = Counter()
-    for shard in dataset.manifest.shards:
-        counts[shard.split] += shard.num_samples
-    return {split: count for split, count in counts.items() if count}
-
-
-_OF_VIEWS = ("spp", "noise_floor_db", "noise_floor_linear_db", "object_noise_floor_db", "at_cap")
+_OF_VIEWS: Mapping[str, Any] = {
+    "spp": np.int64,
+    "noise_floor_db": np.float64,
+    "noise_floor_linear_db": np.float64,
+    "object_noise_floor_db": np.float64,
+    "at_cap": np.bool_,
+}
 
 
 @dataclass(kw_only=True, eq=False)
@@ -152,17 +178,6 @@ class _Tally:
             for name, part in view.get("parts", {}).items():
                 self.parts.setdefault(name, array("d")).append(part["noise_floor_db"])
 
-    def expects_all(self) -> bool:
-        """Return whether every view states an expected error, and there is a view."""
-        return 0 < len(self.expected) == len(self.views["spp"])
-
-    def parts_of_all(self) -> dict[str, NDArray[np.float64]]:
-        """Return the floors of the parts, where every view has all of them."""
-        num_views = len(self.views["spp"])
-        if any(len(column) != num_views for column in self.parts.values()):
-            return {}
-        return {name: np.asarray(column) for name, column in sorted(self.parts.items())}
-
 
 def _count_shard(stream: BinaryIO, shard: ShardEntry, tally: _Tally) -> None:
     for member in scan_members(stream, shard.name):
@@ -179,12 +194,6 @@ def _count_shard(stream: BinaryIO, shard: ShardEntry, tally: _Tally) -> None:
         if excursion := provenance.get("excursion"):
             tally.excursions[excursion["axis"]] += 1
         tally.add_views(record["views"])
-
-
-def _require_whole(dataset: Dataset, shard: ShardEntry) -> None:
-    num_bytes = dataset.files.num_bytes(shard)
-    if num_bytes is not None and num_bytes != shard.num_bytes:
-        raise TrilightError(f"{num_bytes} bytes; expected {shard.num_bytes}")
 
 
 def digest_of_scenes(members: Mapping[str, str]) -> str:

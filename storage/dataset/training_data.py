@@ -1,14 +1,24 @@
-"""Data that `--data` names: a dataset by its root, or shards by a list."""
+"""Data that `--data` names: datasets by their roots, or shards by a list.
+
+The shards of several datasets are numbered one dataset after another, and each dataset stays a part
+of its own. What share of a stream comes from which, the trainer decides (train.data.mixture).
+"""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from storage.conventions import SPLITS
 from storage.dataset.dataset import open_dataset
 from storage.dataset.manifest import Manifest
-from storage.dataset.shard_places import listed_shards
-from storage.dataset.shard_set import KeysSeen, ListedShards, ManifestShards, ShardSet
+from storage.dataset.shard_set import (
+    KeysSeen,
+    ListedShards,
+    ManifestShards,
+    OpenShard,
+    ShardSet,
+    listed_shards,
+)
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.remote.url import parse_local_path
@@ -26,9 +36,7 @@ class DataSource:
     name: str
     """Name of the dataset preset, or the display name of a list of shards."""
     digest: str
-    """Same as `TrainingData.digest`."""
     num_views: int | None
-    """Pictures per scene, where a manifest says it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,15 +74,11 @@ class TrainingData:
 
 
 def open_training_data(data: Sequence[str]) -> TrainingData:
-    """Open what `--data` names.
+    """Open what `--data` names: one root of a dataset, or any number of shards that end in `.tar`.
 
-    Args:
-        data: one root of a dataset, or any number of paths, URLs and brace patterns that end in
-            `.tar`.
-
-    Raises:
-        TrilightError: nothing is named, roots and shards are mixed, a URL is refused, or there is
-            no readable manifest. That no key is in two shards of a dataset, `trilight verify` says.
+    Shards are paths, URLs and brace patterns. It raises TrilightError where nothing is named, roots
+    and shards are mixed, a URL is refused, or there is no readable manifest. That no key is in two
+    shards of a dataset, `trilight verify` says.
     """
     shards = [text for text in data if is_shards(text)]
     if shards and len(shards) == len(data):
@@ -138,3 +142,79 @@ def _of_list(patterns: Sequence[str]) -> TrainingData:
         sources=(DataSource(name=display_name, digest=digest, num_views=None),),
         notes=(NO_MANIFEST,),
     )
+
+
+MIXED = "mix:"
+"""Begins the digest of several datasets."""
+
+
+class MixedShards(ShardSet):
+    """The shards of one split of several datasets, one dataset after another."""
+
+    def __init__(self, sets: Mapping[str, ShardSet]) -> None:
+        """Take the shards by what each dataset is called in messages."""
+        self._at: list[tuple[ShardSet, int]] = []
+        names = list[str]()
+        parts = list[range]()
+        for called, shards in sets.items():
+            parts.append(range(len(names), len(names) + len(shards.names)))
+            names += [f"{called}: {name}" for name in shards.names]
+            self._at += [(shards, number) for number in range(len(shards.names))]
+        self.names = names
+        self._parts = tuple(parts)
+
+    @property
+    def parts(self) -> Sequence[range]:
+        return self._parts
+
+    def num_samples(self, number: int) -> int:
+        shards, at = self._at[number]
+        return shards.num_samples(at)
+
+    def open(self, number: int) -> OpenShard:
+        shards, at = self._at[number]
+        opened = shards.open(at)
+        opened.name = self.names[number]
+        return opened
+
+
+def open_mixture(data: Sequence[str]) -> TrainingData:
+    """Open what `--data` names where it may be more than one dataset.
+
+    It raises as `open_training_data`, and where a dataset is there twice or shards are beside
+    datasets.
+    """
+    if len(data) < 2 or any(is_shards(text) for text in data):
+        return open_training_data(data)
+    opened = [open_training_data([root]) for root in data]
+    for row, each in enumerate(opened):
+        before = next((other for other in opened[:row] if other.digest == each.digest), None)
+        if before is not None:
+            raise TrilightError(
+                f"data: {each.display_name} holds the same dataset as {before.display_name}; "
+                "expected each once. How often its scenes are drawn, data_weights says."
+            )
+        each.split("train")
+    return TrainingData(
+        display_name=" and ".join(each.display_name for each in opened),
+        digest=MIXED + sha256_hex(canonical_json([each.digest for each in opened])),
+        splits={split: shards for split in SPLITS if (shards := _mix_split(opened, split))},
+        num_views=_of_all([each.num_views for each in opened], min),
+        max_triangles=_of_all([each.max_triangles for each in opened], max),
+        notes=tuple(dict.fromkeys(note for each in opened for note in each.notes)),
+        sources=tuple(source for each in opened for source in each.sources),
+    )
+
+
+def _mix_split(opened: Sequence[TrainingData], split: str) -> MixedShards | None:
+    having = [row for row, each in enumerate(opened) if split in each.splits]
+    if not having:
+        return None
+    # by number too, since folders may have one name and datasets one preset
+    return MixedShards({f"dataset {row + 1}": opened[row].split(split) for row in having})
+
+
+def _of_all(values: Sequence[int | None], chosen: Callable[[Sequence[int]], int]) -> int | None:
+    """Return one number of all datasets; None where one of them does not say it."""
+    known = [value for value in values if value is not None]
+    return chosen(known) if len(known) == len(values) else None

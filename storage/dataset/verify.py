@@ -27,12 +27,12 @@ from storage.digests import seal_of, sha256_hex
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.licences import mixed_share_alike
 from storage.machine import available_cores
-from storage.records.held_maps import HeldMaps
-from storage.records.lights import sum_of_lights
+from storage.records.lights import part_names, sum_of_lights, sum_of_parts
 from storage.records.objects import LockedObject, decode_objects_lock, locked_uids
-from storage.records.parts import part_names, sum_of_parts
-from storage.records.passes.stored import decode_passes_exr, passes_in_file, picture_passes
+from storage.records.packed_maps import HeldMaps
+from storage.records.passes.pictures import decode_passes_exr, passes_in_file, picture_passes
 from storage.records.sample import Sample, decode_sample
+from storage.records.scene import Scene
 from storage.remote.fetch import download
 from storage.remote.retries import TransferFailed
 
@@ -53,11 +53,9 @@ class Verification:
     """Result of a check of a dataset."""
 
     manifest: Manifest
-    """The manifest that was checked."""
     problems: Sequence[str]
     """One line per fault, naming shard and sample; empty where the dataset is whole."""
     num_samples: int
-    """Number of samples that were checked."""
     bad_shards: Sequence[str]
     """Names of the shards that are missing, or were read and are not what they should be."""
     num_shards_planned: int
@@ -81,26 +79,22 @@ def verify_dataset(
     fast: bool = False,
     shard_done: Callable[[str], None] = lambda name: None,
 ) -> Verification:
-    """Check a dataset, in a folder or on a server, against its manifest.
+    """Check a dataset, opened or by its path or URL, against its manifest.
 
     Several shards are checked at once in threads: hashing and unpacking release Python's lock.
-    Shards of a server are fetched again, past the cache, and not kept.
+    Shards of a server are fetched again, past the cache, and not kept. `shard_done` is called with
+    the name of each. With `fast`, only sizes are compared, and in a folder also the headers of the
+    members; no picture is read, and a changed byte is not seen.
 
-    Args:
-        root: the dataset, opened, or its path or URL.
-        fast: compare only sizes, and in a folder also the headers of the members; reads no
-            picture. A changed byte is not seen.
-        shard_done: called with the name of each checked shard.
-
-    Raises:
-        TrilightError: there is no readable manifest, so there is nothing to check against; a shard
-            differs from one that was written since; or the disk is full.
+    It raises TrilightError where there is no readable manifest, so nothing to check against; a
+    shard differs from one that was written since; or the disk is full.
     """
     dataset = root if isinstance(root, Dataset) else open_dataset(str(root))
     manifest = dataset.manifest
     lock = dataset.lock_bytes()
     problems = list(_check_lock(lock, dataset))
-    locked = None if problems else _by_uid(lock or b"")
+    rows = [] if problems else decode_objects_lock(lock or b"", "objects.lock.jsonl")
+    locked = None if problems else {row.uid: row for row in rows}
     problems += _check_manifest(dataset)
     problems += [f"{name}: not in the manifest" for name in _list_unlisted(dataset)]
     where: dict[str, str] = {}
@@ -112,7 +106,11 @@ def verify_dataset(
         )
         try:
             for shard, findings in checks:
-                faults = [*findings.faults, *_twice(findings.keys, shard, where)]
+                faults = findings.faults + [
+                    f"sample {key} occurs twice in the dataset, first in {where[key]}"
+                    for key in findings.keys
+                    if where.setdefault(key, shard.name) != shard.name
+                ]
                 bad += [shard.name] if faults else []
                 problems += [
                     f"{shard.name}: {fault.removeprefix(f'{shard.name}: ')}"
@@ -162,10 +160,6 @@ def _list_unlisted(dataset: Dataset) -> list[str]:
     return [name for name in names if name not in listed]
 
 
-def _by_uid(lock: bytes) -> dict[str, LockedObject]:
-    return {entry.uid: entry for entry in decode_objects_lock(lock, "objects.lock.jsonl")}
-
-
 def _check_lock(lock: bytes | None, dataset: Dataset) -> Iterator[str]:
     manifest = dataset.manifest
     if not manifest.objects_lock_sha256:  # a kill may leave it out until the shards are listed
@@ -203,12 +197,6 @@ def _check_manifest(dataset: Dataset) -> Iterator[str]:
             yield f"{document}: missing"
         elif sha256_hex(content) != sha256:
             yield f"{document}: edited since it was written (sha256 differs from the manifest)"
-
-
-def _twice(keys: Sequence[str], shard: ShardEntry, where: dict[str, str]) -> Iterator[str]:
-    for key in keys:
-        if (other := where.setdefault(key, shard.name)) != shard.name:
-            yield f"sample {key} occurs twice in the dataset, first in {other}"
 
 
 def _check_shard(
@@ -282,55 +270,58 @@ def _check_content(
 
 def check_sample(
     sample: Sample, split: str, manifest: Manifest, locked: Mapping[str, LockedObject] | None
-) -> Iterator[str]:
-    """Yield the faults of one sample: laws of the scene, pictures, and rights of its objects."""
+) -> list[str]:
+    """Return the faults of one sample: laws of the scene, pictures, and rights of its objects."""
+    faults = [*_check_pictures(sample, manifest), *_check_rights(sample.scene, split, locked)]
+    return [f"sample {sample.key}: {fault}" for fault in faults]
+
+
+def _check_pictures(sample: Sample, manifest: Manifest) -> Iterator[str]:
     try:
         sample.scene.check()
     except TrilightError as error:
-        yield f"sample {sample.key}: {error}"
+        yield str(error)
     renders = manifest.settings.get("renders")
     renders = renders if isinstance(renders, Mapping) else {}
     resolution = renders.get("resolution")
     expected = (manifest.num_views, resolution, resolution, 3)
     if sample.radiance_rgb.shape != expected or sample.scene.num_views != manifest.num_views:
-        yield f"sample {sample.key}: pictures {sample.radiance_rgb.shape}; expected {expected}"
+        yield f"pictures {sample.radiance_rgb.shape}; expected {expected}"
     if not (np.isfinite(sample.radiance_rgb).all() and (sample.radiance_rgb >= 0).all()):
-        yield f"sample {sample.key}: a picture holds a value that is not finite or negative"
+        yield "a picture holds a value that is not finite or negative"
     yield from _check_lights(sample, per_light=bool(renders.get("per_light")))
     bounces, lobes = (bool(renders.get(name)) for name in ("split", "split_lobes"))
     yield from _check_parts(sample, part_names(bounces=bounces, lobes=lobes))
     yield from _check_passes(sample, manifest.passes)
-    if mixed := mixed_share_alike(sample.scene.licences):
-        yield f"sample {sample.key}: {' and '.join(mixed)} meet; expected one share-alike licence"
+
+
+def _check_rights(
+    scene: Scene, split: str, locked: Mapping[str, LockedObject] | None
+) -> Iterator[str]:
+    if mixed := mixed_share_alike(scene.licences):
+        yield f"{' and '.join(mixed)} meet; expected one share-alike licence"
     if locked is None:  # a lock that is wrong says nothing of a sample
         return
-    scene = sample.scene
     for uid in locked_uids(((row.kind, row.uid) for row in scene.objects), scene.provenance):
         lock = locked.get(uid)
         if lock is None:
-            yield f"sample {sample.key}: object {uid!r} is not in objects.lock.jsonl"
+            yield f"object {uid!r} is not in objects.lock.jsonl"
         elif lock.split != split:
-            yield f"sample {sample.key}: object {uid!r} belongs to split {lock.split}"
+            yield f"object {uid!r} belongs to split {lock.split}"
 
 
 def _check_lights(sample: Sample, *, per_light: bool) -> Iterator[str]:
     """Yield the faults of the pictures of single lights; older manifests know no such setting."""
     if (sample.lights_rgb is not None) != per_light:
         verb = "lacks" if per_light else "has"
-        yield f"sample {sample.key}: {verb} pictures by light; renders.per_light is {per_light}"
-    if sample.lights_rgb is None:
-        return
-    for view, lights in enumerate(sample.lights_rgb):
+        yield f"{verb} pictures by light; renders.per_light is {per_light}"
+    for view, lights in enumerate(() if sample.lights_rgb is None else sample.lights_rgb):
         floors = sample.views[view].lights
         if floors is not None and len(floors) != len(lights):
-            yield (
-                f"sample {sample.key}: view {view} has {len(floors)} stated errors of lights; "
-                f"expected {len(lights)}, one for each"
-            )
-        yield from _differing(
-            f"sample {sample.key}: view {view} is not the sum of its lights",
-            sum_of_lights(lights) != sample.radiance_rgb[view],
-        )
+            errors = f"{len(floors)} stated errors of lights"
+            yield f"view {view} has {errors}; expected {len(lights)}, one for each"
+        differs = sum_of_lights(lights) != sample.radiance_rgb[view]
+        yield from _differing(f"view {view} is not the sum of its lights", differs)
 
 
 def _check_parts(sample: Sample, names: tuple[str, ...]) -> Iterator[str]:
@@ -338,25 +329,14 @@ def _check_parts(sample: Sample, names: tuple[str, ...]) -> Iterator[str]:
     stored = tuple(sample.parts_rgb or ())
     floors = {tuple(view.parts or ()) for view in sample.views}
     if stored != names or floors != {names}:
-        stored_text = ", ".join(stored) or "none"
-        expected_text = ", ".join(names) or "none"
-        yield (
-            f"sample {sample.key}: parts are {stored_text}; the settings and every view expect "
-            f"{expected_text}"
-        )
-        return
-    if sample.parts_rgb is None:
-        return
-    lights_rgb = sample.lights_rgb
-    differs = sum_of_parts(sample.parts_rgb) != (
-        sample.radiance_rgb if lights_rgb is None else lights_rgb
-    )
-    of_what = "picture" if lights_rgb is None else "light"
-    for view, wrong in enumerate(differs):
-        yield from _differing(
-            f"sample {sample.key}: view {view} has a {of_what} that is not the sum of its parts",
-            wrong.any(axis=0) if lights_rgb is not None else wrong,
-        )
+        stored_text, expected = (", ".join(each) or "none" for each in (stored, names))
+        yield f"parts are {stored_text}; the settings and every view expect {expected}"
+    elif sample.parts_rgb is not None:
+        whole_rgb = sample.radiance_rgb if sample.lights_rgb is None else sample.lights_rgb
+        of_what = "picture" if sample.lights_rgb is None else "light"
+        for view, wrong in enumerate(sum_of_parts(sample.parts_rgb) != whole_rgb):
+            what = f"view {view} has a {of_what} that is not the sum of its parts"
+            yield from _differing(what, wrong.any(axis=0) if wrong.ndim == 4 else wrong)
 
 
 def _differing(what: str, differs: NDArray[np.bool_]) -> Iterator[str]:
@@ -369,32 +349,23 @@ def _differing(what: str, differs: NDArray[np.bool_]) -> Iterator[str]:
 
 def _check_passes(sample: Sample, names: Sequence[str]) -> Iterator[str]:
     """Yield the faults of stored passes; settings without that field ask for none."""
-    if sample.passes_exr is None or not names:
-        if names or sample.passes_exr is not None:
-            has = "lacks" if names else "has"
-            yield f"sample {sample.key}: {has} passes; storage.passes is {list(names)}"
+    if bool(names) != (sample.passes_exr is not None):
+        yield f"{'lacks' if names else 'has'} passes; storage.passes is {list(names)}"
         return
     resolution = sample.radiance_rgb.shape[2]
-    for view, packed in enumerate(sample.passes_exr):
+    for view, packed in enumerate(sample.passes_exr or ()):
         try:
             stored = decode_passes_exr(packed, resolution)
-            expected = picture_passes(sample.scene, [*stored], view=view, resolution=resolution)
+            computed = picture_passes(sample.scene, [*stored], view=view, resolution=resolution)
         except TrilightError as error:
-            yield f"sample {sample.key}: view {view}: {error}"
+            yield f"view {view}: {error}"
             continue
-        if set(stored) != (expected_names := set(passes_in_file(sample.scene, names))):
-            yield (
-                f"sample {sample.key}: view {view} has the passes {', '.join(sorted(stored))}; "
-                f"expected {', '.join(sorted(expected_names))}"
-            )
+        if set(stored) != (expected := set(passes_in_file(sample.scene, names))):
+            has = f"view {view} has the passes {', '.join(sorted(stored))}"
+            yield f"{has}; expected {', '.join(sorted(expected))}"
         for name, picture in stored.items():
-            if (share := _fraction_that_differs(picture, expected[name])) > MOST_DIFFERENT:
-                yield (
-                    f"sample {sample.key}: view {view}: pass {name} is not what the scene says in "
-                    f"{share:.1%} of the pixels"
-                )
-
-
-def _fraction_that_differs(stored: NDArray, expected: NDArray) -> float:
-    same = np.isclose(stored, expected, rtol=1e-4, atol=1e-4, equal_nan=True)
-    return 1 - float(np.mean(same if same.ndim == 2 else same.all(axis=-1)))
+            same = np.isclose(picture, computed[name], rtol=1e-4, atol=1e-4, equal_nan=True)
+            share = 1 - float(np.mean(same if same.ndim == 2 else same.all(axis=-1)))
+            if share > MOST_DIFFERENT:
+                what = f"view {view}: pass {name} is not what the scene says"
+                yield f"{what} in {share:.1%} of the pixels"

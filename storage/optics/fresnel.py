@@ -25,14 +25,10 @@ def constant_albedos(
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return diffuse and specular albedo; they add up to at most 1.
 
-    Where nothing is metal the specular one knows nothing of `base`: its shape is that of the
-    others, so that a texture of the base color leaves it one number.
-
-    Args:
-        base: [..., 3] linear base color, 0 to 1.
-        metal: [..., 1] share of metal, 0 to 1, which reflects its base color head-on.
-        f0, f90: what is no metal reflects head-on and at grazing angles, 0 to 1; they broadcast
-            with `base`.
+    `base` is linear color [..., 3], and `metal` the share [..., 1] that reflects it head-on. What
+    is no metal reflects `f0` head-on and `f90` at grazing angles; both broadcast with `base`. All
+    are from 0 to 1. Where nothing is metal the specular one knows nothing of `base`: its shape is
+    that of the others, so that a texture of the base color leaves it one number.
     """
     head_on = (1 - metal) * f0
     if metal.any():

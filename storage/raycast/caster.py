@@ -1,10 +1,15 @@
 """`RayCaster`: which triangles rays meet, on the CPU or on a GPU.
 
-Embree is its form for numpy (storage.raycast.embree); a kernel of model.hits is that for tensors.
+Embree is its form for numpy; a kernel of model.hits is that for tensors.
 """
 
 from dataclasses import dataclass
 from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.records.scene import Scene
 
 MISS = -1
 """Triangle and object of a ray that meets nothing."""
@@ -28,3 +33,77 @@ class RayCaster(Protocol):
 
     def is_free(self, origins: Any, directions: Any, distances_m: Any) -> Any:
         """Return [N] whether rays meet nothing up to a distance [N], in lengths of directions."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MetSurfaces(RayHits):
+    """First hits of N rays, in Embree's precision."""
+
+    distance_m: NDArray[np.float32]
+    """[N] along the ray, in lengths of its direction; beyond all measure where nothing is met."""
+    normal: NDArray[np.float32]
+    """[N, 3] of the triangle's plane, in world space, of any length, towards the side from which
+    its corners run counter-clockwise; undefined where nothing is met."""
+
+
+class Triangles:
+    """Some triangles of many, as Embree's rays meet them: a `RayCaster`.
+
+    Embree works in single precision, here in its robust mode, in which no ray slips between two
+    triangles of one edge. `pipeline.assets.outside_rays` calls Embree by itself: it has no scene.
+    """
+
+    def __init__(self, corners_T33: NDArray[np.float32], rows: NDArray[np.intp]) -> None:
+        """Take the corners of triangles, world space, and the rows of those that are there."""
+        count = 3 * len(rows)
+        vertices = corners_T33[rows].reshape(count, 3)
+        self._build(vertices, np.arange(count, dtype=np.uint32).reshape(-1, 3), rows)
+
+    def _build(
+        self,
+        vertices: NDArray[np.float32],
+        faces: NDArray[np.uint32],
+        rows: NDArray[np.intp],
+    ) -> None:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        self._rows = np.append(rows, MISS)  # the last one, which -1 picks
+        self._embree = EmbreeScene(robust=True)
+        if len(rows):
+            TriangleMesh(self._embree, vertices, faces)
+
+    def intersect(
+        self, origins: NDArray[np.float32], directions: NDArray[np.float32]
+    ) -> MetSurfaces:
+        """Return the first hits of rays [N, 3] from `origins` [N, 3], from either side."""
+        hits = self._embree.run(origins, directions, output=True)
+        return MetSurfaces(
+            triangle=self._rows[hits["primID"]],
+            uv=np.stack([hits["u"], hits["v"]]),
+            distance_m=hits["tfar"],
+            normal=hits["Ng"],
+        )
+
+    def is_free(
+        self,
+        origins: NDArray[np.float32],
+        directions: NDArray[np.float32],
+        distances_m: NDArray[np.float32],
+    ) -> NDArray[np.bool_]:
+        """Return [N] whether rays meet nothing up to a distance [N], in lengths of directions."""
+        occluder = self._embree.run(origins, directions, dists=distances_m, query="OCCLUDED")
+        free: NDArray[np.bool_] = np.asarray(occluder) < 0
+        return free
+
+
+class Surfaces(Triangles):
+    """The triangles of a scene that cameras see.
+
+    Emitters are left out, since they are hidden from camera rays in the pictures too; rays pass
+    through them.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        rows = np.flatnonzero(~scene.triangle_emits)
+        self._build(scene.vertex_positions, scene.faces[rows], rows)

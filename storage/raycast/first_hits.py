@@ -1,6 +1,6 @@
 """First hits of a camera's pixels: triangle, object, depth, position, normals, material.
 
-Embree finds the triangle, in single precision (storage.raycast.embree); where on it, is then
+Embree finds the triangle, in single precision (storage.raycast.caster); where on it, is then
 computed in double precision from the triangle's stored corners. Emitters are hidden from cameras,
 so rays pass through them. Each quantity is computed on first use.
 """
@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
-from storage.raycast.caster import MISS
-from storage.raycast.embree import Surfaces
-from storage.records.lookup import normal_texels, textured_rows
-from storage.records.normal_map import mapped_normals, u_directions
+from storage.raycast.caster import MISS, Surfaces
+from storage.records.lookup import mapped_normals, normal_texels, textured_rows, u_directions
 from storage.records.scene import Scene
 
 
@@ -195,16 +193,9 @@ def first_hits(
 ) -> FirstHits:
     """Return the first hits of a camera of a scene, in all pixels of its picture or in one.
 
-    Rays go through the centers of pixels, as those of the renderer's own `hits`.
-
-    Args:
-        scene: passes `Scene.check`.
-        view: row of `scene.c2w`.
-        resolution: width and height of the picture in pixels.
-        pixel: row from the top and column from the left of the only one that is computed.
-
-    Raises:
-        TrilightError: there is no such view or pixel.
+    Rays go through the centers of pixels, as those of the renderer's own `hits`. The scene passes
+    `Scene.check`; `view` is a row of `scene.c2w`, and `pixel` the row from the top and the column
+    from the left. It raises TrilightError where there is no such view or pixel.
     """
     require_row("view", view, scene.num_views)
     origin, directions = camera_rays(scene.c2w[view], float(scene.fov_deg[view]), resolution)

@@ -3,7 +3,10 @@
 The file holds, per level, `positions_<budget>` f32 [V, 3] and `faces_<budget>` u32 [F, 3], and in
 its metadata what is known of the source and of each level. Positions are in the unit box: the
 bounding box of the cleaned source is centred on the origin and its longest side is 1. Where objects
-keep their own materials it holds their skins too (storage.records.skin); otherwise not a byte more.
+keep their own materials it holds their skins too; otherwise not a byte more. A skin's textures are
+an atlas of the level's own triangles, baked from the source (pipeline.assets.source_materials), so
+that they need no charts and survive any change of the triangles. Each is packed as in a shard
+(storage.records.packed_maps), since a run holds many objects and shows few of them at a time.
 
 `AssetRow` is what `trilight assets` reports of one object. The rows of the accepted objects are a
 catalogue (`objects.jsonl`), so that the output folder is itself a source of objects.
@@ -13,6 +16,7 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,9 +25,103 @@ from safetensors.numpy import save
 
 from storage.errors import TrilightError
 from storage.records.objects import NamedObject
+from storage.records.packed_maps import unpack_texture
 from storage.records.safe_read import read_safetensors
-from storage.records.skin import LevelSkin, OwnMaterials, SkinQuality, read_skin, skin_arrays
+from storage.records.texture import NORMAL, TEXTURED, Texture
 from storage.typed_json import read_json
+
+SkinTextures = tuple[Texture, Texture, Texture]
+"""Diffuse, specular and roughness; one texel in float32 where one is the same everywhere."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkinQuality:
+    """Color errors of a level against its source."""
+
+    colour_error: float
+    """Mean difference of the linear diffuse colour between points spread evenly over the source and
+    the nearest points of the level, over all channels."""
+    colour_error_p95: float
+    missed_cells: float
+    """Share of the texels for which the source has no surface nearby that faces the same way: they
+    show its nearest point."""
+    torn_seams: float
+    """Share of the length of inner edges whose two sides show places of the source that are more
+    than two texels apart."""
+    texels_per_length: float
+    """Texels along the longest side of the object's bounding box."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnMaterials:
+    """Result of reading a source's materials."""
+
+    reason: str = ""
+    """Stable code of why the object goes without them; empty where it has them."""
+    message: str = ""
+    lost: tuple[str, ...] = ()
+    """Properties of the source that this renderer cannot show, such as `emission`."""
+
+    @property
+    def see_through(self) -> tuple[str, ...]:
+        """Those of `lost` by which light passes through surfaces, which are opaque here."""
+        return tuple(word for word in self.lost if word in ("transmission", "transparency"))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LevelSkin:
+    """The look of one level."""
+
+    uv: NDArray[np.float32]
+    """[F, 3, 2] texture coordinates of each corner of each face, within [0, 1], v up."""
+    packed: tuple[bytes, bytes, bytes]
+    """Encoded bytes of the three textures."""
+    packed_normal: bytes | None = None
+    """Encoded bytes of the normal map; None where the source has none, or it was not requested."""
+    quality: SkinQuality
+    emission: NDArray[np.float32] | None = None
+    """[F, 3] what each face emits, in the units of the source; None where nothing does, or
+    where it was not requested."""
+
+    @cached_property
+    def textures(self) -> SkinTextures:
+        """Diffuse, specular and roughness, unpacked."""
+        first, second, third = map(unpack_texture, self.packed, TEXTURED)
+        return first, second, third
+
+    @cached_property
+    def normal(self) -> Texture | None:
+        """The normal map, unpacked."""
+        return None if self.packed_normal is None else unpack_texture(self.packed_normal, NORMAL)
+
+    @property
+    def num_bytes(self) -> int:
+        """Bytes as they are stored."""
+        glow = 0 if self.emission is None else self.emission.nbytes
+        return self.uv.nbytes + sum(map(len, (*self.packed, self.packed_normal or b""))) + glow
+
+
+def _skin_arrays(skin: LevelSkin, name: str) -> dict[str, NDArray]:
+    arrays = {f"uv_{name}": np.ascontiguousarray(skin.uv)}
+    packed = (*skin.packed, skin.packed_normal)
+    for column, data in zip((*TEXTURED, NORMAL), packed, strict=True):
+        if data is not None:
+            arrays[f"{column}_{name}"] = np.frombuffer(data, np.uint8)
+    if skin.emission is not None:
+        arrays[f"emission_{name}"] = np.ascontiguousarray(skin.emission)
+    return arrays
+
+
+def _read_skin(arrays: Mapping[str, NDArray], quality: SkinQuality, name: str) -> LevelSkin:
+    first, second, third = (arrays[f"{column}_{name}"].tobytes() for column in TEXTURED)
+    normal = arrays.get(f"{NORMAL}_{name}")
+    return LevelSkin(
+        uv=arrays[f"uv_{name}"],
+        packed=(first, second, third),
+        packed_normal=None if normal is None else normal.tobytes(),
+        quality=quality,
+        emission=arrays.get(f"emission_{name}"),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +135,6 @@ class SourceFacts:
     num_faces_turned: int
     """Triangles whose winding was reversed to face outward."""
     num_parts: int
-    """Number of connected mesh components."""
     open_edges: int
     """Edges with one face; 0 for a surface without border."""
     nonmanifold_edges: int
@@ -65,11 +162,9 @@ class LevelQuality:
     """
 
     error_mean: float
-    """Mean distance."""
     error_p99: float
     """99th percentile of the distance: what bounds refer to."""
     error_max: float
-    """Largest distance of any sample point."""
     normal_error_deg: float
     """Mean angle between the normals of the source and of the level, 0 to 90."""
     area_ratio: float
@@ -83,7 +178,6 @@ class LevelQuality:
     min_angle_p5_deg: float
     """5th percentile of the triangles' smallest angles."""
     open_edges: int
-    """Number of edges with only one face."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,30 +206,43 @@ class Level:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Asset:
-    """A clean object at falling budgets."""
+class _Facts:
+    """Facts of an asset, and of the metadata of its file."""
 
     geometry_sha256: str
     """Digest of the cleaned source geometry: equal for copies, whatever their names."""
     source_sha256: str
-    """Digest of the source file."""
     recipe: str
     """Name and version of the recipe and of the libraries that made it."""
     source: SourceFacts
-    levels: tuple[Level, ...]
-    """Levels of detail, the largest triangle budget first."""
     materials: OwnMaterials | None = None
     """Result of reading the source's materials; None where they were not requested."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Asset(_Facts):
+    """A clean object at falling budgets."""
+
+    levels: tuple[Level, ...]
+    """Levels of detail, the largest triangle budget first."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Header(_Facts):
+    levels: tuple[LevelRecord, ...]
+    skins: Mapping[str, SkinQuality] = dataclasses.field(default_factory=dict)
+    """Quality of the skin of each level that has one, by its budget."""
 
 
 def encode_asset(asset: Asset) -> bytes:
     """Return the file of an asset; equal assets give equal bytes."""
     arrays: dict[str, NDArray] = {}
     for level in asset.levels:
-        arrays[f"positions_{level.record.budget}"] = np.ascontiguousarray(level.positions)
-        arrays[f"faces_{level.record.budget}"] = np.ascontiguousarray(level.faces)
+        name = str(level.record.budget)
+        arrays[f"positions_{name}"] = np.ascontiguousarray(level.positions)
+        arrays[f"faces_{name}"] = np.ascontiguousarray(level.faces)
         if level.skin is not None:
-            arrays |= skin_arrays(level.skin, str(level.record.budget))
+            arrays |= _skin_arrays(level.skin, name)
     header: dict[str, Any] = {
         "geometry_sha256": asset.geometry_sha256,
         "source_sha256": asset.source_sha256,
@@ -154,11 +261,7 @@ def encode_asset(asset: Asset) -> bytes:
 
 
 def decode_asset(data: bytes) -> Asset:
-    """Return the asset of a file.
-
-    Raises:
-        TrilightError: the file is damaged, or another kind of safetensors file.
-    """
+    """Return the asset of a file; raises TrilightError where it is damaged or of another kind."""
     arrays, metadata = read_safetensors(data)
     try:
         header = read_json(metadata.get("asset", ""), _Header, "its header")
@@ -166,25 +269,10 @@ def decode_asset(data: bytes) -> Asset:
     except (KeyError, TrilightError) as error:
         raise TrilightError(
             f"asset: a safetensors file with arrays {', '.join(arrays) or 'none'} does not hold "
-            f"one ({error}); expected a file of the asset store. Delete "
-            "it, and it is made again."
+            f"one ({error}); expected a file of the asset store. Delete it: it is made again."
         ) from error
     fields = {name: value for name, value in vars(header).items() if name != "skins"}
     return Asset(**{**fields, "levels": levels})
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Header:
-    """Metadata of the file; the fields are those of `Asset`."""
-
-    geometry_sha256: str
-    source_sha256: str
-    recipe: str
-    source: SourceFacts
-    levels: tuple[LevelRecord, ...]
-    materials: OwnMaterials | None = None
-    skins: Mapping[str, SkinQuality] = dataclasses.field(default_factory=dict)
-    """Quality of the skin of each level that has one, by its budget."""
 
 
 def _level(
@@ -195,7 +283,7 @@ def _level(
         record=record,
         positions=arrays[f"positions_{name}"],
         faces=arrays[f"faces_{name}"],
-        skin=read_skin(arrays, skins[name], name) if name in skins else None,
+        skin=_read_skin(arrays, skins[name], name) if name in skins else None,
     )
 
 
@@ -209,7 +297,6 @@ class AssetRow(NamedObject):
     method: str
     """How it was made; `source` where nothing had to be left out."""
     quality: LevelQuality
-    """How it compares with the source."""
     source: SourceFacts
     materials: OwnMaterials | None = None
     """Result of reading the source's materials; None where they were not requested."""

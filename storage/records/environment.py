@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from storage.records.scene_laws import broken_law, require_law
+from storage.records.scene_laws import broken_law, require_array, require_law
 from storage.records.texture import MAX_SIDE, MapSource, content_digest
 
 MAX_RADIANCE = 1e9
@@ -20,22 +20,17 @@ ROTATION_TOLERANCE = 1e-4
 """How far a float32 rotation may be from orthonormal, as that of a camera."""
 
 
-def _identity_rotation() -> NDArray[np.float32]:
-    return np.eye(3, dtype=np.float32)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Environment:
     """A latitude-longitude map of radiance from infinitely far away."""
 
     radiance_rgb: NDArray[np.float32]
     """[H, 2H, 3] linear radiance; row 0 is the top (+Z of the map)."""
-    rotation: NDArray[np.float32] = field(default_factory=_identity_rotation)
+    rotation: NDArray[np.float32] = field(default_factory=lambda: np.eye(3, dtype=np.float32))
     """[3, 3] from the axes of the map to those of the world."""
     is_seen: bool = False
     """True: cameras see the map. It lights the scene in any case."""
     source: MapSource = field(default_factory=MapSource)
-    """Name, URL and rights of the map."""
 
     @cached_property
     def sha256(self) -> str:
@@ -51,9 +46,8 @@ class Environment:
         """Raise TrilightError at the first broken law."""
         radiance = self.radiance_rgb
         name = "environment.radiance_rgb"
-        if radiance.dtype != np.float32:
-            broken_law(f"{name} has dtype {radiance.dtype}", "float32")
-        if radiance.ndim != 3 or radiance.shape[1:] != (2 * radiance.shape[0], 3):
+        require_array(radiance, name, np.float32, (None, None, 3))
+        if radiance.shape[1] != 2 * radiance.shape[0]:
             broken_law(f"{name} has shape {radiance.shape}", "(height, twice the height, 3)")
         if not 1 <= radiance.shape[0] <= MAX_SIDE // 2:
             broken_law(f"{name} has shape {radiance.shape}", f"sides of 1 to {MAX_SIDE} texels")
@@ -61,10 +55,7 @@ class Environment:
             lawful = (radiance >= 0) & (radiance <= MAX_RADIANCE)
             require_law(lawful, name, radiance, f"finite values from 0 to {MAX_RADIANCE:g}")
         rotation = self.rotation
-        if rotation.dtype != np.float32 or rotation.shape != (3, 3):
-            broken_law(
-                f"environment.rotation is {rotation.dtype} {rotation.shape}", "float32 (3, 3)"
-            )
+        require_array(rotation, "environment.rotation", np.float32, (3, 3))
         rotation64 = rotation.astype(np.float64)
         deviation = abs(rotation64 @ rotation64.T - np.eye(3)).max()
         if not (deviation <= ROTATION_TOLERANCE and np.linalg.det(rotation64) > 0):
@@ -72,3 +63,21 @@ class Environment:
                 f"environment.rotation is {rotation.tolist()}",
                 "an orthonormal rotation without mirroring",
             )
+
+
+def row_solid_angles(height: int) -> NDArray[np.float64]:
+    """Return the steradians [H] of a texel in each row of a map with 2 H columns."""
+    edges = np.cos(np.pi * np.arange(height + 1) / height)
+    angles: NDArray[np.float64] = (edges[:-1] - edges[1:]) * np.pi / height
+    return angles
+
+
+def texel_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean over each texel [H, W] of what interpolation between their centres gives."""
+    wide = np.pad(values, ((1, 1), (0, 0)), mode="edge")
+    tall = (wide[:-2] + 6 * wide[1:-1] + wide[2:]) / 8
+    round_about = np.pad(tall, ((0, 0), (1, 1)), mode="wrap")
+    means: NDArray[np.float64] = (
+        round_about[:, :-2] + 6 * round_about[:, 1:-1] + round_about[:, 2:]
+    ) / 8
+    return means

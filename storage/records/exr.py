@@ -84,16 +84,11 @@ def encode_exr(
     *,
     attributes: Attributes | None = None,
 ) -> bytes:
-    """Return the OpenEXR file of a picture, rounded to half floats; one thread.
+    """Return the OpenEXR file of a picture [R, R, 3], rounded to half floats; one thread.
 
-    Args:
-        radiance_rgb: [R, R, 3] linear radiance, finite, in [0, 65504].
-        codec: how to pack it. A lossy one may leave values below 0, or infinite ones where the
-            brightest rounds up: callers look at what comes back.
-        attributes: more entries of the header, by name.
-
-    Raises:
-        TrilightError: a value is not finite, negative, or too large for a half float.
+    A lossy codec may leave values below 0, or infinite ones where the brightest rounds up: callers
+    look at what comes back. It raises TrilightError for a value that is not finite, negative, or
+    too large for a half float.
     """
     return encode_channels({"RGB": to_half(radiance_rgb)}, codec, attributes=attributes)
 
@@ -118,9 +113,8 @@ def encode_channels(
 ) -> bytes:
     """Return the OpenEXR file of named channels, [H, W] each or [H, W, 3] under the name RGB.
 
-    Raises:
-        TrilightError: a number among the attributes that a header cannot hold: integers end at
-            2^31 - 1, and floats with float32.
+    It raises TrilightError for an attribute that a header cannot hold: integers end at 2^31 - 1,
+    and floats with float32.
     """
     for name, value in (attributes or {}).items():
         _require_held(name, value)
@@ -147,22 +141,14 @@ def _require_held(name: str, value: str | int | float) -> None:
 
 
 def channel_names(data: bytes) -> list[str]:
-    """Return the names of the channels of an OpenEXR file of one part; reads no pixel.
-
-    Raises:
-        TrilightError: not an EXR file, truncated, or of several parts.
-    """
+    """Return the names of the channels of an OpenEXR file; raises as `read_header`."""
     return [str(channel.name) for channel in read_header(data)["channels"]]
 
 
 def decode_exr(data: bytes) -> NDArray[np.float32]:
-    """Return the picture of an OpenEXR file as float32 [H, W, 3].
+    """Return the picture of an OpenEXR file as float32 [H, W, 3]; raises as `decode_channels`.
 
     Where the file is packed with losses, what they took below 0 is 0 again.
-
-    Raises:
-        TrilightError: not an EXR file, truncated, larger than MAX_RESOLUTION, or with other
-            channels than R, G and B.
     """
     return to_float32(decode_stored(data))
 
@@ -178,9 +164,6 @@ def decode_stored(data: bytes) -> Stored:
     """Return the picture [H, W, 3] of `decode_exr` as the file holds it.
 
     A function of half floats, such as their logarithm, can be looked up by these bits.
-
-    Raises:
-        TrilightError: as `decode_exr`.
     """
     header: dict[str, Any] = {}
     pixels = decode_channels(data, "RGB", header.update)["RGB"]
@@ -205,19 +188,11 @@ def decode_channels(
     """Return the channels of an OpenEXR file by name, R, G and B as one unless `separate`.
 
     The library takes memory for all that a file's headers speak of, and small files can speak of
-    much: no pixel is read before the headers are what is expected.
-
-    Args:
-        data: the file.
-        names: of the channels that it must have.
-        check: called with the header before any pixel is read; raises TrilightError.
-        size: height and width as they must be; None for any.
-        what: the file in messages about its size.
-        separate: keep R, G and B apart.
-
-    Raises:
-        TrilightError: not an EXR file, truncated, of several parts, with other channels, larger
-            than MAX_RESOLUTION, of more than 3 GiB, of another size, or refused by `check`.
+    much: no pixel is read before the headers are what is expected. `check` is called with the
+    header before that. Height and width are any, or of `size`; messages about it say `what`. It
+    raises TrilightError for another file, or one that is truncated, of several parts, with other
+    channels, larger than MAX_RESOLUTION, of more than 3 GiB, of another size, or refused by
+    `check`.
     """
     with _readable():
         header = read_header(data)
@@ -234,7 +209,7 @@ def decode_channels(
 
 
 def read_header(data: bytes) -> Header:
-    """Return the header of an OpenEXR file of one part; raises TrilightError as `channel_names`."""
+    """Return the header of an OpenEXR file; raises TrilightError for others, and several parts."""
     with _readable():
         find_header_end(data)
         parts = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).parts
@@ -247,8 +222,7 @@ def read_header(data: bytes) -> Header:
 def find_header_end(data: bytes) -> int:
     """Return where the headers of an OpenEXR file end, found without the library.
 
-    Raises:
-        TrilightError: they have more attributes, channels or bytes than are read.
+    It raises TrilightError where they have more attributes, channels or bytes than are read.
     """
     is_many = int.from_bytes(data[4:8], "little") & MANY_PARTS
     at = 8
@@ -323,3 +297,55 @@ def _list_names(names: Sequence[str]) -> str:
     if len(names) <= _MOST_LISTED:
         return ", ".join(names) or "none"
     return f"{', '.join(names[:_MOST_LISTED])} and {len(names) - _MOST_LISTED} more"
+
+
+def encode_layers(names: Sequence[str], radiance_rgb: NDArray[np.float32]) -> bytes:
+    """Return the OpenEXR file of pictures [N, R, R, 3] by names of layers; raises as `encode_exr`.
+
+    The channels of a layer are `<layer>.R`, `.G` and `.B`.
+    """
+    return encode_channels(_channels(names, radiance_rgb))
+
+
+def encode_picture(
+    radiance_rgb: NDArray[np.float32],
+    layers_rgb: Mapping[str, NDArray[np.float32]],
+    attributes: Attributes,
+) -> bytes:
+    """Return the OpenEXR file of a picture [R, R, 3] and its layers; raises as `encode_exr`."""
+    if not layers_rgb:
+        return encode_exr(radiance_rgb, attributes=attributes)
+    layers = _channels(tuple(layers_rgb), np.stack(list(layers_rgb.values())))
+    return encode_channels({"RGB": to_half(radiance_rgb), **layers}, attributes=attributes)
+
+
+def decode_picture(data: bytes, layers: Collection[str]) -> NDArray[np.float32]:
+    """Return the picture [H, W, 3] of a file without these layers; raises as `decode_exr`."""
+    if not layers:
+        return decode_exr(data)
+    names = ["R", "G", "B", *(f"{layer}.{channel}" for layer in layers for channel in "RGB")]
+    by_channel = decode_channels(data, names, separate=True)
+    return np.stack([by_channel[channel] for channel in "RGB"], axis=-1).astype(np.float32)
+
+
+def _channels(
+    names: Sequence[str], radiance_rgb: NDArray[np.float32]
+) -> dict[str, NDArray[np.float16]]:
+    return {
+        f"{name}.{channel}": np.ascontiguousarray(picture[..., index])
+        for name, picture in zip(names, to_half(radiance_rgb), strict=True)
+        for index, channel in enumerate("RGB")
+    }
+
+
+def decode_layers(
+    data: bytes, names: Sequence[str], size: tuple[int, int], what: str
+) -> NDArray[np.float32]:
+    """Return the pictures of an OpenEXR file, float32 [N, H, W, 3]; raises as `decode_channels`.
+
+    `names` of the layers and `size`, H and W, are as they must be; messages say `what`.
+    """
+    channels = [f"{name}.{channel}" for name in names for channel in "RGB"]
+    by_channel = decode_channels(data, channels, size=size, what=what, separate=True)
+    planes = np.stack([np.asarray(by_channel[name], np.float32) for name in channels])
+    return np.moveaxis(planes.reshape(len(names), 3, *size), 1, -1).copy()

@@ -1,23 +1,31 @@
-"""Pictures by light (OLAT): what each emitter adds, and the rule that their sum is the picture.
+"""Pictures by light (OLAT) and by part, and the rule that their sum is the picture.
 
 Light i is the i-th object of kind `emitter`, in the order of `Scene.objects`; a sky that shines is
-one more light, the last one. The member
-`0.lights.exr` of a sample holds the radiance of each alone, as channels `light<i>.R/G/B` of half
-floats. The picture is by definition what `sum_of_lights` returns of them, so a reader can turn
+one more light, the last one. Parts are direct and indirect light, and the diffuse and the specular
+lobe. Direct light reaches the camera by one reflection: lamp, surface, camera. All other light that
+is seen is indirect, since emitters are hidden from cameras. The lobes are those of the surface that
+the camera sees, whatever happened to the light before.
+
+A sample holds the radiance of each alone, as channels of half floats: `light<i>.R/G/B` in the
+member `0.lights.exr`, and in `0.parts.exr` `<part>.R/G/B`, or `light<i>.<part>.R/G/B` where lights
+are apart. The picture is by definition what `sum_of_lights` returns of them, so a reader can turn
 lights off, brighten or colour them and knows the result to the rounding of the stored halves.
 """
+
+import itertools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import TrilightError
 from storage.records.environment import Environment
-from storage.records.exr import to_half
-from storage.records.exr_layers import decode_layers, encode_layers
+from storage.records.exr import decode_layers, encode_layers, to_half
 from storage.records.scene import Scene
 
 MAX_LIGHTS = 64
-"""Most lights whose pictures are kept apart: each takes as much room as a picture."""
+"""Most pictures of one view that are kept apart, parts times lights: each takes as much room as the
+picture."""
 
 
 def num_lights(scene: Scene) -> int:
@@ -60,29 +68,81 @@ def sum_of_lights(lights_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def encode_lights_exr(lights_rgb: NDArray[np.float32]) -> bytes:
-    """Return the OpenEXR file of lights [L, R, R, 3].
-
-    Raises:
-        TrilightError: a value is not finite, negative, or too large for a half float.
-    """
-    return encode_layers(_layers(len(lights_rgb)), lights_rgb)
+    """Return the OpenEXR file of lights [L, R, R, 3]; raises as `encode_layers`."""
+    return encode_layers(_layers([""], len(lights_rgb)), lights_rgb)
 
 
 def decode_lights_exr(data: bytes, shape: tuple[int, int, int]) -> NDArray[np.float32]:
-    """Return the lights of an OpenEXR file, float32 [L, H, W, 3].
+    """Return the lights of an OpenEXR file, float32 [L, H, W, 3]; raises as `decode_layers`."""
+    num, *size = shape
+    return _decode(data, _layers([""], num), (size[0], size[1]), "lights")
 
-    Args:
-        data: the file.
-        shape: L, H and W as they must be.
 
-    Raises:
-        TrilightError: not an EXR file, truncated, or with other channels or another size.
+Parts = Mapping[str, NDArray[np.float32]]
+"""Radiance by the name of the part, in the order of `part_names`."""
+
+_LOBES = ("diffuse", "specular")
+_BOUNCES = ("direct", "indirect")
+
+
+def part_names(*, bounces: bool, lobes: bool) -> tuple[str, ...]:
+    """Return the names of the parts, which other renderers use too; empty where all is together.
+
+    Bounces are direct and indirect light; lobes are the diffuse and the specular one.
     """
-    num, height, width = shape
-    if num > MAX_LIGHTS:
-        raise TrilightError(f"lights: {num} pictures; expected at most {MAX_LIGHTS}.")
-    return decode_layers(data, _layers(num), (height, width), "lights")
+    kinds = [names for names, is_separate in ((_LOBES, lobes), (_BOUNCES, bounces)) if is_separate]
+    return tuple("_".join(words) for words in itertools.product(*kinds)) if kinds else ()
 
 
-def _layers(num: int) -> list[str]:
-    return [f"light{light}" for light in range(num)]
+KNOWN_PARTS = tuple(
+    part_names(bounces=bounces, lobes=lobes)
+    for bounces, lobes in ((True, False), (False, True), (True, True))
+)
+"""The sets of parts that there are."""
+
+
+def sum_of_parts(parts_rgb: Parts) -> NDArray[np.float32]:
+    """Return the pictures that parts, as stored, add up to, as `sum_of_lights` does."""
+    return sum_of_lights(np.stack(list(parts_rgb.values())))
+
+
+def part_layers(parts_rgb: Parts) -> tuple[list[str], NDArray[np.float32]]:
+    """Return the names of the layers of one view's parts, and their pictures [N, R, R, 3].
+
+    Parts are [R, R, 3] each, or [L, R, R, 3] of L lights apart.
+    """
+    stacked = np.stack(list(parts_rgb.values()))
+    num_lights = stacked.shape[1] if stacked.ndim == 5 else None
+    return _layers(tuple(parts_rgb), num_lights), stacked.reshape(-1, *stacked.shape[-3:])
+
+
+def encode_parts_exr(parts_rgb: Parts) -> bytes:
+    """Return the OpenEXR file of one view's parts, as `part_layers`; raises as `encode_layers`."""
+    return encode_layers(*part_layers(parts_rgb))
+
+
+def decode_parts_exr(
+    data: bytes, names: Sequence[str], size: tuple[int, int], num_lights: int | None
+) -> dict[str, NDArray[np.float32]]:
+    """Return the parts of an OpenEXR file, float32 [H, W, 3], or [L, H, W, 3] of lights apart.
+
+    `names`, `size` (H and W) and `num_lights` (None where they are together) are as they must be.
+    It raises as `decode_layers`.
+    """
+    pictures = _decode(data, _layers(names, num_lights), size, "parts")
+    lights = () if num_lights is None else (num_lights,)
+    return dict(zip(names, pictures.reshape(len(names), *lights, *size, 3), strict=True))
+
+
+def _decode(
+    data: bytes, layers: Sequence[str], size: tuple[int, int], what: str
+) -> NDArray[np.float32]:
+    if len(layers) > MAX_LIGHTS:
+        raise TrilightError(f"{what}: {len(layers)} pictures; expected at most {MAX_LIGHTS}.")
+    return decode_layers(data, layers, size, what)
+
+
+def _layers(names: Sequence[str], num_lights: int | None) -> list[str]:
+    if num_lights is None:
+        return list(names)
+    return [f"light{light}.{name}".strip(".") for name in names for light in range(num_lights)]

@@ -13,6 +13,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,9 +37,7 @@ class MaterialColumn:
     name: str
     """Lower case letters, digits and underscores; files and networks name the column so."""
     means: str
-    """One sentence that documents the column."""
     width: int
-    """Number of values a material has in it."""
     within: Within
     """Range of each number; both ends are finite."""
     default: float = 0.0
@@ -68,35 +67,23 @@ class MaterialColumn:
             _wrong(self.name, f"the range {self.within}", "one from 0, since networks read its log")
 
 
+_colour = partial(MaterialColumn, width=3, is_colour=True)
+
 _OURS = {
     column.name: column
     for column in (
-        MaterialColumn(
-            name="diffuse",
-            means="Albedo of the diffuse lobe.",
-            width=3,
-            within=Within(0, 1),
-            is_colour=True,
-        ),
-        MaterialColumn(
-            name="specular",
-            means="Albedo of the specular lobe.",
-            width=3,
-            within=Within(0, 1),
-            is_colour=True,
-        ),
+        _colour(name="diffuse", means="Albedo of the diffuse lobe.", within=Within(0, 1)),
+        _colour(name="specular", means="Albedo of the specular lobe.", within=Within(0, 1)),
         MaterialColumn(
             name="roughness",
             means="Roughness of the specular lobe; its GGX width is the square.",
             width=1,
             within=Within(0, 1),
         ),
-        MaterialColumn(
+        _colour(
             name="emission",
             means="Emitted radiance; a material that emits is a light.",
-            width=3,
             within=Within(0, FLOAT32_MAX),
-            is_colour=True,
             is_radiance=True,
             is_log_encoded=True,
         ),
@@ -119,13 +106,9 @@ def material_columns() -> tuple[MaterialColumn, ...]:
 
 
 def laid_out(names: Sequence[str] | None = None) -> Iterator[tuple[MaterialColumn, slice]]:
-    """Yield columns and where their numbers stand in a row that holds these, in this order.
+    """Yield columns and where their numbers stand in a row of `names`, or of all that are declared.
 
-    Args:
-        names: of the columns; None: all that are declared, as in the rows of a scene.
-
-    Raises:
-        UndeclaredColumn: a name that is not declared.
+    It raises UndeclaredColumn for a name that is not declared.
     """
     start = 0
     for name in COLUMNS if names is None else names:
@@ -175,9 +158,14 @@ def stored_columns(materials: NDArray[np.float32]) -> tuple[str, ...]:
     return (*PUBLISHED_COLUMNS, *unread_columns(materials, PUBLISHED_COLUMNS))
 
 
+def column_places() -> dict[str, slice]:
+    """Return where the numbers of each declared column stand in the material rows of a scene."""
+    return {column.name: part for column, part in laid_out()}
+
+
 def chosen_columns(materials: NDArray[np.float32], names: Sequence[str]) -> NDArray[np.float32]:
     """Return rows [M, width of `names`] with these columns of rows that have all, in this order."""
-    places = {column.name: part for column, part in laid_out()}
+    places = column_places()
     return np.concatenate([materials[:, places[name]] for name in names], axis=1)
 
 
@@ -191,13 +179,9 @@ def stored_names(names: Sequence[str]) -> str | None:
 def completed_rows(stored: NDArray[np.float32], stated: str | None) -> NDArray[np.float32]:
     """Return rows with all declared columns of those that a file holds; others get defaults.
 
-    Args:
-        stored: [M, width] as the file has them.
-        stated: what it says of its columns (`stored_names`).
-
-    Raises:
-        TrilightError: a column is not declared here, or has another width; or `stated` is not of
-            this form or does not fit the array.
+    `stated` is what the file says of its columns (`stored_names`). It raises TrilightError where a
+    column is not declared here, or has another width, or `stated` is not of this form or does not
+    fit the array.
     """
     names = PUBLISHED_COLUMNS if stated is None else _names_of(stated)
     width = material_width(names)
@@ -209,7 +193,7 @@ def completed_rows(stored: NDArray[np.float32], stated: str | None) -> NDArray[n
     if names == tuple(COLUMNS):
         return stored
     rows = default_rows(len(stored))
-    places = {column.name: part for column, part in laid_out()}
+    places = column_places()
     for column, part in laid_out(names):
         rows[:, places[column.name]] = stored[:, part]
     return rows
@@ -237,7 +221,7 @@ def _wrong(name: str, got: str, expected: str) -> None:
     raise TrilightError(f"material column {name!r:.60} has {got}; expected {expected}.")
 
 
-_PLACES = {column.name: part for column, part in laid_out()}
+_PLACES = column_places()
 
 DIFFUSE, SPECULAR, EMISSION = (_PLACES[name] for name in ("diffuse", "specular", "emission"))
 """Places of the published columns in a material row, for code that means exactly them."""

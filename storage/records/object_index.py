@@ -11,7 +11,6 @@ The file is a safetensors file of which columns are read in parts: its arrays ar
 
 import dataclasses
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -66,9 +65,7 @@ class SplitRows:
     """The rows of one split."""
 
     start: int
-    """Index of the first row."""
     stop: int
-    """Index after the last row."""
     camps: Mapping[str, CampSizes]
     """Sizes by camp; "" is that of objects without one."""
 
@@ -78,9 +75,7 @@ class IndexFacts:
     """Identity and contents of an index of objects."""
 
     lock_sha256: str
-    """Hexadecimal digest of the lock's bytes."""
     lock_bytes: int
-    """Size of the lock in bytes."""
     asked: str
     """Digest of the query to the source; a change of it lists the source again."""
     num_found: int
@@ -90,9 +85,7 @@ class IndexFacts:
     camps: tuple[str, ...]
     """Camps by their number in the column."""
     splits: Mapping[str, SplitRows]
-    """Range of index rows of each split."""
     format: int = _FORMAT
-    """Version of the file's form."""
 
     @property
     def num_objects(self) -> int:
@@ -110,11 +103,7 @@ def write_object_index(
     num_found: int,
     num_maps: int = 0,
 ) -> IndexFacts:
-    """Write the index of a lock atomically; arguments as the fields of `IndexFacts`.
-
-    Raises:
-        TrilightError: the file cannot be written.
-    """
+    """Write the index of a lock atomically; arguments as the fields of `IndexFacts`."""
     rows = sorted(objects, key=lambda row: (row.locked.split, row.locked.uid))
     camps = sorted({share_alike_camp(row.locked.licence) for row in rows})
     number = {camp: index for index, camp in enumerate(camps)}
@@ -166,65 +155,33 @@ def _split_rows(
     return splits
 
 
-class StoredColumn:
-    """A column of a file, of which only the rows that are asked for are read."""
-
-    def __init__(self, descriptor: int, dtype: np.dtype[Any], position: int, count: int) -> None:
-        self._place = descriptor, dtype, position
-        self._count = count
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, rows: slice) -> NDArray[Any]:
-        start, stop, step = rows.indices(self._count)
-        assert step == 1
-        descriptor, dtype, position = self._place
-        num_bytes = max(0, stop - start) * dtype.itemsize
-        data = os.pread(descriptor, num_bytes, position + start * dtype.itemsize)
-        if len(data) != num_bytes:
-            raise TrilightError(
-                f"objects.index: ends before row {stop}; expected it whole. Delete it, and it is "
-                "made again."
-            )
-        return np.frombuffer(data, dtype)
-
-
 class ObjectIndex:
-    """An index that is read where it is asked."""
+    """An index of which only the rows that are asked for are read: its columns are mapped."""
 
     def __init__(self, path: Path) -> None:
-        """Open an index and read its header.
-
-        Raises:
-            TrilightError: it is missing, damaged, or of another format.
-        """
+        """Open an index; raises TrilightError where it is missing, damaged or of another form."""
         try:
-            self._stream = open_plain(path)
-            head = self._stream.read(8 + MAX_HEADER_BYTES)
+            with open_plain(path) as stream:
+                head = stream.read(8 + MAX_HEADER_BYTES)
             header = safetensors_header(head, name=str(path))
-            facts = read_json(header["__metadata__"]["objects"], IndexFacts, "its header")
-            if facts.format != _FORMAT:
+            self.facts = read_json(header.pop("__metadata__")["objects"], IndexFacts, "its header")
+            if self.facts.format != _FORMAT:
                 raise ValueError("another format")
-            self.facts = facts
-            self._arrays = {
-                name: (_TYPES[entry["dtype"]], int(entry["data_offsets"][0]))
-                for name, entry in header.items()
-                if name != "__metadata__"
-            }
+            first = 8 + int.from_bytes(head[:8], "little")
+            self._columns: dict[str, np.memmap[Any, Any]] = {}
+            for name, entry in header.items():
+                at = first + int(entry["data_offsets"][0])
+                shape = tuple(entry["shape"])
+                self._columns[name] = np.memmap(path, _TYPES[entry["dtype"]], "r", at, shape)
         except (OSError, LookupError, TypeError, ValueError, RecursionError) as error:
             raise TrilightError(
                 f"{path}: is no index of objects ({error}); delete it, and it is made again."
             ) from error
-        self._data = 8 + int.from_bytes(head[:8], "little")
 
-    def column(self, name: str, rows: SplitRows) -> StoredColumn:
+    def column(self, name: str, rows: SplitRows) -> NDArray[Any]:
         """Return `offset`, `least` or `camp` of the rows of a split."""
-        dtype, begin = self._arrays[name]
-        position = self._data + begin + rows.start * dtype.itemsize
-        return StoredColumn(self._stream.fileno(), dtype, position, rows.stop - rows.start)
+        return self._columns[name][rows.start : rows.stop]
 
     def asset_name(self, row: int) -> str:
         """Return the name of the prepared file of a row of the whole index."""
-        begin = self._data + self._arrays["name"][1] + row * _NAME_BYTES
-        return os.pread(self._stream.fileno(), _NAME_BYTES, begin).hex()
+        return self._columns["name"][row].tobytes().hex()

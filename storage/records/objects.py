@@ -5,8 +5,9 @@
 """
 
 import dataclasses
+import os
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,8 @@ from typing import Any
 from storage.atomic import write_atomically
 from storage.digests import canonical_json
 from storage.errors import TrilightError
-from storage.records.safe_read import read_plain
-from storage.typed_json import read_json_lines
+from storage.records.safe_read import open_plain, read_plain
+from storage.typed_json import read_json, read_json_lines
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +34,6 @@ class NamedObject:
     attribution: str
     """Author to credit, as the source states it."""
     source_url: str
-    """Where the object came from."""
 
     @property
     def identity(self) -> dict[str, str]:
@@ -77,10 +77,8 @@ EMITTER = "emitter"
 def locked_uids(objects: Iterable[tuple[str, str]], provenance: Mapping[str, Any]) -> list[str]:
     """Return the uids of all that a scene has of a lock, sorted: objects, textures and a map.
 
-    Args:
-        objects: kind and uid of each row of the scene's objects; floors and lamps are in none, what
-            an object emits is of that.
-        provenance: of the scene, perhaps from outside; what `maps` says counts where it is text.
+    Objects are given by kind and uid; floors and lamps are in no lock, and what an object emits is
+    of that. The provenance may be from outside: what `maps` says counts where it is text.
     """
     maps = provenance.get("maps", ())
     map_uids = (
@@ -101,7 +99,6 @@ class Failure:
     reason: str
     """Stable reason code in snake_case."""
     message: str
-    """One sentence for a person."""
     attempt: int = 0
     """Number of the attempt at the item, from 0."""
 
@@ -118,11 +115,7 @@ def write_objects_lock(path: Path, objects: Iterable[LockedObject]) -> None:
 
 
 def read_objects_lock(path: Path) -> list[LockedObject]:
-    """Return the objects of a lock.
-
-    Raises:
-        TrilightError: missing, or a line that is not a locked object.
-    """
+    """Return the objects of a lock; raises TrilightError for a missing file, or a wrong line."""
     try:
         data = read_plain(path)
     except OSError as error:
@@ -142,11 +135,7 @@ def encode_failures(failures: Iterable[Failure]) -> bytes:
 
 
 def decode_failures(data: bytes) -> list[Failure]:
-    """Return the failures of a file that `encode_failures` made.
-
-    Raises:
-        TrilightError: a line is not a failure.
-    """
+    """Return the failures of a file of `encode_failures`; raises TrilightError for other lines."""
     return read_json_lines(data, Failure, "failures.jsonl")
 
 
@@ -181,3 +170,68 @@ def _record(row: LockedObject | Failure) -> dict[str, Any]:
         for name, value in dataclasses.asdict(row).items()
         if (name, value) != ("kind", OBJECT)
     }
+
+
+class LockRows:
+    """The rows of a lock file; what it holds in memory does not depend on how many there are."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the lock; raises TrilightError where it is missing, or no plain file."""
+        self._path = path
+        try:
+            self._stream = open_plain(path)
+        except OSError as error:
+            raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
+
+    @property
+    def num_bytes(self) -> int:
+        """Size of the file."""
+        return os.fstat(self._stream.fileno()).st_size
+
+    def at(self, offset: int) -> LockedObject:
+        """Return the row that begins at a byte; raises TrilightError where none does."""
+        self._stream.seek(offset)
+        return self._row(self._stream.readline(), offset)
+
+    def find(self, uid: str) -> LockedObject | None:
+        """Return the row of a uid, or None: rows are sorted, so about 20 of a million are read."""
+        low = 0
+        high = self.num_bytes
+        while low < high:
+            start = self._start_of_row((low + high) // 2, low)
+            self._stream.seek(start)
+            line = self._stream.readline()
+            row = self._row(line, start)
+            if row.uid == uid:
+                return row
+            if row.uid < uid:
+                low = start + len(line)
+            else:
+                high = start
+        return None
+
+    def __iter__(self) -> Iterator[LockedObject]:
+        """Yield all rows, sorted by uid."""
+        offset = 0
+        while offset < self.num_bytes:
+            self._stream.seek(offset)
+            line = self._stream.readline()
+            yield self._row(line, offset)
+            offset += len(line)
+
+    def _start_of_row(self, position: int, low: int) -> int:
+        """Return where the row of a byte begins; `low` is the beginning of some row before it."""
+        step = 1024
+        while position > low:
+            start = max(low, position - step)
+            self._stream.seek(start)
+            cut = self._stream.read(position - start).rfind(b"\n")
+            if cut >= 0:
+                return start + cut + 1
+            step = 2 * step
+            position = start
+        return low
+
+    def _row(self, line: bytes, offset: int) -> LockedObject:
+        place = f"{self._path}: row at byte {offset}"
+        return read_json(line, LockedObject, place)

@@ -5,74 +5,231 @@ equal bytes, whatever it is called. Float32 values that half floats hold exactly
 
 In a shard every map stands once, as a member `__map-<sha256>__` before the first sample that uses
 it. WebDataset skips names of this form, and other readers names without a point: strangers see
-samples as before. Nothing in a header decides how much memory is taken.
+samples as before. Nothing in a header decides how much memory is taken. The record of a scene has
+one entry `maps`: the sha256 of each, with its name and rights, and how the environment is turned.
 """
 
+import dataclasses
+import re
+import threading
 import zlib
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
+from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.environment import Environment
-from storage.records.held_maps import HeldMaps, Map
-from storage.records.map_references import (
-    checked_environment,
-    checked_texture,
-    described_environment,
-    described_texture,
-    environment_entries,
-    map_member,
-    texture_entries,
-    wrong_map,
-)
 from storage.records.safe_read import read_safetensors, safetensors_header
 from storage.records.scene import Scene
-from storage.records.texture import MAX_MAPS_BYTES, Texture
+from storage.records.scene_laws import require_fields, wrong_value
+from storage.records.scene_maps import MAX_TEXTURES
+from storage.records.texture import MAX_MAPS_BYTES, MapSource, Texture
 
+HELD_BYTES = 1 << 26
+"""Most bytes that the maps of all open shards of a set take: 40 skies of 512 x 256 texels in
+float32, or 340 colours of 256 x 256 in 8 bits."""
+
+MAP_NAME = re.compile(r"__map-([0-9a-f]{64})__")
+"""Name of a map among the members of a shard."""
+
+Map = TypeVar("Map", Texture, Environment)
+
+Entry = Mapping[str, Any]
+"""What a record says of one map."""
+
+_SOURCE_FIELDS = tuple(field.name for field in dataclasses.fields(MapSource))
 _ARRAY = "values"
 _FORM = "form"
-_SRGB = "srgb"
-_LINEAR = "linear"
-_ENVIRONMENT = "environment"
+_FORMS: Mapping[type, Sequence[str]] = {Texture: ("srgb", "linear"), Environment: ("environment",)}
 _DTYPES = {"U8": np.uint8, "F16": np.float16, "F32": np.float32}
 _MOST_HEADER = 1 << 10
 _GZIP = 31
 
 
+class HeldMaps:
+    """The most recently used maps, unpacked and checked; for several threads at once.
+
+    They go by the very bytes that they were unpacked from: bytes that are refused once are refused
+    again, in any order of samples and shards. Arrays may not be written to: several samples share
+    them.
+    """
+
+    def __init__(self, most_bytes: int = HELD_BYTES) -> None:
+        """Hold nothing yet, and at most these bytes; a larger map is not held."""
+        self._most = most_bytes
+        self._maps: OrderedDict[tuple[type, str, str], Any] = OrderedDict()
+        self._lock = threading.Lock()
+        self.num_bytes = 0
+        """Of the arrays that are held."""
+
+    def get_or_unpack(
+        self, kind: type[Map], sha256: str, packed: bytes, unpack: Callable[[], Map]
+    ) -> Map:
+        """Return the map of some bytes: the held one, or what `unpack` returns, then held.
+
+        Two threads that miss the same map both unpack it. `kind` and `sha256` are what the map is
+        said to be and to hold; `unpack` raises unless it is so.
+        """
+        key = kind, sha256, sha256_hex(packed)
+        with self._lock:
+            if key in self._maps:
+                self._maps.move_to_end(key)
+                known: Map = self._maps[key]
+                return known
+        made = unpack()
+        array = _array(made)
+        array.flags.writeable = False
+        with self._lock:
+            if array.nbytes <= self._most and key not in self._maps:
+                while self.num_bytes + array.nbytes > self._most:
+                    _, oldest = self._maps.popitem(last=False)
+                    self.num_bytes -= _array(oldest).nbytes
+                self._maps[key] = made
+                self.num_bytes += array.nbytes
+        return made
+
+
+def _array(one: Texture | Environment) -> NDArray:
+    return one.texels if isinstance(one, Texture) else one.radiance_rgb
+
+
+def with_same_content(one: Map, **changes: Any) -> Map:
+    """Return a map with another name or turn; what was computed of its content stays known."""
+    other = dataclasses.replace(one, **changes)
+    vars(other).update({**vars(one), **vars(other)})
+    return other
+
+
+def map_member(sha256: str) -> str:
+    """Return the name of a map among the members of a shard."""
+    return f"__map-{sha256}__"
+
+
+def maps_record(scene: Scene) -> dict[str, Any] | None:
+    """Return what a scene's record says of its maps, as JSON values; None where it has none."""
+    record: dict[str, Any] = {}
+    if scene.textures:
+        record["textures"] = [
+            {"sha256": texture.sha256, **dataclasses.asdict(texture.source)}
+            for texture in scene.textures
+        ]
+    if (sky := scene.environment) is not None:
+        record["environment"] = {
+            "sha256": sky.sha256,
+            "rotation": sky.rotation.tolist(),
+            "is_seen": sky.is_seen,
+            **dataclasses.asdict(sky.source),
+        }
+    return record or None
+
+
+def maps_digest(record: Mapping[str, Any]) -> NDArray[np.uint8]:
+    """Return [32] the sha256 of what `maps_record` says, without names and rights.
+
+    It stands among the arrays of the scene, whose digest so covers what its surfaces look like.
+    """
+    sky = record.get("environment", {})
+    identity = {
+        "textures": [entry["sha256"] for entry in record.get("textures", ())],
+        "environment": {name: sky[name] for name in sky if name not in _SOURCE_FIELDS},
+    }
+    return np.frombuffer(bytes.fromhex(sha256_hex(canonical_json(identity))), np.uint8)
+
+
+def referenced_maps(record: Any) -> list[str]:
+    """Return the member names of the maps that a scene's record names, each once.
+
+    It raises TrilightError where the entry `maps` is not of the form of `maps_record`.
+    """
+    if not isinstance(record, Mapping) or "maps" not in record:
+        return []
+    textures, skies = map_entries(record["maps"])
+    return list(dict.fromkeys(map_member(entry["sha256"]) for entry in (*textures, *skies)))
+
+
+def map_entries(maps: Any) -> tuple[Sequence[Entry], Sequence[Entry]]:
+    """Return what a record says of its textures, and of its sky; raises as `referenced_maps`."""
+    if not isinstance(maps, Mapping) or not set(maps) <= {"textures", "environment"}:
+        wrong_value("maps", maps, "textures, environment, or both")
+    entries = maps.get("textures", [])
+    if not isinstance(entries, list) or len(entries) > MAX_TEXTURES:
+        wrong_value("maps.textures", entries, f"a list of at most {MAX_TEXTURES}")
+    for row, entry in enumerate(entries):
+        _check_entry(entry, f"maps.textures[{row}]", {})
+    if "environment" not in maps:
+        return entries, ()
+    sky = maps["environment"]
+    _check_entry(sky, "maps.environment", {"rotation": list, "is_seen": bool})
+    rows = [row if isinstance(row, list) else [] for row in sky["rotation"]]
+    if [len(row) for row in rows] != [3, 3, 3] or not all(
+        type(number) in (int, float) and abs(number) < 2 for row in rows for number in row
+    ):
+        wrong_value("maps.environment.rotation", sky["rotation"], "three rows of three numbers")
+    return entries, (sky,)
+
+
+def _check_entry(entry: Any, name: str, more: Mapping[str, type]) -> None:
+    require_fields(entry, name, {"sha256": str, **dict.fromkeys(_SOURCE_FIELDS, str), **more})
+    if not MAP_NAME.fullmatch(map_member(entry["sha256"])):
+        wrong_value(f"{name}.sha256", entry["sha256"], "64 hexadecimal digits")
+
+
+def checked_map(kind: type[Map], entry: Entry, values: NDArray, *, is_srgb: bool = False) -> Map:
+    """Return the unturned map of some values; raises where it is not what an entry names."""
+    made: Any
+    if kind is Texture:
+        made = Texture(texels=values, is_srgb=is_srgb)
+        made.check(f"texture {entry['sha256']}")
+    else:
+        made = Environment(radiance_rgb=values)
+        made.check()
+    if made.sha256 != entry["sha256"]:
+        raise TrilightError(
+            f"scene: map {entry['sha256']} has the content {made.sha256}; expected that of its "
+            "name. Run `trilight verify`."
+        )
+    result: Map = made
+    return result
+
+
+def described_map(entry: Entry, one: Map) -> Map:
+    """Return a map as an entry of `maps_record` calls and turns it, by a rotation or an error."""
+    source = MapSource(**{name: entry[name] for name in _SOURCE_FIELDS})
+    if isinstance(one, Texture):
+        return with_same_content(one, source=source)
+    rotation = np.array(entry["rotation"], np.float64).astype(np.float32)
+    sky = with_same_content(one, rotation=rotation, is_seen=entry["is_seen"], source=source)
+    sky.check()
+    return sky
+
+
 def packed_maps(scene: Scene) -> dict[str, bytes]:
     """Return the bytes of a scene's maps by the names of their members."""
-    packed = {map_member(texture.sha256): pack_texture(texture) for texture in scene.textures}
-    if scene.environment is not None:
-        packed[map_member(scene.environment.sha256)] = pack_environment(scene.environment)
-    return packed
+    skies = () if scene.environment is None else (scene.environment,)
+    return {map_member(one.sha256): pack_map(one) for one in (*scene.textures, *skies)}
 
 
-def pack_texture(texture: Texture) -> bytes:
-    """Return the bytes of a texture."""
-    return _pack(stored_values(texture.texels), _SRGB if texture.is_srgb else _LINEAR)
+def pack_map(one: Texture | Environment) -> bytes:
+    """Return the bytes of a texture, or of an environment's map, however it is turned."""
+    form = _FORMS[type(one)][isinstance(one, Texture) and not one.is_srgb]
+    data = save({_ARRAY: np.ascontiguousarray(stored_values(_array(one)))}, {_FORM: form})
+    packer = zlib.compressobj(level=6, wbits=_GZIP)
+    return packer.compress(data) + packer.flush()
 
 
 def unpack_texture(data: bytes, name: str) -> Texture:
-    """Return the texture of `pack_texture`, called `name` in messages.
-
-    Raises:
-        TrilightError: no texture, damaged, or larger than MAX_MAPS_BYTES.
-    """
+    """Return the texture of `pack_map`; raises TrilightError, with `name`, for an unlawful one."""
     packed_map = _PackedMap(data, name)
-    if packed_map.form not in (_SRGB, _LINEAR) or packed_map.num_bytes_held > MAX_MAPS_BYTES:
-        wrong_map(name, packed_map.form, f"a texture of at most {MAX_MAPS_BYTES} bytes")
-    texture = Texture(texels=packed_map.values(), is_srgb=packed_map.form == _SRGB)
+    if packed_map.form not in _FORMS[Texture] or packed_map.num_bytes_held > MAX_MAPS_BYTES:
+        wrong_value(name, packed_map.form, f"a texture of at most {MAX_MAPS_BYTES} bytes")
+    texture = Texture(texels=packed_map.values(), is_srgb=packed_map.form == "srgb")
     texture.check(name)
     return texture
-
-
-def pack_environment(environment: Environment) -> bytes:
-    """Return the bytes of an environment's map, however it is turned."""
-    return _pack(stored_values(environment.radiance_rgb), _ENVIRONMENT)
 
 
 def stored_values(values: NDArray) -> NDArray:
@@ -94,19 +251,14 @@ def unpacked_maps(
 ) -> dict[str, Any]:
     """Return the fields `textures` and `environment` of a scene, whose arrays are read-only.
 
-    Args:
-        maps: what `maps_record` gave, from outside.
-        members: bytes of the maps by the names of their members; others are ignored.
-        held: those of other samples, which are not unpacked again; None where there is no other.
-
-    Raises:
-        TrilightError: not of that form, a map is missing or damaged, all of them take more than
-            MAX_MAPS_BYTES, or one has another content than its name says.
+    `maps` are those of `maps_record`, from outside. The bytes are among `members`, by name. Maps
+    that other samples hold are not unpacked again. It raises TrilightError where they are not of
+    that form, a map is missing or damaged, all of them take more than MAX_MAPS_BYTES, or one has
+    another content than its name says.
     """
-    entries = texture_entries(maps)
-    skies = environment_entries(maps)
+    textures, skies = map_entries(maps)
     packed: dict[str, bytes] = {}
-    for entry in (*entries, *skies):
+    for entry in (*textures, *skies):
         if (name := map_member(entry["sha256"])) not in members:
             raise TrilightError(
                 f"scene: map {entry['sha256']} is missing; expected a member {name} before the "
@@ -115,49 +267,27 @@ def unpacked_maps(
         packed[name] = members[name]
     total = sum(_PackedMap(data, name).num_bytes_held for name, data in packed.items())
     if total > MAX_MAPS_BYTES:
-        wrong_map("maps", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
+        wrong_value("maps", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
     held = HeldMaps() if held is None else held
     fields: dict[str, Any] = {}
-    if entries:
-        fields["textures"] = tuple(
-            described_texture(entry, _load_map(Texture, entry, packed, held, _texture))
-            for entry in entries
-        )
     for entry in skies:
-        sky = _load_map(Environment, entry, packed, held, _environment)
-        fields["environment"] = described_environment(entry, sky)
+        fields["environment"] = _load_map(Environment, entry, packed, held)
+    if textures:
+        fields["textures"] = tuple(_load_map(Texture, each, packed, held) for each in textures)
     return fields
 
 
-def _load_map(
-    kind: type[Map],
-    entry: Mapping[str, Any],
-    packed: Mapping[str, bytes],
-    held: HeldMaps,
-    unpack: Callable[[Mapping[str, Any], bytes], Map],
-) -> Map:
+def _load_map(kind: type[Map], entry: Entry, packed: Mapping[str, bytes], held: HeldMaps) -> Map:
     data = packed[map_member(entry["sha256"])]
-    return held.get_or_unpack(kind, entry["sha256"], data, lambda: unpack(entry, data))
 
+    def unpack() -> Map:
+        packed_map = _PackedMap(data, f"map {entry['sha256']}")
+        if packed_map.form not in _FORMS[kind]:
+            expected = "a texture" if kind is Texture else "an environment map"
+            wrong_value(packed_map.name, packed_map.form, expected)
+        return checked_map(kind, entry, packed_map.values(), is_srgb=packed_map.form == "srgb")
 
-def _texture(entry: Mapping[str, Any], packed: bytes) -> Texture:
-    packed_map = _PackedMap(packed, f"map {entry['sha256']}")
-    if packed_map.form not in (_SRGB, _LINEAR):
-        wrong_map(packed_map.name, packed_map.form, "a texture")
-    return checked_texture(entry, packed_map.values(), is_srgb=packed_map.form == _SRGB)
-
-
-def _environment(entry: Mapping[str, Any], packed: bytes) -> Environment:
-    packed_map = _PackedMap(packed, f"map {entry['sha256']}")
-    if packed_map.form != _ENVIRONMENT:
-        wrong_map(packed_map.name, packed_map.form, "an environment map")
-    return checked_environment(entry, packed_map.values())
-
-
-def _pack(values: NDArray, form: str) -> bytes:
-    packer = zlib.compressobj(level=6, wbits=_GZIP)
-    data = save({_ARRAY: np.ascontiguousarray(values)}, {_FORM: form})
-    return packer.compress(data) + packer.flush()
+    return described_map(entry, held.get_or_unpack(kind, entry["sha256"], data, unpack))
 
 
 class _PackedMap:
@@ -170,7 +300,7 @@ class _PackedMap:
         entry = header.get(_ARRAY)
         metadata = header.get("__metadata__")
         if set(header) != {_ARRAY, "__metadata__"} or not isinstance(entry, Mapping):
-            wrong_map(name, sorted(header), f"one array {_ARRAY}")
+            wrong_value(name, sorted(header), f"one array {_ARRAY}")
         shape = entry.get("shape")
         dtype = entry.get("dtype")
         if (
@@ -179,7 +309,7 @@ class _PackedMap:
             or not all(type(side) is int and 0 < side <= MAX_MAPS_BYTES for side in shape)
             or dtype not in _DTYPES
         ):
-            wrong_map(name, [dtype, shape], "a picture of 8 bits or floats")
+            wrong_value(name, [dtype, shape], "a picture of 8 bits or floats")
         self.form = str(metadata.get(_FORM)) if isinstance(metadata, Mapping) else ""
         count = shape[0] * shape[1] * shape[2]
         self.num_bytes_held = count * (1 if dtype == "U8" else 4)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.records.material import laid_out
-from storage.records.normal_map import FLAT
+from storage.records.lookup import FLAT
+from storage.records.material import column_places
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def without_constant_textures(scene: AnyScene) -> AnyScene:
         return scene
     materials = scene.materials.copy()
     index = scene.material_textures.copy()
-    places = {column.name: part for column, part in laid_out()}
+    places = column_places()
     normals = scene.normal_textures
     if normals is not None:
         flat = [row for row, value in constants.items() if np.array_equal(value, FLAT)]
@@ -66,14 +66,11 @@ def with_textures(
     material_textures: NDArray[np.int32],
     normal_textures: NDArray[np.int32] | None = None,
 ) -> AnyScene:
-    """Return the same scene with textures, whose columns hold their means.
+    """Return the same scene with textures, whose columns hold their means; its own ones go.
 
-    Args:
-        scene: any; its own textures go.
-        uv: [3T, 2] of each corner of each triangle.
-        textures: each used, and each content once.
-        material_textures: [M, 3] rows of `textures`, or CONSTANT, in the order of TEXTURED.
-        normal_textures: [M] rows of `textures` that are normal maps, or CONSTANT; none by default.
+    Each corner of each triangle has its `uv` [3T, 2]. Each texture is used, and each content is
+    there once. `material_textures` [M, 3], in the order of TEXTURED, and `normal_textures` [M] are
+    rows of `textures`, or CONSTANT.
     """
     return dataclasses.replace(
         scene,
@@ -88,12 +85,9 @@ def with_textures(
 def chosen_maps(
     scene: "Scene", triangles: NDArray[np.integer], materials: NDArray[np.integer]
 ) -> dict[str, Any]:
-    """Return the fields that textures take in a scene of other triangles and materials.
+    """Return the fields that textures take in a scene of other triangles [T] and materials [M].
 
-    Args:
-        scene: what they are taken from.
-        triangles: [T] rows of its triangles, or NEW.
-        materials: [M] rows of its materials, or NEW for one that has no textures.
+    These are rows of those of `scene`, or NEW; a new material has no textures.
     """
     if scene.uv is None or scene.material_textures is None:
         return {}
@@ -143,7 +137,7 @@ def _with_means(
     material_textures: NDArray[np.int32],
 ) -> NDArray[np.float32]:
     rows = materials.copy()
-    places = {column.name: part for column, part in laid_out()}
+    places = column_places()
     for place, name in enumerate(TEXTURED):
         for row in np.flatnonzero(material_textures[:, place] != CONSTANT):
             rows[row, places[name]] = textures[material_textures[row, place]].mean

@@ -19,16 +19,25 @@ MAX_HEADER_BYTES = 1 << 20
 
 
 def open_plain(path: Path) -> BinaryIO:
-    """Open a regular file for reading.
+    """Open a regular file for reading; raises OSError as `open`, and for all else.
 
-    Raises:
-        OSError: as `open`, or it is something else: opening a FIFO would block forever.
+    Opening a FIFO would block forever.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # of regular files, it changes nothing
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise OSError(errno.EINVAL, "not a plain file", str(path))
     return os.fdopen(descriptor, "rb")
+
+
+def open_if_there(path: Path) -> BinaryIO | None:
+    """Open as `open_plain`; None for no file, and TrilightError for one that cannot be read."""
+    try:
+        return open_plain(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
 
 
 def read_plain(path: Path) -> bytes:
@@ -42,9 +51,8 @@ def read_safetensors(
 ) -> tuple[dict[str, NDArray], dict[str, str]]:
     """Return arrays and metadata of a safetensors file held in memory.
 
-    Raises:
-        TrilightError: as `safetensors_header`, or the library refuses the bytes (it checks every
-            offset against the length of `data`).
+    It raises as `safetensors_header`, and where the library refuses the bytes: it checks every
+    offset against the length of `data`.
     """
     header = safetensors_header(data, max_header_bytes, name=name)
     try:
@@ -59,16 +67,10 @@ def read_safetensors(
 def safetensors_header(
     data: bytes, max_header_bytes: int = MAX_HEADER_BYTES, *, name: str = "safetensors"
 ) -> dict[str, Any]:
-    """Return the header of a safetensors file held in memory, as it stands there.
+    """Return the header of a safetensors file held in memory, or of as much as a header may take.
 
-    Args:
-        data: the file, or as much of it as the header may take.
-        max_header_bytes: a longer header is refused.
-        name: of the file, for messages.
-
-    Raises:
-        TrilightError: the bytes are truncated, the header is larger than `max_header_bytes`, or it
-            is no JSON object.
+    It raises TrilightError, with `name`, for bytes that are truncated, a longer header, or no JSON
+    object.
     """
     length = int.from_bytes(data[:8], "little")
     if len(data) < 8 or length > min(max_header_bytes, len(data) - 8):

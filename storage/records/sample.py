@@ -4,8 +4,8 @@
     000000123.json                schema version, objects, provenance, one record per view
     000000123.0.exr ...           linear radiance of each view, half-float RGB OpenEXR
     000000123.0.lights.exr ...    optional: each light's part of it (storage.records.lights)
-    000000123.0.parts.exr ...     optional: direct, indirect, ... light (storage.records.parts)
-    000000123.0.passes.exr ...    optional: what its pixels see (storage.records.passes.stored)
+    000000123.0.parts.exr ...     optional: direct, indirect, ... light (storage.records.lights)
+    000000123.0.passes.exr ...    optional: what its pixels see (storage.records.passes.pictures)
     __map-<sha256>__ ...          textures and environment map, where the scene has any: once in a
                                   shard, before the first sample (storage.records.packed_maps)
 
@@ -28,12 +28,18 @@ from storage.conventions import require_readable
 from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.raycast.first_hits import require_row
-from storage.records.exr import decode_exr
-from storage.records.held_maps import HeldMaps
-from storage.records.lights import decode_lights_exr, encode_lights_exr, num_light_pictures
-from storage.records.packed_maps import packed_maps, unpacked_maps
-from storage.records.parts import KNOWN_PARTS, Parts, decode_parts_exr, encode_parts_exr
-from storage.records.passes.stored import picture_passes
+from storage.records.exr import FIRST_ILLEGAL, Stored, decode_exr, decode_stored, to_float32
+from storage.records.lights import (
+    KNOWN_PARTS,
+    Parts,
+    decode_lights_exr,
+    decode_parts_exr,
+    encode_lights_exr,
+    encode_parts_exr,
+    num_light_pictures,
+)
+from storage.records.packed_maps import HeldMaps, packed_maps, unpacked_maps
+from storage.records.passes.pictures import picture_passes
 from storage.records.profiles import Profile, pack_arrays, pack_picture, unpack_arrays
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene
@@ -57,39 +63,35 @@ class PartFloor:
     """Errors of a picture, of one layer of it for all lights together, or of one light."""
 
     noise_floor_db: Plausible
-    """Error in dB, as psnr_log_db."""
-    noise_floor_linear_db: Plausible
-    """The same error as psnr_linear_db."""
-    object_noise_floor_db: Plausible
-    """The same error as object_psnr_log_db."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewRecord:
-    """Sampling and stated errors of one picture."""
-
-    spp: int
-    """Samples per pixel that were spent; on each light where they are apart."""
-    noise_floor_db: Plausible
-    """Measured error of the picture as psnr_log_db (storage.metrics), before it was packed; the
-    profile `compact` adds at most a tenth to its mean square (storage.records.profiles)."""
+    """Error in dB, as psnr_log_db (storage.metrics)."""
     noise_floor_linear_db: Plausible
     """The same error as psnr_linear_db."""
     object_noise_floor_db: Plausible
     """The same error as object_psnr_log_db: over pixels that show geometry."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewRecord(PartFloor):
+    """Sampling and stated errors of one picture.
+
+    They are measured before it is packed; the profile `compact` adds at most a tenth to their mean
+    square (storage.records.profiles).
+    """
+
+    spp: int
+    """Samples per pixel that were spent; on each light where they are apart."""
     coverage: Plausible
     """Share of the picture in which an object is seen first, from a coarse grid of rays."""
     at_cap: bool
     """True: sampling hit the sample limit before the target error."""
     seed: int
-    """Seed of the view's samples."""
     camera_attempt: int
     """Number of cameras that were rejected before this one."""
     expected: PartFloor | None = None
     """Errors that are as often better as worse, where the stated errors are calibrated bounds; a
     record whose floors are bounds by estimate and allowances is written without this field."""
     parts: Mapping[str, PartFloor] | None = None
-    """Floors of the parts that are stored, by name (storage.records.parts); a record that has none
+    """Floors of the parts that are stored, by name (storage.records.lights); a record that has none
     is written without this field."""
     lights: tuple[PartFloor, ...] | None = None
     """Floors of the lights that are stored, in their order (storage.records.lights); absent where
@@ -125,7 +127,7 @@ class Sample(SceneRecord):
     preset keeps lights together."""
     parts_rgb: Parts | None = None
     """[C, R, R, 3] radiance of each part by its name, or [C, L, R, R, 3] where lights are apart;
-    their sum is the picture, or that of the light (storage.records.parts). None where the preset
+    their sum is the picture, or that of the light (storage.records.lights). None where the preset
     keeps all light together."""
     passes_exr: tuple[bytes, ...] | None = None
     """OpenEXR files of the passes that the preset stores, one per camera; `view_passes` reads them.
@@ -136,11 +138,8 @@ class Sample(SceneRecord):
     def view_passes(self, names: Sequence[str], *, view: int = 0) -> dict[str, NDArray]:
         """Return passes of one view by name, at the resolution of its picture, one ray a pixel.
 
-        Those that are stored are read, others are computed; the numbers are the same.
-
-        Args:
-            names: of passes (storage.records.passes.declared), other than `motion_px`.
-            view: row of the cameras.
+        Those that are stored are read, others are computed; the numbers are the same. Names are
+        those of storage.records.passes.declared, other than `motion_px`.
 
         Returns:
             for each name a picture [R, R], or [R, R, K] where the pass has K channels, row 0 on
@@ -192,17 +191,15 @@ def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, by
 
     A sample that was read from the profile `compact` and is packed so again loses once more: what
     is to stay goes into `kept_members`. Where lights or parts are apart, pictures stay exact in
-    every profile: they are the sum of these.
-
-    Raises:
-        TrilightError: a picture holds what half floats cannot (storage.records.exr).
-        ValueError: pictures and view records differ in number.
+    every profile: they are the sum of these. It raises TrilightError for a picture that half floats
+    cannot hold (storage.records.exr).
     """
     scene = without_constant_textures(sample.scene)
-    record = {
-        **scene_record(scene),
-        "views": [_view_record(view) for view in sample.views],
-    }
+    views = [
+        {name: value for name, value in dataclasses.asdict(view).items() if value is not None}
+        for view in sample.views
+    ]
+    record = {**scene_record(scene), "views": views}
     members = pack_arrays(encode_arrays(scene), profile) | {"json": canonical_json(record)}
     together = sample.lights_rgb is None and sample.parts_rgb is None
     of_pictures = profile if together else "lossless"
@@ -223,24 +220,21 @@ def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, by
 def decode_sample(key: str, members: Mapping[str, bytes], held: HeldMaps | None = None) -> Sample:
     """Return the sample of its members (suffix to bytes); `held` as `decode_scene`.
 
-    Raises:
-        TrilightError: a member is missing, unreadable or of another schema version. Laws are not
-            checked here; `Sample.check` does that before a network learns from it.
+    It raises TrilightError for a member that is missing, unreadable or of another schema version.
+    Laws are not checked here; `Sample.check` does that before a network learns from it.
     """
     record = decode_scene(key, members, held)
     with name_errors(key):
         pictures = [decode_exr(members[f"{view}.exr"]) for view in range(len(record.views))]
         radiance_rgb = np.stack(pictures)
-        lights_rgb = decode_lights(record.scene, range(len(pictures)), pictures[0].shape, members)
-        parts_rgb = _decode_parts(record, radiance_rgb, members)
-        passes_exr = _of_views("passes", range(len(pictures)), members)
-    return Sample(
-        **vars(record),
-        radiance_rgb=radiance_rgb,
-        lights_rgb=lights_rgb,
-        parts_rgb=parts_rgb,
-        passes_exr=passes_exr,
-    )
+        every = range(len(pictures))
+        return Sample(
+            **vars(record),
+            radiance_rgb=radiance_rgb,
+            lights_rgb=decode_lights(record.scene, every, pictures[0].shape, members),
+            parts_rgb=_decode_parts(record, radiance_rgb, members),
+            passes_exr=_of_views("passes", every, members),
+        )
 
 
 def _of_views(
@@ -284,17 +278,19 @@ def _decode_parts(
 def decode_scene(
     key: str, members: Mapping[str, bytes], held: HeldMaps | None = None
 ) -> SceneRecord:
-    """Return a sample without its pictures, whose members may be absent.
+    """Return a sample without its pictures, whose members may be absent; raises as `decode_sample`.
 
     The maps that its record names are among the members, under the names that shards give them.
     Those that are held are not unpacked again; equal members give equal scenes with any.
-
-    Raises:
-        TrilightError: as `decode_sample`.
     """
     if "json" not in members:
         raise TrilightError(f"sample {key}: member {key}.json is missing.")
-    record = _decode_record(key, members["json"])
+    try:
+        record = json.loads(members["json"])
+    except (ValueError, RecursionError) as error:
+        raise TrilightError(f"sample {key}: member {key}.json is not JSON ({error}).") from error
+    version = record.get("schema_version") if isinstance(record, dict) else None
+    require_readable(version, f"sample {key}")
     with name_errors(key):
         views = _views(record["views"])
         objects = scene_objects(record["objects"])
@@ -305,21 +301,6 @@ def decode_scene(
         provenance = scene_provenance(record["provenance"])
         scene = Scene(objects=objects, provenance=provenance, **fields)
     return SceneRecord(key=key, scene=scene, views=views)
-
-
-def _decode_record(key: str, data: bytes) -> dict[str, Any]:
-    try:
-        record = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise TrilightError(f"sample {key}: member {key}.json is not JSON ({error}).") from error
-    version = record.get("schema_version") if isinstance(record, dict) else None
-    require_readable(version, f"sample {key}")
-    return record
-
-
-def _view_record(view: ViewRecord) -> dict[str, Any]:
-    record = dataclasses.asdict(view)
-    return {name: value for name, value in record.items() if value is not None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -365,11 +346,8 @@ def check_radiance(
 ) -> None:
     """Raise TrilightError, which names the pixel, where radiance is not finite or below 0.
 
-    Args:
-        key: of the sample.
-        which: part of its pictures, behind a space; empty for all light.
-        radiance_rgb: pictures [C, R, R, 3].
-        first_view: number of the first of them.
+    Of the pictures [C, R, R, 3], messages number the first `first_view`, and say `which` part of
+    the light they hold, behind a space.
     """
     if radiance_rgb.min() >= 0 and radiance_rgb.max() < math.inf:  # NaN is neither
         return
@@ -386,3 +364,70 @@ def check_lights(key: str, lights_rgb: NDArray[np.float32], *, first_view: int =
     """Check lights [C, L, R, R, 3] as `check_radiance` does."""
     for light, radiance_rgb in enumerate(np.moveaxis(lights_rgb, 1, 0)):
         check_radiance(key, f" light {light}", radiance_rgb, first_view=first_view)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StoredSample(SceneRecord):
+    """One scene, which passes `Scene.check`, whose pictures stay packed until they are asked for.
+
+    A training step looks at two of a scene's four views or more, and unpacking a picture takes
+    longer than all else that is done to it. What is asked for obeys the same laws as a whole
+    sample's (`Sample.check`); of the other pictures nothing is said.
+    """
+
+    members: Mapping[str, bytes]
+    """Bytes of the sample's members in the shard, by suffix."""
+
+    def pictures(self, views: Sequence[int]) -> Stored:
+        """Return the pictures of some views [V, R, R, 3], at least one, as they are stored.
+
+        Bits of half floats, uint16, each below FIRST_ILLEGAL; float32 where one is stored so. It
+        raises TrilightError where one is missing, unreadable, not square, of another size than the
+        others, or holds a radiance that is not finite or below 0.
+        """
+        with name_errors(self.key):
+            pictures = [decode_stored(self.members[f"{view}.exr"]) for view in views]
+        if any(picture.dtype == np.float32 for picture in pictures):
+            pictures = [to_float32(picture) for picture in pictures]
+        shapes = {picture.shape for picture in pictures}
+        if len(shapes) > 1 or any(height != width for height, width, _ in shapes):
+            sizes = ", ".join(sorted(f"{height} x {width}" for height, width, _ in shapes))
+            raise TrilightError(
+                f"sample {self.key}: pictures of {sizes} pixels; expected squares of one size."
+            )
+        for view, picture in zip(views, pictures, strict=True):
+            if picture.dtype == np.float32 or picture.max() >= FIRST_ILLEGAL:
+                check_radiance(self.key, "", to_float32(picture)[None], first_view=view)
+        stacked: NDArray = np.stack(pictures)
+        if stacked.dtype == np.uint16:  # the only legal one that is not below it is -0
+            stacked[stacked >= FIRST_ILLEGAL] = 0
+        return stacked
+
+    def lights_rgb(self, views: Sequence[int], resolution: int) -> NDArray[np.float32] | None:
+        """Return radiance of each light alone [V, L, R, R, 3]; None where they are together.
+
+        `views` are at least one, and `resolution` is R of `pictures`. It raises as `pictures`.
+        """
+        with name_errors(self.key):
+            size = (resolution, resolution)
+            lights_rgb = decode_lights(self.scene, views, size, self.members)
+        if lights_rgb is not None:
+            for view, lights in zip(views, lights_rgb, strict=True):
+                check_lights(self.key, lights[None], first_view=view)
+        return lights_rgb
+
+
+def stored_sample(
+    key: str, members: Mapping[str, bytes], held: HeldMaps | None = None
+) -> StoredSample:
+    """Return the sample of its members; `held` as `decode_scene`.
+
+    It raises TrilightError for a scene or record that is missing, unreadable or unlawful, and
+    unless it has as many records of views, and pictures, as cameras.
+    """
+    record = decode_scene(key, members, held)
+    require_lawful(record)
+    suffixes = (f"{view}.exr" for view in range(len(record.views)))
+    if missing := [suffix for suffix in suffixes if suffix not in members]:
+        raise TrilightError(f"sample {key}: {missing[0]!r} is missing.")
+    return StoredSample(**vars(record), members=members)

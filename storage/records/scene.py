@@ -21,7 +21,7 @@ from storage.records.material import (
     material_columns,
     material_width,
 )
-from storage.records.scene_laws import broken_law, require_law
+from storage.records.scene_laws import broken_law, require_array, require_law
 from storage.records.scene_maps import MAX_TEXTURES, MAX_UV, check_maps, has_maps
 from storage.records.texture import CONSTANT, Texture
 from storage.settings.fields import describe_fields
@@ -68,7 +68,6 @@ class SceneObject:
     attribution: str = ""
     """Author to credit, as the source states it."""
     source_url: str = ""
-    """Where the object came from."""
 
     @property
     def is_lamp(self) -> bool:
@@ -114,7 +113,7 @@ class Scene:
     """[M, 3] rows of `textures` that stand for diffuse, specular and roughness of each material, or
     -1 where its own column does; None where nothing is textured."""
     normal_textures: Annotated[NDArray[np.int32], Within(CONSTANT, MAX_TEXTURES - 1)] | None = None
-    """[M] rows of `textures` that are the normal map of each material (storage.records.normal_map),
+    """[M] rows of `textures` that are the normal map of each material (storage.records.lookup),
     or -1 for none; None where no material has one."""
     environment: Environment | None = None
     """Light from far away; None where there is none."""
@@ -176,17 +175,18 @@ ARRAY_FIELDS: Mapping[str, tuple[type, tuple[int | None, ...]]] = {
 }
 """dtype and shape of every array field; None is any length, or as many as columns are declared."""
 
+_EQUALLY_LONG = (
+    ("vertex_normals", "vertex_positions"),
+    ("fov_deg", "c2w"),
+    ("material_index", "faces"),
+    ("object_index", "faces"),
+)
+
 
 def _check_arrays(scene: Scene) -> None:
     for name, (dtype, shape) in ARRAY_FIELDS.items():
         array = getattr(scene, name)
-        if array.dtype != dtype:
-            broken_law(f"{name} has dtype {array.dtype}", f"{np.dtype(dtype)}")
-        fits = array.ndim == len(shape) and all(
-            expected in (None, got) for expected, got in zip(shape, array.shape, strict=True)
-        )
-        if not fits:
-            broken_law(f"{name} has shape {array.shape}", f"{shape} with None for any length")
+        require_array(array, name, dtype, shape)
         if np.issubdtype(dtype, np.floating):
             require_law(np.isfinite(array), name, array, "finite values")
     _check_columns(scene)
@@ -197,10 +197,11 @@ def _check_arrays(scene: Scene) -> None:
         holds = field.within.holds(values)
         if not holds.all():  # what was expected is put into words only then
             require_law(holds, field.name, values, str(field.within))
-    for name, other in (("vertex_normals", "vertex_positions"), ("fov_deg", "c2w")):
-        _same_length(scene, name, other)
-    for name in ("material_index", "object_index"):
-        _same_length(scene, name, "faces")
+    for name, other in _EQUALLY_LONG:
+        got = len(getattr(scene, name))
+        expected = len(getattr(scene, other))
+        if got != expected:
+            broken_law(f"{name} has {got} rows", f"{expected}, as {other} has")
 
 
 def _check_columns(scene: Scene) -> None:
@@ -266,10 +267,3 @@ def _check_cameras(scene: Scene) -> None:
     require_law(np.linalg.det(rotation) > 0, "c2w", scene.c2w, "a rotation without mirroring")
     bottom = (scene.c2w[:, 3] == np.array([0, 0, 0, 1])).all(axis=1)
     require_law(bottom, "c2w", scene.c2w, "a last row of 0 0 0 1")
-
-
-def _same_length(scene: Scene, name: str, other: str) -> None:
-    got = len(getattr(scene, name))
-    expected = len(getattr(scene, other))
-    if got != expected:
-        broken_law(f"{name} has {got} rows", f"{expected}, as {other} has")

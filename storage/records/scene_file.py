@@ -15,7 +15,7 @@ import json
 import stat
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,23 +24,25 @@ from safetensors.numpy import save
 from storage.conventions import MAPS_VERSION, SCHEMA_VERSION
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
-from storage.records.map_references import (
-    checked_environment,
-    checked_texture,
-    described_environment,
-    described_texture,
-    environment_entries,
+from storage.records.environment import Environment
+from storage.records.material import chosen_columns, completed_rows, stored_columns, stored_names
+from storage.records.packed_maps import (
+    Entry,
+    Map,
+    checked_map,
+    described_map,
+    held_values,
+    map_entries,
     maps_digest,
     maps_record,
-    texture_entries,
+    stored_values,
 )
-from storage.records.material import chosen_columns, completed_rows, stored_columns, stored_names
-from storage.records.packed_maps import held_values, stored_values
 from storage.records.retextured import without_constant_textures
 from storage.records.safe_read import read_safetensors
 from storage.records.scene import ARRAY_FIELDS, OBJECT_KINDS, Scene, SceneObject
+from storage.records.scene_laws import require_fields, wrong_value
 from storage.records.scene_maps import MAP_ARRAYS, MAX_TEXTURES
-from storage.records.texture import MAX_MAPS_BYTES
+from storage.records.texture import MAX_MAPS_BYTES, Texture
 
 MAX_FILE_BYTES = (256 << 20) + MAX_MAPS_BYTES
 """A million triangles with three vertices each take 90 MB."""
@@ -79,13 +81,9 @@ def encode_arrays(scene: Scene) -> bytes:
 def decode_arrays(data: bytes, maps: Any = None) -> dict[str, NDArray]:
     """Return the array fields of a scene from the bytes of `encode_arrays`.
 
-    Args:
-        data: the bytes.
-        maps: what the record of the scene says of its maps (storage.records.map_references).
-
-    Raises:
-        TrilightError: damaged, an array is missing, a material column is not declared here, or the
-            arrays are those of a scene with other maps.
+    `maps` is what the record of the scene says of its maps (storage.records.packed_maps). It raises
+    TrilightError where they are damaged, an array is missing, a material column is not declared
+    here, or the arrays are those of a scene with other maps.
     """
     arrays, metadata = read_safetensors(data)
     if missing := set(ARRAY_FIELDS) - set(arrays):
@@ -106,11 +104,7 @@ def scene_digest(scene: Scene) -> str:
 
 
 def encode_scene(scene: Scene) -> bytes:
-    """Return the `.safetensors` file of a scene.
-
-    Raises:
-        TrilightError: the scene breaks a law, or is larger than `decode_scene_file` accepts.
-    """
+    """Return the `.safetensors` file of a scene; raises where it breaks a law, or is too large."""
     scene.check()
     scene = without_constant_textures(scene)
     record = scene_record(scene)
@@ -135,11 +129,7 @@ def encode_scene(scene: Scene) -> bytes:
 
 
 def read_scene_file(path: Path) -> Scene:
-    """Return the scene of a `.safetensors` file; its size is checked before it is read.
-
-    Raises:
-        TrilightError: it cannot be read, or as `decode_scene_file`.
-    """
+    """Return the scene of a `.safetensors` file; raises as `decode_scene_file`."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_FILE_BYTES:
@@ -153,16 +143,11 @@ def read_scene_file(path: Path) -> Scene:
 
 
 def decode_scene_file(data: bytes, name: str) -> Scene:
-    """Return the scene of a `.safetensors` file held in memory.
+    """Return the scene of a `.safetensors` file held in memory, called `name` in messages.
 
-    Args:
-        data: the bytes.
-        name: of the file, for messages.
-
-    Raises:
-        TrilightError: larger than MAX_FILE_BYTES, damaged, an array too many, too few or of
-            another type or shape, metadata that are not a scene's, another schema version, or a
-            broken law.
+    It raises TrilightError where it is larger than MAX_FILE_BYTES or damaged, has an array too
+    many, too few or of another type or shape, metadata that are not a scene's or of another schema
+    version, or breaks a law.
     """
     if len(data) > MAX_FILE_BYTES:
         raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_FILE_BYTES}.")
@@ -207,49 +192,32 @@ def require_version_of_maps(record: Mapping[str, Any]) -> None:
 
 
 def scene_objects(value: Any) -> tuple[SceneObject, ...]:
-    """Return the objects that a JSON value lists.
-
-    Raises:
-        TrilightError: no list, a field too many or too few, no text, or an unknown kind.
-    """
+    """Return the objects that a JSON value lists; raises TrilightError at the first wrong field."""
     if not isinstance(value, list):
-        _broken("objects", value, "a list")
-    return tuple(_object(entry, row) for row, entry in enumerate(value))
+        wrong_value("objects", value, "a list")
+    fields = dict.fromkeys((field.name for field in dataclasses.fields(SceneObject)), str)
+    for row, entry in enumerate(value):
+        require_fields(entry, f"objects[{row}]", fields)
+        if entry["kind"] not in OBJECT_KINDS:
+            expected = f"one of {', '.join(OBJECT_KINDS)}"
+            wrong_value(f"objects[{row}].kind", entry["kind"], expected)
+    return tuple(SceneObject(**entry) for entry in value)
 
 
 def scene_provenance(value: Any) -> Mapping[str, Any]:
-    """Return the provenance of a JSON value.
-
-    Raises:
-        TrilightError: it is no object, or its template or excursion is malformed.
-    """
+    """Return the provenance of a JSON value; raises TrilightError where it has another form."""
     if not isinstance(value, dict):
-        _broken("provenance", value, "a JSON object")
+        wrong_value("provenance", value, "a JSON object")
     if not isinstance(value.get("template", ""), str):
-        _broken("provenance.template", value["template"], "text")
+        wrong_value("provenance.template", value["template"], "text")
     excursion = value.get("excursion")
     if excursion and not (
         isinstance(excursion, dict)
         and isinstance(excursion.get("axis"), str)
         and isinstance(excursion.get("value"), int | float)
     ):
-        _broken("provenance.excursion", excursion, "an axis and a value")
+        wrong_value("provenance.excursion", excursion, "an axis and a value")
     return value
-
-
-_OBJECT_FIELDS = frozenset(field.name for field in dataclasses.fields(SceneObject))
-
-
-def _object(value: Any, row: int) -> SceneObject:
-    if not isinstance(value, dict) or value.keys() != _OBJECT_FIELDS:
-        fields = ", ".join(sorted(_OBJECT_FIELDS))
-        _broken(f"objects[{row}]", value, f"exactly the fields {fields}")
-    for name, text in value.items():
-        if not isinstance(text, str):
-            _broken(f"objects[{row}].{name}", text, "text")
-    if value["kind"] not in OBJECT_KINDS:
-        _broken(f"objects[{row}].kind", value["kind"], f"one of {', '.join(OBJECT_KINDS)}")
-    return SceneObject(**value)
 
 
 def _arrays(scene: Scene) -> dict[str, NDArray]:
@@ -265,28 +233,25 @@ def _maps(record: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> dict[str,
     """Return the fields `textures` and `environment` of what a file says, where it has any."""
     if _MAPS not in record:
         return {}
-    entries = texture_entries(record[_MAPS])
-    fields = dict[str, Any]()
+    textures, skies = map_entries(record[_MAPS])
     is_srgb = record.get(_IS_SRGB, [])
-    if not isinstance(is_srgb, list) or [type(each) for each in is_srgb] != [bool] * len(entries):
-        _broken(_IS_SRGB, is_srgb, "true or false for each texture")
+    if not isinstance(is_srgb, list) or [type(each) for each in is_srgb] != [bool] * len(textures):
+        wrong_value(_IS_SRGB, is_srgb, "true or false for each texture")
+
+    def load(kind: type[Map], name: str, entry: Entry, *, is_srgb: bool = False) -> Map:
+        if name not in arrays:
+            raise TrilightError(f"scene: the array {name} is missing.")
+        made = checked_map(kind, entry, held_values(arrays[name]), is_srgb=is_srgb)
+        return described_map(entry, made)
+
+    fields: dict[str, Any] = {}
+    for sky in skies:
+        fields[_ENVIRONMENT] = load(Environment, _ENVIRONMENT, sky)
     fields["textures"] = tuple(
-        described_texture(
-            entry,
-            checked_texture(entry, _map_values(arrays, f"{_TEXTURE}{row}"), is_srgb=is_srgb[row]),
-        )
-        for row, entry in enumerate(entries)
+        load(Texture, f"{_TEXTURE}{row}", entry, is_srgb=is_srgb[row])
+        for row, entry in enumerate(textures)
     )
-    for entry in environment_entries(record[_MAPS]):
-        sky = checked_environment(entry, _map_values(arrays, _ENVIRONMENT))
-        fields["environment"] = described_environment(entry, sky)
     return fields
-
-
-def _map_values(arrays: Mapping[str, NDArray], name: str) -> NDArray:
-    if name not in arrays:
-        raise TrilightError(f"scene: the array {name} is missing.")
-    return held_values(arrays[name])
 
 
 def _check_names(arrays: Mapping[str, NDArray]) -> None:
@@ -299,7 +264,7 @@ def _check_names(arrays: Mapping[str, NDArray]) -> None:
     # half floats take twice their size in memory
     total = sum(arrays[name].size * (1 if arrays[name].dtype == np.uint8 else 4) for name in maps)
     if total > MAX_MAPS_BYTES:
-        _broken("textures and environment", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
+        wrong_value("textures and environment", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
 
 
 def _metadata_record(metadata: Mapping[str, str]) -> dict[str, Any]:
@@ -322,7 +287,3 @@ def _metadata_record(metadata: Mapping[str, str]) -> dict[str, Any]:
 
 def _refused_constant(text: str) -> float:
     raise TrilightError(f"{text} is no JSON number")
-
-
-def _broken(name: str, got: Any, expected: str) -> NoReturn:
-    raise TrilightError(f"scene: {name} is {got!r:.80}; expected {expected}.")

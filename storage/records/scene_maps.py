@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.records.lookup import texture_values
-from storage.records.material import laid_out
-from storage.records.scene_laws import broken_law, require_law
+from storage.records.material import column_places, laid_out
+from storage.records.scene_laws import broken_law, require_array, require_law
 from storage.records.texture import CONSTANT, MAX_MAPS_BYTES, TEXTURED, Texture
 
 if TYPE_CHECKING:
@@ -63,10 +63,10 @@ def check_maps(scene: "Scene") -> None:
     if scene.normal_textures is not None and not scene.textures:
         broken_law("normal_textures is there without textures", "both, or no normal_textures")
     if scene.textures:
-        _require_shape(scene, "uv", 3 * scene.num_triangles)
-        _require_shape(scene, "material_textures", len(scene.materials))
-        if scene.normal_textures is not None:
-            _require_shape(scene, "normal_textures", len(scene.materials))
+        for name, (dtype, (_, *widths)) in MAP_ARRAYS.items():
+            length = 3 * scene.num_triangles if name == "uv" else len(scene.materials)
+            if (array := getattr(scene, name)) is not None:
+                require_array(array, name, dtype, (length, *widths))
         _check_textures(scene)
         for row, diffuse, specular in _albedos(scene):
             _check_sum(row, diffuse, specular)
@@ -89,23 +89,16 @@ def _check_textures(scene: "Scene") -> None:
     unused = np.setdiff1d(np.arange(count), np.append(index, normals))
     if len(unused):
         broken_law(f"textures[{unused[0]}] is used by no material", "textures that are used")
-    for place, (name, width) in enumerate(_widths().items()):
+    widths = {column.name: column.width for column, _ in laid_out()}
+    for place, name in enumerate(TEXTURED):
         for row in np.unique(index[:, place][index[:, place] != CONSTANT]):
-            if (got := scene.textures[row].channels) != width:
-                broken_law(f"textures[{row}] has {got} channels", f"{width}, as {name} has")
+            if (got := scene.textures[row].channels) != widths[name]:
+                broken_law(f"textures[{row}] has {got} channels", f"{widths[name]}, as {name} has")
     for row in np.unique(normals[normals != CONSTANT]):
         texture = scene.textures[row]
         if texture.channels != 3 or texture.is_srgb:
             got = f"{texture.channels} channels{', sRGB-encoded' if texture.is_srgb else ''}"
             broken_law(f"textures[{row}] has {got}", "3 linear channels, as a normal map has")
-
-
-def _require_shape(scene: "Scene", name: str, length: int) -> None:
-    array: NDArray = getattr(scene, name)
-    dtype, (_, *widths) = MAP_ARRAYS[name]
-    shape = (length, *widths)
-    if array.dtype != dtype or array.shape != shape:
-        broken_law(f"{name} is {array.dtype} of shape {array.shape}", f"{np.dtype(dtype)} {shape}")
 
 
 Reflecting = Texture | NDArray[np.float32]
@@ -115,7 +108,7 @@ Reflecting = Texture | NDArray[np.float32]
 def _albedos(scene: "Scene") -> Iterator[tuple[int, Reflecting, Reflecting]]:
     """Yield the diffuse and the specular albedo of the material rows in which one is textured."""
     assert scene.material_textures is not None
-    places = {column.name: part for column, part in laid_out()}
+    places = column_places()
     index = scene.material_textures[:, [_DIFFUSE, _SPECULAR]]
     for row in np.flatnonzero((index != CONSTANT).any(axis=1)):
         diffuse, specular = (
@@ -162,8 +155,3 @@ def _greatest_sum(one: Texture, other: Texture) -> NDArray[np.float64]:
         total = texture_values(one, uv) + texture_values(other, uv)
         greatest = np.maximum(greatest, total.max(axis=(0, 1)))
     return greatest
-
-
-def _widths() -> dict[str, int]:
-    widths = {column.name: column.width for column, _ in laid_out()}
-    return {name: widths[name] for name in TEXTURED}

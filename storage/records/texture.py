@@ -43,7 +43,6 @@ class MapSource:
     attribution: str = ""
     """Author to credit, as the source states it."""
     source_url: str = ""
-    """URL of the page or file it came from."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,7 +55,6 @@ class Texture:
     is_srgb: bool = False
     """True: the 8-bit values are sRGB-encoded. float32 is always linear."""
     source: MapSource = field(default_factory=MapSource)
-    """Name, URL and rights of the texture."""
 
     @property
     def channels(self) -> int:

@@ -40,12 +40,7 @@ class Facts:
 
 
 def facts_of(url: RemoteUrl) -> Facts:
-    """Ask about a file.
-
-    Raises:
-        TransferFailed: there is none, it may not be seen, or the server gives no answer.
-        TrilightError: the driver's package is missing.
-    """
+    """Ask about a file; raises TransferFailed where there is none, or no answer."""
     driver = shared_driver(url)
     info = with_tries(lambda: _fresh_info(driver, url))
     if info.get("type") == "directory":
@@ -65,18 +60,11 @@ def version_of(facts: Mapping[str, Any]) -> dict[str, str]:
 
 
 def download(url: RemoteUrl, stream: BinaryIO, *, num_bytes: int | None, max_bytes: int) -> None:
-    """Write all bytes of a file to an open one, from its start.
+    """Write all bytes of a file to an open one, from its start: exactly, or at most, so many.
 
-    Args:
-        url: the file.
-        stream: where they go.
-        num_bytes: how many there must be, where that is known.
-        max_bytes: how many there may be, where it is not.
-
-    Raises:
-        TransferFailed: as `facts_of`, it has another size than `num_bytes`, it breaks off again and
-            again without moving on, or comes too slowly (storage.remote.retries).
-        TrilightError: the driver's package is missing, or the disk is full.
+    It raises TransferFailed as `facts_of`, and where it has another size than `num_bytes`, breaks
+    off again and again without moving on, or comes too slowly (storage.remote.retries);
+    TrilightError where the driver's package is missing, or the disk is full.
     """
     driver = shared_driver(url)
     fill = _fill_http if url.is_http else _fill_bucket
@@ -94,17 +82,12 @@ class _Expected:
         self.pace = pace
         self.version: dict[str, str] | None = None
 
-    def require(self, num_bytes: int) -> None:
-        """Refuse a file that is announced with another size."""
-        if self.exact is not None and num_bytes != self.exact:
+    def require(self, num_bytes: int, *, is_all: bool = True) -> None:
+        """Refuse a file that is announced with another size, or is longer than it may be."""
+        if is_all and self.exact not in (None, num_bytes):
             raise TransferFailed("download_failed", f"has {num_bytes} bytes; expected {self.exact}")
-        self.require_limit(num_bytes)
-
-    def require_limit(self, reached: int) -> None:
-        """Refuse to go on with a file that is longer than it may be."""
-        if reached > self.most:
-            message = f"is longer than {self.most} bytes"
-            raise TransferFailed("too_large_bytes", message)
+        if num_bytes > self.most:
+            raise TransferFailed("too_large_bytes", f"is longer than {self.most} bytes")
 
     def is_same(self, version: Mapping[str, str]) -> bool:
         """Return whether the file is still the one that the bytes so far came from."""
@@ -116,11 +99,6 @@ class _Expected:
         """Give up a file that comes too slowly; one that has come whole is not given up."""
         if reached != total:
             self.pace.require()
-
-    def require_all(self, reached: int) -> None:
-        """Notice an end that came early."""
-        if self.exact is not None and reached != self.exact:
-            raise Interrupted from EOFError(f"got {reached} of {self.exact} bytes")
 
 
 def _fill_bucket(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: _Expected) -> None:
@@ -142,8 +120,7 @@ def _fill_bucket(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: _Expec
         stream.write(piece)
         expected.require_pace(stream.tell(), num_bytes)
     if num_bytes > PIECE_BYTES and not expected.is_same(version_of(_fresh_info(driver, url))):
-        _start_over(stream)
-        raise Interrupted from EOFError("the file changed while it was read")
+        _start_over(stream, _CHANGED)
 
 
 def _fill_http(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: _Expected) -> None:
@@ -160,40 +137,42 @@ async def _stream_http(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: 
     options = {**driver.kwargs, "headers": headers, "timeout": transfer_timeout()}
     async with session.get(driver.encode_url(url.root), **options) as answer:
         if start and answer.status == 416:  # it has become shorter
-            _start_over(stream)
-            raise Interrupted from EOFError("the file changed while it was read")
+            _start_over(stream, _CHANGED)
         if answer.status == 404:
             raise FileNotFoundError(url.display_url)
         answer.raise_for_status()
         if answer.status != 206:
             _start_over(stream)
         elif not answer.headers.get("Content-Range", "").startswith(f"bytes {start}-"):
-            _start_over(stream)
-            raise Interrupted from EOFError("the server sent another part than was asked for")
+            _start_over(stream, "the server sent another part than was asked for")
         if not expected.is_same(version_of(answer.headers)) and stream.tell():
-            _start_over(stream)
-            raise Interrupted from EOFError("the file changed while it was read")
+            _start_over(stream, _CHANGED)
         total = None
         if answer.content_length is not None:
             expected.require(total := stream.tell() + answer.content_length)
         async for chunk in answer.content.iter_chunked(_CHUNK_BYTES):
-            expected.require_limit(stream.tell() + len(chunk))
+            expected.require(stream.tell() + len(chunk), is_all=False)
             stream.write(chunk)
             expected.require_pace(stream.tell(), total)
-    expected.require_all(stream.tell())
+    if expected.exact not in (None, stream.tell()):
+        raise Interrupted from EOFError(f"got {stream.tell()} of {expected.exact} bytes")
 
 
-def _start_over(stream: BinaryIO) -> None:
+def _start_over(stream: BinaryIO, why: str = "") -> None:
+    """Drop what has come, and for a reason interrupt the transfer."""
     stream.seek(0)
     stream.truncate()
+    if why:
+        raise Interrupted from EOFError(why)
+
+
+_CHANGED = "the file changed while it was read"
 
 
 def fetch_if_there(url: RemoteUrl, stream: BinaryIO, *, max_bytes: int) -> bool:
     """Write a file to an open one as `download`, and return True; False where there is none.
 
-    Raises:
-        Unreadable: it cannot be read.
-        TrilightError: as `download`.
+    It raises Unreadable where it cannot be read, and as `download`.
     """
     try:
         download(url, stream, num_bytes=None, max_bytes=max_bytes)
@@ -209,6 +188,5 @@ def unreadable(url: RemoteUrl, error: TransferFailed) -> Unreadable:
     hint = " Public buckets need FSSPEC_S3_ANON=true." if url.scheme == "s3" else ""
     return Unreadable(
         f"{url.what} {url.display_url!r}: cannot be read ({error.message}); expected a file that "
-        "can be "
-        f"reached. Check the URL and your access to it.{hint}"
+        f"can be reached. Check the URL and your access to it.{hint}"
     )

@@ -25,12 +25,7 @@ _MAY_PASS_STATUS = (408, 409, 425, 429)
 
 
 class TransferFailed(Exception):
-    """A permanent transfer failure.
-
-    Attributes:
-        reason: a stable code in snake_case.
-        message: a sentence without secrets.
-    """
+    """A permanent transfer failure: a stable code in snake_case, and a sentence without secrets."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(reason, message)
@@ -46,17 +41,11 @@ def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) ->
     """Retry a function after transient errors, with growing pauses.
 
     The pause before try n is PAUSE_S 2^(n-1), at most MAX_PAUSE_S, times a random factor between a
-    half and one and a half, so that many readers of one server do not come back all at once.
+    half and one and a half, so that many readers of one server do not come back all at once. Where
+    the file of `pace` came at the least rate since the last error, tries are counted again from 1.
 
-    Args:
-        function: what to try.
-        pace: of the file that is on its way; where it came at the least rate since the last error,
-            the tries are counted again from 1.
-
-    Raises:
-        TransferFailed: as the function raised it, or `download_failed` for any other exception, or
-            the file comes too slowly.
-        TrilightError: as the function raised it, or the disk is full (an EnvironmentFailure).
+    It raises TransferFailed, and TrilightError, as the function; `download_failed` for any other
+    exception, or a file that comes too slowly; an EnvironmentFailure where the disk is full.
     """
     from tenacity import Retrying, retry_if_exception, stop_after_attempt  # slow to import
 
@@ -177,12 +166,7 @@ class Pace:
     def __init__(
         self, position: Callable[[], int], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """Begin to watch.
-
-        Args:
-            position: how many bytes have come; falls where a transfer starts over.
-            clock: seconds.
-        """
+        """Begin to watch how many bytes have come; that falls where a transfer starts over."""
         self._position = position
         self._clock = clock
         self._patience = PATIENCE

@@ -35,11 +35,9 @@ class ShardCache:
     """A folder of shards by URL and hash."""
 
     def __init__(self, root: Path, max_bytes: int) -> None:
-        """Remember the folder.
+        """Remember the folder, which is the cache's alone, and what all shards together may take.
 
-        Args:
-            root: the folder; belongs to the cache alone.
-            max_bytes: what all shards together may take. What is being read stays even beyond it.
+        What is being read stays even beyond that.
         """
         self.root = root
         self.max_bytes = max_bytes
@@ -47,15 +45,9 @@ class ShardCache:
     def open(self, url: RemoteUrl, *, num_bytes: int | None, sha256: str | None) -> BinaryIO:
         """Return a shard, open for reading and safe from removal until it is closed.
 
-        Args:
-            url: the shard.
-            num_bytes: its size, where a manifest says it.
-            sha256: its digest, where a manifest says it; without one, the shard is known by what
-                the server says of it, and its bytes are not checked.
-
-        Raises:
-            TrilightError: it cannot be fetched, has another size, twice has the wrong bytes, or
-                the disk is full.
+        A manifest says its size and digest; without a digest, the shard is known by what the server
+        says of it, and its bytes are not checked. It raises TrilightError where it cannot be
+        fetched, has another size, twice has the wrong bytes, or the disk is full.
         """
         try:
             path = self.root / _name(url, sha256)
@@ -72,11 +64,6 @@ class ShardCache:
         """Move a shard of this machine into the cache, since it is on the server too.
 
         The file is gone afterwards, also where the cache has no room for it.
-
-        Args:
-            path: the shard.
-            url: where it is on the server.
-            sha256: its digest.
         """
         with contextlib.suppress(OSError):
             num_bytes = path.stat().st_size
@@ -98,8 +85,7 @@ class ShardCache:
                 return
         raise TrilightError(
             f"{url.what} {url.display_url!r}: the bytes are not those of the manifest (sha256 "
-            "differs, "
-            f"{_ARRIVALS} times); expected {sha256}. Mend the file on the server."
+            f"differs, {_ARRIVALS} times); expected {sha256}. Fix the file on the server."
         )
 
     def _make_room(self, num_bytes: int) -> None:

@@ -55,16 +55,14 @@ class Store(ABC):
     def get(self, name: str, num_bytes: int | None = None) -> bytes | None:
         """Return a file, or its first bytes; None where there is none.
 
-        Raises:
-            TrilightError: it cannot be read (an EnvironmentFailure where that may pass).
+        It raises TrilightError where it cannot be read, an EnvironmentFailure where that may pass.
         """
 
     @abstractmethod
     def put(self, name: str, content: Path | bytes) -> None:
         """Write a file, or replace it; one that stands at its place in a folder stays.
 
-        Raises:
-            TrilightError: it cannot be written (an EnvironmentFailure where that may pass).
+        It raises TrilightError where that fails, an EnvironmentFailure where that may pass.
         """
 
     @abstractmethod
@@ -97,17 +95,13 @@ class LocalStore(Store):
         self.root = root
 
     def get(self, name: str, num_bytes: int | None = None) -> bytes | None:
-        from storage.records.safe_read import open_plain  # slow, and most names need no file
+        from storage.records.safe_read import open_if_there  # slow, and most names need no file
 
-        try:
-            with open_plain(self.root / name) as stream:
-                return stream.read(-1 if num_bytes is None else num_bytes)
-        except (FileNotFoundError, NotADirectoryError):
+        stream = open_if_there(self.root / name)
+        if stream is None:
             return None
-        except OSError as error:
-            raise TrilightError(
-                f"{self.root / name}: cannot be read ({error.strerror})."
-            ) from error
+        with stream:
+            return stream.read(-1 if num_bytes is None else num_bytes)
 
     def put(self, name: str, content: Path | bytes) -> None:
         self._write(name, content, replace=True)
@@ -150,10 +144,8 @@ class BucketStore(Store):
     def __init__(self, url: RemoteUrl, work: Path | None = None) -> None:
         """Name the folder.
 
-        Args:
-            url: the folder.
-            work: a folder of this machine for its claims, and its name as their holder, which is
-                written at its first claim: a machine that is killed has its claims again at once.
+        `work` is a folder of this machine for its claims, and its name as their holder, which is
+        written at its first claim: a machine that is killed has its claims again at once.
         """
         self.url = url
         self._work = work
@@ -201,12 +193,7 @@ class BucketStore(Store):
         return self._list_paths(folder, list_files)
 
     def list_all(self) -> set[str]:
-        """Return the names of all files, however deep; a thousand names are a request.
-
-        Raises:
-            TrilightError: the bucket does not exist or may not be listed, or the server gives no
-                answer (an EnvironmentFailure where that may pass).
-        """
+        """Return the names of all files, however deep; a thousand are a request."""
         return self._list_paths("", lambda driver, place: driver.find(place))
 
     def _list_paths(self, folder: str, find: Callable[[Any, str], Iterable[str]]) -> set[str]:
@@ -260,10 +247,9 @@ class BucketStore(Store):
         if self.create_if_absent(_PROBE, b"\n") and self.create_if_absent(_PROBE, b"\n"):
             raise TrilightError(
                 f"{self.url.what} {self.url.display_url!r}: the server does not know conditional "
-                "writes "
-                "(If-None-Match, or ifGenerationMatch), so two workers could replace each other's "
-                "files; expected one that refuses to create a file twice. Use another server, or "
-                "a folder."
+                "writes (If-None-Match, or ifGenerationMatch), so two workers could replace each "
+                "other's files; expected one that refuses to create a file twice. Use another "
+                "server, or a folder."
             )
 
     def _upload(self, name: str, content: Path | bytes, *, mode: str) -> None:
@@ -289,9 +275,8 @@ class BucketStore(Store):
             kind = TrilightError if lasting else EnvironmentFailure
             raise kind(
                 f"{self.url.what} {self.url.display_url!r}: cannot be {what} ({error.message}); "
-                "expected "
-                "a bucket that exists, and access that lets you list, read and write there. What "
-                "was finished is safe: fix it and run the same command again."
+                "expected a bucket that exists, and access that lets you list, read and write "
+                "there. What was finished is safe: fix it and run the same command again."
             ) from error
 
 

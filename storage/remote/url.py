@@ -40,13 +40,11 @@ class RemoteUrl:
     what: str = field(compare=False)
     """Name of the resource in messages, such as `objects`."""
     scheme: str
-    """URL scheme, a key of PACKAGES."""
     root: str
     """Path as the driver takes it: no secrets, query or final slash."""
     query: tuple[tuple[str, str], ...] = field(default=(), repr=False)
     """Sent with every request, since it may hold the key; http and https only."""
     user: str = field(default="", repr=False)
-    """Sent with every request; http and https only."""
     password: str = field(default="", repr=False)
     """Sent with every request; http and https only."""
 
@@ -68,15 +66,10 @@ class RemoteUrl:
 
 
 def parse_url(source: str, *, what: str) -> RemoteUrl | Path:
-    """Return where something is: on this machine, or on a server.
+    """Return where a path or URL is: on this machine, or on a server; messages begin with `what`.
 
-    Args:
-        source: a path, or a URL.
-        what: begins every message, such as `objects`.
-
-    Raises:
-        TrilightError: the URL is chained (`::`), runs a program (`pipe:`), has a scheme that is not
-            admitted, names no host or bucket, or holds a password where none is read.
+    It raises TrilightError for a URL that is chained (`::`), runs a program (`pipe:`), has a scheme
+    that is not admitted, names no host or bucket, or holds a password where none is read.
     """
     url_text = printable(safe_text(source))
     if source.startswith("pipe:"):
@@ -113,8 +106,7 @@ def parse_local_path(text: str) -> Path:
 def open_driver(url: RemoteUrl) -> Any:
     """Return the fsspec file system that reads a folder; it keeps no listings.
 
-    Raises:
-        TrilightError: its package is not installed; names the package.
+    It raises TrilightError, which names the package, where that is not installed.
     """
     package = PACKAGES[url.scheme]
     try:

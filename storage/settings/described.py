@@ -11,6 +11,7 @@ and the records in manifests and checkpoints. Laws between fields stay in `__pos
 streams shards does not import this file: tests/architecture/test_light_imports.py.
 """
 
+import dataclasses
 import functools
 import json
 import reprlib
@@ -77,13 +78,26 @@ def checked(called: str = "") -> Callable[[type[Settings]], type[Settings]]:
     return decorate
 
 
+def leaves_out(*names: str) -> Any:
+    """Return the serializer of a class whose record lacks later fields at their defaults.
+
+    Digests of earlier presets stay so. It works as an attribute of the class, whatever its name.
+    """
+
+    @pydantic.model_serializer(mode="wrap")
+    def record(self: Any, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        later = {each.name: each.default for each in dataclasses.fields(self) if each.name in names}
+        usual: dict[str, Any] = as_usual(self)
+        return {k: v for k, v in usual.items() if k not in later or getattr(self, k) != later[k]}
+
+    return record
+
+
 def settings_record(group: Any, *, stated: bool = False) -> dict[str, Any]:
     """Return settings as JSON values, as manifests and checkpoints hold them.
 
-    Args:
-        group: an instance.
-        stated: leave out what is at its default; such a record stays what it is when a field is
-            added whose default is what was done before.
+    With `stated`, what is at its default is left out: such a record stays what it is when a field
+    is added whose default is what was done before.
     """
     adapter = _adapter(typing.cast(Any, type(group)))
     record: dict[str, Any] = adapter.dump_python(group, mode="json", exclude_defaults=stated)
@@ -93,18 +107,13 @@ def settings_record(group: Any, *, stated: bool = False) -> dict[str, Any]:
 def from_record(kind: type[Settings], record: Any) -> Settings:
     """Return the settings of a record; what it lacks is at its default.
 
-    Raises:
-        TrilightError: a value that they refuse, by its dotted place.
+    It raises TrilightError for a value that they refuse, by its dotted place.
     """
     return typing.cast(Settings, _read(record, kind, kind))
 
 
 def field_value(kind: type, field: FieldDescription, value: Any, display_name: str) -> Any:
-    """Return a JSON value as the value of a field of `kind`, which complaints call `display_name`.
-
-    Raises:
-        TrilightError: the value is of another type or outside its range.
-    """
+    """Return a JSON value as that of a field of `kind`; complaints call it `display_name`."""
     return _read(value, field.hint, kind, field=field, display_name=display_name)
 
 
@@ -118,8 +127,7 @@ def _read(value: Any, hint: Any, kind: type, **place: Any) -> Any:
 def parse_strictly(data: bytes | str, kind: Any, source: str) -> Any:
     """Return the value of a JSON text, of a type that is made of plain dataclasses, or None.
 
-    Raises:
-        TrilightError: other JSON than the type says; `source` begins the complaint.
+    It raises TrilightError for other JSON; `source` begins the complaint.
     """
     try:
         return _strict_adapter(kind).validate_json(data)
@@ -151,13 +159,9 @@ def _complaint(
 ) -> TrilightError:
     """Return what is wrong first: the place, the value and what was expected.
 
-    Args:
-        error: what pydantic found.
-        kind: the class whose values were read.
-        called: begins the complaint.
-        option: returns what a dotted place is called where people write it.
-        field: the field whose value alone was read.
-        display_name: what is shown of that field.
+    Values of `kind` were read, or of its `field` alone, which is shown as `display_name`. The
+    complaint begins with `called`, and `option` returns what a dotted place is called where people
+    write it.
     """
     mistakes = error.errors(include_url=False)
     # a name that is unknown says more than the one that lacks then

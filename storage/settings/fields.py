@@ -53,10 +53,8 @@ class FieldDescription:
     """Description of one field of a dataclass."""
 
     owner: type
-    """Dataclass of the field."""
     name: str
     hint: Any
-    """Type annotation, with its notes."""
     bare: Any
     """The type without its notes and without None."""
     notes: Sequence[Any]

@@ -31,10 +31,8 @@ Override = tuple[Sequence[str], Any, str]
 def json_or_word(text: str) -> Any:
     """Return the JSON value that a text is, or the text: what a person writes as a value.
 
-    Words in a list need no quotes either: [depth,normal].
-
-    Raises:
-        TrilightError: a number of thousands of digits, or values nested hundreds deep.
+    Words in a list need no quotes either: [depth,normal]. It raises TrilightError for a number of
+    thousands of digits, or values nested hundreds deep.
     """
     try:
         return json.loads(text)
@@ -48,12 +46,7 @@ def json_or_word(text: str) -> Any:
 
 
 def option_words(settings: Any, *, leave_out: tuple[str, ...] = ()) -> list[str]:
-    """Return the options of a command that state settings, but for those at their default.
-
-    Args:
-        settings: an instance of a class of settings.
-        leave_out: fields that are not stated.
-    """
+    """Return the options of a command that state settings, without defaults and `leave_out`."""
     kind: Any = type(settings)
     words: list[str] = []
     for field in describe_fields(kind):
@@ -79,11 +72,8 @@ def _write_value(value: Any) -> str:
 def apply_overrides(settings: Settings, overrides: Mapping[str, Any]) -> Settings:
     """Return settings, a frozen dataclass, with the values of overrides, all at once.
 
-    Values that only fit each other may therefore come in any order.
-
-    Raises:
-        TrilightError: a name that does not exist, a value of another kind, or one that the
-            settings themselves refuse; a name that is nearly right is asked back.
+    Values that only fit each other may therefore come in any order. It raises TrilightError for a
+    name that does not exist, a value of another kind, or one that the settings refuse.
     """
     result: Settings = _replace_fields(
         settings, [(n.split("."), v, n) for n, v in overrides.items()]
@@ -92,11 +82,9 @@ def apply_overrides(settings: Settings, overrides: Mapping[str, Any]) -> Setting
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
-    """Return by dotted name what differs in a record; groups of another kind are whole.
+    """Return by dotted name what differs in a record `now` from that `before`.
 
-    Args:
-        before: a record (storage.settings.described.settings_record), or part of one.
-        now: that whose values are returned; what it lacks does not differ.
+    Groups of another kind are whole; what `now` lacks does not differ.
     """
     differing: dict[str, Any] = {}
     for name, value in now.items():

@@ -7,20 +7,33 @@
 outside. Laws between fields are none of this: they stay in `__post_init__`, or in `Scene.check`.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
 
 
+class Law(ABC):
+    """Note at a field whose values obey a law beyond their type."""
+
+    @abstractmethod
+    def require(self, value: Any) -> Any:
+        """Return a lawful value; another is a ValueError, or an error of pydantic's."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Let pydantic check the law after the type."""
+        from pydantic_core import core_schema  # readers of scenes do without pydantic
+
+        return core_schema.no_info_after_validator_function(self.require, handler(source))
+
+
 @dataclass(frozen=True)
-class Within:
+class Within(Law):
     """Lowest and highest value; both are admitted unless that end is open."""
 
     low: float
-    """Least value; see `low_open`."""
     high: float
-    """Greatest value; see `high_open`."""
     low_open: bool = False
     """True: `low` itself is refused."""
     high_open: bool = False
@@ -33,12 +46,6 @@ class Within:
         above = value > self.low if self.low_open else value >= self.low
         below = value < self.high if self.high_open else value <= self.high
         return above & below
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Let pydantic check the range after the type: of a number, or of each in a tuple."""
-        from pydantic_core import core_schema  # readers of scenes do without pydantic
-
-        return core_schema.no_info_after_validator_function(self._check, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
         """Let forms show the range, at the number or at the entries of a list."""
@@ -55,7 +62,8 @@ class Within:
             end = f", up to {high}" if self.low_open else f" to {high}"
         return start + end + (f" {self.unit}" if self.unit else "")
 
-    def _check(self, value: Any) -> Any:
+    def require(self, value: Any) -> Any:
+        """Return a number, or a tuple of numbers, in the range."""
         from pydantic_core import PydanticCustomError
 
         numbers = value if isinstance(value, tuple) else (value,)
@@ -87,21 +95,13 @@ _EXACT = 2**53
 
 
 @dataclass(frozen=True)
-class LowFirst:
+class LowFirst(Law):
     """Law of a pair: the first number is at most the second."""
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Let pydantic check the order after the type."""
-        from pydantic_core import core_schema
-
-        return core_schema.no_info_after_validator_function(self._check, handler(source))
-
-    def _check(self, pair: tuple[float, float]) -> tuple[float, float]:
-        from pydantic_core import PydanticCustomError
-
-        if pair[0] > pair[1]:
-            raise PydanticCustomError("not_in_order", "expected the lower number first")
-        return pair
+    def require(self, value: Any) -> Any:
+        if value[0] > value[1]:
+            raise ValueError("expected the lower number first")
+        return value
 
 
 EXECUTION = "execution"

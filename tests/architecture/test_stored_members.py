@@ -17,10 +17,15 @@ from pipeline.documents.scene_page import Neighbours, encode_scene_page
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_channels, encode_exr
-from storage.records.lights import decode_lights_exr, encode_lights_exr, num_lights
-from storage.records.map_references import MAP_NAME
-from storage.records.parts import decode_parts_exr, encode_parts_exr
-from storage.records.passes.stored import passes_exr
+from storage.records.lights import (
+    decode_lights_exr,
+    decode_parts_exr,
+    encode_lights_exr,
+    encode_parts_exr,
+    num_lights,
+)
+from storage.records.packed_maps import MAP_NAME
+from storage.records.passes.pictures import passes_exr
 from storage.records.sample import PartFloor, Sample, decode_sample, decode_scene, encode_sample
 from storage.records.scene_facts import scene_values
 from storage.records.texture import MapSource

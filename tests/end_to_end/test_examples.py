@@ -18,7 +18,7 @@ from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.executors.registry import EXECUTORS
 from pipeline.objects.sources import check_source, find_objects
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings, resolve_dataset_preset
-from scene_templates.skies.draw import draw_sky
+from scene_templates.skies.procedural_skies import draw_sky
 from scene_templates.textures import draw_look
 from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError

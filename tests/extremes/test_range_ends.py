@@ -44,6 +44,7 @@ from storage.seeds import SceneKey
 from storage.settings.fields import FieldDescription
 from storage.settings.overrides import apply_overrides
 from tests.extremes.test_ranges import FIELDS, SMOKE, End
+from tests.extremes.test_renders import FLOOR, LAMP
 from tests.extremes.test_scenes import require_laws
 from tests.for_each import case, for_each
 from tests.model.kit import FAMILIES, attend_reference, awake, random_scene, tiny_config
@@ -172,13 +173,12 @@ def test_scenes_at_several_ends_keep_their_laws_or_have_a_reason(
 RENDER = RenderSettings(
     resolution=8, noise_floor_db=1.0, min_spp=8, max_spp=8, aux_spp=4, min_mean_radiance=0.0
 )
-FLOOR = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], material(diffuse=0.8))
 WALL = quad([[-1, 1, 0], [1, 1, 0], [1, 1, 2], [-1, 1, 2]], material(diffuse=0.8))
-LAMP = light([[-0.5, -0.5, 2], [0, 0.5, 2], [0.5, -0.5, 2]], 10.0)
 
 
 def _render(**changes: Any) -> RenderedView:
-    scene = join([FLOOR, WALL, LAMP], fov_deg=60)
+    lamp = light(LAMP * [5, 5, 1], 10.0)
+    scene = join([quad(FLOOR, material(diffuse=0.8)), WALL, lamp], fov_deg=60)
     renderer = SceneRenderer(scene, dataclasses.replace(RENDER, **changes))
     view = renderer.render_view(scene.c2w[0], 60.0, seed=0)
     assert np.isfinite(view.radiance_rgb).all() and (view.radiance_rgb >= 0).all()
@@ -219,16 +219,20 @@ NETWORKS: dict[str, ModelConfig] = {
 }
 
 
-@pytest.mark.parametrize("config", NETWORKS.values(), ids=NETWORKS.keys())
-def test_networks_at_an_end_see_and_learn(config: ModelConfig) -> None:
-    model = awake(config, torch.float32)
-    scene = random_scene(5, num_views=1, dtype=torch.float32)
-    picture = model(batch_scenes([scene]), config.picture_px)
-    picture.square().mean().backward()
-    assert picture.shape[2:] == (config.picture_px, config.picture_px, 3)
-    assert torch.isfinite(picture).all()
+def require_learning(model: nn.Module, scenes: SceneBatch, px: int) -> None:
+    """Require a finite picture, and finite gradients of every weight."""
+    model.zero_grad()
+    picture = model(scenes, px)
+    (picture - 6.0).square().mean().backward()
+    assert picture.shape[2:] == (px, px, 3) and torch.isfinite(picture).all()
     for name, weight in model.named_parameters():
         assert weight.grad is not None and torch.isfinite(weight.grad).all(), name
+
+
+@pytest.mark.parametrize("config", NETWORKS.values(), ids=NETWORKS.keys())
+def test_networks_at_an_end_see_and_learn(config: ModelConfig) -> None:
+    scene = random_scene(5, num_views=1, dtype=torch.float32)
+    require_learning(awake(config, torch.float32), batch_scenes([scene]), config.picture_px)
 
 
 def test_the_largest_networks_can_be_described() -> None:
@@ -403,13 +407,8 @@ def test_no_matrix_product_comes_near_the_end_of_float16(name: str) -> None:
 def test_pictures_and_gradients_are_finite(family: str) -> None:
     model = awake(tiny_config(family), torch.float32)
     for emission in EMISSIONS:
-        model.zero_grad()
-        picture = model(lit(emission), 32)
-        (picture - 6.0).abs().mean().backward()
-        assert torch.isfinite(picture).all(), emission
-        for name, weight in model.named_parameters():
-            assert weight.grad is not None, name
-            assert torch.isfinite(weight.grad).all(), (emission, name)
+        with case(emission):
+            require_learning(model, lit(emission), 32)
 
 
 @pytest.mark.parametrize("distance", [1.0, 30.0, MAX_NETWORK_M])

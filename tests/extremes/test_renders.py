@@ -25,7 +25,7 @@ from pipeline.renders.vector_tracer import VectorTracer
 from storage.conventions import camera_rays
 from storage.errors import Rejected
 from storage.records.exr import decode_exr, encode_exr
-from storage.records.parts import sum_of_parts
+from storage.records.lights import sum_of_parts
 from storage.records.scene import Scene
 from tests.for_each import case
 from tests.pipeline.renders.guided_scenes import FLOOR as GUIDED_FLOOR
@@ -46,22 +46,31 @@ from tests.pipeline.renders.scene_kit import (
 SETTINGS = RenderSettings(
     resolution=16, noise_floor_db=1.0, min_spp=32, max_spp=32, aux_spp=16, min_mean_radiance=0.0
 )
-FLOOR = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
-LAMP = [[-0.1, -0.1, 2], [0, 0.1, 2], [0.1, -0.1, 2]]
+NOT_DENOISED = dataclasses.replace(SETTINGS, min_spp=128, max_spp=128, denoiser="off")
+FLOOR = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+LAMP = np.array([[-0.1, -0.1, 2], [0, 0.1, 2], [0.1, -0.1, 2]])
+GREY = material(diffuse=0.5)
 
 
-def _floor(surface: NDArray[np.float64] | None = None) -> Part:
-    return quad(FLOOR, material(diffuse=0.5) if surface is None else surface)
+def _floor(surface: NDArray[np.float64] = GREY) -> Part:
+    return quad(FLOOR, surface)
 
 
 def _lamp(radiance: float = 100.0, scale: float = 1.0, diffuse: float = 0.0) -> Part:
-    return light(np.array(LAMP) * scale, radiance, diffuse)
+    return light(LAMP * scale, radiance, diffuse)
 
 
-def _render(scene: Scene, settings: RenderSettings = SETTINGS) -> RenderedView:
+def _render(scene: Scene, settings: RenderSettings = SETTINGS, **changes: Any) -> RenderedView:
     scene.check()
-    renderer = SceneRenderer(scene, settings)
+    renderer = SceneRenderer(scene, dataclasses.replace(settings, **changes))
     return renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), seed=0)
+
+
+def _picture(parts: list[Part], settings: RenderSettings = SETTINGS) -> NDArray[np.float32]:
+    """Return a picture that is finite and not negative."""
+    radiance_rgb = _render(join(parts), settings).radiance_rgb
+    assert np.isfinite(radiance_rgb).all() and (radiance_rgb >= 0).all()
+    return radiance_rgb
 
 
 def _mirror(side: float = 1.0) -> Part:
@@ -82,7 +91,7 @@ SHAPES = {
     "one triangle": [flat([[[-1, -1, 0], [1, -1, 0], [0, 1, 0]]], material(diffuse=0.5)), _lamp()],
     "interpenetrating": [sphere([0, 0, 0], 0.5, material(diffuse=0.9)), _floor(), _lamp()],
     "light on the floor": [  # which it does not light: only what stands above it
-        _floor(), light(np.array(LAMP) * [1, 1, 0], 100.0),
+        _floor(), light(LAMP * [1, 1, 0], 100.0),
         sphere([0.5, 0, 0.5], 0.3, material(diffuse=0.9)),
     ],
     "light inside an object": [
@@ -92,7 +101,7 @@ SHAPES = {
     "faint light": [_floor(), _lamp(1e-3)],
     "white lights face to face": [_floor(), _lamp(diffuse=1.0), _lamp(scale=1.001, diffuse=1.0)],
     "64 lights": [_floor(), *[_lamp(1.0 + i, 1 + 0.01 * i) for i in range(64)]],
-    "caustic of a tiny light": [_floor(), _mirror(), light(np.array(LAMP) * [1e-3, 1e-3, 1], 1e6)],
+    "caustic of a tiny light": [_floor(), _mirror(), light(LAMP * [1e-3, 1e-3, 1], 1e6)],
     "a light between two mirrors": [_floor(), _mirror(), _mirror(-1), _lamp()],
     "a light far away": [_floor(), _mirror(), light(np.add(LAMP, [0, 0, 998]), 1e7)],
 }  # fmt: skip
@@ -105,11 +114,9 @@ def test_extreme_materials(surface: NDArray[np.float64]) -> None:
     What a lobe lacks is exactly black.
     """
     ball = sphere([0, 0, 0.5], 0.5, surface)
-    picture = _render(join([ball, _floor(surface), _lamp()])).radiance_rgb
-    assert np.isfinite(picture).all()
-    assert (picture >= 0).all()
+    _picture([ball, _floor(surface), _lamp()])
     scene = join([ball, _floor(surface), _mirror(), _lamp()])
-    view = _render(scene, dataclasses.replace(SETTINGS, split=True, split_lobes=True))
+    view = _render(scene, split=True, split_lobes=True)
     assert view.parts_rgb is not None
     np.testing.assert_array_equal(sum_of_parts(view.parts_rgb), view.radiance_rgb)
     for name, part in view.parts_rgb.items():
@@ -121,12 +128,12 @@ def test_extreme_materials(surface: NDArray[np.float64]) -> None:
 @pytest.mark.parametrize("roughness", [0.0, 0.01, 1.0])
 def test_extreme_materials_at_grazing_angles(roughness: float) -> None:
     """The scale for multiple scattering is 0 / 0 along the surface, and largest at roughness 1."""
-    low = light(np.array(LAMP) * [1, 1, 0] + [0, 0.9, 1e-3], 100.0)
+    low = light(LAMP * [1, 1, 0] + [0, 0.9, 1e-3], 100.0)
     for specular, height in (
-        ([1.0, 1.0, 1.0], 1e-3),
-        ([0.0, 0.0, 0.0], 1e-3),
-        ([1.0, 0.5, 0.0], 1e-3),
-        ([1.0, 1.0, 1.0], 1e-2),
+        ([1, 1, 1], 1e-3),
+        ([0, 0, 0], 1e-3),
+        ([1, 0.5, 0], 1e-3),
+        ([1, 1, 1], 1e-2),
     ):
         surface = material(specular=specular, roughness=roughness)
         scene = join([_floor(surface), low, _lamp()], eye=(0, -0.9, height), target=(0, 0.5, 0))
@@ -138,10 +145,8 @@ def test_extreme_materials_at_grazing_angles(roughness: float) -> None:
 
 def test_extreme_shapes_and_lights() -> None:
     for name, parts in SHAPES.items():
-        picture = _render(join(parts)).radiance_rgb
-        assert np.isfinite(picture).all(), name
-        assert (picture >= 0).all(), name
-        assert picture.max() > 0, name
+        with case(name):
+            assert _picture(parts).max() > 0
 
 
 CLOSED = sphere([0, 0, 1], 0.5, material(diffuse=0.9))
@@ -149,15 +154,15 @@ INSIDE: dict[str, Any] = {"eye": (0, 0, 1), "target": (0.3, 0, 1)}
 REASONS = {
     "inside a closed object": (join([CLOSED, _floor(), _lamp()], **INSIDE), "black_view"),
     "light in a closed object": (
-        join([CLOSED, _floor(), light(np.array(LAMP) * [1, 1, 0.5], 9.0)]), "black_view",
+        join([CLOSED, _floor(), light(LAMP * [1, 1, 0.5], 9.0)]), "black_view",
     ),
     "too faint": (join([_floor(), _lamp(1e-3)]), "black_view"),
     "emitters alone": (join([_lamp(), _lamp(1.0, 1.1)]), "no_surfaces"),
     "brighter than float32": (
-        join([_floor(), light(np.array(LAMP) * [90, 90, 1], 3e38)]), "nonfinite_radiance",
+        join([_floor(), light(LAMP * [90, 90, 1], 3e38)]), "nonfinite_radiance",
     ),
     "beyond the denoiser": (
-        join([_floor(), light(np.array(LAMP) * [9, 9, 1], 3e38)]), "radiance_overflow",
+        join([_floor(), light(LAMP * [9, 9, 1], 3e38)]), "radiance_overflow",
     ),
     "brighter than halves": (join([_floor(), _lamp(1e9)]), "radiance_overflow"),
 }  # fmt: skip
@@ -180,16 +185,15 @@ def test_what_cannot_be_rendered_or_lit_has_a_reason() -> None:
 
 
 def test_cameras_in_rooms_on_faces_and_on_emitters_take_pictures() -> None:
-    inside = join([CLOSED, light(np.array(LAMP) * 0.3 + [0, 0, 0.6], 5.0)], **INSIDE)
+    inside = join([CLOSED, light(LAMP * 0.3 + [0, 0, 0.6], 5.0)], **INSIDE)
     picture = _render(inside).radiance_rgb
-    assert np.isfinite(picture).all()
-    assert picture.min() > 0
+    assert np.isfinite(picture).all() and picture.min() > 0
     for eye in ((0, 0, 0), (-1, -1, 0), (0, 0.1, 2)):
         scene = join([_floor(), _lamp()], eye=eye, target=(0.5, 0.4, -0.2))
         assert np.isfinite(_render(scene).radiance_rgb).all(), eye
 
 
-WIDE_VIEW = join([_floor(), light(np.array(LAMP) * [9, 9, 1], 5.0)], fov_deg=60)
+WIDE_VIEW = join([_floor(), light(LAMP * [9, 9, 1], 5.0)], fov_deg=60)
 
 
 @pytest.fixture(scope="module")
@@ -284,33 +288,13 @@ def test_a_guided_view_is_finite(name: str) -> None:
     assert view.radiance_rgb.max() > 0
 
 
-NOT_DENOISED = RenderSettings(
-    resolution=16, noise_floor_db=1.0, min_spp=128, max_spp=128, aux_spp=16, denoiser="off",
-    min_mean_radiance=0.0,
-)  # fmt: skip
-GREY = material(diffuse=0.5)
-CORNERS = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-FLOOR_PART = quad(CORNERS, GREY)
-LAMP_CORNERS = np.array([[-0.1, -0.1, 2], [0, 0.1, 2], [0.1, -0.1, 2]])
-
-
-def _view(scene: Scene, **changes: Any) -> RenderedView:
-    settings = dataclasses.replace(NOT_DENOISED, **changes)
-    fov_deg = float(scene.fov_deg[0])
-    return SceneRenderer(scene, settings).render_view(scene.c2w[0], fov_deg, seed=0)
-
-
-def _picture(parts: list[Part], *, spp: int = 128, **camera: Any) -> NDArray[np.float32]:
-    return _view(join(parts, **camera), min_spp=spp, max_spp=spp).radiance_rgb
-
-
-PLAIN = [FLOOR_PART, light(LAMP_CORNERS, 100.0)]
+PLAIN = [_floor(), _lamp()]
 
 
 @pytest.fixture(scope="module")
 def plain() -> NDArray[np.float32]:
     """A floor of two triangles under one lamp."""
-    return _picture(PLAIN)
+    return _picture(PLAIN, NOT_DENOISED)
 
 
 def _grid(cells: int) -> Part:
@@ -331,22 +315,22 @@ def _without_area() -> Part:
 
 
 def _tilted(slope: float) -> Part:
-    return quad(CORNERS + np.array([[0, 0, -slope], [0, 0, slope]])[[0, 1, 1, 0]], GREY)
+    return quad(FLOOR + np.array([[0, 0, -slope], [0, 0, slope]])[[0, 1, 1, 0]], GREY)
 
 
 SAME: dict[str, list[Part]] = {
-    "a floor twice": [FLOOR_PART, FLOOR_PART],
-    "two floors through each other at 1e-6": [FLOOR_PART, _tilted(1e-6)],
+    "a floor twice": [_floor(), _floor()],
+    "two floors through each other at 1e-6": [_floor(), _tilted(1e-6)],
     "16200 triangles": [_grid(90)],
-    "a point and a line as triangles": [FLOOR_PART, _without_area()],
-    "a sliver of 1e-7": [FLOOR_PART, flat([[[-0.5, 0, 0.5], [0.5, 0, 0.5], [0, 1e-7, 0.5]]], GREY)],
+    "a point and a line as triangles": [_floor(), _without_area()],
+    "a sliver of 1e-7": [_floor(), flat([[[-0.5, 0, 0.5], [0.5, 0, 0.5], [0, 1e-7, 0.5]]], GREY)],
 }
 
 
 def test_what_adds_nothing_changes_nothing(plain: NDArray[np.float32]) -> None:
     """No surface shadows itself or its twin, and what has no area is met by no ray."""
     for name, parts in SAME.items():
-        picture = _picture([*parts, light(LAMP_CORNERS, 100.0)])
+        picture = _picture([*parts, _lamp()], NOT_DENOISED)
         # equal samples: what differs is float32 rounding of hits, and of heights of 1e-6
         np.testing.assert_allclose(picture, plain, rtol=2e-5, atol=1e-7, err_msg=name)
 
@@ -355,7 +339,7 @@ def test_what_adds_nothing_changes_nothing(plain: NDArray[np.float32]) -> None:
 def test_light_scales_the_picture(denoiser: str) -> None:
     """The denoiser too: it finds its exposure anew."""
     usual, *others = (
-        _view(join([FLOOR_PART, light(LAMP_CORNERS, level)]), denoiser=denoiser).radiance_rgb
+        _render(join([_floor(), _lamp(level)]), NOT_DENOISED, denoiser=denoiser).radiance_rgb
         / level
         for level in (100.0, 1e-3, 1.0, 1e6)
     )
@@ -369,14 +353,14 @@ def test_an_emitter_far_below_a_pixel_gives_the_light_of_a_larger_one(
     size: float, plain: NDArray[np.float32]
 ) -> None:
     """As much power from a smaller triangle, down to a micrometre 2 m away."""
-    middle = LAMP_CORNERS.mean(axis=0)
-    small = light((LAMP_CORNERS - middle) * size + middle, 100.0 / size**2)
-    picture = _picture([FLOOR_PART, small])
+    middle = LAMP.mean(axis=0)
+    small = light((LAMP - middle) * size + middle, 100.0 / size**2)
+    picture = _picture([_floor(), small], NOT_DENOISED)
     # Of the lamp's extent, 0.2 in 2: (0.1)^2 / 4 of the irradiance. Float32 corners at height 2 are
     # known to 2.4e-7, which is 12 % of a side of 2e-6: the area of the smallest is its own.
     corners = small.triangles[0].astype(np.float32).astype(np.float64)
     area, wanted = (
-        np.linalg.norm(np.cross(c[1] - c[0], c[2] - c[0])) for c in (corners, (LAMP_CORNERS * size))
+        np.linalg.norm(np.cross(c[1] - c[0], c[2] - c[0])) for c in (corners, (LAMP * size))
     )
     assert picture.mean() == pytest.approx(plain.mean() * area / wanted, rel=0.01)
 
@@ -386,7 +370,9 @@ def test_a_camera_close_to_a_surface_sees_that_point(height: float) -> None:
     """As from a tenth of a metre; no ray begins behind what it should meet."""
 
     def seen(h: float) -> RenderedView:
-        return _view(join(PLAIN, eye=(0.3, 0.2, h), target=(0.3 + 0.3 * h, 0.2, 0), fov_deg=10))
+        return _render(
+            join(PLAIN, eye=(0.3, 0.2, h), target=(0.3 + 0.3 * h, 0.2, 0), fov_deg=10), NOT_DENOISED
+        )
 
     near, far = seen(height), seen(0.1)
     assert near.hits.all()
@@ -407,7 +393,7 @@ def test_every_field_of_view_shows_what_its_rays_meet(
     fov_deg: float, eye: ArrayLike, target: ArrayLike
 ) -> None:
     scene = join(PLAIN, eye=eye, target=target, fov_deg=fov_deg)
-    view = _view(scene, resolution=64, min_spp=8, max_spp=8)
+    view = _render(scene, NOT_DENOISED, resolution=64, min_spp=8, max_spp=8)
     origin, rays = camera_rays(scene.c2w[0], fov_deg, 64)
     distance = -origin[2] / rays[..., 2]
     there = origin + distance[..., None] * rays
@@ -427,7 +413,7 @@ def scene() -> Scene:
     """A floor and a smooth mirror beside it, under one small lamp."""
     row = material(specular=1.0, roughness=0.2)
     mirror = quad([[1, -1, 0], [1, 1, 0], [1, 1, 2], [1, -1, 2]], row)
-    return join([FLOOR_PART, mirror, light(LAMP_CORNERS, 100.0)])
+    return join([_floor(), mirror, _lamp()])
 
 
 def _passes(scene: Scene, *, count: int, spp: int, first_seed: int) -> NDArray[np.float64]:

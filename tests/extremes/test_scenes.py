@@ -20,7 +20,7 @@ from scene_templates.settings import SceneSettings
 from storage.records.asset import Asset
 from storage.records.scene import Scene
 from storage.settings.overrides import apply_overrides
-from tests.for_each import case
+from tests.for_each import case, for_each
 from tests.pipeline.assets.meshes_by_hand import (
     cube,
     geometry,
@@ -82,20 +82,19 @@ def _one_triangle(pool: list[PooledAsset]) -> PooledAsset:
     return PooledAsset(locked=entry.locked, asset=dataclasses.replace(entry.asset, levels=(level,)))
 
 
-@pytest.mark.parametrize(
+@for_each(
     "changes",
     [
-        {"views.min_coverage": 0.0},
-        {"views.min_coverage": 0.0, "placement.overlap_share": 1.0},
-        {"views.min_coverage": 0.0, "families.smooth_share": 1.0, "materials.coloured_share": 1.0},
-        {"views.min_coverage": 0.0, "fill_to": 1536},
+        {},
+        {"placement.overlap_share": 1.0},
+        {"families.smooth_share": 1.0, "materials.coloured_share": 1.0},
+        {"fill_to": 1536},
     ],
-    ids=["apart", "overlapping", "smooth", "filled"],
 )
 def test_objects_of_one_triangle_compose(
     pool: list[PooledAsset], changes: Mapping[str, Any]
 ) -> None:
-    settings = apply_overrides(SETTINGS, changes)
+    settings = apply_overrides(SETTINGS, {"views.min_coverage": 0.0, **changes})
     for index in range(3):
         scene = first_scene(settings, [_one_triangle(pool)], seed=0, scene_index=index)
         require_laws(scene, settings)
@@ -185,8 +184,7 @@ def test_four_faces_are_enough(tmp_path: Path, flip: bool) -> None:
 
 def test_one_triangle_is_an_object(tmp_path: Path) -> None:
     one = TriangleMesh(positions=np.eye(3), faces=np.array([[0, 1, 2]]))
-    settings = AssetSettings()
-    asset = prepare(write_off(tmp_path / "a.off", one), settings)
+    asset = prepare(write_off(tmp_path / "a.off", one), AssetSettings())
     (level,) = asset.levels
     assert (len(level.faces), level.record.method) == (1, "source")
     assert asset.source.open_edges == 3

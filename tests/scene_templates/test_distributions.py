@@ -41,43 +41,32 @@ ROUGH_LOW, ROUGH_HIGH, ROUGH_BIAS = 0.06, 1.055, 0.05
 class Stated:
     """What the two kinds of settings say of a scene."""
 
-    weights: dict[str, float]
-    """Of the families by name."""
-    counts: dict[str, tuple[int, int]]
-    """Fewest and most objects of each family."""
-    scales: dict[str, tuple[float, float]]
-    """Diameters of the spheres of each family's objects, before halving."""
-    flatter: frozenset[str]
-    """Families of whose surfaces a quarter instead of half are smooth."""
-    overlap_share: float
-    """Of scenes whose objects may meet."""
+    rows: tuple[Row, ...]
+    """The families."""
     published: bool
-    """Whether rotations are three Euler angles, and sizes and places free of what fits."""
-    triangle_colours_share: float
-    """Of the many-coloured objects."""
+    """Whether all objects may meet and none has colours by triangle, rotations are three Euler
+    angles, and sizes and places free of what fits."""
+
+    def row_of(self, one: Drawn) -> Row:
+        """Return the family of a scene."""
+        return next(row for row in self.rows if row[0] == one.plan.family.name)
 
 
 def plan_table(scenes: Sequence[Drawn], stated: Stated) -> Table:
     """Families, counts and overlaps."""
-    total = sum(stated.weights.values())
     families = [one.plan.family.name for one in scenes]
-    odds = {name: weight / total for name, weight in stated.weights.items()}
     table = {
-        "families": choices(families, odds),
+        "families": choices(families, {name: weight for name, weight, *_ in stated.rows}),
         "light counts": choices(
             [one.plan.num_lights for one in scenes], dict.fromkeys(range(1, 9), 1.0)
         ),
-        "overlaps": share([one.plan.overlaps for one in scenes], stated.overlap_share),
+        "overlaps": share([one.plan.overlaps for one in scenes], 1.0 if stated.published else 0.1),
     }
-    for low, high in sorted(set(stated.counts.values())):
-        found = [len(d.layout.objects) for d in scenes if stated.counts[_name(d)] == (low, high)]
+    for low, high in sorted({row[2] for row in stated.rows}):
+        found = [len(d.layout.objects) for d in scenes if stated.row_of(d)[2] == (low, high)]
         odds_of_counts = dict.fromkeys(range(low, high + 1), 1.0)
         table[f"object counts {low} to {high}"] = choices(found, odds_of_counts)
     return table
-
-
-def _name(one: Drawn) -> str:
-    return one.plan.family.name
 
 
 def rotation_table(rotations: Iterable[NDArray[np.float64]], *, euler: bool) -> Table:
@@ -185,25 +174,13 @@ def _euler_normals() -> NDArray[np.float64]:
     return np.column_stack([x, y, z])
 
 
-def _stated(rows: tuple[Row, ...], *, published: bool) -> Stated:
-    return Stated(
-        weights={name: weight for name, weight, *_ in rows},
-        counts={name: counts for name, _, counts, *_ in rows},
-        scales={name: scale for name, _, _, scale, _ in rows},
-        flatter=frozenset(row[0] for row in rows if row[-1] == 0.25),
-        overlap_share=1.0 if published else 0.1,
-        published=published,
-        triangle_colours_share=0.0 if published else 0.5,
-    )
-
-
 FEWER = 1200
 """Scenes in which everything that is wrong below is noticed."""
 
 STATED = {
-    "pretrain-256": _stated(DEFAULT, published=False),
-    "renderformer-v1-256": _stated(STAGE_1, published=True),
-    "renderformer-v1-512": _stated(STAGE_2, published=True),
+    "pretrain-256": Stated(rows=DEFAULT, published=False),
+    "renderformer-v1-256": Stated(rows=STAGE_1, published=True),
+    "renderformer-v1-512": Stated(rows=STAGE_2, published=True),
 }
 
 
@@ -227,12 +204,12 @@ def _table(scenes: list[Drawn], stated: Stated) -> Table:
         centres = np.stack([pose.centre for pose in poses])
         for axis, name in enumerate("xyz"):
             table[f"centre {name}"] = uniform(centres[:, axis], -0.5, 0.5)
-        for low, high in sorted(set(stated.scales.values())):
+        for low, high in sorted({row[3] for row in stated.rows}):
             found = [
                 4 * placement.pose.radius
                 for one in scenes
                 for placement in one.layout.objects
-                if stated.scales[one.plan.family.name] == (low, high)
+                if stated.row_of(one)[3] == (low, high)
             ]
             table[f"sizes {low} to {high}"] = uniform(found, low, high)
     return table
@@ -240,10 +217,8 @@ def _table(scenes: list[Drawn], stated: Stated) -> Table:
 
 def _surface_tables(scenes: list[Drawn], stated: Stated) -> Table:
     table: dict[str, float] = {}
-    for flatter in {name in stated.flatter for name in stated.weights}:
-        chosen = [
-            one.layout for one in scenes if (one.plan.family.name in stated.flatter) == flatter
-        ]
+    for smooth_share in {row[4] for row in stated.rows}:
+        chosen = [one.layout for one in scenes if stated.row_of(one)[4] == smooth_share]
         for kind in ("shell", "object"):
             surfaces = [
                 part.surface
@@ -253,12 +228,11 @@ def _surface_tables(scenes: list[Drawn], stated: Stated) -> Table:
             rows = surface_table(
                 surfaces,
                 kind=kind,
-                smooth_share=0.25 if flatter else 0.5,
-                triangle_colours_share=stated.triangle_colours_share,
+                smooth_share=smooth_share,
+                triangle_colours_share=0.0 if stated.published else 0.5,
             )
-            table |= {
-                f"{kind} {name}{' special' if flatter else ''}": p for name, p in rows.items()
-            }
+            special = " special" if smooth_share == 0.25 else ""
+            table |= {f"{kind} {name}{special}": p for name, p in rows.items()}
     return table
 
 

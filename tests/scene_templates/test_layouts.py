@@ -19,13 +19,13 @@ from scene_templates.rooms import (
     PATCH_FACES,
     SIDES,
     Room,
+    SeparateSides,
     SharedRoom,
     patch,
     plane_of,
 )
 from scene_templates.sample_layout import sample_layout, scene_plan
 from scene_templates.sample_material import MaterialSettings, sample_material
-from scene_templates.separate_sides import SeparateSides
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
@@ -196,8 +196,10 @@ SQUARE = SharedRoom(square_share=1.0)
 LOOSE = SharedRoom(square_share=0.0)
 
 
-def _corner_normals(positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    corners = positions[PATCH_FACES]
+def _corner_normals(
+    positions: NDArray[np.float64], faces: NDArray[np.uint32] = PATCH_FACES
+) -> NDArray[np.float64]:
+    corners = positions[faces]
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
@@ -323,15 +325,11 @@ def _as_rows(families: tuple[Family, ...]) -> tuple[Row, ...]:
 
 
 @pytest.mark.parametrize("policy", POLICIES)
-def test_families_are_the_published_ones(policy: Policy) -> None:
+def test_families_are_the_published_ones_and_ours_the_stated_ones(policy: Policy) -> None:
     first, second = stage_1_families(policy), stage_2_families(policy)
-    assert _as_rows(first) == STAGE_1
-    assert _as_rows(second) == STAGE_2
+    assert (_as_rows(first), _as_rows(second)) == (STAGE_1, STAGE_2)
     assert (len(first), sum(family.weight for family in first)) == (21, 46)
     assert (len(second), sum(family.weight for family in second)) == (14, 42)
-
-
-def test_our_families_are_the_stated_ones() -> None:
     assert _as_rows(DEFAULT_FAMILIES) == DEFAULT
 
 
@@ -349,30 +347,18 @@ def test_every_side_has_its_published_ranges(policy: Policy, stage: int) -> None
         )
 
 
-def _shell(family: Family) -> tuple[ShellPart, ...]:
-    return one_drawn(SceneSettings(families=(family,)), 0).layout.shell
-
-
 @pytest.mark.parametrize("policy", POLICIES)
-def test_only_the_original_box_turns_one_wall_away(policy: Policy) -> None:
+def test_boxes_turn_one_wall_away_as_published_and_patches_are_exact(policy: Policy) -> None:
     """The normal of each face, against the direction to the middle of the nominal room."""
-    for family in (*stage_1_families(policy), *stage_2_families(policy)):
-        if family.template != "open_box":
-            continue
-        for part in _shell(family):
-            corners = part.positions[part.faces]
-            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            inward = np.einsum("tk,k->t", normals, plane_of(part.positions).normal)
-            turned_away = part.name == "wall2" and policy == "original"
-            assert ((inward < 0) == turned_away).all()
-
-
-@pytest.mark.parametrize("policy", POLICIES)
-def test_patch_families_are_the_exact_unit_box(policy: Policy) -> None:
     seen = set()
     for family in (*stage_1_families(policy), *stage_2_families(policy)):
-        if "patch" in family.name:
-            for part in _shell(family):
+        for part in one_drawn(SceneSettings(families=(family,)), 0).layout.shell:
+            if family.template == "open_box":
+                normals = _corner_normals(part.positions, part.faces)
+                inward = np.einsum("tk,k->t", normals, plane_of(part.positions).normal)
+                turned_away = part.name == "wall2" and policy == "original"
+                assert ((inward < 0) == turned_away).all()
+            if "patch" in family.name:
                 assert np.array_equal(part.positions, patch(SIDES[part.name], STILL))
                 assert (np.abs(part.positions[:, SIDES[part.name].axis]) == 0.5).all()
                 seen.add((family.template, part.name))

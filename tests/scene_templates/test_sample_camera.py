@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scene_templates.families import Family, alone
 from scene_templates.sample_camera import CameraPath, CameraSettings, path_position, sample_camera
 from scene_templates.settings import SceneSettings
-from scene_templates.skies.settings import SkySettings
-from scene_templates.templates import ALONE, CORNER
+from scene_templates.skies.procedural_skies import SkySettings
+from scene_templates.templates import TEMPLATES
 from storage.errors import TrilightError
 from storage.settings.described import from_record, settings_record
 from tests.for_each import for_each
@@ -24,7 +24,7 @@ def _directions(path: CameraPath, count: int, seed: int = 0, **changes: object) 
     positions = [
         path_position(path, view, count, np.random.default_rng(seed)) for view in range(count)
     ]
-    poses = [sample_camera(rng, settings, ALONE.cameras, each) for each in positions]
+    poses = [sample_camera(rng, settings, TEMPLATES["alone"].cameras, each) for each in positions]
     return np.stack([pose.c2w[:3, 2] for pose in poses])
 
 
@@ -66,7 +66,7 @@ def test_a_narrow_sector_holds_its_path() -> None:
     for view in range(30):
         position = path_position("fibonacci", view, 30, np.random.default_rng(0))
         assert position is not None
-        x, y, _ = CORNER.cameras.direction_at(*position)
+        x, y, _ = TEMPLATES["corner"].cameras.direction_at(*position)
         assert 180 <= np.degrees(np.arctan2(y, x)) % 360 <= 270
 
 

@@ -98,15 +98,11 @@ def test_what_is_no_file_of_python_is_named(tmp_path: Path, name: str) -> None:
         load_extension(tmp_path / name)
 
 
-def test_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
+def test_two_files_of_one_name_and_one_that_changes_under_a_run_are_refused(tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     load_extension(written(tmp_path, ADDS))
     with pytest.raises(TrilightError, match=r"another own\.py is loaded already"):
         load_extension(written(tmp_path / "other", ADDS))
-
-
-def test_a_file_that_changes_under_a_run_is_refused(tmp_path: Path) -> None:
-    load_extension(written(tmp_path, ADDS))
     files = loaded_files()
     load_same(files)
     with pytest.raises(TrilightError, match=r"extension own\.py has changed while a run was using"):
@@ -143,10 +139,16 @@ def test_other_extensions_are_refused_with_a_next_step(
     assert message in str(caught.value)
 
 
-def test_what_decides_something_is_registered_by_a_file() -> None:
-    """Else a dataset would be made of it that could not say so, and children would not know it."""
+def test_what_decides_something_is_registered_by_a_file_that_a_person_named(tmp_path: Path) -> None:
+    """Else a dataset would be made of it that could not say so, and children would not know it.
+
+    Only `resolve`, which a command line calls with what a person typed, looks at files.
+    """
     with pytest.raises(TrilightError, match="word 'two' is registered outside an extension, so"):
         WORDS.register("two", "2")
+    path = written(tmp_path, "raise SystemExit\n")
+    with pytest.raises(TrilightError, match="is unknown; expected one of one"):
+        WORDS.find(f"{path}:seven")
 
 
 def test_functions_of_a_file_are_named_by_both(tmp_path: Path) -> None:
@@ -162,13 +164,6 @@ def test_functions_of_a_file_are_named_by_both(tmp_path: Path) -> None:
         WORDS.resolve(f"{path}:eleven", str)
     with pytest.raises(TrilightError, match=r"own\.py, line 5: ZeroDivisionError"):
         WORDS.resolve(f"{path}:bad", str)
-
-
-def test_a_name_from_elsewhere_never_runs_a_file(tmp_path: Path) -> None:
-    """Only `typed`, which a command line calls with what a person typed, looks at files."""
-    path = written(tmp_path, "raise SystemExit\n")
-    with pytest.raises(TrilightError, match="is unknown; expected one of one"):
-        WORDS.find(f"{path}:seven")
 
 
 def test_the_variable_names_several(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 from model.scene_tensors import lit_sky, require_known_sky
 from storage.dataset.shard_set import OpenShard, ShardSet
 from storage.errors import TrilightError
-from storage.records.stored_sample import StoredSample
+from storage.records.sample import StoredSample
 from storage.seeds import rng_for
 from train.data.augment import augment_scene, withhold_inputs
 from train.data.bad_samples import BadSampleCounter, count_lost_samples

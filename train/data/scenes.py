@@ -20,9 +20,8 @@ from storage.conventions import log10_radiance
 from storage.errors import TrilightError
 from storage.records.exr import FIRST_ILLEGAL, HALF_FLOATS, Stored, to_float32
 from storage.records.lights import light_rows
-from storage.records.sample import Sample, ViewRecord
+from storage.records.sample import Sample, StoredSample, ViewRecord
 from storage.records.scene import Scene
-from storage.records.stored_sample import StoredSample
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

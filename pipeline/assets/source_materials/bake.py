@@ -23,8 +23,8 @@ from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.picture import spread_points
 from storage.conventions import linear_from_srgb8, srgb8
 from storage.errors import Rejected
-from storage.records.normal_map import FLAT as FLAT_NORMAL
-from storage.records.normal_map import unit_or_zero
+from storage.records.lookup import FLAT as FLAT_NORMAL
+from storage.records.lookup import unit_or_zero
 from storage.records.texture import Texture
 
 _INSET = 0.02

@@ -21,9 +21,8 @@ from pipeline.foreign.source_file import SourceFile
 from pipeline.foreign.textured_mesh import TexturedMesh
 from pipeline.foreign.usd.materials import usd_textured_mesh
 from storage.errors import Rejected, TrilightError
-from storage.records.asset import Level
-from storage.records.packed_maps import pack_texture
-from storage.records.skin import LevelSkin, OwnMaterials, SkinQuality
+from storage.records.asset import Level, LevelSkin, OwnMaterials, SkinQuality
+from storage.records.packed_maps import pack_map
 from storage.records.texture import TEXTURED, Texture
 
 _LEAST_REACH = 1e-3
@@ -105,11 +104,11 @@ class SkinBaker:
         self._require_near(quality, level.record.budget)
         glow = level_emission(mesh, self._surface, self._nearest, reach)
         _require_lawful(baked.textures, glow)
-        first, second, third = map(pack_texture, baked.textures)
+        first, second, third = map(pack_map, baked.textures)
         skin = LevelSkin(
             uv=baked.uv,
             packed=(first, second, third),
-            packed_normal=None if baked.normal is None else pack_texture(baked.normal),
+            packed_normal=None if baked.normal is None else pack_map(baked.normal),
             quality=quality,
             emission=glow,
         )

@@ -12,7 +12,7 @@ from pipeline.foreign.material import MaterialSamples, Slot, SourceMaterial, sou
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.textured_mesh import TexturedMesh
 from storage.errors import Rejected
-from storage.records.normal_map import LEAST_Z, u_directions, unit_or_zero
+from storage.records.lookup import LEAST_Z, u_directions, unit_or_zero
 
 _LEAST_FOUND = 0.999
 """Fraction of the cleaned faces that must match one of the file: all but those that rounding split.

@@ -10,8 +10,8 @@ from pipeline.assets.source_materials.bake import DIFFUSE, BakedTextures
 from pipeline.assets.source_materials.nearest import SurfaceLookup, barycentric
 from pipeline.assets.source_materials.source_surface import SourceSurface
 from pipeline.foreign.mesh import TriangleMesh
+from storage.records.asset import SkinQuality
 from storage.records.lookup import texture_values
-from storage.records.skin import SkinQuality
 from storage.seeds import rng_for
 
 _NUM_POINTS = 4096

@@ -2,17 +2,65 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.conventions import in_camera
+from storage.conventions import in_camera, pixel_places
 from storage.errors import TrilightError, expected_one_of
 from storage.raycast.caster import MISS
+from storage.raycast.first_hits import FirstHits, corner_table
 from storage.records.material import laid_out
-from storage.records.passes.rays import PassRays, motion_px
+from storage.records.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Later:
+    """Another moment of a scene, or another camera, that `motion_px` leads to."""
+
+    scene: Scene
+    """Has the same triangles with their corners in the same order, possibly elsewhere."""
+    view: int
+
+    @cached_property
+    def corners(self) -> NDArray[np.float64]:
+        """[T + 1, 3, 3] positions in metres, the last row NaN."""
+        return corner_table(self.scene, self.scene.vertex_positions)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PassRays:
+    """Rays of a view, with what they meet."""
+
+    hits: FirstHits
+    c2w: NDArray[np.float64]
+    """[4, 4] of the camera."""
+    fov_deg: float
+    resolution: int
+    """Width and height of the picture in pixels, however many rays a pixel has."""
+    later: Later | None
+
+
+def motion_px(rays: PassRays) -> NDArray[np.float64]:
+    """Return where the other camera shows the points that rays meet, less where this one does.
+
+    That is x to the right and y down [..., 2] in pixels; NaN where nothing is met or where the
+    point lies behind the other camera.
+    """
+    if rays.later is None:
+        raise TrilightError("motion_px: no other moment is given; expected `then` or `then_view`.")
+    later_scene = rays.later.scene
+    view = rays.later.view
+    places = pixel_places(
+        rays.hits.interpolate(rays.later.corners),
+        later_scene.c2w[view],
+        float(later_scene.fov_deg[view]),
+        rays.resolution,
+    )
+    return places - pixel_places(rays.hits.position, rays.c2w, rays.fov_deg, rays.resolution)
+
 
 Frame = Literal["", "world", "camera", "picture"]
 """Axes of a vector. World and camera are those of storage.conventions (a camera looks along -Z with
@@ -24,17 +72,18 @@ Averaging = Literal["centre ray", "surfaces", "pixel"]
 times `coverage` it is the mean over the whole pixel. `pixel`: the mean over all its rays."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Pass:
     """One picture of what the pixels of a camera see."""
 
     name: str
     """Lower case letters and underscores, with the unit where there is one."""
     means: str
-    """One sentence that documents the pass."""
-    channels: tuple[str, ...]
-    """Names of its numbers; a single number has none, and its picture no last axis."""
+    of: Callable[[PassRays], NDArray] = field(compare=False, repr=False)
+    """Returns the values at rays, [...] or [..., channels]."""
     averaging: Averaging
+    channels: tuple[str, ...] = ()
+    """Names of its numbers; a single number has none, and its picture no last axis."""
     unit: str = ""
     frame: Frame = ""
     dtype: type = np.float64
@@ -44,8 +93,6 @@ class Pass:
     """A shorter word for it on the command line and in settings."""
     layer: str = ""
     """Name of its layer in OpenEXR files, where other programs have one; by default its own."""
-    of: Callable[[PassRays], NDArray] = field(compare=False, repr=False)
-    """Returns the values at rays, [...] or [..., channels]."""
 
     @property
     def exr_channels(self) -> tuple[str, ...]:
@@ -70,141 +117,108 @@ _WITHOUT_LAYER = ("Z", "A")
 _XYZ = ("x", "y", "z")
 _RGB = ("r", "g", "b")
 
+_at_centre = partial(Pass, averaging="centre ray")
+_over_surfaces = partial(Pass, averaging="surfaces")
+_row = partial(_at_centre, dtype=np.int32, nothing=MISS)
+_depth = partial(_over_surfaces, unit="m", nothing=np.inf)
+_vector = partial(_over_surfaces, channels=_XYZ, frame="world")
+_in_camera = partial(_over_surfaces, channels=_XYZ, frame="camera")
+
 PASSES = (
-    Pass(
-        name="triangle",
-        means="Row of `Scene.faces` of the triangle that is seen.",
-        channels=(),
-        averaging="centre ray",
-        dtype=np.int32,
-        nothing=MISS,
-        of=lambda rays: rays.hits.triangle,
+    _row(
+        "triangle",
+        "Row of `Scene.faces` of the triangle that is seen.",
+        lambda rays: rays.hits.triangle,
     ),
-    Pass(
-        name="object",
-        means="Row of `Scene.objects` of the object that is seen.",
-        channels=(),
-        averaging="centre ray",
-        dtype=np.int32,
-        nothing=MISS,
-        of=lambda rays: rays.hits.object,
+    _row(
+        "object",
+        "Row of `Scene.objects` of the object that is seen.",
+        lambda rays: rays.hits.object,
     ),
-    Pass(
-        name="barycentric",
-        means="Shares of the triangle's three corners in the point that is seen, adding up to 1.",
+    _at_centre(
+        "barycentric",
+        "Shares of the triangle's three corners in the point that is seen, adding up to 1.",
+        lambda rays: rays.hits.barycentric,
         channels=("a", "b", "c"),
-        averaging="centre ray",
-        of=lambda rays: rays.hits.barycentric,
     ),
-    Pass(
-        name="hit",
-        means="Whether the ray through the pixel's centre meets a surface.",
-        channels=(),
-        averaging="centre ray",
+    _at_centre(
+        "hit",
+        "Whether the ray through the pixel's centre meets a surface.",
+        lambda rays: rays.hits.met,
         dtype=np.bool_,
         nothing=False,
-        of=lambda rays: rays.hits.met,
     ),
     Pass(
-        name="coverage",
-        layer="A",
-        means="Share of the pixel's rays that meet a surface.",
-        channels=(),
+        "coverage",
+        "Share of the pixel's rays that meet a surface.",
+        lambda rays: rays.hits.met,
         averaging="pixel",
+        layer="A",
         nothing=0,
-        of=lambda rays: rays.hits.met,
     ),
-    Pass(
-        name="depth_axis_m",
+    _depth(
+        "depth_axis_m",
+        "Distance from the camera's plane to the surface, along the axis of the camera.",
+        lambda rays: -in_camera(rays.hits.position, rays.c2w)[..., 2],
         short="depth",
         layer="Z",
-        means="Distance from the camera's plane to the surface, along the axis of the camera.",
-        channels=(),
-        averaging="surfaces",
-        unit="m",
-        nothing=np.inf,
-        of=lambda rays: -in_camera(rays.hits.position, rays.c2w)[..., 2],
     ),
-    Pass(
-        name="depth_ray_m",
-        means="Distance from the camera's centre to the surface, along the ray.",
-        channels=(),
-        averaging="surfaces",
-        unit="m",
-        nothing=np.inf,
-        of=lambda rays: rays.hits.depth_m,
+    _depth(
+        "depth_ray_m",
+        "Distance from the camera's centre to the surface, along the ray.",
+        lambda rays: rays.hits.depth_m,
     ),
-    Pass(
-        name="position_m",
+    _vector(
+        "position_m",
+        "Point of the surface.",
+        lambda rays: rays.hits.position,
         short="position",
         layer="P",
-        means="Point of the surface.",
-        channels=_XYZ,
-        averaging="surfaces",
         unit="m",
-        frame="world",
-        of=lambda rays: rays.hits.position,
     ),
-    Pass(
-        name="geometric_normal",
-        layer="Ng",
-        means="Unit normal of the triangle, towards the side from which its corners run "
+    _vector(
+        "geometric_normal",
+        "Unit normal of the triangle, towards the side from which its corners run "
         "counter-clockwise, even where the other side is seen.",
-        channels=_XYZ,
-        averaging="surfaces",
-        frame="world",
-        of=lambda rays: rays.hits.geometric_normal,
+        lambda rays: rays.hits.geometric_normal,
+        layer="Ng",
     ),
-    Pass(
-        name="geometric_normal_camera",
-        means="The pass `geometric_normal` in the axes of the camera.",
-        channels=_XYZ,
-        averaging="surfaces",
-        frame="camera",
-        of=lambda rays: rays.hits.geometric_normal @ rays.c2w[:3, :3],
+    _in_camera(
+        "geometric_normal_camera",
+        "The pass `geometric_normal` in the axes of the camera.",
+        lambda rays: rays.hits.geometric_normal @ rays.c2w[:3, :3],
     ),
-    Pass(
-        name="shading_normal",
+    _vector(
+        "shading_normal",
+        "Unit normal interpolated between the triangle's corners and bent by its normal map, not "
+        "turned to the camera.",
+        lambda rays: rays.hits.shading_normal,
         short="normal",
         layer="N",
-        means="Unit normal interpolated between the triangle's corners and bent by its normal map, "
-        "not turned to the camera.",
-        channels=_XYZ,
-        averaging="surfaces",
-        frame="world",
-        of=lambda rays: rays.hits.shading_normal,
     ),
-    Pass(
-        name="shading_normal_camera",
-        means="The pass `shading_normal` in the axes of the camera.",
-        channels=_XYZ,
-        averaging="surfaces",
-        frame="camera",
-        of=lambda rays: rays.hits.shading_normal @ rays.c2w[:3, :3],
+    _in_camera(
+        "shading_normal_camera",
+        "The pass `shading_normal` in the axes of the camera.",
+        lambda rays: rays.hits.shading_normal @ rays.c2w[:3, :3],
     ),
-    Pass(
-        name=UV,
-        means="Texture coordinates of the point that is seen, u to the right and v up; undefined "
-        "where the scene has none.",
+    _at_centre(
+        UV,
+        "Texture coordinates of the point that is seen, u to the right and v up; undefined where "
+        "the scene has none.",
+        lambda rays: rays.hits.uv,
         channels=("u", "v"),
-        averaging="centre ray",
-        of=lambda rays: rays.hits.uv,
     ),
-    Pass(
-        name=MOTION,
-        means="How far the point that is seen moves in the picture until another moment or camera, "
+    _over_surfaces(
+        MOTION,
+        "How far the point that is seen moves in the picture until another moment or camera, "
         "whether or not something hides it there; undefined where it is behind that camera.",
+        motion_px,
         channels=("x", "y"),
-        averaging="surfaces",
         unit="px",
         frame="picture",
-        of=motion_px,
     ),
 )
 """All passes but those of material columns."""
-
-MATERIAL = "material_"
-"""What the name of a column's pass begins with."""
 
 
 def declared_passes() -> tuple[Pass, ...]:
@@ -213,26 +227,21 @@ def declared_passes() -> tuple[Pass, ...]:
     Emission is 0 wherever a surface is seen, since emitters are hidden from cameras.
     """
     return PASSES + tuple(
-        Pass(
-            name=MATERIAL + column.name,
+        _over_surfaces(
+            f"material_{column.name}",
+            column.means,
+            partial(_column, part=part),
             short=column.name,
-            means=column.means,
             channels=_channels(column.width, is_colour=column.is_colour),
-            averaging="surfaces",
-            of=partial(_column, part=part),
         )
         for column, part in laid_out()
     )
 
 
 def pass_names(words: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of the passes of one scene that words mean, each once, in their own order.
+    """Return the names of the passes that words, names or shorter ones, mean, each once, in order.
 
-    Args:
-        words: names of passes, or their shorter words.
-
-    Raises:
-        TrilightError: there is no such pass, or it needs another moment of the scene.
+    It raises TrilightError where there is no such pass, or it needs another moment of the scene.
     """
     passes = [each for each in declared_passes() if each.name != MOTION]
     meant = {word: each.name for each in passes for word in (each.short, each.name) if word}

@@ -2,9 +2,15 @@
 
 The rays of a pixel stand on a regular grid over its area, the same for every pixel, so that equal
 arguments give equal numbers. Ids and barycentrics are those of one more ray, through the centre.
+
+In OpenEXR files all channels are float32, packed without loss: ids below 2^24 are exact in it, and
+Nuke and Blender turn every channel into it anyway. Names of channels are `Pass.exr_channels`. The
+channel A, which is the pass `coverage`, is always there. Where it is 0 nothing is met, and the file
+holds 0 instead of NaN, since filters of other programs would spread NaN over its neighbours;
+readers restore it. For the same reason a scene without textures has no channels of the pass `uv`.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +18,15 @@ from numpy.typing import NDArray
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
 from storage.raycast.first_hits import SeenFrom, require_row
-from storage.records.passes.declared import MOTION, UV, Pass, declared_passes
-from storage.records.passes.rays import Later, PassRays, require_same_triangles
+from storage.records.exr import channel_names, decode_channels, encode_channels
+from storage.records.passes.declared import (
+    MOTION,
+    UV,
+    Later,
+    Pass,
+    PassRays,
+    declared_passes,
+)
 from storage.records.scene import Scene
 
 BLOCK_RAYS = 2**14
@@ -150,10 +163,127 @@ def _later(scene: Scene, view: int, then: Scene | None, then_view: int | None) -
         return None
     later = Later(scene if then is None else then, view if then_view is None else then_view)
     require_row("then_view", later.view, later.scene.num_views)
-    require_same_triangles(scene, later.scene)
+    _require_same_triangles(scene, later.scene)
     return later
+
+
+def _require_same_triangles(now: Scene, then: Scene) -> None:
+    """Raise TrilightError unless the triangles of two scenes have the same corners, in order."""
+    if now.faces.shape != then.faces.shape:
+        raise TrilightError(
+            f"motion_px: the other scene has {then.num_triangles} triangles; expected the "
+            f"{now.num_triangles} of this one, in the same order."
+        )
+    differ = np.flatnonzero((now.faces != then.faces).any(axis=1))
+    if len(differ):
+        row = int(differ[0])
+        raise TrilightError(
+            f"motion_px: faces[{row}] of the other scene is {then.faces[row].tolist()}; expected "
+            f"{now.faces[row].tolist()} as in this one, since points are followed by triangles."
+        )
 
 
 def _require_whole(name: str, value: int, most: int) -> None:
     if not isinstance(value, int | np.integer) or not 1 <= value <= most:
         raise TrilightError(f"{name} is {value}; expected a whole number from 1 to {most}.")
+
+
+COVERAGE = "coverage"
+"""The pass that every file has."""
+
+MOST_IDS = 2**24
+"""Float32 holds every whole number up to this one."""
+
+
+def passes_exr(
+    scene: Scene, names: Sequence[str], *, view: int, resolution: int, rays_a_side: int = 1
+) -> bytes:
+    """Return the OpenEXR file of passes of one camera; equal arguments give equal bytes.
+
+    Arguments are those of `view_passes`, and `passes_in_file` says which passes the file has. It
+    raises as `view_passes`, and for a scene of more than 2^24 triangles.
+    """
+    if scene.num_triangles > MOST_IDS:
+        raise TrilightError(
+            f"passes: the scene has {scene.num_triangles} triangles; expected at most {MOST_IDS}, "
+            "so that ids are exact in a file."
+        )
+    pictures = view_passes(
+        scene,
+        passes_in_file(scene, names),
+        view=view,
+        resolution=resolution,
+        rays_a_side=rays_a_side,
+    )
+    is_hit = pictures[COVERAGE] > 0
+    channels: dict[str, NDArray[np.float32]] = {}
+    for each in _passes(pictures):
+        values = np.atleast_3d(pictures[each.name]).astype(np.float32)
+        unmet = np.isnan(values) & ~is_hit[..., None]
+        planes = np.where(unmet, np.float32(0), values)
+        for number, channel in enumerate(each.exr_channels):
+            channels[channel] = np.ascontiguousarray(planes[..., number])
+    return encode_channels(channels)
+
+
+def decode_passes_exr(data: bytes, resolution: int) -> dict[str, NDArray]:
+    """Return the passes in a file by name, as `picture_passes`; `coverage` is among them.
+
+    It raises as `decode_channels`, and for channels that are no whole passes.
+    """
+    stored_channels = set(channel_names(data))
+    passes = [each for each in declared_passes() if stored_channels >= set(each.exr_channels)]
+    names = [channel for each in passes for channel in each.exr_channels]
+    if COVERAGE not in {each.name for each in passes}:
+        raise TrilightError("passes: channel A (coverage) is missing.")
+    size = (resolution, resolution)
+    channels = decode_channels(data, names, size=size, what="passes", separate=True)
+    nowhere = channels["A"] == 0
+    return {each.name: _restore(each, channels, nowhere) for each in passes}
+
+
+def picture_passes(
+    scene: Scene, names: Sequence[str], *, view: int, resolution: int, stored: bytes | None = None
+) -> dict[str, NDArray]:
+    """Return passes of one view by name, one ray a pixel: the same numbers, stored or computed.
+
+    Arguments and result are those of `view_passes`, with float32 in place of float64. What
+    `stored`, an OpenEXR file of passes of this view, lacks is computed. It raises as
+    `decode_passes_exr` too.
+    """
+    pictures = {} if stored is None else decode_passes_exr(stored, resolution)
+    lacking = [name for name in names if name not in pictures]
+    if lacking:
+        computed = view_passes(scene, lacking, view=view, resolution=resolution)
+        pictures |= {
+            each.name: computed[each.name].astype(_stored_dtype(each)) for each in _passes(computed)
+        }
+    return {name: pictures[name] for name in names}
+
+
+def passes_in_file(scene: Scene, names: Sequence[str]) -> list[str]:
+    """Return the passes that a file has where `names` are asked for.
+
+    `coverage` is among them; `uv` only where the scene has texture coordinates, so that of a preset
+    which mixes textured and plain scenes no file holds NaN where a surface is met.
+    """
+    known = [name for name in names if name != UV or scene.uv is not None]
+    return known if COVERAGE in known else [*known, COVERAGE]
+
+
+def _passes(pictures: Mapping[str, NDArray]) -> list[Pass]:
+    return [each for each in declared_passes() if each.name in pictures]
+
+
+def _stored_dtype(each: Pass) -> type:
+    """Return the type of a pass that went through a file."""
+    return np.float32 if each.dtype is np.float64 else each.dtype
+
+
+def _restore(each: Pass, channels: Mapping[str, NDArray], nowhere: NDArray[np.bool_]) -> NDArray:
+    planes = [np.asarray(channels[channel], np.float32) for channel in each.exr_channels]
+    if np.isnan(each.nothing):
+        unmet = nowhere & np.all([plane == 0 for plane in planes], axis=0)
+        planes = [np.where(unmet, np.float32(np.nan), plane) for plane in planes]
+    picture = np.stack(planes, axis=-1) if each.channels else planes[0]
+    return picture.astype(_stored_dtype(each))

@@ -14,11 +14,10 @@ from infra.cli.extend_option import load_extensions
 from infra.repair import repair
 from infra.run_record import is_run, run_facts
 from pipeline.generation.generate_options import GenerateOptions
-from storage.dataset.asked import write_asked
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import write_manifest
-from storage.dataset.progress import announce_objects
+from storage.dataset.progress import announce_objects, write_asked
 from storage.dataset.scene_logs import log_scene
 from storage.digests import sha256_hex
 from storage.errors import TrilightError

@@ -35,7 +35,7 @@ from storage.dataset.shard import write_shard
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.exr import decode_exr
-from storage.records.parts import sum_of_parts
+from storage.records.lights import sum_of_parts
 from storage.records.profiles import Profile
 from storage.records.sample import Sample, encode_sample
 from storage.records.scene import Scene

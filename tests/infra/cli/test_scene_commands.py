@@ -15,7 +15,7 @@ from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
 from storage.dataset.shard import write_shard
-from storage.records.passes.stored import decode_passes_exr, passes_exr
+from storage.records.passes.pictures import decode_passes_exr, passes_exr
 from storage.records.profiles import Profile
 from storage.records.sample import encode_sample
 from storage.records.scene import Scene

@@ -30,8 +30,7 @@ from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneBatch, SceneTensors, batch_scenes, scene_tensors
 from model.weights import decode_weights, encode_weights
 from storage.errors import TrilightError
-from storage.raycast.caster import RayHits
-from storage.raycast.embree import Triangles
+from storage.raycast.caster import RayHits, Triangles
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from tests.for_each import for_each

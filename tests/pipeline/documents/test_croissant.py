@@ -11,11 +11,9 @@ from pipeline.documents.croissant import encode_croissant
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.distributions import dataset_distributions
 from pipeline.documents.rights import rights_of
-from storage.dataset import sampled
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.sampled import described_shards
-from storage.dataset.statistics import dataset_statistics
+from storage.dataset.statistics import dataset_statistics, described_shards
 from storage.records.objects import read_objects_lock
 from tests.pipeline.documents.dataset_by_hand import five_scenes, locked, sample, write_dataset
 from tests.scenes_by_hand import tiny_scene
@@ -88,7 +86,7 @@ def test_documents_of_a_sample_say_so(
 ) -> None:
     whole = dataset_statistics(dataset)
     assert whole.scene_digest and "what follows is" not in dict(whole.lines())
-    monkeypatch.setattr(sampled, "MOST_SCENES", 4)
+    monkeypatch.setattr("storage.dataset.statistics.MOST_SCENES", 4)
     monkeypatch.setattr(croissant, "MOST_LISTED", 3)
     out = DatasetFolder(tmp_path / "documents")
     out.root.mkdir()

@@ -14,9 +14,8 @@ from pipeline.documents.gallery import Card, gallery_filters, make_card
 from pipeline.documents.pages import is_address, render_page
 from pipeline.documents.quality_page import Pair, encode_quality_page
 from storage.conventions import preview_gain, preview_srgb8
-from storage.records.asset import AssetRow
+from storage.records.asset import AssetRow, OwnMaterials
 from storage.records.objects import Failure
-from storage.records.skin import OwnMaterials
 from tests.pipeline.documents.dataset_by_hand import furnished, sample
 from tests.pipeline.documents.pages_read import HARM, Tags, read, text_of
 from tests.pipeline.documents.rows_by_hand import row

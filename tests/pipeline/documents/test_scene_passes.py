@@ -20,8 +20,7 @@ from pipeline.documents.scene_passes import depth_grays, finite_range, id_colors
 from storage.conventions import look_at_c2w
 from storage.dataset.dataset import open_dataset
 from storage.dataset.manifest import write_manifest
-from storage.records.passes.pictures import view_passes
-from storage.records.passes.stored import decode_passes_exr
+from storage.records.passes.pictures import decode_passes_exr, view_passes
 from storage.records.sample import Sample
 from storage.records.scene import Scene
 from tests.command_line import trilight

@@ -19,10 +19,10 @@ from pipeline.isolation import call_with_retries
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings, resolve_dataset_preset
 from pipeline.shards.derive import _extensions
 from scene_templates.families import FAMILIES
-from storage.dataset.asked import read_asked, write_asked
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest, write_manifest
+from storage.dataset.progress import read_asked, write_asked
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.extensions import load_extension, mistake_in_extension

@@ -187,8 +187,7 @@ def test_an_index_that_contradicts_the_objects_is_refused(
     path = made[0].folder.staged_index
     was = path.read_bytes()
     index = ObjectIndex(path)
-    _, begin = index._arrays["least"]
-    row = index._data + begin + 4 * index.facts.splits["train"].start
+    row = index._columns["least"].offset + 4 * index.facts.splits["train"].start
     path.write_bytes(was[:row] + bytes([was[row] ^ 1]) + was[row + 1 :])
     try:
         with pytest.raises(TrilightError, match=r"objects\.index: says otherwise of 'object .*Del"):

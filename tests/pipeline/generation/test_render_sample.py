@@ -19,7 +19,7 @@ from pipeline.scenes.compose import compose_scene
 from storage.dataset.layout import DatasetFolder
 from storage.errors import Rejected, TrilightError
 from storage.records.objects import Failure
-from storage.records.passes.stored import passes_exr
+from storage.records.passes.pictures import passes_exr
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene
 from storage.renderer import Sampling

@@ -146,9 +146,8 @@ def test_a_default_that_is_changed_later_changes_no_frozen_set() -> None:
         from scene_templates import settings as scenes
         from scene_templates import families
         from scene_templates import rooms
-        from scene_templates import separate_sides
         from storage.dataset import settings as dataset_settings
-        modules = (assets, presets, renders, scenes, families, rooms, separate_sides)
+        modules = (assets, presets, renders, scenes, families, rooms)
         kinds = {kind for module in (*modules, dataset_settings) for kind in vars(module).values()
                  if hasattr(kind, "__pydantic_fields__")}
         assert len(kinds) > 14

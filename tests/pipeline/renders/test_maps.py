@@ -25,12 +25,11 @@ from scene_templates.sample_material import MaterialSettings
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.raycast.first_hits import first_hits
-from storage.records.environment import Environment
+from storage.records.environment import Environment, row_solid_angles
 from storage.records.lights import light_rows
 from storage.records.lookup import environment_values, texture_values
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene, SceneObject
-from storage.records.sky_texels import row_solid_angles
 from storage.records.texture import MAX_SIDE, Texture
 from storage.seeds import SceneKey
 from tests.oracle.plugin_tracer import PluginTracer

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.renders.load_tracer import load_tracer
 from scene_templates.rotations import uniform_rotation
 from storage.raycast.first_hits import first_hits
-from storage.records.normal_map import FLAT, LEAST_Z, mapped_normals, u_directions
+from storage.records.lookup import FLAT, LEAST_Z, mapped_normals, u_directions
 from storage.records.passes.pictures import view_passes
 from storage.records.retextured import with_textures
 from storage.records.scene import Scene

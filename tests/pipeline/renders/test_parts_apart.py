@@ -18,8 +18,13 @@ from storage.dataset.verify import check_sample
 from storage.errors import Rejected
 from storage.metrics import MAX_DB, psnr_log_db
 from storage.records.exr import decode_exr, encode_exr
-from storage.records.lights import MAX_LIGHTS, rounded_to_half, sum_of_lights
-from storage.records.parts import part_names, sum_of_parts
+from storage.records.lights import (
+    MAX_LIGHTS,
+    part_names,
+    rounded_to_half,
+    sum_of_lights,
+    sum_of_parts,
+)
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene
 from tests.pipeline.renders.guided_scenes import mirrors

@@ -22,8 +22,7 @@ from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.settings import RenderSettings
 from storage.metrics import psnr_linear_db, psnr_log_db
 from storage.records.exr import decode_exr
-from storage.records.passes.pictures import view_passes
-from storage.records.passes.stored import passes_exr
+from storage.records.passes.pictures import passes_exr, view_passes
 from storage.records.scene import Scene
 from tests.pipeline.renders.sampling import block_means, camera_of, render_view
 from tests.pipeline.renders.scene_kit import (

@@ -30,19 +30,18 @@ from scene_templates.layout import Emitter, Layout, ObjectPlacement, Pose, Shell
 from scene_templates.rooms import PATCH_FACES, SIDES, patch
 from scene_templates.rotations import rotate_points
 from scene_templates.settings import SceneSettings
-from scene_templates.surfaces.draw import SurfaceMapSettings
+from scene_templates.surfaces.procedural_textures import SurfaceMapSettings
 from scene_templates.textures import TextureSettings
 from storage.errors import Rejected
-from storage.records.asset import Level
+from storage.records.asset import Level, LevelSkin, SkinQuality
 from storage.records.lookup import texture_values
-from storage.records.map_facts import texture_families
 from storage.records.material import EMISSION, default_rows
 from storage.records.objects import locked_uids
-from storage.records.packed_maps import pack_texture
+from storage.records.packed_maps import pack_map
 from storage.records.retextured import without_normal_maps
 from storage.records.scene import Scene, SceneObject
+from storage.records.scene_facts import texture_families
 from storage.records.scene_file import scene_digest
-from storage.records.skin import LevelSkin, SkinQuality
 from storage.records.texture import Texture
 from storage.seeds import SceneKey
 from storage.settings.overrides import apply_overrides
@@ -74,7 +73,7 @@ def _skinned(level: Level, seed: int = 0, every: int = 0) -> Level:
     """Return a level with noise on it, whose every so-manieth triangle emits, ever redder."""
     drawn = np.random.default_rng(seed).uniform(0, 0.5, (4, 4, 7)).astype(np.float32)
     parts = (slice(0, 3), slice(3, 6), slice(6, 7))
-    first, second, third = (pack_texture(Texture(texels=drawn[..., part])) for part in parts)
+    first, second, third = (pack_map(Texture(texels=drawn[..., part])) for part in parts)
     uv = np.random.default_rng(seed).random((len(level.faces), 3, 2)).astype(np.float32)
     skin = LevelSkin(uv=uv, packed=(first, second, third), quality=QUALITY)
     if every:
@@ -400,7 +399,7 @@ def test_textures_have_the_rights_and_the_means_of_their_objects() -> None:
 def test_an_object_whose_textures_break_a_law_costs_scenes_by_its_name() -> None:
     entries, level = _pool()[1:2], _skinned(small_pool()[1].asset.levels[0])
     assert level.skin is not None
-    broken = pack_texture(Texture(texels=np.full((1, 1, 3), np.nan, np.float32)))
+    broken = pack_map(Texture(texels=np.full((1, 1, 3), np.nan, np.float32)))
     skin = dataclasses.replace(level.skin, packed=(broken, *level.skin.packed[1:]))
     levels = [dataclasses.replace(level, skin=skin)]
     with pytest.raises(Rejected, match=f"^law_broken: object {entries[0].locked.uid}: .*diffuse"):
@@ -417,7 +416,7 @@ def test_a_normal_map_comes_with_the_rights_of_its_object_and_changes_nothing_el
             if level.skin is None
             else dataclasses.replace(
                 level,
-                skin=dataclasses.replace(level.skin, packed_normal=pack_texture(bumps(seed))),
+                skin=dataclasses.replace(level.skin, packed_normal=pack_map(bumps(seed))),
             )
             for level in entry.asset.levels
         ]

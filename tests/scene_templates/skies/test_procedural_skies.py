@@ -8,9 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scene_templates.skies.draw import SkyMap, SkyMapSettings, draw_sky
-from scene_templates.skies.draws import SkyDraws
-from scene_templates.skies.procedural_skies import OUR_SKIES, SKIES
+from scene_templates.skies.procedural_skies import (
+    OUR_SKIES,
+    SKIES,
+    SkyDraws,
+    SkyMap,
+    SkyMapSettings,
+    draw_sky,
+)
 from scene_templates.skies.texels import SkyTexels
 from storage.seeds import rng_for
 from storage.settings.overrides import apply_overrides

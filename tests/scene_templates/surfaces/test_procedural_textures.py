@@ -8,10 +8,13 @@ import pytest
 from numpy.typing import NDArray
 
 from scene_templates.exact import Numbers
-from scene_templates.surfaces.draw import SurfaceMapSettings, draw_surface
-from scene_templates.surfaces.draws import SurfaceDraws
-from scene_templates.surfaces.maps import Finish, SurfaceMaps
-from scene_templates.surfaces.procedural_textures import OUR_SURFACES, SURFACES
+from scene_templates.surfaces.maps import Finish, SurfaceDraws, SurfaceMaps
+from scene_templates.surfaces.procedural_textures import (
+    OUR_SURFACES,
+    SURFACES,
+    SurfaceMapSettings,
+    draw_surface,
+)
 from scene_templates.surfaces.texels import Texels
 from storage.seeds import rng_for
 from storage.settings.overrides import apply_overrides

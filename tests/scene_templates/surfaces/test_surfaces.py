@@ -6,13 +6,14 @@ import math
 import numpy as np
 import pytest
 
-from scene_templates.surfaces.draw import SurfaceMapSettings, draw_surface
 from scene_templates.surfaces.maps import MOST_ALBEDO, finish, surface_maps
 from scene_templates.surfaces.procedural_textures import (
     HEXAGONS,
     OUR_SURFACES,
     SURFACES,
+    SurfaceMapSettings,
     _hexagon_of,
+    draw_surface,
     exceeded_by,
     lay_rows,
 )

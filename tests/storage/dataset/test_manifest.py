@@ -23,7 +23,6 @@ from hypothesis import strategies as st
 
 from storage.conventions import SPLITS
 from storage.dataset import progress, scene_logs
-from storage.dataset.asked import write_asked
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import (
@@ -43,6 +42,7 @@ from storage.dataset.progress import (
     read_progress,
     read_status,
     tell_views,
+    write_asked,
 )
 from storage.dataset.scene_logs import SceneLog, log_scene, sample_logs
 from storage.dataset.settings import SplitSettings
@@ -57,71 +57,47 @@ from storage.dataset.splits import (
     split_of_shard,
 )
 from storage.errors import TrilightError
-from storage.installation import IMPORT_ROOT, module_name
 from storage.seeds import rng_for, seed_for
+from tests.conftest import ROOT
 from tests.for_each import for_each
 from tests.http_server import serve
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes
 from tests.pipeline.generation.test_dataset_writer import begin_tiny, make_tiny_shard
 
 SAMPLES_PER_SHARD = 256
-SUFFIXES = ("0.exr", "1.exr", "2.exr", "3.exr", "json", "scene.safetensors.gz")
-MEMBER_BYTES = 25_600
-"""Bytes of a member with its header: a sample of four small pictures takes about 150 kB."""
+SAMPLE_BYTES = 150_000
+"""A sample of four small pictures takes about as much."""
 
 
 def write_manifest_of(root: Path, num_samples: int) -> None:
     """Write the manifest of a dataset whose every scene is for training."""
-    shards = [
-        _shard(number, range(first, min(first + SAMPLES_PER_SHARD, num_samples)))
-        for number, first in enumerate(range(0, num_samples, SAMPLES_PER_SHARD))
-    ]
-    _write_manifest(DatasetFolder(root), num_samples, shards)
-
-
-def _write_manifest(folder: DatasetFolder, num_samples: int, shards: list[ShardEntry]) -> None:
+    firsts = range(0, num_samples, SAMPLES_PER_SHARD)
+    counts = [min(SAMPLES_PER_SHARD, num_samples - first) for first in firsts]
+    shards = tuple(
+        ShardEntry(
+            name=named_shard(number, "train"), split="train", num_samples=count,
+            num_bytes=count * SAMPLE_BYTES + 10_240, sha256=f"{number:064x}",
+        )
+        for number, count in enumerate(counts)
+    )  # fmt: skip
     manifest = Manifest(
         build="bench", settings={}, environment={}, num_scenes=num_samples, num_views=4,
-        objects_lock_sha256="", shards=tuple(shards),
+        objects_lock_sha256="", shards=shards,
     )  # fmt: skip
-    write_manifest(folder.manifest, manifest)
+    write_manifest(DatasetFolder(root).manifest, manifest)
 
 
-def _shard(number: int, indices: range) -> ShardEntry:
-    return ShardEntry(
-        name=named_shard(number, "train"),
-        split="train",
-        num_samples=len(indices),
-        num_bytes=len(indices) * len(SUFFIXES) * MEMBER_BYTES + 10_240,
-        sha256=f"{number:064x}",
-    )
-
-
-def memory_of_opening(root: Path, small: Path) -> dict[str, float]:
-    """Open a dataset for training in a process that has opened a small one; returns what it takes.
-
-    `peak_bytes` is what the process grows by at most, `held_bytes` what of it stays.
-    """
-    module = module_name("storage.dataset.training_data")
-    command = [sys.executable, "-c", _CHILD, str(root), module, str(small)]
-    ran = subprocess.run(command, cwd=IMPORT_ROOT, capture_output=True, text=True, check=True)
-    peak, held, seconds = map(float, ran.stdout.split())
-    return {"peak_bytes": peak, "held_bytes": held, "open_s": seconds}
-
-
-_CHILD = """
-import sys, time
-from importlib import import_module
-open_training_data = import_module(sys.argv[2]).open_training_data
-open_training_data([sys.argv[3]])  # the reader by type takes 10 MB, once
-def now(name):
+OPENING = """
+import sys
+from storage.dataset.training_data import open_training_data
+open_training_data([sys.argv[2]])  # the reader by type takes 10 MB, once
+def peak_bytes():
     # not getrusage: its peak counts the parent too, from before this program was begun
     lines = open("/proc/self/status").read().splitlines()
-    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(name))
-peak, held, began = now("VmHWM"), now("VmRSS"), time.perf_counter()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
+before = peak_bytes()
 data = open_training_data([sys.argv[1]])
-seconds = time.perf_counter() - began
-print(now("VmHWM") - peak, now("VmRSS") - held, seconds)
+print(peak_bytes() - before)
 """
 
 
@@ -157,8 +133,10 @@ def test_a_shard_takes_200_bytes_of_a_manifest(tmp_path: Path) -> None:
 def test_opening_a_large_dataset_takes_few_bytes_a_sample(tmp_path: Path) -> None:
     write_manifest_of(tmp_path / "large", 100_000)
     write_manifest_of(tmp_path / "small", 1)
-    taken = memory_of_opening(tmp_path / "large", tmp_path / "small")["peak_bytes"]
-    assert taken < 100_000 * 40  # 390 shards; measured: 17, nearly all of it a piece of the text
+    command = [sys.executable, "-c", OPENING, str(tmp_path / "large"), str(tmp_path / "small")]
+    ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    # 390 shards; measured: 17, nearly all of it a piece of the text
+    assert int(ran.stdout) < 100_000 * 40
 
 
 LIES: dict[str, Any] = {
@@ -257,12 +235,9 @@ def test_every_cycle_has_each_split(cycle: int) -> None:
     assert splits.count("validation") == splits.count("test") == 1
 
 
-def test_a_small_dataset_has_all_splits() -> None:
+def test_a_small_dataset_has_all_splits_and_one_without_objects_is_one_clear_line() -> None:
     names = [shard_name(index, SETTINGS) for index in range(shards_for(24, SETTINGS))]
     assert {name.split("-")[0] for name in names} == set(SPLITS)
-
-
-def test_a_split_without_objects_is_one_clear_line() -> None:
     with pytest.raises(TrilightError, match="split 'validation': none of the 5"):
         require_objects({"train": 5}, {"train", "validation"})
     require_objects({"train": 5}, {"train"})
@@ -367,13 +342,10 @@ def test_scenes_at_work_count_in_part(tmp_path: Path) -> None:
     (left,) = (folder.staging / "at_work").iterdir()
     os.utime(left, (0, 0))
     assert read_progress(folder).views_done == 4 * 2
-
-
-def test_where_nothing_can_be_written_nothing_is_told(tmp_path: Path) -> None:
-    folder = DatasetFolder(tmp_path)
-    (tmp_path / ".staging").write_text("in the way")
-    tell_views(folder, 0, 0.5)
-    forget_views(folder, 0)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / ".staging").write_text("in the way")
+    for note in (lambda at: tell_views(at, 0, 0.5), lambda at: forget_views(at, 0)):
+        note(DatasetFolder(tmp_path / "full"))  # where nothing can be written, nothing is told
 
 
 def test_shards_scenes_and_what_to_do_next(tmp_path: Path) -> None:

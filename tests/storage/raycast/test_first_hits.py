@@ -6,8 +6,7 @@ from numpy.typing import NDArray
 
 from storage.conventions import camera_rays, look_at_c2w
 from storage.errors import TrilightError
-from storage.raycast.caster import MISS
-from storage.raycast.embree import Surfaces
+from storage.raycast.caster import MISS, Surfaces
 from storage.raycast.first_hits import FirstHits, SeenFrom, first_hits
 from storage.records.scene import Scene
 from tests.for_each import for_each

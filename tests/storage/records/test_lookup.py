@@ -8,7 +8,7 @@ import pytest
 from storage.conventions import latlong_direction, latlong_uv, srgb8
 from storage.records.environment import Environment
 from storage.records.lookup import environment_values, texture_values
-from storage.records.map_facts import SkyFacts, sky_facts, texture_families, textured_objects
+from storage.records.scene_facts import SkyFacts, sky_facts, texture_families, textured_objects
 from storage.records.texture import MapSource, Texture
 from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, tiny_scene

@@ -17,9 +17,12 @@ from storage.conventions import MAPS_VERSION, SCHEMA_VERSION
 from storage.errors import TrilightError
 from storage.records import packed_maps
 from storage.records.environment import Environment
-from storage.records.held_maps import HeldMaps, with_same_content
-from storage.records.map_references import map_member
-from storage.records.packed_maps import pack_environment, pack_texture
+from storage.records.packed_maps import (
+    HeldMaps,
+    map_member,
+    pack_map,
+    with_same_content,
+)
 from storage.records.profiles import PROFILES, Profile
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene
@@ -97,9 +100,9 @@ def test_scenes_without_maps_are_what_they_were() -> None:
 def test_equal_content_has_equal_bytes_whatever_it_is_called() -> None:
     texture = colour_texture()
     other = dataclasses.replace(texture, source=number_texture().source)
-    assert pack_texture(texture) == pack_texture(other) and texture.sha256 == other.sha256
+    assert pack_map(texture) == pack_map(other) and texture.sha256 == other.sha256
     turned = sky(rotation=np.eye(3, dtype=np.float32), is_seen=True)
-    assert pack_environment(sky()) == pack_environment(turned)
+    assert pack_map(sky()) == pack_map(turned)
     assert sky().sha256 == turned.sha256
     read_as_linear = dataclasses.replace(texture, is_srgb=False)
     assert read_as_linear.sha256 != texture.sha256
@@ -109,11 +112,11 @@ def test_floats_are_stored_in_halves_only_where_nothing_is_lost() -> None:
     def dtype(data: bytes) -> str:
         return str(load(gzip.decompress(data))["values"].dtype)
 
-    assert dtype(pack_texture(HALVES)) == "float16"
-    assert dtype(pack_texture(number_texture())) == "float32"
-    assert dtype(pack_environment(sky())) == "float32"  # its sun of 1e6 is beyond half floats
+    assert dtype(pack_map(HALVES)) == "float16"
+    assert dtype(pack_map(number_texture())) == "float32"
+    assert dtype(pack_map(sky())) == "float32"  # its sun of 1e6 is beyond half floats
     dim = sky(radiance_rgb=np.full((1, 2, 3), 7, np.float32))
-    assert dtype(pack_environment(dim)) == "float16"
+    assert dtype(pack_map(dim)) == "float16"
 
 
 def _record(change: Callable[[dict[str, Any]], None]) -> Callable[[Members], None]:

@@ -16,19 +16,17 @@ from storage.dataset.verify import check_sample
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_exr
 from storage.records.lights import (
+    KNOWN_PARTS,
     MAX_LIGHTS,
     decode_lights_exr,
+    decode_parts_exr,
     encode_lights_exr,
+    encode_parts_exr,
     num_light_pictures,
     num_lights,
+    part_names,
     rounded_to_half,
     sum_of_lights,
-)
-from storage.records.parts import (
-    KNOWN_PARTS,
-    decode_parts_exr,
-    encode_parts_exr,
-    part_names,
     sum_of_parts,
 )
 from storage.records.sample import PartFloor, Sample, decode_sample, decode_scene, encode_sample
@@ -74,16 +72,13 @@ def test_lights_come_back_exactly_and_in_order(count: int) -> None:
     np.testing.assert_array_equal(last, lights[-1, ..., 1])
 
 
-def test_a_sum_beyond_half_floats_is_seen() -> None:
+def test_another_shape_is_refused_and_a_sum_beyond_half_floats_is_seen() -> None:
+    data = encode_lights_exr(_noise(2, *SIZE))
+    for shape in ((3, 16, 16), (2, 8, 16), (2, 16, 24), (MAX_LIGHTS + 1, 16, 16)):
+        with pytest.raises(TrilightError, match="lights: |channels are light0.B, .*; expected l"):
+            decode_lights_exr(data, shape)
     lights = np.full((2, 8, 8, 3), HALF_FLOAT_MAX * 0.6, np.float32)
     assert np.isinf(sum_of_lights(rounded_to_half(lights))).all()
-
-
-@for_each("shape", [(3, 16, 16), (2, 8, 16), (2, 16, 24), (MAX_LIGHTS + 1, 16, 16)])
-def test_another_shape_is_refused(shape: tuple[int, int, int]) -> None:
-    data = encode_lights_exr(_noise(2, *SIZE))
-    with pytest.raises(TrilightError, match="lights: |channels are light0.B, .*; expected light0"):
-        decode_lights_exr(data, shape)
 
 
 def test_a_sample_with_lights_comes_back() -> None:
@@ -97,7 +92,6 @@ def test_a_sample_with_lights_comes_back() -> None:
     del members["1.lights.exr"]
     with pytest.raises(TrilightError, match="1.lights.exr.*missing"):
         decode_sample(sample.key, members)
-    assert decode_sample("000000000", encode_sample(tiny_sample())).lights_rgb is None
 
 
 def test_a_sky_is_one_more_light_of_a_sample() -> None:
@@ -116,6 +110,12 @@ def test_a_sky_is_one_more_light_of_a_sample() -> None:
     assert "view 0 has 1 stated errors of lights; expected 3" in first and "view 1" in second
 
 
+def _one_bit_off(sample: Sample) -> Sample:
+    pictures = sample.radiance_rgb.copy()
+    pictures[1, 3, 5, 2] = np.nextafter(np.float16(pictures[1, 3, 5, 2]), np.float16(np.inf))
+    return dataclasses.replace(sample, radiance_rgb=pictures)
+
+
 def test_verify_demands_the_sum_of_lights() -> None:
     sample = _lit_sample()
     assert faults(sample, per_light=True) == []
@@ -123,9 +123,7 @@ def test_verify_demands_the_sum_of_lights() -> None:
     assert "has pictures by light" in faults(sample, per_light=False)[0]
     without = _lit_sample(lights_rgb=None)
     assert "lacks pictures by light" in faults(without, per_light=True)[0]
-    pictures = sample.radiance_rgb.copy()
-    pictures[1, 3, 5, 2] = np.nextafter(np.float16(pictures[1, 3, 5, 2]), np.float16(np.inf))
-    (fault,) = faults(_lit_sample(radiance_rgb=pictures), per_light=True)
+    (fault,) = faults(_one_bit_off(sample), per_light=True)
     assert "view 1 is not the sum of its lights in 1 pixels, first in (3, 5)" in fault
 
 
@@ -257,12 +255,13 @@ def test_a_sample_with_parts_comes_back_and_verify_accepts_it(
         decode_sample(sample.key, members)
 
 
-def test_a_sample_without_parts_is_written_as_ever() -> None:
+def test_a_sample_without_parts_and_lights_is_written_as_ever() -> None:
     members = encode_sample(tiny_sample())
-    assert not any("parts" in suffix for suffix in members)
+    assert not any("parts" in suffix or "lights" in suffix for suffix in members)
     assert all("parts" not in view for view in json.loads(members["json"])["views"])
     back = decode_sample("000000000", members)
-    assert back.parts_rgb is None and all(view.parts is None for view in back.views)
+    assert back.lights_rgb is back.parts_rgb is None
+    assert all(view.parts is None for view in back.views)
 
 
 @for_each(
@@ -286,9 +285,7 @@ def test_verify_demands_the_sum_of_parts() -> None:
     assert "parts are none" in faults(tiny_sample(), split=True)[0]
     views = (sample.views[0], dataclasses.replace(sample.views[1], parts=None))
     assert faults(dataclasses.replace(sample, views=views), split=True)
-    pictures = sample.radiance_rgb.copy()
-    pictures[1, 3, 5, 2] = np.nextafter(np.float16(pictures[1, 3, 5, 2]), np.float16(np.inf))
-    (fault,) = faults(dataclasses.replace(sample, radiance_rgb=pictures), split=True)
+    (fault,) = faults(_one_bit_off(sample), split=True)
     assert "view 1 has a picture that is not the sum of its parts in 1 pixels" in fault
     assert fault.endswith("first in (3, 5)")
     both = _sample(lights=True)

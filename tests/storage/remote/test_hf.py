@@ -93,7 +93,7 @@ DATASET = f"hf://datasets/{REPOSITORY}"
 READ = """
 import pathlib
 from storage.dataset.dataset import open_dataset
-from storage.dataset.shard_places import listed_shards
+from storage.dataset.shard_set import listed_shards
 from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError

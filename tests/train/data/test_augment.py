@@ -19,9 +19,8 @@ from model.hits.tracing import lit_scene_of
 from model.hits.view_inputs import Channel, view_inputs
 from model.scene_tensors import SceneTensors, scene_tensors, tensors_of
 from storage.errors import TrilightError
-from storage.records.sample import encode_sample
+from storage.records.sample import StoredSample, encode_sample, stored_sample
 from storage.records.scene import Scene
-from storage.records.stored_sample import StoredSample, stored_sample
 from storage.seeds import rng_for
 from tests.for_each import for_each
 from tests.model.hits.kit import corner, textured

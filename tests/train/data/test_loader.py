@@ -29,8 +29,7 @@ from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from storage.records.exr import encode_channels
 from storage.records.profiles import PROFILES, Profile
-from storage.records.sample import Sample, decode_sample, encode_sample, sample_key
-from storage.records.stored_sample import stored_sample
+from storage.records.sample import Sample, decode_sample, encode_sample, sample_key, stored_sample
 from storage.seeds import rng_for
 from tests.conftest import ROOT
 from tests.for_each import for_each

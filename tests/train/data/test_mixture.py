@@ -21,8 +21,7 @@ from torch import Tensor
 from model.checkpoint_format import path_of_step
 from storage.conventions import log10_radiance
 from storage.dataset.dataset import Dataset
-from storage.dataset.mixed_data import open_mixture
-from storage.dataset.training_data import TrainingData, open_training_data
+from storage.dataset.training_data import TrainingData, open_mixture, open_training_data
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.train.data.test_loader import by_key, identity, same_batches

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from pxr import Gf, Usd
 
 from storage.records.asset import Asset, decode_asset, encode_asset
-from storage.records.lookup import texture_values
-from storage.records.normal_map import mapped_normals, u_directions
+from storage.records.lookup import mapped_normals, texture_values, u_directions
 from storage.settings.described import settings_record
 from tests.for_each import for_each
 from tests.pipeline.assets.meshes_by_hand import prepare, write_glb

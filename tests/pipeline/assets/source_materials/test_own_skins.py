@@ -20,8 +20,7 @@ from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected
-from storage.records.asset import decode_asset, encode_asset
-from storage.records.skin import LevelSkin
+from storage.records.asset import LevelSkin, decode_asset, encode_asset
 from storage.settings.described import settings_record
 from tests.command_line import trilight
 from tests.for_each import for_each

@@ -18,14 +18,14 @@ from storage.raycast.first_hits import first_hits
 from storage.records.exr import channel_names, decode_channels, encode_channels
 from storage.records.lookup import texture_values
 from storage.records.material import default_rows
-from storage.records.passes import pictures, stored
-from storage.records.passes.declared import MOTION, PASSES, declared_passes, pass_names
-from storage.records.passes.pictures import view_passes
-from storage.records.passes.stored import (
+from storage.records.passes import pictures
+from storage.records.passes.declared import MOTION, PASSES, Pass, declared_passes, pass_names
+from storage.records.passes.pictures import (
     decode_passes_exr,
     passes_exr,
     passes_in_file,
     picture_passes,
+    view_passes,
 )
 from storage.records.sample import Sample, decode_sample, encode_sample
 from storage.records.scene import Scene
@@ -138,33 +138,34 @@ def _mirrored(scene: Scene) -> Scene:
 @for_each("a_side", [2, 3])
 def test_averages_are_those_of_a_plain_loop(a_side: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A finer picture has the rays of the grid; blocks of rows join to the same picture."""
-    scene, resolution = room(0), 12
-    whole = view_passes(scene, resolution=resolution, rays_a_side=a_side)
-    monkeypatch.setattr(pictures, "BLOCK_RAYS", 5 * resolution * a_side**2)
-    joined = view_passes(scene, resolution=resolution, rays_a_side=a_side)
-    fine = view_passes(scene, resolution=resolution * a_side)
-    centre = view_passes(scene, resolution=resolution)
-    assert 0 < ((whole["coverage"] > 0) & (whole["coverage"] < 1)).sum()
-    for each in declared_passes():
-        if each.name in ("motion_px", "uv"):  # the first needs another camera, the other textures
-            continue
-        np.testing.assert_allclose(joined[each.name], whole[each.name], rtol=1e-12)
-        if each.averaging == "centre ray":
-            np.testing.assert_array_equal(whole[each.name], centre[each.name])
-        else:
-            by_loop = _averaged(fine[each.name], fine["hit"], a_side, each.averaging, each.nothing)
-            np.testing.assert_allclose(whole[each.name], by_loop, atol=1e-12, err_msg=each.name)
+    for scene in (room(0), textured_scene()):
+        resolution = 12
+        monkeypatch.setattr(pictures, "BLOCK_RAYS", 2**14)
+        whole = view_passes(scene, resolution=resolution, rays_a_side=a_side)
+        monkeypatch.setattr(pictures, "BLOCK_RAYS", 5 * resolution * a_side**2)
+        joined = view_passes(scene, resolution=resolution, rays_a_side=a_side)
+        fine = view_passes(scene, resolution=resolution * a_side)
+        centre = view_passes(scene, resolution=resolution)
+        assert 0 < ((whole["coverage"] > 0) & (whole["coverage"] < 1)).sum()
+        assert ("uv" in whole) == bool(scene.textures)
+        for each in declared_passes():
+            if each.name not in whole:
+                continue
+            np.testing.assert_allclose(joined[each.name], whole[each.name], rtol=1e-12)
+            if each.averaging == "centre ray":
+                np.testing.assert_array_equal(whole[each.name], centre[each.name])
+            else:
+                by_loop = _averaged(fine[each.name], fine["hit"], a_side, each)
+                np.testing.assert_allclose(whole[each.name], by_loop, atol=1e-12, err_msg=each.name)
 
 
-def _averaged(
-    fine: NDArray, hit: NDArray[np.bool_], a_side: int, averaging: str, nothing: float
-) -> NDArray:
+def _averaged(fine: NDArray, hit: NDArray[np.bool_], a_side: int, each: Pass) -> NDArray:
     size = len(fine) // a_side
-    result = np.full((size, size, *fine.shape[2:]), float(nothing))
+    result = np.full((size, size, *fine.shape[2:]), float(each.nothing))
     for row, column in np.ndindex(size, size):
         place = (slice(row * a_side, (row + 1) * a_side), slice(column * a_side, (column + 1) * a_side))  # fmt: skip  # noqa: E501
         values, counted = fine[place], hit[place]
-        if averaging == "pixel":
+        if each.averaging == "pixel":
             result[row, column] = values.mean()
         elif counted.any():
             result[row, column] = values[counted].mean(axis=0)
@@ -259,8 +260,11 @@ def test_a_column_of_ones_own_is_a_pass() -> None:
     np.testing.assert_array_equal(seen["material_waves"], np.full((4, 4, 5), 0.5))
 
 
-def test_a_camera_that_steps_aside_in_closed_form() -> None:
-    """At fov 90 and 1 m, 16 pixels are 2 m: a step of 0.25 m to the right moves all left by 2."""
+def test_a_camera_and_a_floor_that_step_aside_in_closed_form() -> None:
+    """At fov 90 and 1 m, 16 pixels are 2 m: a step of 0.25 m to the right moves all left by 2.
+
+    Points are followed by their triangles: a floor that slides by 0.5 m moves by 4.
+    """
     scene = from_above(height=1, fov_deg=90)
     poses = np.concatenate([scene.c2w, scene.c2w])
     poses[1, :3, 3] += [0.25, 0.125, 0]  # right and up in the picture
@@ -269,6 +273,11 @@ def test_a_camera_that_steps_aside_in_closed_form() -> None:
         motion = view_passes(both, ["motion_px"], resolution=16, rays_a_side=a_side, then_view=1)
         expected = np.broadcast_to([-2.0, 1.0], (16, 16, 2))
         np.testing.assert_allclose(motion["motion_px"], expected, atol=1e-6)
+    moved = scene.vertex_positions.copy()
+    moved[:4, 0] += 0.5
+    later = dataclasses.replace(scene, vertex_positions=moved)
+    slid = view_passes(scene, ["motion_px"], resolution=16, then=later)["motion_px"]
+    np.testing.assert_allclose(slid, np.broadcast_to([4.0, 0.0], (16, 16, 2)), atol=1e-6)
 
 
 def test_it_is_the_difference_of_projections() -> None:
@@ -279,16 +288,6 @@ def test_it_is_the_difference_of_projections() -> None:
         for view in (0, 1)
     )
     np.testing.assert_allclose(seen["motion_px"], then - now, atol=1e-6)
-
-
-def test_points_are_followed_by_their_triangles() -> None:
-    """The floor slides by 0.5 m to the right, which is 4 of 16 pixels."""
-    scene = from_above(height=1, fov_deg=90)
-    moved = scene.vertex_positions.copy()
-    moved[:4, 0] += 0.5
-    later = dataclasses.replace(scene, vertex_positions=moved)
-    motion = view_passes(scene, ["motion_px"], resolution=16, then=later)["motion_px"]
-    np.testing.assert_allclose(motion, np.broadcast_to([4.0, 0.0], (16, 16, 2)), atol=1e-6)
 
 
 def test_what_is_behind_the_other_camera_does_not_move() -> None:
@@ -357,9 +356,14 @@ def test_a_sample_gives_the_same_numbers_stored_or_not() -> None:
         decode_sample(sample.key, members)
 
 
-def test_stored_passes_are_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stored_passes_are_not_computed_and_ids_fit_float32(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     sample = with_passes(("triangle",))
-    monkeypatch.setattr(stored, "view_passes", None)
+    monkeypatch.setattr(pictures, "MOST_IDS", 2)
+    with pytest.raises(TrilightError, match="3 triangles; expected at most 2"):
+        with_passes(("triangle",))
+    monkeypatch.setattr(pictures, "view_passes", None)
     assert sample.view_passes(["triangle"])["triangle"].shape == (16, 16)
 
 
@@ -395,12 +399,6 @@ def test_words_mean_passes() -> None:
         StorageSettings(passes=("dept",))
     with pytest.raises(TrilightError, match="motion_px needs another moment"):
         pass_names([MOTION])
-
-
-def test_more_triangles_than_float32_counts_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stored, "MOST_IDS", 2)
-    with pytest.raises(TrilightError, match="3 triangles; expected at most 2"):
-        with_passes(("triangle",))
 
 
 @for_each(
@@ -458,16 +456,6 @@ def test_coordinates_and_columns_are_those_of_the_point(view: int) -> None:
     np.testing.assert_array_equal(seen["material_specular"][met], specular)
     assert all(np.isnan(seen[name][~met]).all() for name in COLUMNS)
     assert np.ptp(diffuse, axis=0).min() > 0.1  # it is a texture that was looked up
-
-
-def test_columns_are_averaged_after_they_are_looked_up() -> None:
-    scene = textured_scene()
-    names = ["material_diffuse", "hit"]
-    fine = view_passes(scene, names, resolution=RESOLUTION * 2)
-    coarse = view_passes(scene, names, resolution=RESOLUTION, rays_a_side=2)["material_diffuse"]
-    blocks = fine["material_diffuse"].reshape(RESOLUTION, 2, RESOLUTION, 2, 3)
-    whole = fine["hit"].reshape(RESOLUTION, 2, RESOLUTION, 2).all(axis=(1, 3))
-    np.testing.assert_allclose(coarse[whole], blocks.mean(axis=(1, 3))[whole], rtol=1e-12)
 
 
 def test_one_pixel_is_that_of_the_picture_and_changes_no_table() -> None:
