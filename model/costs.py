@@ -12,14 +12,13 @@ from dataclasses import dataclass
 
 import torch
 
+from model.attention import cut_windows
 from model.config import HitStage, ModelConfig
 from model.hits.decoder import view_flops
-from model.image_head import LAST_CHANNELS, picture_channels
 from model.positions import encoded_normal_width
 from model.precision import PRECISIONS, rounded_parts
-from model.renderformer import RenderFormer, count_parameters
-from model.triangle_encoder import SIDE_LIGHTS
-from model.windows import cut_windows
+from model.renderformer import SIDE_LIGHTS, RenderFormer, count_parameters
+from model.view_decoder import LAST_CHANNELS, picture_channels
 from storage.records.material import material_width
 
 TRAINING_BYTES = 16

@@ -19,11 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from model.config import HitStage, hit_stage
-from model.encoded_scene import EncodedScene
-from model.hits.denoised import denoise_traced
-from model.hits.traced import Traced
+from model.hits.traced import Traced, denoise_traced
 from model.light_groups import LightGroup, light_groups
 from model.open import find_network
+from model.positions import EncodedScene
 from model.precision import set_precision
 from model.renderformer import RenderFormer, radiance
 from model.replayed import Replayed

@@ -13,9 +13,8 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from model.base_widths import BaseWidths
+from model.config import BaseWidths, hits_base, hits_smoke
 from model.config import base as base_model
-from model.config import hits_base, hits_smoke
 from model.config import large as large_model
 from model.config import smoke as smoke_model
 from storage.aliases import PRESET_ALIASES

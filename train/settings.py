@@ -10,9 +10,8 @@ from collections.abc import Mapping
 from dataclasses import field
 from typing import Annotated, Any, ClassVar, Literal
 
-from model.base_widths import BaseWidths
 from model.config import REMOVED as REMOVED_FROM_MODEL
-from model.config import ModelConfig
+from model.config import BaseWidths, ModelConfig
 from storage.errors import TrilightError
 from storage.removed import without_removed
 from storage.settings.described import checked, settings_record

@@ -20,9 +20,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize, silu, softplus
 
-from model.attention import Keys, attend
+from model.attention import Keys, Packing, attend
 from model.config import HitStage, ModelConfig, hit_stage
-from model.encoded_scene import EncodedScene, KeysValues, TokenPositions
 from model.hits.light_filter import LightFilter, filter_flops
 from model.hits.second_hits import DEVICE_BLOCK
 from model.hits.traced import INPUTS, Traced
@@ -37,8 +36,16 @@ from model.layers import (
     run_layer,
     split_heads,
 )
-from model.packing import Packing
-from model.positions import Rotation, TriangleRotary, packed_rotation, rotate, world_rotation
+from model.positions import (
+    EncodedScene,
+    KeysValues,
+    Rotation,
+    TokenPositions,
+    TriangleRotary,
+    packed_rotation,
+    rotate,
+    world_rotation,
+)
 from model.precision import fast_float32_products, without_autocast
 
 NEIGHBOURS = 9

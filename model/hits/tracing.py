@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from model.config import HitStage, ModelConfig, hit_stage
-from model.hits.denoised import denoise_traced
 from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import DeviceTriangles, compiled_kernel
 from model.hits.lit_scene import LitScene
 from model.hits.radiosity import SceneLight, scene_light
-from model.hits.traced import INPUTS, Traced, stack_traced
+from model.hits.traced import INPUTS, Traced, denoise_traced, stack_traced
 from model.hits.view_inputs import ViewInputs, view_inputs
 from model.scene_tensors import Cameras, SceneBatch, SceneTensors, batch_scenes, require_known_sky
 from storage.conventions import radiance_from_log10

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.anchors import anchor_pixels, gathered_at
-from model.hits.camera import CameraHits, Rays, camera_hits
+from model.hits.anchors import CameraHits, Rays, anchor_pixels, camera_hits, gathered_at
 from model.hits.device_arrays import DeviceArray, MaskedRows
 from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
 from model.hits.lit_scene import LitScene, Points

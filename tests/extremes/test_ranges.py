@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from infra.render.options import RenderOptions
 from infra.serving.train_model import TrainOptions
 from infra.setup.settings_page import ROOTS, reachable
-from model.base_widths import BaseWidths
-from model.config import ModelConfig, smoke, tiny
+from model.config import BaseWidths, ModelConfig, smoke, tiny
 from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSettings
 from pipeline.flows.forms import DatasetInRuns
 from pipeline.generation.price import CorePrice

@@ -20,11 +20,11 @@ from torch.nn.functional import interpolate
 from model import inference
 from model.config import ModelConfig, smoke
 from model.demodulated import compose_radiance, with_albedo
-from model.image_head import BilinearUpsample, DptHead, Fusion
 from model.inference import NeuralRenderer
 from model.light_groups import LightGroup, light_groups
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
+from model.view_decoder import BilinearUpsample, DptHead, Fusion
 from model.weights import RANGE_KEY, TrainedRange, encode_weights, trained_range
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from model.attention import attend
+from model.attention import attend, attend_in_windows, cut_windows
 from model.layers import CrossAttention, SelfAttention, merge_heads, split_heads
 from model.positions import (
     Rotation,
@@ -28,10 +28,9 @@ from model.positions import (
     token_positions,
     world_rotation,
 )
-from model.rays import bundle_rays, ray_directions, unbundle
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, batch_scenes, map_tensors
-from model.windows import attend_in_windows, cut_windows
+from model.view_decoder import bundle_rays, ray_directions, unbundle
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
 from tests.for_each import for_each

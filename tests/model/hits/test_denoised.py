@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from model.config import hit_stage
-from model.hits.denoised import denoise_traced
-from model.hits.traced import Traced
+from model.hits.traced import Traced, denoise_traced
 from model.hits.tracing import with_traced
 from model.hits.view_inputs import Channel
 from model.inference import NeuralRenderer

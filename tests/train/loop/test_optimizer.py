@@ -19,8 +19,7 @@ from torch import Tensor
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from model.base_widths import BaseWidths
-from model.config import ModelConfig
+from model.config import BaseWidths, ModelConfig
 from model.costs import Workload, training_flops
 from model.renderformer import RenderFormer
 from model.width_scales import width_scales

@@ -19,10 +19,10 @@ from torch._dynamo.testing import CompileCounterWithBackend
 from torch._inductor.utils import run_and_get_code
 
 from model.checkpoint_format import path_of_step, saved_steps
-from model.image_head import Fusion
 from model.layers import Norm
 from model.renderformer import RenderFormer
 from model.scene_tensors import batch_scenes
+from model.view_decoder import Fusion
 from storage.errors import TrilightError
 from tests.for_each import for_each
 from tests.model.kit import awake, picture_and_gradients, random_scene, tiny_config
