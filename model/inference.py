@@ -18,7 +18,6 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from model.config import HitStage, hit_stage
 from model.hits.traced import Traced, denoise_traced
 from model.light_groups import LightGroup, light_groups
 from model.open import find_network
@@ -150,7 +149,7 @@ class NeuralRenderer:
             knows_sky = self._model.config.sky_rays
             sky = dataclasses.replace(sky, is_seen=False) if knows_sky else None
             scene = dataclasses.replace(scene, environment=sky)
-        by_hits = isinstance(self._model.config.stage, HitStage)
+        by_hits = self._model.config.by_hits
         all_lights = [LightGroup(scene=scene, fraction=1.0)]
         groups = [
             (_encode(self._model, group.scene, self.device), group.fraction)
@@ -181,7 +180,7 @@ class NeuralRenderer:
         angle = torch.tensor(fov_deg, dtype=torch.float32, device=self.device)
         views = prepared.views
         if resolution not in views:
-            if isinstance(self._model.config.stage, HitStage):
+            if self._model.config.by_hits:
                 ((encoded, _),) = prepared.groups
                 views[resolution] = _TracedView(self._model, encoded, resolution)
             else:
@@ -203,7 +202,7 @@ class NeuralRenderer:
     def resolution_notes(self, resolution: int) -> tuple[str, ...]:
         """Return sentences on what pictures of this width by this network lack."""
         trained = self.trained.resolution
-        by_pixel = isinstance(self._model.config.stage, HitStage)
+        by_pixel = self._model.config.by_hits
         if trained is None or resolution == trained or by_pixel:
             return ()
         return (
@@ -297,7 +296,7 @@ class _TracedView:
     def __call__(self, c2w_44: Tensor, fov_deg: Tensor) -> Tensor:
         """Return linear radiance [R, R, 3] of at least 0."""
         traced = Traced(*self._trace(c2w_44, fov_deg))
-        denoised = denoise_traced(traced, hit_stage(self._model.config))
+        denoised = denoise_traced(traced, self._model.config)
         (picture_RR3,) = self._decode(*denoised.tensors())
         return picture_RR3
 

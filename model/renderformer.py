@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from model.attention import Keys, Packing, pack_tokens
-from model.config import BundleStage, HitStage, ModelConfig, hit_stage
+from model.config import ModelConfig
 from model.demodulated import albedo_of_cameras, compose_radiance
 from model.hits.decoder import HitDecoder
 from model.hits.lit_scene import LitScene
@@ -61,8 +61,7 @@ class TriangleTokens(nn.Module):
         self.material_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
         self.normal = nn.Linear(encoded_normal_width(self.octaves), config.width)
         self.normal_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
-        by_hits = isinstance(config.stage, HitStage)
-        self.light = nn.Linear(SIDE_LIGHTS, config.width) if by_hits else None
+        self.light = nn.Linear(SIDE_LIGHTS, config.width) if config.by_hits else None
 
     def forward(
         self, material_BTM: Tensor, normals_BT33: Tensor, light_BTL: Tensor | None = None
@@ -151,7 +150,7 @@ class RenderFormer(nn.Module):
             head_width=config.head_width,
         )
         self.encoder: Any = TriangleEncoder(config, rotary) if config.scene_tokens else None
-        stage = HitDecoder if isinstance(config.stage, HitStage) else ViewDecoder
+        stage = HitDecoder if config.by_hits else ViewDecoder
         self.decoder: Any = stage(config, rotary)
 
     def forward(self, batch: SceneBatch, resolution: int) -> Tensor:
@@ -161,28 +160,25 @@ class RenderFormer(nn.Module):
             TrilightError: the resolution is not a multiple of `config.picture_px`, or the network
                 does not support the sky of a scene.
         """
-        stage = self.config.stage
-        if batch.albedo_BVRR6 is None and isinstance(stage, BundleStage):
-            return self.decode(self.encode(batch), batch.cameras, resolution)
+        albedo_BVRR6 = batch.albedo_BVRR6
+        if not self.config.by_hits and albedo_BVRR6 is None:
+            return self.decode(self.encode(batch), batch, resolution)
         self._require_resolution(resolution)
-        if isinstance(stage, BundleStage):
-            return self._bundles(
-                self._encode_scenes(batch), batch.cameras, resolution, batch.albedo_BVRR6
-            )
+        if not self.config.by_hits:
+            return self._bundles(self._encode_scenes(batch), batch, resolution, albedo_BVRR6)
         scenes: tuple[TracedScene, ...] = ()
         traced = batch.traced
         if traced is None:
             scenes = traced_batch(batch)
-            traced = traced_cameras(scenes, batch.cameras, resolution, stage)
-            traced = denoise_traced(traced, stage)
+            traced = traced_cameras(scenes, batch, resolution, self.config)
+            traced = denoise_traced(traced, self.config)
         encoded = self._encode_scenes(batch, scenes, traced.sides_T12, traced.unit_3)
         return self.decode_traced(encoded, traced)
 
     def encode(self, batch: SceneBatch) -> EncodedScene:
         """Return the encoded scenes of a batch; its cameras are ignored."""
-        stage = self.config.stage
-        if isinstance(stage, BundleStage):
-            surfaces = lit_scenes(batch) if stage.albedo_rays else ()
+        if not self.config.by_hits:
+            surfaces = lit_scenes(batch) if self.config.demodulated else ()
             return self._encode_scenes(batch, surfaces=surfaces)
         scenes = traced_batch(batch)
         longest = batch.triangles_BT33.shape[1]
@@ -243,22 +239,21 @@ class RenderFormer(nn.Module):
             TrilightError: the resolution is no such multiple.
         """
         self._require_resolution(resolution)
-        stage = self.config.stage
-        if isinstance(stage, HitStage):
+        if self.config.by_hits:
             traced = self.trace(scene, cameras, resolution)
-            return self.decode_traced(scene, denoise_traced(traced, stage))
+            return self.decode_traced(scene, denoise_traced(traced, self.config))
         albedo_BVRR6 = None
-        if rays := stage.albedo_rays:
+        if rays := self.config.hit_rays:
             albedo_BVRR6 = albedo_of_cameras(scene.surfaces, cameras, resolution, rays)
         return self._bundles(scene, cameras, resolution, albedo_BVRR6)
 
     def trace(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Traced:
         """Return the traced inputs of views, for `hits`; arguments are as of `decode`."""
         with tf32(self.tf32):
-            return traced_cameras(scene.traced, cameras, resolution, hit_stage(self.config))
+            return traced_cameras(scene.traced, cameras, resolution, self.config)
 
     def decode_traced(self, scene: EncodedScene, traced: Traced) -> Tensor:
-        """Return the pictures [B, V, R, R, 3] of traced views, denoised where the stage asks."""
+        """Return the pictures [B, V, R, R, 3] of traced views, denoised where the network asks."""
         with tf32(self.tf32):
             pictures: Tensor = self.decoder(scene, traced)
         return pictures

@@ -81,14 +81,12 @@ class Cameras:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SceneBatch:
+class SceneBatch(Cameras):
     """Scenes of equal view count, padded with zeros to the longest; fields as in SceneTensors."""
 
     triangles_BT33: Tensor
     normals_BT33: Tensor
     material_BTM: Tensor
-    c2w_BV44: Tensor
-    fov_deg_BV: Tensor
     is_triangle_BT: Tensor | None
     """bool, False in the padding; None without padding, so that attention needs no mask."""
     columns: tuple[str, ...] = PUBLISHED_COLUMNS
@@ -102,10 +100,6 @@ class SceneBatch:
     """Textures of each scene; None if no scene has any."""
     skies: tuple[Environment | None, ...] | None = None
     """Environment light of each scene; None if no scene has any."""
-
-    @property
-    def cameras(self) -> Cameras:
-        return Cameras(c2w_BV44=self.c2w_BV44, fov_deg_BV=self.fov_deg_BV)
 
     def material_of(self, columns: tuple[str, ...]) -> Tensor:
         """Return the material [B, T, M] with only these columns, in this order.

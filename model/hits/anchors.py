@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.lit_scene import LitScene, Points
+from model.hits.lit_scene import LitScene, PerPoint, Points
 from model.hits.radiosity import SceneLight
 from model.hits.second_hits import blocks, outgoing_radiance
 from model.hits.vectors import Floats, cosine_direction, spread, unit
@@ -44,7 +44,7 @@ class Rays:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class CameraHits:
+class CameraHits(PerPoint):
     """The first hits of the rays of P pixels, each of which has K rays."""
 
     along: Floats
@@ -53,12 +53,6 @@ class CameraHits:
     """[K, P] row of the triangle, or MISS."""
     uv: Floats
     """[2, K, P] weights of its second and third corner."""
-
-    def only(self, part: slice) -> "CameraHits":
-        """Return the hits of some pixels."""
-        return CameraHits(
-            along=self.along[:, :, part], triangle=self.triangle[:, part], uv=self.uv[:, :, part]
-        )
 
     @property
     def coverage(self) -> Floats:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from model.config import HitStage
+from model.config import ModelConfig
 from model.hits.view_inputs import Channel
 from storage.denoiser import Features, denoise, gpu_is_supported
 
@@ -85,8 +85,8 @@ def stack_traced(scenes: Sequence[Traced], longest: int) -> Traced:
 _SUMMED = (Channel.SHOWN_DIFFUSE, Channel.DIRECT_SPECULAR, Channel.MIRRORED)
 
 
-def denoise_traced(traced: Traced, stage: HitStage) -> Traced:
-    """Return views whose direct and mirrored light is filtered as one picture, where a stage asks.
+def denoise_traced(traced: Traced, config: ModelConfig) -> Traced:
+    """Return views whose direct and mirrored light is filtered as one picture, if a network asks.
 
     It is in SHOWN_DIFFUSE; DIRECT_SPECULAR and MIRRORED become 0: two filters cost twice as much
     and were no better. Light is filtered in units of the scene's, so that pictures scale with the
@@ -94,10 +94,10 @@ def denoise_traced(traced: Traced, stage: HitStage) -> Traced:
 
     Args:
         traced: views of one scene, or of a batch; on any device.
-        stage: of the network.
+        config: of the network.
     """
     resolution = traced.pixels_VRRC.shape[-2]
-    if not stage.denoises(resolution):
+    if not config.denoises(resolution):
         return traced
     unit = traced.unit_3[..., None, None, None, :].expand(*traced.pixels_VRRC.shape[:-3], 1, 1, 3)
     views = traced.pixels_VRRC.clone()

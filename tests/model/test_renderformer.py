@@ -243,7 +243,7 @@ def test_one_encoding_serves_every_camera_in_any_order(family: str) -> None:
             alone = dataclasses.replace(
                 scene, c2w_V44=scene.c2w_V44[[index]], fov_deg_V=scene.fov_deg_V[[index]]
             )
-            got = model.decode(encoded, batch_scenes([alone]).cameras, RESOLUTION)
+            got = model.decode(encoded, batch_scenes([alone]), RESOLUTION)
             close(got[0], render(model, alone)[0])
             close(got[0, 0], together[index])
 
