@@ -20,7 +20,7 @@ from storage.errors import TrilightError
 from storage.extensions import extension_digests
 from storage.records.safe_read import read_plain
 from storage.typed_json import read_json
-from train.data.mixture import RECORD, plan_mixture
+from train.data.order import RECORD, plan_mixture
 from train.folder import RunFolder
 from train.loop.checkpoints import (
     newest_checkpoint,
@@ -29,7 +29,7 @@ from train.loop.checkpoints import (
     save_checkpoint,
 )
 from train.loop.distributed import DistributedContext
-from train.loop.muon import choose_muon_precision
+from train.loop.optimizer import choose_muon_precision
 from train.loop.recorder import MetricsLog
 from train.loop.train_state import TrainState, new_state
 from train.monitoring.rows import read_rows

@@ -114,7 +114,11 @@ def _train(
     for note in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
         early_notes.note(note)
     if workers is None:
-        workers = _choose_workers(settings, dist_context, early_notes)
+        machine = detect_machine()
+        threads = torch.get_num_threads()
+        on_gpu = dist_context.device.type == "cuda"
+        workers, reason = choose_workers(machine, settings, on_gpu=on_gpu, busy_threads=threads)
+        early_notes.note(reason)
     plan = plan_start(settings, folder, dataset.digest, start, dist_context, early_notes)
     settings = plan.settings
     lpips = dist_context.run_once_per_machine(partial(load_lpips, start.lpips))
@@ -124,7 +128,15 @@ def _train(
     judge = recorder = None
     if dist_context.is_first:
         judge = _make_judge(dataset, settings, state.bad_samples)
-        recorder = _begin_records(state, settings, folder, judge, progress, watched)
+        progress.begin(
+            step=state.step,
+            num_steps=settings.num_steps,
+            num_parameters=count_parameters(state.model),
+            median_scores=judge.median_scores if judge else None,
+        )
+        recorder = Recorder(
+            folder, settings, judge, progress, first_step=state.step, wandb=watched.wandb
+        )
         how = "went on" if start.resume else "began"
         many = "process" if dist_context.world_size == 1 else "processes"
         where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"
@@ -149,20 +161,6 @@ def _train(
         return None
     recorder.close()
     return finish_run(state, settings, folder, dataset, judge, time.monotonic() - began)
-
-
-def _choose_workers(
-    settings: TrainSettings, dist_context: DistributedContext, progress: TrainProgress
-) -> int:
-    """Return the number of decoding threads, and report the reason."""
-    choice = choose_workers(
-        detect_machine(),
-        settings,
-        on_gpu=dist_context.device.type == "cuda",
-        busy_threads=torch.get_num_threads(),
-    )
-    progress.note(choice.reason)
-    return choice.threads
 
 
 def _resolve_restart(
@@ -260,20 +258,3 @@ def _make_judge(
     for sample in samples:  # before any step, not at the first validation
         require_known_sky(lit_sky(sample.scene.environment), settings.model)
     return Judge(samples, settings.resolution, median_picture(training))
-
-
-def _begin_records(
-    state: TrainState,
-    settings: TrainSettings,
-    folder: RunFolder,
-    judge: Judge | None,
-    progress: TrainProgress,
-    watched: WatchSettings,
-) -> Recorder:
-    progress.begin(
-        step=state.step,
-        num_steps=settings.num_steps,
-        num_parameters=count_parameters(state.model),
-        median_scores=judge.median_scores if judge else None,
-    )
-    return Recorder(folder, settings, judge, progress, first_step=state.step, wandb=watched.wandb)

@@ -74,17 +74,6 @@ Compile = Literal["auto", "yes", "no"]
 """Compilation of layers, head and LPIPS by torch: `auto` compiles on a GPU with Triton, `yes` also
 on a CPU, where it takes minutes and gains little."""
 
-Decayed = Literal["all", "matrices"]
-"""Weights that decay: `all`, or `matrices` without norms, biases and learned tokens."""
-
-MuonTakes = Literal["matrices", "hidden"]
-"""Weights that Muon updates: all `matrices`, or only the `hidden` ones of the layers, with queries,
-keys and values as separate matrices, as its authors do."""
-
-Schedule = Literal["wsd", "cosine"]
-"""Course of the learning rate after its warm-up. `wsd` (warm-up, stable, decay) stays at the peak
-and falls over the last steps by 1 - sqrt; `cosine` falls along half a wave from the first."""
-
 Count = Annotated[int, Within(1, 10**9)]
 """Number of steps or of scenes; no run reaches a billion."""
 
@@ -141,11 +130,11 @@ class TrainSettings:
     base_widths: BaseWidths = field(default_factory=BaseWidths)
     """Widths for which the rates above and the initial weights are stated; no other width of the
     network changes them unless `width` is one."""
-    muon_takes: MuonTakes = "matrices"
+    muon_takes: Literal["matrices", "hidden"] = "matrices"
     """Weights that Muon updates: all matrices, or only the hidden ones of the layers."""
     warmup_steps: Annotated[int, Within(0, 10**9 - 1, unit="steps")]
     """Steps of linear warm-up to the peak learning rate."""
-    schedule: Schedule = "cosine"
+    schedule: Literal["wsd", "cosine"] = "cosine"
     """Course of the learning rate after the warm-up: `wsd` stays at the peak until the last steps,
     so that a run can be extended or branched; `cosine`, the value of runs that store none, falls
     from the start."""
@@ -156,7 +145,7 @@ class TrainSettings:
     """Learning rate at the last step, as a fraction of the peak."""
     weight_decay: Annotated[float, Within(0, 10)] = 0.01
     """Decoupled weight decay (Loshchilov and Hutter 2019) of the weights that `decayed` names."""
-    decayed: Decayed = "all"
+    decayed: Literal["all", "matrices"] = "all"
     """Weights that decay: all, or matrices without norms, biases and learned tokens."""
     betas: Annotated[tuple[float, float], BelowOne] = (0.9, 0.99)
     """Decay rates of AdamW's running means of the gradient and of its square."""

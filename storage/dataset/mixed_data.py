@@ -1,7 +1,7 @@
 """Several datasets as one: `--data A --data B`.
 
 Their shards are numbered one dataset after another, and each dataset stays a part of its own. What
-share of a stream comes from which, the trainer decides (train.data.mixture).
+share of a stream comes from which, the trainer decides (train.data.order).
 """
 
 from collections.abc import Callable, Mapping, Sequence

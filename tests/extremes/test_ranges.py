@@ -270,7 +270,6 @@ def test_no_number_is_without_a_range() -> None:
 
 INTERNAL = {
     "LoaderSettings": "made of TrainSettings",
-    "OrderSettings": "made of LoaderSettings",
     "PublishedConfig": "a ModelConfig, and one number that the published code fixes",
     "PreviewSettings": "made of RenderOptions",
     "StorageSettings": "has no number",

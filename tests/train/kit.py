@@ -19,8 +19,7 @@ from tests.train.toy import toy_sample
 from train.data.bad_samples import BadSampleCounter
 from train.data.buckets import TrainingBatch, collate_batch
 from train.data.loader import LoaderSettings, load_batches
-from train.data.mixture import Mixture
-from train.data.order import RankSlice
+from train.data.order import Mixture, RankSlice
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.evaluate import EvalConfig
 from train.loop.distributed import DistributedContext

@@ -6,14 +6,13 @@ of ranks and threads: a run resumes by the number of its step.
 
 import dataclasses
 import itertools
-import queue
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import closing, nullcontext, suppress
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
-from types import TracebackType
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -25,15 +24,13 @@ from storage.records.stored_sample import StoredSample
 from storage.seeds import rng_for
 from train.data.augment import augment_scene, withhold_inputs
 from train.data.bad_samples import BadSampleCounter, count_lost_samples
-from train.data.mixture import Mixture, mix_visits
 from train.data.order import (
-    OrderSettings,
+    Mixture,
     RankSlice,
     Visit,
-    batch_visits,
+    mix_visits,
     shuffled_shards,
     visits_from,
-    windows_from,
 )
 from train.data.scenes import (
     TrainingScene,
@@ -75,10 +72,6 @@ class LoaderSettings:
     network: "ModelConfig | None" = None
     """Configuration of the network, whose traced inputs are computed here; None traces none."""
 
-    @property
-    def order(self) -> OrderSettings:
-        return OrderSettings(seed=self.seed, window=self.window)
-
 
 def load_batches(
     shards: ShardSet,
@@ -111,14 +104,14 @@ def load_batches(
     pool = ThreadPoolExecutor(workers, "decode") if workers else _InlineExecutor()
     with OpenShards(shards) as opened, pool as decoders:
         maker = _SceneMaker(shards, opened, settings, unusable)
-        counted = _SampleCounts(shards, unusable)
-        plan = _plan_batches(counted, settings, mixture, first, rank_slice, opened)
+        counts = [partial(_count_samples, shards, unusable, part) for part in shards.parts]
+        plan = _plan_batches(shards, counts, settings, mixture, first, rank_slice, opened)
         waiting: deque[tuple[list[Visit], list[Future[TrainingScene]]]] = deque()
         depth = (
             -(-PREFETCHED_SCENES * rank_slice.world_size // settings.batch_size) if workers else 0
         )
         try:
-            with closing(prefetch(plan, _plan_ahead(counted, settings, mixture))) as batches:
+            with closing(prefetch(plan, _plan_ahead(shards, counts, settings, mixture))) as batches:
                 for mine in batches:
                     waiting.append((mine, [decoders.submit(maker.scene, p) for p in mine]))
                     if len(waiting) > depth:
@@ -147,12 +140,7 @@ class OpenShards:
     def __enter__(self) -> "OpenShards":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close all shards; wait for those being opened, whose files must not be left open."""
         self._opening.shutdown(wait=True, cancel_futures=True)
         with self._lock:
@@ -202,28 +190,19 @@ class _InlineExecutor(Executor):
         return done
 
 
-class _SampleCounts:
-    """Sizes of the shards of each dataset; an unusable shard counts as empty."""
-
-    def __init__(self, shards: ShardSet, unusable: BadSampleCounter) -> None:
-        self._shards = shards
-        self._unusable = unusable
-        self.parts = shards.parts
-
-    def in_part(self, part: range) -> Callable[[int], int]:
-        """Return a function from a shard's number in its dataset to its number of samples."""
-        return lambda number: self._count(part.start + number)
-
-    def _count(self, number: int) -> int:
-        try:
-            return self._shards.num_samples(number)
-        except TrilightError as error:
-            self._unusable.add(self._shards.names[number], 1, error)
-            return 0
+def _count_samples(shards: ShardSet, unusable: BadSampleCounter, part: range, number: int) -> int:
+    """Return the size of a dataset's shard; an unusable one counts as empty."""
+    number += part.start
+    try:
+        return shards.num_samples(number)
+    except TrilightError as error:
+        unusable.add(shards.names[number], 1, error)
+        return 0
 
 
 def _plan_batches(
-    counted: _SampleCounts,
+    shards: ShardSet,
+    counts: Sequence[Callable[[int], int]],
     settings: LoaderSettings,
     mixture: Mixture | None,
     first: int,
@@ -234,29 +213,32 @@ def _plan_batches(
     position = first * settings.batch_size
     begin = (position,) if mixture is None else mixture.counts_before(position)
     streams = [
-        visits_from(windows_from(len(part), counted.in_part(part), settings.order, start), start)
-        for part, start in zip(counted.parts, begin, strict=True)
+        visits_from(len(part), count, start, seed=settings.seed, window=settings.window)
+        for part, count, start in zip(shards.parts, counts, begin, strict=True)
     ]
-    if mixture is None:
-        visits = streams[0]
-    else:
-        visits = mix_visits(mixture, streams, counted.parts, position)
-    for batch in batch_visits(visits, settings.batch_size):
-        mine = rank_slice.of_batch(batch)
+    visits = streams[0]
+    if mixture is not None:
+        visits = mix_visits(mixture, streams, shards.parts, position)
+    while True:
+        mine = rank_slice.of_batch(tuple(itertools.islice(visits, settings.batch_size)))
         opened.plan(visit.shard for visit in mine)
         yield mine
 
 
-def _plan_ahead(counted: _SampleCounts, settings: LoaderSettings, mixture: Mixture | None) -> int:
+def _plan_ahead(
+    shards: ShardSet,
+    counts: Sequence[Callable[[int], int]],
+    settings: LoaderSettings,
+    mixture: Mixture | None,
+) -> int:
     """Return the number of batches to plan ahead: about a window, to open its shards in time.
 
     With several datasets it is the window that ends first.
     """
     weights = (1.0,) if mixture is None else mixture.weights
     ahead = []
-    for part, weight in zip(counted.parts, weights, strict=True):
-        some = shuffled_shards(len(part), settings.order, 0)[0]
-        window = counted.in_part(part)(some) * settings.window
+    for part, count, weight in zip(shards.parts, counts, weights, strict=True):
+        window = count(shuffled_shards(len(part), settings.seed, 0)[0]) * settings.window
         ahead.append(int(window * sum(weights) / weight) // settings.batch_size)
     return max(min(ahead), 1)
 
@@ -370,39 +352,12 @@ def prefetch(items: Iterator[Item], depth: int) -> Generator[Item, None, None]:
     Args:
         depth: maximum number of items to compute ahead.
     """
-    ready: queue.Queue[tuple[Item] | BaseException | None] = queue.Queue(depth)
-    closed = threading.Event()
-    worker = threading.Thread(target=_fill, args=(items, ready, closed), daemon=True)
-    worker.start()
-    try:
-        while (item := ready.get()) is not None:
-            if isinstance(item, BaseException):
-                raise item
-            yield item[0]
-    finally:
-        closed.set()
-        with suppress(queue.Empty):
-            while True:
-                ready.get_nowait()
-        worker.join()
-
-
-def _fill(
-    items: Iterator[Item],
-    ready: "queue.Queue[tuple[Item] | BaseException | None]",
-    closed: threading.Event,
-) -> None:
-    made: tuple[Item] | BaseException | None
-    while not closed.is_set():
+    end: Any = object()
+    with ThreadPoolExecutor(1, "prefetch") as thread:
+        ahead = deque(thread.submit(next, items, end) for _ in range(depth + 1))
         try:
-            made = (next(items),)
-        except StopIteration:
-            made = None
-        except Exception as error:
-            made = error
-        while not closed.is_set():
-            with suppress(queue.Full):
-                ready.put(made, timeout=0.1)
-                break
-        if not isinstance(made, tuple):
-            return
+            while (item := ahead.popleft().result()) is not end:
+                ahead.append(thread.submit(next, items, end))
+                yield item
+        finally:
+            thread.shutdown(cancel_futures=True)

@@ -35,16 +35,6 @@ class Machine:
     """Number of the run's processes on this node."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class WorkerResult:
-    """Number of decoding threads, with its reason."""
-
-    threads: int
-    """Number of threads that decode samples, 1 or more."""
-    reason: str
-    """Sentence for the user, without a full stop."""
-
-
 def detect_machine(root: Path = Path("/")) -> Machine:
     """Detect cores, memory and processes of this node; `root` is that of the file system."""
     return Machine(
@@ -56,8 +46,8 @@ def detect_machine(root: Path = Path("/")) -> Machine:
 
 def choose_workers(
     machine: Machine, settings: "TrainSettings", *, on_gpu: bool, busy_threads: int
-) -> WorkerResult:
-    """Return the number of decoding threads.
+) -> tuple[int, str]:
+    """Return the number of decoding threads, 1 or more, and its reason as a sentence.
 
     Args:
         settings: settings of the run, which determine the memory of its scenes.
@@ -77,4 +67,4 @@ def choose_workers(
             threads = max(fits, 1)
             reason += f" and {machine.free_bytes / 2**30:.1f} GiB of free memory"
     decision = "1 thread decodes" if threads == 1 else f"{threads} threads decode"
-    return WorkerResult(threads=threads, reason=f"{decision} samples, by {reason}")
+    return threads, f"{decision} samples, by {reason}"

@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from train.evaluation.board import NOISE
+from train.evaluation.board import NOISE, Standing, WidthStandings
 from train.evaluation.cost_charts import SeriesPoint, draw_panels
-from train.evaluation.judged_view import NETWORK, JudgedView
-from train.evaluation.pairs import METRIC
-from train.evaluation.standings import Standing, WidthStandings
+from train.evaluation.judged_view import METRIC, NETWORK, JudgedView
 
 _PANEL = (7.4, 6.2)
 _DPI = 110

@@ -36,7 +36,7 @@ from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions
 from storage.settings.ranges import Within
 from storage.typed_json import FINITE, Sha256, read_json
-from train.data.mixture import RECORD, Mixture
+from train.data.order import RECORD, Mixture
 from train.loop.distributed import DistributedContext
 from train.loop.schedule import decay_start_step
 from train.loop.step import StepReport

@@ -19,12 +19,11 @@ from model.precision import fast_float32_products
 from storage.errors import TrilightError
 from train.data.buckets import TrainingBatch
 from train.loop.compiled import compile_parts, is_compiler_error, undo_compiling
-from train.loop.decision import defers_sync, make_decision
 from train.loop.distributed import DistributedContext
+from train.loop.optimizer import defers_sync, make_decision
 from train.loop.train_state import TrainState
 from train.loss.training_loss import TrainingLoss
-from train.monitoring.activity import Activity
-from train.monitoring.layers import LayerNorms
+from train.monitoring.activity import Activity, LayerNorms
 from train.settings import Precision, TrainSettings
 
 

@@ -16,9 +16,8 @@ from model.renderformer import RenderFormer
 from model.width_scales import scale_start, width_scales
 from storage.seeds import seed_for
 from train.data.bad_samples import BadSampleCounter
-from train.data.mixture import Mixture
-from train.loop.decision import Decision, Updates, move_towards
-from train.loop.optimizer import Updater
+from train.data.order import Mixture
+from train.loop.optimizer import Decision, Updater, Updates, move_towards
 from train.resume import Event
 from train.settings import Precision, TrainSettings
 

@@ -40,16 +40,15 @@ from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.augment import augment_scene
 from train.data.buckets import MOST_WASTE, bucket_scenes
 from train.data.loader import LoaderSettings, OpenShards, prefetch
-from train.data.order import (
-    OrderSettings,
-    RankSlice,
-    ShardWindow,
-    Visit,
-    batch_visits,
-    visits_from,
-    windows_from,
+from train.data.order import RankSlice, Visit, visits_from
+from train.data.scenes import (
+    TrainingScene,
+    block_mean,
+    require_few_triangles,
+    scene_of_views,
+    training_scene,
+    with_target,
 )
-from train.data.scenes import TrainingScene, block_mean, scene_of_views, training_scene, with_target
 from train.settings import AugmentationSettings
 
 SETTINGS = LoaderSettings(
@@ -244,9 +243,9 @@ def test_a_view_takes_its_target_and_noise_along_and_targets_are_logarithms() ->
     scene = training_scene(dataclasses.replace(sample, views=floors), 16)
     torch.testing.assert_close(scene.noise_V, torch.tensor([1e-2, 1e-5]))
     most = sample.scene.num_triangles
-    assert training_scene(sample, 16, most_triangles=most).tensors.num_triangles == most
+    require_few_triangles(sample.key, sample.scene, most)
     with pytest.raises(TrilightError, match=f"{most} triangles; the run takes at most {most - 1}"):
-        training_scene(sample, 16, most_triangles=most - 1)
+        require_few_triangles(sample.key, sample.scene, most - 1)
     with pytest.raises(TrilightError, match=r"not kept apart, which light_mix needs.*per_light"):
         training_scene(sample, 16, lights_apart=True)
 
@@ -330,55 +329,40 @@ WORLDS = (1, 2, 3, 8)
 BATCH = 24
 
 
-def windows(
-    sizes: list[int], first: int = 0, *, seed: int = 0, window: int = 2
-) -> list[ShardWindow]:
-    """Return the windows of two epochs from the one that holds `first`."""
-    chosen = OrderSettings(seed=seed, window=window)
-    stream = windows_from(len(sizes), lambda shard: sizes[shard], chosen, first)
-    end = 2 * sum(sizes)
-    return list(itertools.takewhile(lambda one: one.visits[0].position < end, stream))
-
-
-def places(found: list[ShardWindow]) -> list[Visit]:
-    return [place for window in found for place in window.visits]
+def places(
+    sizes: list[int], first: int = 0, *, seed: int = 0, window: int = 2, count: int | None = None
+) -> list[Visit]:
+    """Return the visits from `first` on to the end of two epochs, or so many."""
+    stream = visits_from(len(sizes), sizes.__getitem__, first, seed=seed, window=window)
+    return list(itertools.islice(stream, 2 * sum(sizes) - first if count is None else count))
 
 
 @settings(deadline=None)  # a busy machine is no failure
 @given(SIZES, st.integers(1, 12), st.integers(0, 3))
-def test_an_epoch_uses_every_sample_once_and_positions_count(
+def test_an_epoch_uses_every_sample_once_and_windows_of_shards_follow_each_other(
     sizes: list[int], window: int, seed: int
 ) -> None:
-    found = places(windows(sizes, seed=seed, window=window))
+    found = places(sizes, seed=seed, window=window)
     every = {(shard, row) for shard, size in enumerate(sizes) for row in range(size)}
     total = len(every)
     assert [place.position for place in found] == list(range(2 * total))
     for epoch in (found[:total], found[total:]):
         assert {(place.shard, place.row) for place in epoch} == every
-
-
-@settings(deadline=None)  # a busy machine is no failure
-@given(SIZES, st.integers(1, 12))
-def test_samples_stay_within_their_window_of_shards(sizes: list[int], window: int) -> None:
-    for one in windows(sizes, window=window):
-        assert len(one.shards) <= window
-        held = {(shard, row) for shard in one.shards for row in range(sizes[shard])}
-        assert {(place.shard, place.row) for place in one.visits} == held
+        windows = [place.arrival // window for place in epoch]
+        assert windows == sorted(windows) and len({p.shard for p in epoch}) <= len(sizes)
 
 
 @settings(deadline=None)  # a busy machine is no failure
 @given(SIZES, st.data())
 def test_entering_later_gives_the_rest(sizes: list[int], data: st.DataObject) -> None:
     first = data.draw(st.integers(0, 2 * sum(sizes) - 1))
-    whole = places(windows(sizes))
-    assert first in [place.position for place in windows(sizes, first)[0].visits]
-    assert [p for p in places(windows(sizes, first)) if p.position >= first] == whole[first:]
+    assert places(sizes, first) == places(sizes)[first:]
 
 
 def test_the_order_is_a_function_of_seed_and_epoch() -> None:
     sizes = [16, 16, 16]
-    assert windows(sizes, seed=3) == windows(sizes, seed=3)
-    both = [places(windows(sizes, seed=seed, window=3)) for seed in range(3)]
+    assert places(sizes, seed=3) == places(sizes, seed=3)
+    both = [places(sizes, seed=seed, window=3) for seed in range(3)]
     epochs = [epoch for found in both for epoch in (found[:48], found[48:])]
     assert len({tuple((p.shard, p.row) for p in epoch) for epoch in epochs}) == 6
     assert len({tuple(p.shard for p in epoch) for epoch in epochs}) == 6
@@ -388,25 +372,22 @@ def test_the_order_is_a_function_of_seed_and_epoch() -> None:
 @given(SIZES, st.integers(0, 40), st.integers(1, 5))
 def test_the_ranks_share_out_every_batch(sizes: list[int], first: int, window: int) -> None:
     """Whatever their number: each place with one rank, equally many each, nobody left out."""
-    chosen = OrderSettings(seed=1, window=window)
-    stream = windows_from(len(sizes), lambda shard: sizes[shard], chosen, first)
-    for batch in itertools.islice(batch_visits(visits_from(stream, first), BATCH), 3):
+    stream = places(sizes, first, seed=1, window=window, count=3 * BATCH)
+    for batch in (stream[at : at + BATCH] for at in range(0, 3 * BATCH, BATCH)):
         assert [place.position for place in batch] == list(range(first, first + BATCH))
         first += BATCH
         for world in WORLDS:
             shares = [RankSlice(rank=r, world_size=world).of_batch(batch) for r in range(world)]
             assert {len(share) for share in shares} == {BATCH // world}
-            assert sorted(itertools.chain(*shares), key=lambda p: p.position) == list(batch)
+            assert sorted(itertools.chain(*shares), key=lambda p: p.position) == batch
 
 
 def test_each_rank_reads_few_shards_of_a_window() -> None:
     """That is why batches are shared out by shard: 2 ranks of 8 shards need about 4 each."""
-    sizes = [64] * 8
-    chosen = OrderSettings(seed=0, window=8)
-    stream = windows_from(8, lambda shard: sizes[shard], chosen, 0)
+    stream = places([64] * 8, window=8, count=8 * 64)
     read: list[set[int]] = [set(), set()]
     samples: list[list[int]] = [[], []]
-    for batch in itertools.islice(batch_visits(visits_from(stream, 0), 64), 8):
+    for batch in (stream[at : at + 64] for at in range(0, 8 * 64, 64)):
         for rank in range(2):
             mine = RankSlice(rank=rank, world_size=2).of_batch(batch)
             read[rank] |= {place.shard for place in mine}
@@ -425,9 +406,8 @@ def test_ranks_that_do_not_exist_are_refused(rank: int, world_size: int) -> None
 def test_unequal_shares_and_empty_shards_are_refused() -> None:
     with pytest.raises(TrilightError, match="batch of 10 scenes is not divisible by 4 ranks"):
         RankSlice(rank=0, world_size=4).require_equal(10)
-    chosen = OrderSettings(seed=0, window=1)
     with pytest.raises(TrilightError, match="all 3 shards are empty"):
-        next(windows_from(3, lambda shard: 0, chosen, 0))
+        places([0, 0, 0], count=1)
 
 
 class _Shard(OpenShard):

@@ -32,12 +32,14 @@ from train.evaluation.equal_time import (
     EqualTimeResult,
     Filter,
     Level,
+    Price,
     TracerTimes,
     equal_time,
     sentences,
     spread_text,
     spread_views,
     time_both,
+    time_scene,
 )
 from train.evaluation.error_colors import ERROR_WHITE, error_picture
 from train.evaluation.evaluate import EvalConfig, judge_views, sheet_views
@@ -52,8 +54,7 @@ from train.evaluation.metrics import (
     score_view,
     summarize_scores,
 )
-from train.evaluation.pages import evaluation_page
-from train.evaluation.report import record
+from train.evaluation.pages import evaluation_page, record
 from train.evaluation.sheet import (
     NOISE_WHITE,
     SheetView,
@@ -62,7 +63,6 @@ from train.evaluation.sheet import (
     write_picture,
 )
 from train.evaluation.stored_pictures import median_picture
-from train.evaluation.timing import Price, time_scene
 from train.evaluation.validation import hit_masks
 from train.loss.lpips import Lpips
 

@@ -29,10 +29,9 @@ from tests.train.kit import TINY_MODEL, tiny_run
 from tests.train.toy import toy_sample
 from train.data.buckets import MOST_WASTE, TrainingBatch, bucket_scenes, collate_batch
 from train.data.scenes import TrainingScene, training_scene
-from train.loop import muon as muon_file
+from train.loop import optimizer as muon_file
 from train.loop.distributed import DistributedContext
-from train.loop.muon import choose_muon_precision, muon, orthogonal, split_over_ranks
-from train.loop.optimizer import Updater
+from train.loop.optimizer import Updater, choose_muon_precision, muon, orthogonal, split_over_ranks
 from train.loop.schedule import decay_start_step, learning_rate
 from train.loop.train_state import new_state
 from train.settings import Precision, TrainSettings

@@ -32,12 +32,11 @@ from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.buckets import TrainingBatch, bucket_scenes, collate_batch
 from train.data.scenes import training_scene
 from train.folder import RunFolder
-from train.loop import compiled, muon, optimizer
+from train.loop import compiled, optimizer
 from train.loop import step as step_module
 from train.loop.checkpoints import read_checkpoint
 from train.loop.compiled import compile_parts, compiled_parts, undo_compiling
-from train.loop.decision import Decision, move_along, move_towards
-from train.loop.optimizer import Updater
+from train.loop.optimizer import Decision, Updater, move_along, move_towards
 from train.loop.step import Stepper, StepReport, predict_log10
 from train.loop.train_state import TrainState, ema_step, new_state
 from train.loss.training_loss import TrainingLoss
@@ -221,7 +220,7 @@ LATE = tiny_run(ema_decay=0.9, muon_rate=3.0, muon_takes="hidden", weight_decay=
 @pytest.fixture
 def late(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have a processor decide as a card does."""
-    for module in (step_module, optimizer, muon):
+    for module in (step_module, optimizer):
         monkeypatch.setattr(module, "defers_sync", lambda _: True)
 
 
