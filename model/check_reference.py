@@ -57,17 +57,17 @@ def differences(path: Path) -> dict[str, float]:
     model = load_published_weights(parameters, config)
     expected_BVRR3 = tensors[_OUTPUT].float().movedim(2, -1)
 
-    def difference(batch: SceneBatch, expected: Tensor) -> Tensor:
-        got = elu(model(batch, int(metadata["resolution"])), alpha=ELU_ALPHA)
+    def difference(scenes: SceneBatch, expected: Tensor) -> Tensor:
+        got = elu(model(scenes, int(metadata["resolution"])), alpha=ELU_ALPHA)
         return (got - expected).abs().max()
 
-    whole, exists_BT = _batch(tensors)
+    batch, exists_BT = _batch(tensors)
     alone = [
-        difference(_scene_alone(whole, scene, exists_T), expected_BVRR3[[scene]])
+        difference(_scene_alone(batch, scene, exists_T), expected_BVRR3[[scene]])
         for scene, exists_T in enumerate(exists_BT)
     ]
     return {
-        "padded": difference(whole, expected_BVRR3).item(),
+        "padded": difference(batch, expected_BVRR3).item(),
         "unpadded": torch.stack(alone).max().item(),
         "std": expected_BVRR3.std().item(),
     }
@@ -111,15 +111,15 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write("usage: python -m model.check_reference FILE.safetensors\n")
         return 2
     try:
-        found = differences(Path(arguments[0]))
+        largest = differences(Path(arguments[0]))
     except TrilightError as mistake:
         sys.stderr.write(f"check_reference: {mistake}\n")
         return 1
-    std = found.pop("std")
-    for name, value in found.items():
+    std = largest.pop("std")
+    for name, value in largest.items():
         text = f"max difference {value:.3g} ({value / std:.3g} of the output's std)"
         sys.stdout.write(f"{name:<9} {text}\n")
-    passes = all(value <= TOLERANCE for value in found.values())  # NaN is not
+    passes = all(value <= TOLERANCE for value in largest.values())  # NaN is not
     sys.stdout.write(f"{'passes' if passes else 'FAILS'}: expected at most {TOLERANCE:g}\n")
     return 0 if passes else 1
 

@@ -48,7 +48,10 @@ def light_groups(scene: Scene, most: int) -> list[LightGroup]:
     corners_E33 = scene.vertex_positions[scene.faces[emitting_E]].astype(np.float64)
     lamp_E = _lamps(corners_E33)
     groups = _pack_lamps(lamp_E, _is_inside(scene, corners_E33, lamp_E), most)
-    power_E = _emitted_power(scene, emitting_E, corners_E33)
+    a, b, c = np.moveaxis(corners_E33, 1, 0)
+    area_E = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    emission_E3 = scene.materials[scene.material_index[emitting_E], EMISSION]
+    power_E = area_E * emission_E3.mean(axis=1, dtype=np.float64)  # up to a constant factor
     powers = [float(power_E[np.isin(lamp_E, lamps)].sum()) for lamps in groups]
     if len(groups) == 1 or not any(powers):
         return [LightGroup(scene=scene, fraction=1.0)]
@@ -112,16 +115,6 @@ def _pack_lamps(
             groups[-1].append(int(lamp))
             room -= count
     return groups
-
-
-def _emitted_power(
-    scene: Scene, emitting_E: NDArray[np.int64], corners_E33: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return area times mean radiance of each emitting triangle, proportional to its power."""
-    a, b, c = np.moveaxis(corners_E33, 1, 0)
-    area_E = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    emission_E3 = scene.materials[scene.material_index[emitting_E], EMISSION]
-    return area_E * emission_E3.mean(axis=1, dtype=np.float64)
 
 
 def _group(scene: Scene, removed_faces: NDArray[np.int64], fraction: float) -> LightGroup:

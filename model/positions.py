@@ -158,17 +158,6 @@ def to_camera(points_BT33: Tensor, c2w_BV44: Tensor) -> Tensor:
     return (relative_BVT33[..., None] * rotation_BV1133).sum(dim=-2)
 
 
-def register_position(triangles_BT33: Tensor, is_triangle_BT: Tensor | None) -> Tensor:
-    """Return the mean vertex of each scene, repeated three times, [B, 1, 3, 3]."""
-    center_BT3 = triangles_BT33.mean(dim=-2)
-    if is_triangle_BT is None:
-        mean_B3 = center_BT3.mean(dim=1)
-    else:
-        weight_BT1 = is_triangle_BT[..., None].to(center_BT3.dtype)
-        mean_B3 = (center_BT3 * weight_BT1).sum(dim=1) / weight_BT1.sum(dim=1)
-    return mean_B3[:, None, None, :].expand(-1, 1, 3, 3)
-
-
 def token_positions(
     triangles_BT33: Tensor,
     is_triangle_BT: Tensor | None,
@@ -184,16 +173,19 @@ def token_positions(
     reproduces this for published weights; with 0 the network is exactly invariant to translation.
     """
     batch, longest = triangles_BT33.shape[:2]
-    register_B133 = register_position(triangles_BT33, is_triangle_BT)
-    registers_BR33 = register_B133.expand(-1, num_registers, -1, -1)
+    center_BT3 = triangles_BT33.mean(dim=-2)
     scale_BN11 = triangles_BT33.new_ones((batch, num_registers + longest, 1, 1))
     if is_triangle_BT is None:
+        mean_B3 = center_BT3.mean(dim=1)
         count_B = scale_BN11.new_full((batch,), longest)
         is_key_BN = None
     else:
+        weight_BT1 = is_triangle_BT[..., None].to(center_BT3.dtype)
+        mean_B3 = (center_BT3 * weight_BT1).sum(dim=1) / weight_BT1.sum(dim=1)
         count_B = is_triangle_BT.sum(dim=1).to(scale_BN11.dtype)
         is_key_BN = nn.functional.pad(is_triangle_BT, (num_registers, 0), value=True)
     scale_BN11[:, :num_registers] = (count_B / (count_B + eps))[:, None, None, None]
+    registers_BR33 = mean_B3[:, None, None, :].expand(-1, num_registers, 3, 3)
     return TokenPositions(
         positions_BN33=torch.cat([registers_BR33, triangles_BT33], dim=1),
         scale_BN11=scale_BN11,

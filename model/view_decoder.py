@@ -23,7 +23,6 @@ from model.layers import LAYER_NORM_EPS, TOKEN_NORM_EPS, DecoderLayer, Norm, dty
 from model.positions import (
     EncodedScene,
     KeysValues,
-    Rotation,
     TokenPositions,
     TriangleRotary,
     camera_rotation,
@@ -221,10 +220,6 @@ class DptHead(nn.Module):
         return self.reassemble[level](self.resize[level](self.project[level](grid_MWQQ)))
 
 
-Cuts = tuple[Windows | None, Windows | None]
-"""Windows of even and of odd layers; None if every bundle attends to all others."""
-
-
 class ViewDecoder(nn.Module):
     """Decoder from context and cameras to pictures."""
 
@@ -262,51 +257,33 @@ class ViewDecoder(nn.Module):
         # packed keys are grouped by view, so views come before scenes for the bundles too
         views_first = scene.packing is not None
         fov_deg_BV = cameras.fov_deg_BV.T if views_first else cameras.fov_deg_BV
-        x_BVQW = self.bundle_tokens(fov_deg_BV, resolution)
+        rays_BVQC = bundle_rays(ray_directions(fov_deg_BV, resolution), self.patch_px)
+        with without_autocast(rays_BVQC.device):
+            x_BVQW = self.token_W + self.rays_norm(self.rays(rays_BVQC))
         rotation = camera_rotation(self.rotary, scene.places, cameras.c2w_BV44)
         if scene.packing is not None:
             rotation = packed_camera_rotation(rotation, scene.packing)
-        cuts = self._cuts(resolution // self.patch_px, x_BVQW.device)
-        taps = self._taps(x_BVQW, scene, rotation, cuts)
-        weights = rounded_parts_of(self.head, self.head.rounded_parts(), x_BVQW.device)
-        picture_MCRR = rounded_call(self.head, weights, taps)
-        picture_BVRRC = picture_MCRR.movedim(1, -1).unflatten(0, fov_deg_BV.shape)
-        return picture_BVRRC.transpose(0, 1) if views_first else picture_BVRRC
-
-    def _taps(
-        self, x_BVQW: Tensor, scene: EncodedScene, rotation: Rotation, cuts: Cuts
-    ) -> list[Tensor]:
-        """Return the outputs [B V, Q, W] of the layers that the head reads."""
+        cuts: list[Windows | None] = [None, None]
+        if self.window_bundles:
+            cuts = [
+                cut_windows(
+                    resolution // self.patch_px,
+                    self.window_bundles,
+                    shifted=shifted,
+                    device=x_BVQW.device,
+                )
+                for shifted in (False, True)
+            ]
         x_BVQW = x_BVQW.to(dtype_of(self.layers))
         keys = scene.keys(views=rotation[0].shape[1])
-        outputs = {}
-        for index, (layer, keys_values) in enumerate(
-            zip(self.layers, scene.keys_values, strict=True)
-        ):
-            x_BVQW = run_layer(
-                layer,
-                x_BVQW,
-                keys_values,
-                rotation,
-                keys,
-                cuts[index % 2],
-                recompute=self.recompute,
-            )
+        taps = {}
+        for index, (layer, (k, v)) in enumerate(zip(self.layers, scene.keys_values, strict=True)):
+            inputs = x_BVQW, (k, v), rotation, keys, cuts[index % 2]
+            x_BVQW = run_layer(layer, *inputs, recompute=self.recompute)
             if index in self.head.taps:
-                outputs[index] = x_BVQW
-        return [torch.flatten(outputs[tap], 0, 1) for tap in self.head.taps]
-
-    def bundle_tokens(self, fov_deg_BV: Tensor, resolution: int) -> Tensor:
-        """Return the tokens [B, V, Q, W] of square pictures, float32 under autocast too."""
-        rays_BVQC = bundle_rays(ray_directions(fov_deg_BV, resolution), self.patch_px)
-        with without_autocast(rays_BVQC.device):
-            return self.token_W + self.rays_norm(self.rays(rays_BVQC))
-
-    def _cuts(self, per_side: int, device: torch.device) -> Cuts:
-        if not self.window_bundles:
-            return None, None
-        even_cut, odd_cut = (
-            cut_windows(per_side, self.window_bundles, shifted=shifted, device=device)
-            for shifted in (False, True)
-        )
-        return even_cut, odd_cut
+                taps[index] = x_BVQW
+        weights = rounded_parts_of(self.head, self.head.rounded_parts(), x_BVQW.device)
+        tokens = [torch.flatten(taps[tap], 0, 1) for tap in self.head.taps]
+        picture_MCRR = rounded_call(self.head, weights, tokens)
+        picture_BVRRC = picture_MCRR.movedim(1, -1).unflatten(0, fov_deg_BV.shape)
+        return picture_BVRRC.transpose(0, 1) if views_first else picture_BVRRC

@@ -141,36 +141,23 @@ def init_or_resume_state(
     for note in plan.resume_plan.notes:
         progress.note(note)
     _record_execution_changes(plan.checkpoint, dist_context, state, progress)
-    if dist_context.is_first:
-        _write_resumed_run(plan, folder, state, data_digest, dist_context)
+    if dist_context.is_first:  # on disk, so that a kill before the next checkpoint loses nothing
+        if plan.branch is not None:
+            root = plan.branch if plan.branch.is_dir() else plan.branch.parent.parent
+            log = MetricsLog(folder.metrics, first_step=0)
+            for row in read_rows(RunFolder(root).metrics):
+                if row["step"] <= state.step:
+                    log.append(row)
+        _write_settings(folder, plan.settings, state, data_digest, dist_context)
+        if plan.branch is not None or plan.resume_plan.changes_meaning:
+            save_checkpoint(
+                folder.checkpoints,
+                state,
+                plan.settings,
+                data_digest=data_digest,
+                world_size=dist_context.world_size,
+            )
     return state
-
-
-def _write_resumed_run(
-    plan: StartPlan,
-    folder: RunFolder,
-    state: TrainState,
-    data_digest: str,
-    dist_context: DistributedContext,
-) -> None:
-    """Write how a run resumes, so that a kill before its next checkpoint loses nothing."""
-    if plan.branch is not None:
-        root = plan.branch if plan.branch.is_dir() else plan.branch.parent.parent
-        log = MetricsLog(folder.metrics, first_step=0)
-        for row in read_rows(RunFolder(root).metrics):
-            if row["step"] <= state.step:
-                log.append(row)
-    _write_settings(folder, plan.settings, state, data_digest, dist_context)
-    if plan.branch is not None or (
-        plan.resume_plan is not None and plan.resume_plan.changes_meaning
-    ):
-        save_checkpoint(
-            folder.checkpoints,
-            state,
-            plan.settings,
-            data_digest=data_digest,
-            world_size=dist_context.world_size,
-        )
 
 
 def _origin(step: int, name: str, header: Mapping[str, Any]) -> Event:

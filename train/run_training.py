@@ -10,7 +10,6 @@ from pathlib import Path
 import torch
 
 from model.checkpoint_format import saved_steps
-from model.renderformer import count_parameters
 from model.scene_tensors import lit_sky, require_known_sky
 from storage.dataset.mixed_data import open_mixture
 from storage.dataset.training_data import TrainingData
@@ -128,15 +127,7 @@ def _train(
     judge = recorder = None
     if dist_context.is_first:
         judge = _make_judge(dataset, settings, state.bad_samples)
-        progress.begin(
-            step=state.step,
-            num_steps=settings.num_steps,
-            num_parameters=count_parameters(state.model),
-            median_scores=judge.median_scores if judge else None,
-        )
-        recorder = Recorder(
-            folder, settings, judge, progress, first_step=state.step, wandb=watched.wandb
-        )
+        recorder = Recorder(folder, settings, judge, progress, state, wandb=watched.wandb)
         how = "went on" if start.resume else "began"
         many = "process" if dist_context.world_size == 1 else "processes"
         where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"

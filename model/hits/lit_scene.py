@@ -220,6 +220,10 @@ class LitScene:
         # as the renderer: the triangle's own normal goes with the shading normal, then both turn
         plane = plane * np.where(dot(plane, normal) < 0, np.float32(-1), np.float32(1))
         flip = np.where(dot(plane, direction) > 0, np.float32(-1), np.float32(1))
+        reflectance = None
+        if self.textures is not None:
+            materials = self.textures.materials(triangle, weights, self._materials_TM)
+            reflectance = reflectance_of(materials)
         return Points(
             triangle=triangle,
             position=position,
@@ -228,15 +232,8 @@ class LitScene:
             to_viewer=-direction,
             edge=np.take(self.edge, triangle, axis=1),
             back=back,
-            reflectance=self._textured_reflectance(triangle, weights),
+            reflectance=reflectance,
         )
-
-    def _textured_reflectance(
-        self, triangle: NDArray[np.intp], weights: Floats
-    ) -> Reflectance | None:
-        if self.textures is None:
-            return None
-        return reflectance_of(self.textures.materials(triangle, weights, self._materials_TM))
 
     def first_hits(self, origin: Floats, direction: Floats) -> RayHits:
         """Return the first hits of rays [3, P] from one camera [3]."""

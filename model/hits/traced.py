@@ -2,13 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from model.config import ModelConfig
 from model.hits.view_inputs import Channel
 from storage.denoiser import Features, denoise, gpu_is_supported
+
+if TYPE_CHECKING:  # it loads pydantic
+    from model.config import ModelConfig
 
 INPUTS = ("open", "direct", "mirrored", "gathered", "tokens")
 """Inputs that a network of hits may lack: light from lamps as if nothing stood between, with its
@@ -85,7 +88,7 @@ def stack_traced(scenes: Sequence[Traced], longest: int) -> Traced:
 _SUMMED = (Channel.SHOWN_DIFFUSE, Channel.DIRECT_SPECULAR, Channel.MIRRORED)
 
 
-def denoise_traced(traced: Traced, config: ModelConfig) -> Traced:
+def denoise_traced(traced: Traced, config: "ModelConfig") -> Traced:
     """Return views whose direct and mirrored light is filtered as one picture, if a network asks.
 
     It is in SHOWN_DIFFUSE; DIRECT_SPECULAR and MIRRORED become 0: two filters cost twice as much

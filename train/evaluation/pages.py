@@ -67,6 +67,7 @@ def record(
         traced: comparison at equal time (evaluation.equal_time); None if it was not measured.
     """
     ours = summarize_views(views)
+    both = [view for view in views if GROUPED in view.scores]  # one pass, and groups of lights
     published = {
         metric: {"published": figure, "ours": ours[metric]["mean"]}
         for metric, figure in PUBLISHED.items()
@@ -81,19 +82,16 @@ def record(
         },
         "path tracer": traced,
         "swapped scenes": loss_by_swapping(views),
-        "light passes": passes_compared(views),
+        "light passes": {
+            "one pass": summarize_views(both, NETWORK),
+            "groups": summarize_views(both, GROUPED),
+        }
+        if both
+        else None,
         "published": published if about.get("build") == BENCHMARK else None,
         "groups": by_group(views),
         "views": [dataclasses.asdict(view) for view in views],
     }
-
-
-def passes_compared(views: Sequence[JudgedView]) -> dict[str, Any] | None:
-    """Return summaries of one pass and of light groups over the views that have both, or None."""
-    both = [view for view in views if GROUPED in view.scores]
-    if not both:
-        return None
-    return {"one pass": summarize_views(both, NETWORK), "groups": summarize_views(both, GROUPED)}
 
 
 def loss_by_swapping(views: Sequence[JudgedView]) -> dict[str, Any] | None:

@@ -175,7 +175,7 @@ class Stepper:
     def sync(self, steps: Sequence[PendingStats]) -> SyncedSteps:
         """Wait for steps, and for pending layer statistics, with a single copy to the host."""
         self.activity.begin("device")
-        layers = self.layers.pending()
+        layers = self.layers.pending
         parts = [*steps, *([] if layers is None else [layers.to(steps[0]).flatten()])]
         values = torch.cat(parts).tolist()
         self.activity.begin("other")

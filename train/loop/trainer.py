@@ -7,7 +7,7 @@ once on a CPU, at each row of the log on a GPU, and before every validation and 
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -41,29 +41,16 @@ class Window:
         """Begin with steps of an earlier call, whose losses count and whose time does not.
 
         Args:
-            reports: reports of those steps; the window appends to this list.
+            reports: reports of those steps, to which the caller appends further ones.
         """
         self._reports = reports
         self._began = time.monotonic()
-        self._views = 0
-        self._waited_s = 0.0
-        self._flops = 0.0
-
-    def add(self, report: StepReport) -> None:
-        """Append the report of one step."""
-        self._reports.append(report)
-
-    def add_cost(self, *, views: int, waited_s: float, flops: float) -> None:
-        """Add the cost of one step.
-
-        Args:
-            views: number of views over all processes.
-            waited_s: seconds in which the network waited for data.
-            flops: FLOPs of this process's scenes, without padding.
-        """
-        self._views += views
-        self._waited_s += waited_s
-        self._flops += flops
+        self.views = 0
+        """Number of views over all processes."""
+        self.waited_s = 0.0
+        """Seconds in which the network waited for data."""
+        self.flops = 0.0
+        """FLOPs of this process's scenes, without padding."""
 
     @contextmanager
     def pause(self) -> Iterator[None]:
@@ -77,7 +64,7 @@ class Window:
     @property
     def views_per_s(self) -> float:
         """Views of all processes per second so far."""
-        return self._views / self._seconds()
+        return self.views / self._seconds()
 
     def row(self, peak_flops_per_s: float) -> dict[str, Any]:
         """Return the log's values of these steps; a mean is None if no step was finite."""
@@ -86,9 +73,9 @@ class Window:
             "l1": _finite_mean(report.l1 for report in self._reports),
             "grad_norm": _finite_mean(report.grad_norm for report in self._reports),
             "views_per_s": self.views_per_s,
-            "data_wait_share": self._waited_s / self._seconds(),
-            "flops_per_s": self._flops / self._seconds(),
-            "peak_share": self._flops / self._seconds() / peak_flops_per_s,
+            "data_wait_share": self.waited_s / self._seconds(),
+            "flops_per_s": self.flops / self._seconds(),
+            "peak_share": self.flops / self._seconds() / peak_flops_per_s,
         }
 
     def _seconds(self) -> float:
@@ -319,11 +306,9 @@ class Trainer:
         self._note_unusable()
         while self.stepper.remarks:
             self._note(self.stepper.remarks.pop(0))
-        self.window.add_cost(
-            views=settings.scenes_per_step * settings.views_per_scene,
-            waited_s=waited_s,
-            flops=sum(scene_flops(settings, count) for count in scenes.num_triangles),
-        )
+        self.window.views += settings.scenes_per_step * settings.views_per_scene
+        self.window.waited_s += waited_s
+        self.window.flops += sum(scene_flops(settings, count) for count in scenes.num_triangles)
         self.state.step += 1
         self.watch.end_step()
         self.pending.append(_PendingStep(step=self.state.step, keys=scenes.keys, stats=stats))
@@ -340,7 +325,7 @@ class Trainer:
         synced = self.stepper.sync([each.stats for each in pending])
         self.asked_to_stop = synced.asked_to_stop
         for each, report in zip(pending, synced.reports, strict=True):
-            self.window.add(report)
+            self.state.reports.append(report)
             self.dead_start.add(each.step, report)
             self.watch.add_report(each.step, report, each.keys)
             if report.applied:
@@ -417,24 +402,19 @@ class Trainer:
         """Exchange statistics with the other processes, and write the row of the log."""
         seen, spikes = self.watch.end_window()
         if self.recorder is not None:
-            self._write_window(self.recorder, seen, spikes)
+            for spike in spikes:
+                self.recorder.row(spike)
+            peak = device_peak(self.dist_context.device, PRODUCTS[self.settings.precision])
+            row = {
+                "step": self.state.step,
+                "learning_rate": learning_rate(self.state.step - 1, self.settings),
+                "skipped_steps": self.state.skipped_steps,
+                **self.window.row(peak),
+            }
+            assert all(value is None or math.isfinite(value) for value in row.values())
+            self.recorder.row({**row, **seen})
         self.state.reports = []
         self.window = Window(self.state.reports)
-
-    def _write_window(
-        self, recorder: Recorder, seen: Mapping[str, Any], spikes: Sequence[Mapping[str, Any]]
-    ) -> None:
-        for spike in spikes:
-            recorder.row(spike)
-        peak = device_peak(self.dist_context.device, PRODUCTS[self.settings.precision])
-        row = {
-            "step": self.state.step,
-            "learning_rate": learning_rate(self.state.step - 1, self.settings),
-            "skipped_steps": self.state.skipped_steps,
-            **self.window.row(peak),
-        }
-        assert all(value is None or math.isfinite(value) for value in row.values())
-        recorder.row({**row, **seen})
 
     def _note(self, text: str, step: int | None = None) -> None:
         """Report a note in the first process; by default about the last step."""

@@ -124,7 +124,10 @@ class TrainingLoss(nn.Module):
             target_BVRR3: log10(1 + radiance).
             noise_BV: root mean square noise of the targets in the same space.
         """
-        l1_BV = view_l1(prediction_BVRR3, target_BVRR3)
+        # Zeng et al. 2025, section 4, first term, but before the ELU, whose slope is a thousandth
+        # for negative values: a network that once predicts below 0 would hardly come back. Targets
+        # are at least 0, so the best prediction is the same.
+        l1_BV = (prediction_BVRR3 - target_BVRR3).abs().mean(dim=(2, 3, 4))
         total_BV = l1_BV
         if self._dissimilarity is not None:
             pictures = [
@@ -137,16 +140,6 @@ class TrainingLoss(nn.Module):
         if half:
             total_BV = total_BV * (half / (half + noise_BV))
         return ViewLosses(total_BV=total_BV, l1_BV=l1_BV.detach())
-
-
-def view_l1(prediction_BVRR3: Tensor, target_BVRR3: Tensor) -> Tensor:
-    """Return the L1 error [B, V] of log10(1 + radiance), before the output's ELU.
-
-    Zeng et al. 2025, section 4, first term. Before the ELU because its slope is a thousandth for
-    negative values: a network that once predicts below 0 would hardly come back. Targets are at
-    least 0, so the best prediction is the same.
-    """
-    return (prediction_BVRR3 - target_BVRR3).abs().mean(dim=(2, 3, 4))
 
 
 def _dissimilarity(

@@ -96,7 +96,8 @@ class LayerNorms:
         self._due = due
         self._grads: list[Tensor] = []
         self._before: list[list[Tensor]] = []
-        self._pending: Tensor | None = None
+        self.pending: Tensor | None = None
+        """New norms [layers, LAYER_COLUMNS] on the device; None if there are none."""
         self._row: dict[str, list[float | None]] = {}
 
     @torch.no_grad()
@@ -121,11 +122,7 @@ class LayerNorms:
             columns.append(torch.stack([grad, length, ratio]))
         if columns:
             self.expect_update(False)
-            self._pending = torch.stack(columns)
-
-    def pending(self) -> Tensor | None:
-        """Return new norms [layers, LAYER_COLUMNS] on the device; None if there are none."""
-        return self._pending
+            self.pending = torch.stack(columns)
 
     def set_values(self, values: Sequence[float]) -> None:
         """Store the numbers of `pending` from the host, layer after layer."""

@@ -122,15 +122,12 @@ class Watchdog:
             known.append(now_s - before.since_s)
         known = self._usual_s.get(kind, deque())
         usual_s = statistics.median(known) if len(known) >= MIN_SAMPLES else None
+        limit_s = UNKNOWN_FACTOR * self._settings.hang_after_s
+        if usual_s is not None:
+            limit_s = max(self._settings.hang_after_s, self._settings.hang_factor * usual_s)
         self._stretch = _Stretch(
-            kind=kind, step=step, since_s=now_s, usual_s=usual_s, limit_s=self._limit_s(usual_s)
+            kind=kind, step=step, since_s=now_s, usual_s=usual_s, limit_s=limit_s
         )
-
-    def _limit_s(self, usual_s: float | None) -> float:
-        least_s = self._settings.hang_after_s
-        if usual_s is None:
-            return UNKNOWN_FACTOR * least_s
-        return max(least_s, self._settings.hang_factor * usual_s)
 
     def _watch(self) -> None:
         hang: _Hang | None = None
