@@ -298,13 +298,8 @@ SIZES: Registry[Callable[[], ModelConfig]] = Registry(
     "size",
     Callable,
     {
-        "smoke": smoke,
-        "hits-smoke": hits_smoke,
-        "tiny": tiny,
-        "small": small,
-        "base": base,
-        "hits-base": hits_base,
-        "large": large,
+        size.__name__.replace("_", "-"): size
+        for size in (smoke, hits_smoke, tiny, small, base, hits_base, large)
     },
     decides=("weights",),
 )

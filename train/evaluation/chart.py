@@ -21,45 +21,35 @@ def plot_leaderboard(widths: Sequence[WidthStandings], title: str, path: Path) -
     import matplotlib
 
     matplotlib.use("Agg")  # before pyplot: no display is needed
-    with matplotlib.rc_context({"text.parse_math": False}):  # names may hold dollar signs
-        _plot(widths, title, path)
-
-
-def _plot(widths: Sequence[WidthStandings], title: str, path: Path) -> None:
     import matplotlib.pyplot as plt
 
-    figure, panels = plt.subplots(
-        1,
-        len(widths),
-        figsize=(_PANEL[0] * len(widths), _PANEL[1]),
-        dpi=_DPI,
-        squeeze=False,
-        layout="constrained",
-    )
-    figure.suptitle(title, fontsize=12)
-    for axes, one in zip(panels.flat, widths, strict=True):
-        axes.set_title(f"{one.width} x {one.width} pixels, {one.num_views} views", fontsize=11)
-        axes.set_xlabel("CPU seconds, one thread", fontsize=_FONT)
-        axes.set_ylabel(f"median {METRIC}, higher is better", fontsize=_FONT)
-        for standing in one.standings:
-            if standing.first_s is None:
-                _line_across(axes, standing)
-    draw_panels(figure, list(panels.flat), [_points(one) for one in widths], _COSTS)
-    figure.savefig(path, metadata={"Software": None})
-    plt.close(figure)
-
-
-def _points(one: WidthStandings) -> list[SeriesPoint]:
-    return [
-        SeriesPoint(
-            name=each.name,
-            kind=each.kind,
-            costs=[each.first_s, each.further_s],
-            error=each.median_db,
+    with matplotlib.rc_context({"text.parse_math": False}):  # names may hold dollar signs
+        figure, panels = plt.subplots(
+            1,
+            len(widths),
+            figsize=(_PANEL[0] * len(widths), _PANEL[1]),
+            dpi=_DPI,
+            squeeze=False,
+            layout="constrained",
         )
-        for each in one.standings
-        if each.first_s is not None and each.further_s is not None
-    ]
+        groups = []
+        for axes, one in zip(panels.flat, widths, strict=True):
+            axes.set_title(f"{one.width} x {one.width} pixels, {one.num_views} views", fontsize=11)
+            axes.set_xlabel("CPU seconds, one thread", fontsize=_FONT)
+            axes.set_ylabel(f"median {METRIC}, higher is better", fontsize=_FONT)
+            groups.append(list[SeriesPoint]())
+            for each in one.standings:
+                if each.first_s is None or each.further_s is None:
+                    _line_across(axes, each)
+                    continue
+                costs = [each.first_s, each.further_s]
+                groups[-1].append(
+                    SeriesPoint(name=each.name, kind=each.kind, costs=costs, error=each.median_db)
+                )
+        figure.suptitle(title, fontsize=12)
+        draw_panels(figure, list(panels.flat), groups, _COSTS)
+        figure.savefig(path, metadata={"Software": None})
+    plt.close(figure)
 
 
 def _line_across(axes: Any, standing: Standing) -> None:

@@ -56,14 +56,6 @@ class Decision:
         return (~self.applied).float()
 
 
-def make_decision(
-    loss: Tensor, grad_norm: Tensor, updates: Updates, *, defer_sync: bool
-) -> Decision:
-    """Return the decision about a step from its loss [] and gradient norm []."""
-    applied = torch.isfinite(loss) & torch.isfinite(grad_norm)
-    return Decision(applied=applied, updates=updates, defer_sync=defer_sync)
-
-
 def move_towards(
     tensors: Sequence[Tensor],
     goals: Sequence[Tensor],
@@ -232,7 +224,9 @@ class StackedMuon(torch.optim.Muon):
         constants = group["ns_coefficients"], group["ns_steps"], group["eps"]
 
         def steps(some: Sequence[Tensor]) -> Tensor:
-            return orthogonal(_stack(some, self._products), *constants)
+            stack_SMN = some[0].new_empty((len(some), *some[0].shape), dtype=self._products)
+            torch._foreach_copy_(list(stack_SMN), list(some))  # stacks and casts in one pass
+            return orthogonal(stack_SMN, *constants)
 
         steps_SMN = split_over_ranks(directions, steps, self._products)
         # Liu et al. 2025: as long as a typical step of AdamW, whatever the shape
@@ -254,13 +248,6 @@ class StackedMuon(torch.optim.Muon):
         means: list[Tensor] = [self.state[weight]["momentum_buffer"] for weight in weights]
         move_towards(means, gradients, 1 - momentum, self.decision)
         return torch._foreach_lerp(gradients, means, momentum)
-
-
-def _stack(matrices: Sequence[Tensor], kind: torch.dtype) -> Tensor:
-    """Return matrices stacked to [S, M, N] and cast to a type, in one pass."""
-    stack_SMN = matrices[0].new_empty((len(matrices), *matrices[0].shape), dtype=kind)
-    torch._foreach_copy_(list(stack_SMN), list(matrices))
-    return stack_SMN
 
 
 def split_over_ranks(

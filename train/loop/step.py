@@ -20,7 +20,7 @@ from storage.errors import TrilightError
 from train.data.buckets import TrainingBatch
 from train.loop.compiled import compile_parts, is_compiler_error, undo_compiling
 from train.loop.distributed import DistributedContext
-from train.loop.optimizer import defers_sync, make_decision
+from train.loop.optimizer import Decision, defers_sync
 from train.loop.train_state import TrainState
 from train.loss.training_loss import TrainingLoss
 from train.monitoring.activity import Activity, LayerNorms
@@ -165,12 +165,13 @@ class Stepper:
         """Update weights and EMA if the step is finite; return whether it is, bool []."""
         state = self._state
         updates = self._updates if self.defer_sync else state.updates
-        decision = make_decision(loss, norm, updates, defer_sync=self.defer_sync)
+        applied = torch.isfinite(loss) & torch.isfinite(norm)
+        decision = Decision(applied=applied, updates=updates, defer_sync=self.defer_sync)
         state.updater.step(learning_rate, decision)
         state.update_ema(self._settings.ema_decay, decision)
-        self._updates += decision.applied
+        self._updates += applied
         self.layers.record_update()
-        return decision.applied
+        return applied
 
     def sync(self, steps: Sequence[PendingStats]) -> SyncedSteps:
         """Wait for steps, and for pending layer statistics, with a single copy to the host."""
