@@ -6,7 +6,6 @@ Light of groups adds up to the scene's. Demodulated pictures: what reflects noth
 import dataclasses
 import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +28,6 @@ from model.weights import RANGE_KEY, TrainedRange, encode_weights, trained_range
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.raycast.first_hits import first_hits
-from storage.records.environment import Environment
 from storage.records.material import DIFFUSE, EMISSION, SPECULAR
 from storage.records.scene import Scene
 from tests.for_each import for_each
@@ -38,8 +36,21 @@ from tests.model.kit import RESOLUTION, awake, random_scene, render, tiny_config
 from tests.pipeline.renders.scene_kit import Part, box, flat, join, light, material, quad
 from tests.scenes_by_hand import tiny_scene
 
+FLOOR = quad(
+    [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]], material(diffuse=0.5)
+)
+CUBE = box([0, 0, 0.2], 0.4, material(diffuse=0.3))
+
+
 TRIANGLE = 0.05 * np.array([[-1.0, 1, 0], [1, -1, 0], [1, 1, 0]])
-ABOVE = np.array([0.0, 0, 2])
+
+
+def lamp(centre: tuple[float, float, float], radiance: float = 300.0) -> Part:
+    return light(TRIANGLE + np.array(centre), radiance)
+
+
+def row_of_lamps(count: int) -> list[Part]:
+    return [lamp((0.2 * at, 0, 2), 100 + at) for at in range(count)]
 
 
 def network() -> RenderFormer:
@@ -53,12 +64,6 @@ def network() -> RenderFormer:
     return model
 
 
-def many_lights(count: int) -> Scene:
-    floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], material(diffuse=0.5))
-    lamps = [light(TRIANGLE + ABOVE + 0.2 * at * np.eye(3)[0], 100.0 + at) for at in range(count)]
-    return join([floor, *lamps])
-
-
 def test_three_lines_are_enough(tmp_path: Path) -> None:
     (tmp_path / "model.safetensors").write_bytes(encode_weights(network()))
     renderer = NeuralRenderer.load(tmp_path / "model.safetensors", device="cpu")
@@ -70,7 +75,7 @@ def test_three_lines_are_enough(tmp_path: Path) -> None:
 
 def test_few_lights_are_the_networks_own_picture() -> None:
     """The same numbers in the same order; one view at a time may sum in another (1e-5 relative)."""
-    seen = many_lights(8).with_cameras(tiny_scene().c2w, tiny_scene().fov_deg)
+    seen = join([FLOOR, *row_of_lamps(8)]).with_cameras(tiny_scene().c2w, tiny_scene().fov_deg)
     for model, scene in ((network(), seen), (awake(KINDS["4 pixels"], torch.float32), corner())):
         whole = radiance(render(model, scene_tensors(scene), resolution=16)[0].double()).numpy()
         shown = NeuralRenderer(model).render(scene, 16)
@@ -89,46 +94,13 @@ def test_other_cameras_see_the_same_prepared_scene() -> None:
     )
 
 
-def _light_of(model: RenderFormer, scene: Scene, device: torch.device) -> Tensor:
-    """Stand for the first stage of an exactly linear network: the light of each channel."""
-    tensors = scene_tensors(scene)
-    a, b, c = tensors.triangles_T33.double().unbind(dim=1)
-    area_T = torch.linalg.cross(b - a, c - a).norm(dim=-1) / 2
-    emission_T3 = torch.pow(10.0, tensors.material_TM[:, EMISSION].double()) - 1
-    return (area_T[:, None] * emission_T3).sum(dim=0)
-
-
-def _flat_picture(_: RenderFormer, light_3: Tensor, *camera: Any) -> Tensor:
-    """Stand for its second stage: every pixel shows that light."""
-    return torch.log10(1 + light_3).expand(camera[-1], camera[-1], 3)
-
-
-@for_each(("count", "most"), [(64, 8), (64, 1), (9, 8), (20, 3)])
-def test_groups_give_what_a_linear_network_gives_at_once(
-    monkeypatch: pytest.MonkeyPatch, count: int, most: int
-) -> None:
-    """Emission goes through log10 in float32: 1e-6 relative."""
-    monkeypatch.setattr(inference, "_encode", _light_of)
-    monkeypatch.setattr(inference, "_decode", _flat_picture)
-    scene, renderer = many_lights(count), NeuralRenderer(network())
-
-    def picture(lights_per_pass: int) -> NDArray[np.float32]:
-        prepared = renderer.prepare(scene, lights_per_pass=lights_per_pass)
-        assert len(prepared.groups) == -(-count // lights_per_pass)
-        return renderer.view(prepared, scene.c2w[0], 40.0, 8)
-
-    at_once = picture(count)
-    assert at_once.min() > 0.1
-    np.testing.assert_allclose(picture(most), at_once, rtol=1e-6)
-
-
 def test_extremes_give_finite_pictures() -> None:
     model = awake(smoke(), torch.float32)
     with torch.no_grad():
         model.decoder.head.last.weight *= 0.1
     renderer = NeuralRenderer(model)
-    one = join([flat(TRIANGLE * 10, material(diffuse=0.5)), light(TRIANGLE + ABOVE, 1e4)])
-    for scene in (one, many_lights(64), tiny_scene()):
+    one = join([flat(TRIANGLE * 10, material(diffuse=0.5)), lamp((0, 0, 2), 1e4)])
+    for scene in (one, join([FLOOR, *row_of_lamps(64)]), tiny_scene()):
         for fov_deg in (1.0, 170.0):
             picture = renderer.view(renderer.prepare(scene), scene.c2w[0], fov_deg, 8)
             assert np.isfinite(picture).all()
@@ -193,30 +165,6 @@ def test_pictures_are_as_wide_as_those_that_it_was_trained_on() -> None:
     assert known.render(tiny_scene()).shape == (2, 16, 16, 3)
     with pytest.raises(TrilightError, match="resolution is None, and the network does not say"):
         NeuralRenderer(network()).render(tiny_scene())
-
-
-def test_a_sky_that_is_left_out_is_said() -> None:
-    renderer = NeuralRenderer(network())
-    scene = tiny_scene()
-    environment = Environment(radiance_rgb=np.ones((2, 4, 3), np.float32))
-    below_sky = renderer.prepare(dataclasses.replace(scene, environment=environment))
-    assert any("has an environment" in note for note in below_sky.notes)
-    assert not any("environment" in note for note in renderer.prepare(scene).notes)
-
-
-FLOOR = quad(
-    [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]], material(diffuse=0.5)
-)
-CUBE = box([0, 0, 0.2], 0.4, material(diffuse=0.3))
-
-
-def lamp(centre: tuple[float, float, float], radiance: float = 300.0) -> Part:
-    triangle = 0.05 * np.array([[-1.0, 1, 0], [1, -1, 0], [1, 1, 0]])
-    return light(triangle + np.array(centre), radiance)
-
-
-def row_of_lamps(count: int) -> list[Part]:
-    return [lamp((0.2 * at, 0, 2), 100 + at) for at in range(count)]
 
 
 def emission_of(scene: Scene) -> dict[bytes, NDArray[np.float32]]:

@@ -19,7 +19,6 @@ from torch import Tensor, nn
 
 from model.config import ModelConfig
 from model.hits import decoder
-from model.hits.decoder import _around
 from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import SOURCE, DeviceTriangles, build_tree
 from model.hits.traced import INPUTS
@@ -66,13 +65,6 @@ def in_double(batch: SceneBatch) -> SceneBatch:
 def picture(model: RenderFormer, *scenes: SceneTensors) -> Tensor:
     shown: Tensor = model(batch_scenes(scenes), PX)
     return shown
-
-
-def test_anchors_around_a_part_are_those_beside_it() -> None:
-    numbers = torch.arange(16.0).reshape(1, 16, 1)
-    around = _around(numbers, 4)[0, ..., 0]
-    assert around[5].tolist() == [0, 1, 2, 4, 5, 6, 8, 9, 10]
-    assert around[0].tolist() == [0, 0, 1, 0, 0, 1, 4, 4, 5], "at the rim the nearest stand again"
 
 
 def test_a_picture_that_moves_by_half_an_anchor_shows_no_seam() -> None:
@@ -206,33 +198,6 @@ def test_every_weight_has_a_gradient_and_comes_back_from_its_file(tokens: bool) 
     scene = tensors(corner())
     shown = picture(again, scene)
     assert torch.equal(shown, picture(model.eval(), scene)) and torch.isfinite(shown).all()
-
-
-def test_gradients_are_those_of_differences() -> None:
-    """In double precision, for some weights of every part."""
-    model = network().double()
-    scenes = in_double(batch_scenes([tensors(corner())]))
-
-    def value() -> Tensor:
-        total: Tensor = model(scenes, PX).square().sum()
-        return total
-
-    model.zero_grad()
-    value().backward()
-    for weight in (model.decoder.head.last.weight, model.decoder.told.weight,
-                   model.encoder.tokens.light.weight, model.decoder.head.nearness):  # fmt: skip
-        flat, grad = weight.data.view(-1), weight.grad.view(-1)
-        at = int(grad.abs().argmax())
-        step = 1e-5
-        flat[at] += step
-        with torch.no_grad():
-            above = value()
-        flat[at] -= 2 * step
-        with torch.no_grad():
-            below = value()
-        flat[at] += step
-        # central differences: the error falls with the square of the step
-        assert float((above - below) / (2 * step)) == pytest.approx(float(grad[at]), rel=1e-4)
 
 
 @for_each(

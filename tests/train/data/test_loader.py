@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -67,35 +68,15 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return write_toy_dataset(folder, train=14, validation=2, per_shard=3, resolution=16)
 
 
-def same(a: TrainingScene, b: TrainingScene) -> bool:
-    return (
-        a.key == b.key
-        and torch.equal(a.target_VRR3, b.target_VRR3)
-        and all(
-            torch.equal(value, getattr(b.tensors, name))
-            for name, value in tensors_of(a.tensors).items()
-        )
-    )
-
-
-def same_batches(a: list[list[TrainingScene]], b: list[list[TrainingScene]]) -> bool:
-    return len(a) == len(b) and all(
-        len(x) == len(y) and all(same(p, q) for p, q in zip(x, y, strict=True))
-        for x, y in zip(a, b, strict=True)
-    )
-
-
-def by_key(batch: list[TrainingScene]) -> list[TrainingScene]:
-    return sorted(batch, key=identity)
-
-
 def identity(scene: TrainingScene) -> tuple[str | bytes, ...]:
     """Key and bytes: two visits of a scene may differ in nothing that a sum would tell."""
-    tensors = [
-        scene.target_VRR3,
-        *(value for _, value in sorted(tensors_of(scene.tensors).items())),
-    ]
-    return (scene.key, *(tensor.contiguous().numpy().tobytes() for tensor in tensors))
+    tensors = {**tensors_of(scene.tensors), "target": scene.target_VRR3}
+    named = sorted(tensors.items())
+    return (scene.key, *(tensor.contiguous().numpy().tobytes() for _, tensor in named))
+
+
+def identities(batches: list[list[TrainingScene]]) -> list[list[tuple[str | bytes, ...]]]:
+    return [[identity(scene) for scene in batch] for batch in batches]
 
 
 WHOLE = 8
@@ -111,7 +92,8 @@ def whole(data: Dataset) -> list[list[TrainingScene]]:
 def test_resuming_after_every_batch_is_uninterrupted(
     data: Dataset, whole: list[list[TrainingScene]], first: int
 ) -> None:
-    assert same_batches(whole[first:], take(data, SETTINGS, WHOLE - first, first=first))
+    resumed = take(data, SETTINGS, WHOLE - first, first=first)
+    assert identities(resumed) == identities(whole[first:])
 
 
 @for_each("world_size", [2, 3, 6])
@@ -119,25 +101,15 @@ def test_resuming_after_every_batch_is_uninterrupted(
 def test_any_number_of_ranks_may_go_on(
     data: Dataset, whole: list[list[TrainingScene]], first: int, world_size: int
 ) -> None:
+    part: dict[str, Any] = {"first": first, "world_size": world_size}
     shares = [
-        take(
-            data,
-            SETTINGS,
-            WHOLE - first,
-            first=first,
-            rank=rank,
-            world_size=world_size,
-            workers=1 + rank % 2,
-        )
+        take(data, SETTINGS, WHOLE - first, rank=rank, workers=1 + rank % 2, **part)
         for rank in range(world_size)
     ]
     assert {len(batch) for share in shares for batch in share} == {6 // world_size}
-    together = [
-        [scene for share in parts for scene in share] for parts in zip(*shares, strict=True)
-    ]
-    assert same_batches(
-        [by_key(batch) for batch in together], [by_key(batch) for batch in whole[first:]]
-    )
+    together = [list(itertools.chain(*parts)) for parts in zip(*shares, strict=True)]
+    for got, wanted in zip(identities(together), identities(whole[first:]), strict=True):
+        assert sorted(got) == sorted(wanted)
 
 
 @for_each("workers", [0, 2, 5])
@@ -145,7 +117,7 @@ def test_the_number_of_threads_changes_nothing(
     data: Dataset, whole: list[list[TrainingScene]], workers: int
 ) -> None:
     before = threading.active_count()
-    assert same_batches(take(data, SETTINGS, WHOLE, workers=workers), whole)
+    assert identities(take(data, SETTINGS, WHOLE, workers=workers)) == identities(whole)
     assert threading.active_count() <= before, "closing the stream ends its threads"
 
 
@@ -154,8 +126,8 @@ def test_a_list_of_the_same_shards_gives_the_same_batches(
 ) -> None:
     listed = open_training_data([f"{data.folder.root}/train-{{000000..000004}}.tar"])
     assert "without a manifest" in listed.notes[0]
-    assert same_batches(take(listed, SETTINGS, 4), whole[:4])
-    assert same_batches(take(listed, SETTINGS, 2, first=3), whole[3:5])
+    assert identities(take(listed, SETTINGS, 4)) == identities(whole[:4])
+    assert identities(take(listed, SETTINGS, 2, first=3)) == identities(whole[3:5])
 
 
 def test_epochs_show_every_scene_and_differ(whole: list[list[TrainingScene]]) -> None:
@@ -165,7 +137,7 @@ def test_epochs_show_every_scene_and_differ(whole: list[list[TrainingScene]]) ->
     assert all(len(set(epoch)) == 14 for epoch in keys)
     assert len({tuple(epoch) for epoch in keys}) == 3
     visits = [scene for scene in scenes if scene.key == keys[0][0]]
-    assert not same(visits[0], visits[1]), "every visit draws its own views and symmetries"
+    assert identity(visits[0]) != identity(visits[1]), "each draws its views and symmetries"
 
 
 def test_views_are_drawn_without_repetition_and_equal_shares(data: Dataset) -> None:
@@ -200,7 +172,7 @@ def test_albedo_is_that_of_the_scene_after_its_symmetries(data: Dataset) -> None
         expected = with_albedo(other.tensors, 16, 2).albedo_VRR6
         assert expected is not None and scene.tensors.albedo_VRR6 is not None
         assert torch.equal(scene.tensors.albedo_VRR6, expected) and expected.max() > 0
-        assert same(other, dataclasses.replace(scene, tensors=other.tensors))
+        assert identity(other) == identity(dataclasses.replace(scene, tensors=other.tensors))
         assert other.tensors.albedo_VRR6 is None
 
 
