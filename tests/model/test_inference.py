@@ -53,6 +53,10 @@ def row_of_lamps(count: int) -> list[Part]:
     return [lamp((0.2 * at, 0, 2), 100 + at) for at in range(count)]
 
 
+def many_lights(count: int) -> Scene:
+    return join([FLOOR, *row_of_lamps(count)])
+
+
 def network() -> RenderFormer:
     """Return a small network whose radiance stays below a hundred."""
     model = awake(tiny_config(), torch.float32)
@@ -75,7 +79,7 @@ def test_three_lines_are_enough(tmp_path: Path) -> None:
 
 def test_few_lights_are_the_networks_own_picture() -> None:
     """The same numbers in the same order; one view at a time may sum in another (1e-5 relative)."""
-    seen = join([FLOOR, *row_of_lamps(8)]).with_cameras(tiny_scene().c2w, tiny_scene().fov_deg)
+    seen = many_lights(8).with_cameras(tiny_scene().c2w, tiny_scene().fov_deg)
     for model, scene in ((network(), seen), (awake(KINDS["4 pixels"], torch.float32), corner())):
         whole = radiance(render(model, scene_tensors(scene), resolution=16)[0].double()).numpy()
         shown = NeuralRenderer(model).render(scene, 16)
@@ -100,7 +104,7 @@ def test_extremes_give_finite_pictures() -> None:
         model.decoder.head.last.weight *= 0.1
     renderer = NeuralRenderer(model)
     one = join([flat(TRIANGLE * 10, material(diffuse=0.5)), lamp((0, 0, 2), 1e4)])
-    for scene in (one, join([FLOOR, *row_of_lamps(64)]), tiny_scene()):
+    for scene in (one, many_lights(64), tiny_scene()):
         for fov_deg in (1.0, 170.0):
             picture = renderer.view(renderer.prepare(scene), scene.c2w[0], fov_deg, 8)
             assert np.isfinite(picture).all()
@@ -188,7 +192,7 @@ def test_a_scene_within_limits_is_rendered_as_it_is(count: int) -> None:
 
 @given(count=st.integers(9, 64), most=st.integers(1, 8))
 def test_the_light_of_the_groups_is_that_of_the_scene(count: int, most: int) -> None:
-    scene = join([FLOOR, *row_of_lamps(count)])
+    scene = many_lights(count)
     groups = light_groups(scene, most)
     assert max(counts(groups)) <= most
     assert len(groups) == -(-count // most)

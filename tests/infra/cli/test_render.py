@@ -46,9 +46,8 @@ from tests.crash import CrashingRenderer
 from tests.for_each import case
 from tests.infra.child_here import use_processes
 from tests.infra.conftest import write_network
-from tests.model.test_inference import FLOOR, row_of_lamps
+from tests.model.test_inference import many_lights
 from tests.pipeline.exchange.strangers_stage import write_stage
-from tests.pipeline.renders.scene_kit import join
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 from train.evaluation.error_colors import error_picture
 
@@ -237,16 +236,14 @@ def test_a_network_clips_what_half_floats_lack_and_groups_lights(
     assert found["clipped_pixels"] == 16 * 16
     assert "neural: pixels beyond what half floats hold were clipped" in str(found["notes"])
     assert decode_exr(out.read_bytes()).max() == 65504
-    source.write_bytes(encode_scene(join([FLOOR, *row_of_lamps(9)])))
+    source.write_bytes(encode_scene(many_lights(9)))
     drawn = (source, "--out", out, "--engine", "neural", "--checkpoint", network)
     for most, passes in (("8", 2), ("3", 3), ("9", 1)):
         assert render(*drawn, "--lights-per-pass", most)["passes"] == passes
     np.testing.assert_array_equal(
         shown(out.with_suffix(".png"))[::16, ::16], preview_srgb8(decode_exr(out.read_bytes()))
     )
-    write_renderformer_h5(
-        tmp_path / "many.h5", join([FLOOR, *row_of_lamps(9)]), texture_type="float32"
-    )
+    write_renderformer_h5(tmp_path / "many.h5", many_lights(9), texture_type="float32")
     first = decode_exr(out.read_bytes())
     render(tmp_path / "many.h5", *drawn[1:], "--lights-per-pass", "9")
     # it orders the triangles anew, and half floats are exact to 2^-11 of their value
