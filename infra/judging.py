@@ -48,9 +48,9 @@ from train.evaluation.evaluate import (
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.pages import evaluation_page, record
 from train.evaluation.sheet import draw_sheet, write_picture
+from train.folder import pretty_json
 from train.loop.distributed import choose_device
 from train.loss.lpips import load_lpips
-from train.result import pretty_json
 
 FILTERS: tuple[Filter, ...] = ("fast", "high")
 

@@ -1,6 +1,7 @@
 """Paths in the folder of a run, and the lock of the trainer that writes them."""
 
 import contextlib
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -71,3 +72,8 @@ def claim_run(folder: RunFolder, dist_context: "DistributedContext") -> Iterator
                 for remove in (folder.claim.unlink, *(place.rmdir for place in new)):
                     with contextlib.suppress(OSError):
                         remove()
+
+
+def pretty_json(record: object) -> bytes:
+    """Return indented, sorted JSON with a final newline."""
+    return json.dumps(record, indent=1, sort_keys=True).encode() + b"\n"

@@ -21,7 +21,7 @@ from storage.extensions import extension_digests
 from storage.records.safe_read import read_plain
 from storage.typed_json import read_json
 from train.data.order import RECORD, plan_mixture
-from train.folder import RunFolder
+from train.folder import RunFolder, pretty_json
 from train.loop.checkpoints import (
     newest_checkpoint,
     read_checkpoint,
@@ -34,7 +34,6 @@ from train.loop.recorder import MetricsLog
 from train.loop.train_state import TrainState, new_state
 from train.monitoring.rows import read_rows
 from train.progress import TrainProgress
-from train.result import pretty_json
 from train.resume import Event, ResumePlan, StartOptions, event_records, plan_resume
 from train.settings import TrainSettings, stored_settings
 

@@ -1,7 +1,6 @@
 """Result of a finished run, and its files."""
 
 import dataclasses
-import json
 from dataclasses import dataclass
 
 from model.renderformer import count_parameters
@@ -11,7 +10,7 @@ from storage.dataset.training_data import TrainingData
 from train.evaluation.metrics import Lead
 from train.evaluation.sheet import draw_validation_sheet, write_picture
 from train.evaluation.validation import Judge
-from train.folder import RunFolder
+from train.folder import RunFolder, pretty_json
 from train.loop.train_state import TrainState
 from train.monitoring.rows import read_rows
 from train.resume import Event
@@ -91,8 +90,3 @@ def finish_run(
     del record["folder"]
     write_atomically(folder.summary, pretty_json(record))
     return result
-
-
-def pretty_json(record: object) -> bytes:
-    """Return indented, sorted JSON with a final newline."""
-    return json.dumps(record, indent=1, sort_keys=True).encode() + b"\n"

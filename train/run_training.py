@@ -19,8 +19,7 @@ from train.data.buckets import decodes_on_device, step_scenes
 from train.data.loader import LoaderSettings, load_batches
 from train.data.scenes import TrainingScene, training_scene
 from train.data.workers import choose_workers, detect_machine
-from train.evaluation.stored_pictures import median_picture
-from train.evaluation.validation import Judge
+from train.evaluation.validation import Judge, median_picture
 from train.folder import RunFolder, claim_run
 from train.initial_state import init_or_resume_state, plan_start
 from train.loop.distributed import DistributedContext

@@ -22,8 +22,8 @@ from torch.nn.functional import normalize, silu, softplus
 
 from model.attention import Keys, Packing, attend
 from model.config import ModelConfig
+from model.hits.anchors import DEVICE_BLOCK
 from model.hits.light_filter import LightFilter, filter_flops
-from model.hits.second_hits import DEVICE_BLOCK
 from model.hits.traced import INPUTS, Traced
 from model.hits.view_inputs import Channel
 from model.layers import (

@@ -11,13 +11,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.anchors import CameraHits, Rays, anchor_pixels, camera_hits, gathered_at
+from model.hits.anchors import (
+    DIMMEST,
+    SMOOTH_ALPHA,
+    CameraHits,
+    Rays,
+    anchor_pixels,
+    blocks,
+    camera_hits,
+    gathered_at,
+    outgoing_radiance,
+)
 from model.hits.device_arrays import DeviceArray, MaskedRows
 from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
 from model.hits.lit_scene import LitScene, PerPoint, Points
 from model.hits.radiosity import SceneLight
 from model.hits.reflectance import Gloss, gloss_at, lobe, sample_lobe
-from model.hits.second_hits import DIMMEST, SMOOTH_ALPHA, blocks, outgoing_radiance
 from model.hits.sky_light import add_sky_light, escaped_light
 from model.hits.vectors import Floats, brightest, dot, spread
 from model.replayed import aside

@@ -48,7 +48,7 @@ from train.evaluation.chart import plot_leaderboard
 from train.evaluation.equal_time import Price
 from train.evaluation.judged_view import METRIC, NETWORK
 from train.evaluation.options import LeaderboardOptions
-from train.evaluation.stored_pictures import PictureSource, nearest_view
+from train.evaluation.validation import PictureSource, nearest_view
 
 PX = 16
 SHIPPED = {"network builtin:", "network builtin:tokens"}

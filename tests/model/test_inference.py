@@ -19,8 +19,7 @@ from torch.nn.functional import interpolate
 from model import inference
 from model.config import ModelConfig, smoke
 from model.demodulated import compose_radiance, with_albedo
-from model.inference import NeuralRenderer
-from model.light_groups import LightGroup, light_groups
+from model.inference import LightGroup, NeuralRenderer, light_groups
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from model.view_decoder import BilinearUpsample, DptHead, Fusion

@@ -56,8 +56,7 @@ from train.data.buckets import collate_batch
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.evaluate import judge_views, make_baselines
 from train.evaluation.judged_view import NETWORK, summarize_views
-from train.evaluation.stored_pictures import MEDIAN, NEAREST
-from train.evaluation.validation import predict
+from train.evaluation.validation import MEDIAN, NEAREST, predict
 from train.loop.distributed import DistributedContext
 from train.loop.schedule import learning_rate
 from train.loop.train_state import TrainState, new_state

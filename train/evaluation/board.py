@@ -38,8 +38,7 @@ from train.evaluation.judged_view import (
     summarize_views,
 )
 from train.evaluation.metrics import METRICS, noise_floors, picture_scores
-from train.evaluation.stored_pictures import PictureSource
-from train.evaluation.validation import ValidationScene, validation_scene
+from train.evaluation.validation import PictureSource, ValidationScene, validation_scene
 from train.loss.lpips import Lpips
 
 UNKNOWN_MACHINE = "a machine that is not named"

@@ -10,8 +10,7 @@ from pydantic import SkipValidation
 
 from model.hits.traced import INPUTS, with_others_tokens
 from model.hits.tracing import with_traced
-from model.inference import NeuralRenderer
-from model.light_groups import light_groups
+from model.inference import NeuralRenderer, light_groups
 from model.renderformer import RenderFormer
 from model.scene_tensors import SceneTensors
 from model.weights import MAX_LIGHTS
@@ -30,8 +29,7 @@ from train.evaluation.judged_view import GROUPED, NETWORK, JudgedView, scene_fac
 from train.evaluation.metrics import noise_floors, picture_scores
 from train.evaluation.options import SceneCount, Width
 from train.evaluation.sheet import SheetView
-from train.evaluation.stored_pictures import Baselines
-from train.evaluation.validation import ValidationScene, predict, validation_scene
+from train.evaluation.validation import Baselines, ValidationScene, predict, validation_scene
 from train.loss.lpips import Lpips
 
 BASELINE_SCENES = 256

@@ -14,7 +14,7 @@ from storage.records.sample import Sample
 from train.evaluation.metrics import METRICS
 
 NETWORK = "network"
-"""Name of the evaluated network among all methods; others are train.evaluation.stored_pictures."""
+"""Name of the evaluated network among all methods; others are train.evaluation.validation."""
 
 GROUPED = f"network, {MAX_LIGHTS} lights at a time"
 """Name of the same network with lights rendered in groups, to compare groups with one pass. Only

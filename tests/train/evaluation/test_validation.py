@@ -62,8 +62,7 @@ from train.evaluation.sheet import (
     noise_picture,
     write_picture,
 )
-from train.evaluation.stored_pictures import median_picture
-from train.evaluation.validation import hit_masks
+from train.evaluation.validation import hit_masks, median_picture
 from train.loss.lpips import Lpips
 
 
