@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import pad
+from torch.nn.utils.rnn import pad_sequence
 
 from model.attention import Keys, Packing, pack_tokens
 from model.config import ModelConfig
@@ -181,9 +181,8 @@ class RenderFormer(nn.Module):
             surfaces = lit_scenes(batch) if self.config.demodulated else ()
             return self._encode_scenes(batch, surfaces=surfaces)
         scenes = traced_batch(batch)
-        longest = batch.triangles_BT33.shape[1]
-        sides = [pad(each.sides_T12, (0, 0, 0, longest - len(each.sides_T12))) for each in scenes]
-        sides_BT12 = like(torch.stack(sides), batch.triangles_BT33)
+        sides_BT12 = pad_sequence([each.sides_T12 for each in scenes], True)
+        sides_BT12 = like(sides_BT12, batch.triangles_BT33)
         units_B3 = like(torch.stack([each.unit_3 for each in scenes]), batch.triangles_BT33)
         scenes = tuple(each.on(batch.triangles_BT33.device) for each in scenes)
         return self._encode_scenes(batch, scenes, sides_BT12, units_B3)

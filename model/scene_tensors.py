@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from model.hits.textures import SurfaceTextures, surface_textures
 from model.hits.traced import Traced, stack_traced
@@ -193,26 +194,19 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
     textures = tuple(scene.textures for scene in scenes)
     skies = tuple(scene.sky for scene in scenes)
     return SceneBatch(
-        triangles_BT33=_stack_padded([scene.triangles_T33 for scene in scenes], longest),
-        normals_BT33=_stack_padded([scene.normals_T33 for scene in scenes], longest),
-        material_BTM=_stack_padded([scene.material_TM for scene in scenes], longest),
+        triangles_BT33=pad_sequence([scene.triangles_T33 for scene in scenes], True),
+        normals_BT33=pad_sequence([scene.normals_T33 for scene in scenes], True),
+        material_BTM=pad_sequence([scene.material_TM for scene in scenes], True),
         c2w_BV44=torch.stack([scene.c2w_V44 for scene in scenes]),
         fov_deg_BV=torch.stack([scene.fov_deg_V for scene in scenes]),
         is_triangle_BT=torch.arange(longest) < torch.tensor(lengths)[:, None] if padded else None,
         columns=scenes[0].columns,
         num_triangles=tuple(lengths) if padded else None,
-        traced=stack_traced(traced, longest) if len(traced) == len(scenes) else None,
+        traced=stack_traced(traced) if len(traced) == len(scenes) else None,
         albedo_BVRR6=torch.stack(albedo) if len(albedo) == len(scenes) else None,
         textures=None if all(each is None for each in textures) else textures,
         skies=None if all(each is None for each in skies) else skies,
     )
-
-
-def _stack_padded(rows: Sequence[Tensor], length: int) -> Tensor:
-    stacked = rows[0].new_zeros((len(rows), length, *rows[0].shape[1:]))
-    for index, row in enumerate(rows):
-        stacked[index, : len(row)] = row
-    return stacked
 
 
 def lit_sky(sky: Environment | None) -> Environment | None:

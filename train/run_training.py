@@ -180,7 +180,7 @@ def _batches(
         data.split("train"),
         stream,
         state.step,
-        rank_slice=dist_context.rank_slice,
+        rank_slice=dist_context,
         workers=workers,
         unusable=state.bad_samples,
         mixture=state.mixture,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from model.hits.view_inputs import Channel
 from storage.denoiser import Features, denoise, gpu_is_supported
@@ -72,15 +73,11 @@ def with_others_tokens(traced: Traced, other: Traced | None) -> Traced:
     return replace(traced, sides_T12=sides_T12)
 
 
-def stack_traced(scenes: Sequence[Traced], longest: int) -> Traced:
+def stack_traced(scenes: Sequence[Traced]) -> Traced:
     """Return the batch of scenes, their triangles padded with zeros."""
-    padded = [
-        torch.nn.functional.pad(each.sides_T12, (0, 0, 0, longest - len(each.sides_T12)))
-        for each in scenes
-    ]
     names = [each.name for each in fields(Traced) if each.name != "sides_T12"]
     return Traced(
-        sides_T12=torch.stack(padded),
+        sides_T12=pad_sequence([each.sides_T12 for each in scenes], True),
         **{name: torch.stack([getattr(each, name) for each in scenes]) for name in names},
     )
 

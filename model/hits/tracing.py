@@ -163,10 +163,7 @@ def traced_cameras(
             scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True
         )
     ]
-    longest = max(scene.lit.num_triangles for scene in scenes)
-    return stack_traced(traced, longest).convert_tensors(
-        lambda each: like(each, cameras.fov_deg_BV)
-    )
+    return stack_traced(traced).convert_tensors(lambda each: like(each, cameras.fov_deg_BV))
 
 
 def like(numbers: Tensor, other: Tensor) -> Tensor:

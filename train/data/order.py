@@ -15,6 +15,7 @@ of scenes of each before a position follows from the weights alone.
 
 import dataclasses
 import heapq
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -146,8 +147,11 @@ class Mixture:
 
         The time does not depend on the position.
         """
-        counts, remaining = self._lower_counts(position - self.first)
-        for source, _ in zip(self._source_order(counts), range(remaining), strict=False):
+        exact = self._exact_weights
+        number = position - self.first
+        time = max(number - len(exact), 0) / sum(exact)  # lower bounds of the counts, then the rest
+        counts = [int(time * weight + Fraction(1, 2)) for weight in exact]
+        for source in itertools.islice(self._source_order(counts), number - sum(counts)):
             counts[source] += 1
         return tuple(now + then for now, then in zip(counts, self.before, strict=True))
 
@@ -157,13 +161,6 @@ class Mixture:
             now - then for now, then in zip(self.counts_before(position), self.before, strict=True)
         ]
         return self._source_order(counts)
-
-    def _lower_counts(self, number: int) -> tuple[list[int], int]:
-        """Return lower bounds of the counts among the first `number`, and the remainder."""
-        exact = self._exact_weights
-        time = max(number - len(exact), 0) / sum(exact)
-        counts = [int(time * weight + Fraction(1, 2)) for weight in exact]
-        return counts, number - sum(counts)
 
     def _source_order(self, counts: Sequence[int]) -> Iterator[int]:
         """Yield the number of the next dataset, without end, after `counts` scenes of each."""

@@ -128,7 +128,25 @@ def evaluation_page(report: Mapping[str, Any]) -> str:
         "",
         scores_table(contestants),
     ]
-    lines += ["", *_noise_lines(network), *_equal_time_lines(report["path tracer"])]
+    gaps = [_score(name, network[name]["median_worse_than_noise"]) for name in METRICS]
+    drawn = ", ".join(name for name, metric in METRICS.items() if metric.floor is None)
+    lines += [
+        "",
+        "Median of how much worse the network's picture is than the noise of its own target. The "
+        "noise of the PSNRs was measured, at the resolution of the data; log_l1 stands against an "
+        f"upper bound of it, and against independent noise of that size stand {drawn}:",
+        "",
+        table(["", *METRICS], [["worse than noise", *gaps]], numbers=len(gaps)),
+        "",
+        f"{network['near_floor']:.1%} of {network['views']} views are within {NEAR_DB:g} dB of "
+        "their floor.",
+    ]
+    if traced := report["path tracer"]:
+        lines += ["", "## Beside the path tracer, in the network's own time", ""]
+        lines += [text(" ".join(sentences(traced)))]
+        if "tracer" in traced:
+            both = {NETWORK: traced["network"], TRACER: traced["tracer"]}
+            lines += ["", scores_table(both)]
     if loss := report["swapped scenes"]:
         lines += ["", swapped_text(loss)]
     if report["published"]:
@@ -202,31 +220,6 @@ def _meanings(meanings: Mapping[str, str]) -> list[str]:
         "",
         *(f"- `{name}` ({better[name]} is better): {text(meanings[name])}" for name in meanings),
     ]
-
-
-def _noise_lines(network: Mapping[str, Any]) -> list[str]:
-    gaps = [_score(name, network[name]["median_worse_than_noise"]) for name in METRICS]
-    drawn = ", ".join(name for name, metric in METRICS.items() if metric.floor is None)
-    return [
-        "Median of how much worse the network's picture is than the noise of its own target. The "
-        "noise of the PSNRs was measured, at the resolution of the data; log_l1 stands against an "
-        f"upper bound of it, and against independent noise of that size stand {drawn}:",
-        "",
-        table(["", *METRICS], [["worse than noise", *gaps]], numbers=len(gaps)),
-        "",
-        f"{network['near_floor']:.1%} of {network['views']} views are within {NEAR_DB:g} dB of "
-        "their floor.",
-    ]
-
-
-def _equal_time_lines(traced: Mapping[str, Any] | None) -> list[str]:
-    if traced is None:
-        return []
-    lines = ["", "## Beside the path tracer, in the network's own time", ""]
-    lines += [text(" ".join(sentences(traced)))]
-    if "tracer" not in traced:
-        return lines
-    return [*lines, "", scores_table({NETWORK: traced["network"], TRACER: traced["tracer"]})]
 
 
 def _medians_table(parts: Mapping[str, Any]) -> str:

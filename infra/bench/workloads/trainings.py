@@ -94,7 +94,7 @@ def _trained_network(
         shards,
         loader_settings(settings),
         0,
-        rank_slice=crew.rank_slice,
+        rank_slice=crew,
         workers=1,
         unusable=state.bad_samples,
     )
