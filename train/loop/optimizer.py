@@ -320,7 +320,7 @@ class Updater:
     """Precision of Muon's products; None if AdamW updates every weight."""
 
     def __init__(self, model: RenderFormer, settings: TrainSettings, precision: Precision) -> None:
-        """Create the optimizers; `precision` is that of Muon's products (loop.muon)."""
+        """Create the optimizers; `precision` is that of Muon's products."""
         device = next(model.parameters()).device
         self._names: dict[Tensor, str] = {weight: name for name, weight in model.named_parameters()}
         scales = width_scales(model, settings.base_widths)

@@ -48,16 +48,6 @@ PendingStats = Tensor
 gradient norm, 1 if it was applied, above 0 if a process was asked to stop."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SyncedSteps:
-    """Statistics of several steps, on the host."""
-
-    reports: list[StepReport]
-    """Report of each step, in their order."""
-    asked_to_stop: bool
-    """True if any process received a signal before one of the steps; equal in all processes."""
-
-
 class Stepper:
     """Takes optimizer steps of a state's network, together with the other processes."""
 
@@ -93,7 +83,7 @@ class Stepper:
 
     def step(self, batches: Sequence[TrainingBatch], learning_rate: float) -> StepReport:
         """Launch a step, wait for it, and return its report; see `launch`."""
-        (report,) = self.sync([self.launch(batches, learning_rate)]).reports
+        (report,), _ = self.sync([self.launch(batches, learning_rate)])
         return report
 
     def launch(
@@ -173,8 +163,13 @@ class Stepper:
         self.layers.record_update()
         return applied
 
-    def sync(self, steps: Sequence[PendingStats]) -> SyncedSteps:
-        """Wait for steps, and for pending layer statistics, with a single copy to the host."""
+    def sync(self, steps: Sequence[PendingStats]) -> tuple[list[StepReport], bool]:
+        """Wait for steps, and for pending layer statistics, with a single copy to the host.
+
+        Returns:
+            The report of each step, in their order, and whether any process received a signal
+            before one of them, which is equal in all processes.
+        """
         self.activity.begin("device")
         layers = self.layers.pending
         parts = [*steps, *([] if layers is None else [layers.to(steps[0]).flatten()])]
@@ -184,9 +179,7 @@ class Stepper:
         rows = [values[width * row : width * (row + 1)] for row in range(len(steps))]
         if layers is not None:
             self.layers.set_values(values[width * len(steps) :])
-        return SyncedSteps(
-            reports=[_report(row) for row in rows], asked_to_stop=any(row[-1] > 0 for row in rows)
-        )
+        return [_report(row) for row in rows], any(row[-1] > 0 for row in rows)
 
     def _add_gradient(self, batch: TrainingBatch, num_views: int, *, last: bool) -> Tensor:
         """Add one batch's gradient; return its sums of loss, L1, and both brightnesses."""
@@ -264,23 +257,20 @@ def explain_out_of_memory(settings: TrainSettings, step: int) -> Iterator[None]:
         of_memory = isinstance(error, torch.OutOfMemoryError | MemoryError)
         if not of_memory and _SAID_ON_CPU not in str(error):
             raise
+        most = min(settings.scenes_per_pass, settings.scenes_per_step)
+        advice = (
+            "One scene at a time and without its activations needs less than any setting can save; "
+            "expected a machine with more memory."
+        )
+        if most > 1:
+            advice = (
+                f"Go on with --resume --set scenes_per_pass={most // 2} instead of {most}, which "
+                "adds up the same gradients; --set recompute_activations=true takes less memory "
+                "too."
+            )
+        elif not settings.recompute_activations:
+            advice = "Go on with --resume --set recompute_activations=true, which takes longer."
         raise TrilightError(
             f"training: too little memory in step {step + 1}; the newest checkpoint is safe. "
-            f"{_memory_advice(settings)}"
+            f"{advice}"
         ) from error
-
-
-def _memory_advice(settings: TrainSettings) -> str:
-    """Return advice on execution settings that need less memory."""
-    most = min(settings.scenes_per_pass, settings.scenes_per_step)
-    if most > 1:
-        return (
-            f"Go on with --resume --set scenes_per_pass={most // 2} instead of {most}, which adds "
-            "up the same gradients; --set recompute_activations=true takes less memory too."
-        )
-    if not settings.recompute_activations:
-        return "Go on with --resume --set recompute_activations=true, which takes longer."
-    return (
-        "One scene at a time and without its activations needs less than any setting can save; "
-        "expected a machine with more memory."
-    )

@@ -103,7 +103,7 @@ def new_state(
         settings: settings of the run; they alone decide the random weights.
         device: device of the network; by default the CPU.
         begin_with: network of the same configuration whose weights are copied.
-        muon_precision: precision of Muon's products (loop.muon.choose_muon_precision).
+        muon_precision: precision of Muon's products (loop.optimizer.choose_muon_precision).
         bad_counts: damage that the run has met, as `BadSampleCounter.counts` has it.
     """
     model = RenderFormer(settings.model)

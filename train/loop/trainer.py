@@ -322,9 +322,8 @@ class Trainer:
         self.pending = []
         if not pending:
             return
-        synced = self.stepper.sync([each.stats for each in pending])
-        self.asked_to_stop = synced.asked_to_stop
-        for each, report in zip(pending, synced.reports, strict=True):
+        reports, self.asked_to_stop = self.stepper.sync([each.stats for each in pending])
+        for each, report in zip(pending, reports, strict=True):
             self.state.reports.append(report)
             self.dead_start.add(each.step, report)
             self.watch.add_report(each.step, report, each.keys)
@@ -334,7 +333,7 @@ class Trainer:
                 self._skip(each)
         self.progress.advance(
             step=self.state.step,
-            loss=synced.reports[-1].loss,
+            loss=reports[-1].loss,
             learning_rate=learning_rate(self.state.step - 1, self.settings),
             views_per_s=self.window.views_per_s,
         )

@@ -239,8 +239,8 @@ class ProcessMonitor:
     def end_window(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         """End a window; return additional values of its row, and rows of spikes.
 
-        All processes must call it. The values: `time_s`, seconds of the window by phase
-        (monitoring.activity); `memory_mb`; `layers` (monitoring.layers); and with several processes
+        All processes must call it. The values: `time_s`, seconds of the window by phase,
+        and `layers` (monitoring.activity); `memory_mb`; and with several processes
         `own_s`, the seconds of a step that each spent on its own work.
         """
         taken_s = self._activity.pop_seconds()

@@ -238,7 +238,7 @@ def taken(batches: list[TrainingBatch]) -> tuple[TrainState, list[bool]]:
     for each in batches:
         unread.append(late.launch([each], 3e-3))
         state.step += 1
-    return state, [report.applied for report in late.sync(unread).reports]
+    return state, [report.applied for report in late.sync(unread)[0]]
 
 
 def tensors(state: TrainState) -> dict[str, Tensor]:
