@@ -322,8 +322,7 @@ class NeuralRenderer:
     def resolution_notes(self, resolution: int) -> tuple[str, ...]:
         """Return sentences on what pictures of this width by this network lack."""
         trained = self.trained.resolution
-        by_pixel = self._model.config.by_hits
-        if trained is None or resolution == trained or by_pixel:
+        if trained is None or resolution == trained or self._model.config.by_hits:
             return ()
         return (
             f"pictures of {resolution} pixels, and the network was trained on {trained}: expect "
@@ -362,7 +361,8 @@ class NeuralRenderer:
         """Refuse a scene of which one layer's tokens alone exceed the free memory."""
         config = self._model.config
         least = num_triangles * (2 * config.hidden_width + 2 * config.width) * _FLOAT_BYTES
-        free = _free_bytes(self.device)
+        on_card = self.device.type == "cuda"
+        free = int(torch.cuda.mem_get_info(self.device)[0]) if on_card else free_memory()
         if free is not None and least > free:
             raise TrilightError(
                 f"{num_triangles} triangles need more than {least / 1e9:.1f} GB of memory, and "
@@ -385,18 +385,11 @@ def _predict_picture(
 ) -> Tensor:
     """Return linear radiance [R, R, 3] of at least 0, the sum over groups of lights."""
     total = torch.zeros(resolution, resolution, 3, dtype=torch.float64, device=c2w_44.device)
+    camera = Cameras(c2w_BV44=c2w_44[None, None], fov_deg_BV=fov_deg[None, None])
     for encoded, share in groups:
-        log10_RR3 = _decode(model, encoded, c2w_44, fov_deg, resolution)
+        log10_RR3 = model.decode(encoded, camera, resolution)[0, 0]
         total += share * radiance(log10_RR3.double()).clamp(min=0)
     return total.float()
-
-
-def _decode(
-    model: RenderFormer, encoded: EncodedScene, c2w_44: Tensor, fov_deg: Tensor, resolution: int
-) -> Tensor:
-    """Return log10(1 + radiance) [R, R, 3] from one camera."""
-    camera = Cameras(c2w_BV44=c2w_44[None, None], fov_deg_BV=fov_deg[None, None])
-    return model.decode(encoded, camera, resolution)[0, 0]
 
 
 class _TracedView:
@@ -427,10 +420,3 @@ class _TracedView:
     def _picture(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         log10_RR3 = self._model.decode_traced(self._encoded, Traced(*tensors))[0, 0]
         return (radiance(log10_RR3.double()).clamp(min=0).float(),)
-
-
-def _free_bytes(device: torch.device) -> int | None:
-    """Return the free memory of a device in bytes, or None where it is unknown."""
-    if device.type == "cuda":
-        return int(torch.cuda.mem_get_info(device)[0])
-    return free_memory()

@@ -14,7 +14,7 @@ the padding is zero, because a mask hides finite values but not NaN (0 * NaN is 
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
@@ -121,7 +121,7 @@ class SceneBatch(Cameras):
         )
 
 
-Scenes = TypeVar("Scenes", SceneTensors, SceneBatch)
+Mapped = TypeVar("Mapped")
 
 
 def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> SceneTensors:
@@ -165,12 +165,14 @@ def tensors_of(scenes: SceneTensors | SceneBatch) -> dict[str, Tensor]:
     return {name: value for name, value in vars(scenes).items() if isinstance(value, Tensor)}
 
 
-def map_tensors(scenes: Scenes, convert: Callable[[Tensor], Tensor]) -> Scenes:
-    """Return the same scenes with each tensor converted, such as moved to a device."""
-    fields: dict[str, Any] = {name: convert(each) for name, each in tensors_of(scenes).items()}
-    if scenes.traced is not None:
-        fields["traced"] = scenes.traced.convert_tensors(convert)
-    return dataclasses.replace(scenes, **fields)
+def map_tensors(whole: Mapped, convert: Callable[[Tensor], Tensor]) -> Mapped:
+    """Return the same scenes, or what holds them, with each tensor converted, as to a device."""
+    fields = {
+        name: convert(each) if isinstance(each, Tensor) else map_tensors(each, convert)
+        for name, each in vars(whole).items()
+        if isinstance(each, Tensor | SceneBatch | Traced)
+    }
+    return dataclasses.replace(whole, **fields)  # type: ignore[type-var]
 
 
 def in_light_units(batch: SceneBatch, unit_B3: Tensor) -> SceneBatch:

@@ -1,9 +1,9 @@
-"""Settings of a training run: everything that decides the weights. Imports no torch.
+"""Settings of a training run, everything that decides the weights, and of its monitoring.
 
-A run is a Python function that returns all settings (train.presets); the command line picks one and
-may replace fields. Fields marked EXECUTION may differ at every resume: the weights are equal up to
-rounding, or do not depend on them. All other fields are the meaning of the run, and change only by
-a decision that the run records (train.resume).
+Imports no torch. A run is a Python function that returns all settings (train.presets); the command
+line picks one and may replace fields. Fields marked EXECUTION may differ at every resume: the
+weights are equal up to rounding, or do not depend on them. All other fields are the meaning of the
+run, and change only by a decision that the run records (train.resume).
 """
 
 from collections.abc import Mapping
@@ -235,3 +235,29 @@ def known_settings(record: Mapping[str, Any], source: str) -> dict[str, Any]:
         if isinstance(record.get(group), Mapping)
     }
     return {**record, **known}
+
+
+OnHang = Literal["wait", "stop"]
+"""Action when a step does not end."""
+
+
+@checked("watch settings")
+class WatchSettings:
+    """Monitoring of a run; decides no weight."""
+
+    hang_after_s: Annotated[float, Within(0.1, 1e6, unit="seconds")] = 120.0
+    """Time after which a step may count as hanging; before three of its kind are known, five times
+    as long."""
+    hang_factor: Annotated[float, Within(1, 1e6, unit="x the usual")] = 10.0
+    """Multiple of the usual time from which on a step counts as hanging."""
+    on_hang: OnHang = "wait"
+    """Action on a hang, after it is reported and the stacks of all threads are written: wait, or
+    stop the run, which --resume continues from the last checkpoint."""
+    spike_bound: Annotated[float, Within(1, 1e6, unit="deviations")] = 8.0
+    """Robust standard deviations above the recent median at which a loss or gradient is recorded
+    with the scenes of its step."""
+    profile: Annotated[int, Within(0, 1000, unit="steps")] = 0
+    """Number of steps to trace with PyTorch's profiler, after the first three; 0 traces none."""
+    wandb: str | None = None
+    """Project of Weights & Biases that the log is written to as well, if the package is installed;
+    offline unless WANDB_MODE says otherwise. By default nothing is."""

@@ -1,6 +1,6 @@
 """`Traced`: traced inputs of scenes and views, as tensors that a network of hits reads."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
@@ -46,10 +46,6 @@ class Traced:
     def tensors(self) -> tuple[Tensor, ...]:
         """Return the tensors in the order of the fields."""
         return tuple(getattr(self, each.name) for each in fields(self))
-
-    def convert_tensors(self, convert: Callable[[Tensor], Tensor]) -> "Traced":
-        """Return the same with each tensor converted, such as moved to a device."""
-        return Traced(*map(convert, self.tensors()))
 
     def without(self, kept_VI: Tensor) -> "Traced":
         """Return the same for views that lack the inputs whose number in `kept_VI` is 0."""

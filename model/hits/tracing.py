@@ -18,7 +18,14 @@ from model.hits.lit_scene import LitScene
 from model.hits.radiosity import SceneLight, scene_light
 from model.hits.traced import INPUTS, Traced, denoise_traced, stack_traced
 from model.hits.view_inputs import ViewInputs, view_inputs
-from model.scene_tensors import Cameras, SceneBatch, SceneTensors, batch_scenes, require_known_sky
+from model.scene_tensors import (
+    Cameras,
+    SceneBatch,
+    SceneTensors,
+    batch_scenes,
+    map_tensors,
+    require_known_sky,
+)
 from storage.conventions import radiance_from_log10
 from storage.raycast.caster import RayCaster
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
@@ -146,7 +153,7 @@ def with_traced(
     cameras = [each.to(ready.unit_3.device) for each in (scene.c2w_V44, scene.fov_deg_V)]
     traced = traced_views(ready, cameras[0], cameras[1], resolution, config, seed)
     place = scene.c2w_V44.device
-    traced = denoise_traced(traced, config).convert_tensors(lambda each: each.to(place))
+    traced = map_tensors(denoise_traced(traced, config), lambda each: each.to(place))
     return dataclasses.replace(scene, traced=traced)
 
 
@@ -163,7 +170,7 @@ def traced_cameras(
             scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True
         )
     ]
-    return stack_traced(traced).convert_tensors(lambda each: like(each, cameras.fov_deg_BV))
+    return map_tensors(stack_traced(traced), lambda each: like(each, cameras.fov_deg_BV))
 
 
 def like(numbers: Tensor, other: Tensor) -> Tensor:

@@ -56,9 +56,8 @@ from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import bumpy_scene
 from train.evaluation.options import EvaluationOptions, LeaderboardOptions
-from train.monitoring.settings import WatchSettings
 from train.presets import training_preset
-from train.settings import AugmentationSettings, LossSettings, TrainSettings
+from train.settings import AugmentationSettings, LossSettings, TrainSettings, WatchSettings
 
 End = Literal["low", "high"]
 

@@ -77,36 +77,16 @@ def test_round_trip_is_exact_and_reproducible(head: str) -> None:
     assert encode_weights(again) == data
 
 
-@for_each(
-    ("name", "tensor", "message"),
-    [
-        ("decoder.token_W", None, r"decoder.token_W is missing, expected \(48,\)"),
-        ("decoder.token_W", torch.zeros(3), r"decoder.token_W is \(3,\), expected \(48,\)"),
-        ("stranger", torch.zeros(3), r"stranger is \(3,\), expected no such tensor"),
-    ],
-)
-def test_wrong_tensors_are_listed(name: str, tensor: Tensor | None, message: str) -> None:
+def test_wrong_tensors_are_listed() -> None:
     config = tiny_config()
     tensors = load(encode_weights(awake(config, torch.float32)))
-    tensors.pop(name, None)
-    if tensor is not None:
-        tensors[name] = tensor
-    with pytest.raises(TrilightError, match=message):
+    tensors["decoder.token_W"] = torch.zeros(3)
+    with pytest.raises(TrilightError, match=r"decoder.token_W is \(3,\), expected \(48,\)"):
         decode_weights(save(tensors, metadata={CONFIG_KEY: encode_config(config)}))
-
-
-@for_each(
-    "data",
-    [
-        b"",
-        b"PK\x03\x04 a zip with a pickle in it",
-        save({"a": torch.zeros(1)}),
-        save({"a": torch.zeros(1)}, metadata={CONFIG_KEY: "{}"}),
-    ],
-)
-def test_other_files_are_refused(data: bytes) -> None:
-    with pytest.raises(TrilightError):
-        decode_weights(data)
+    with pytest.raises(TrilightError, match="the file has no trilight_model entry"):
+        decode_weights(save(tensors))
+    with pytest.raises(TrilightError, match="width is missing"):
+        decode_weights(save(tensors, metadata={CONFIG_KEY: "{}"}))
 
 
 def test_equal_networks_give_equal_bytes_in_any_process() -> None:
@@ -234,10 +214,11 @@ def test_a_config_that_is_none_is_refused(published: Path) -> None:
         open_network(str(published))
 
 
-def test_a_truncated_file_is_refused(ours: Path) -> None:
+def test_a_file_that_is_cut_or_something_else_is_refused(ours: Path) -> None:
     path = ours / WEIGHTS_NAME
     whole = path.read_bytes()
-    for start in (b"", whole[:7], whole[:8], whole[:1000], b"no network"):
+    pickle = b"PK\x03\x04 a zip with a pickle in it"
+    for start in (b"", whole[:7], whole[:8], whole[:1000], b"no network", pickle):
         path.write_bytes(start)
         with case(start[:9]), pytest.raises(TrilightError, match="model.safetensors") as caught:
             open_network(str(path))
@@ -328,29 +309,6 @@ def test_export_and_import_give_the_same_network(family: str, patch: int) -> Non
     assert again.state_dict().keys() == model.state_dict().keys()
     for name, tensor in again.state_dict().items():
         assert torch.equal(tensor, model.state_dict()[name]), name
-
-
-@for_each("name", ["base_tiny", "swin_tiny"])
-def test_export_gives_back_what_was_published(shared: Path, name: str) -> None:
-    """All but the texture encoder bit by bit; that one as a function, by the test above."""
-    path = shared / "renderformer_reference" / f"{name}.safetensors"
-    if not path.exists():
-        pytest.skip(f"{path} is missing")
-    _, metadata = read_tensors(path)
-    config = decode_published_config(json.loads(metadata["config"]))
-    published = {
-        key.removeprefix("param."): tensor.float()
-        for key, tensor in load_file(path).items()
-        if key.startswith("param.")
-    }
-    exported = export_published_weights(
-        load_published_weights(published, config), config.texture_patch
-    )
-    assert exported.keys() == published.keys()
-    for key, tensor in exported.items():
-        assert tensor.shape == published[key].shape, key
-        if not key.startswith("texture_encoder."):
-            assert torch.equal(tensor, published[key]), key
 
 
 def test_frequencies_differ_by_their_rounding_alone() -> None:
@@ -486,6 +444,24 @@ def reference(request: pytest.FixtureRequest, shared: Path) -> Path:
 @pytest.fixture(scope="module")
 def base(shared: Path) -> Path:
     return found_in(shared, FILES[0])
+
+
+def test_export_gives_back_what_was_published(reference: Path) -> None:
+    """All but the texture encoder bit by bit; that one as a function, by the test above."""
+    tensors, metadata = load_file(reference), read_tensors(reference)[1]
+    config = decode_published_config(json.loads(metadata["config"]))
+    published = {
+        key.removeprefix("param."): tensor.float()
+        for key, tensor in tensors.items()
+        if key.startswith("param.")
+    }
+    network = load_published_weights(published, config)
+    exported = export_published_weights(network, config.texture_patch)
+    assert exported.keys() == published.keys()
+    for key, tensor in exported.items():
+        assert tensor.shape == published[key].shape, key
+        if not key.startswith("texture_encoder."):
+            assert torch.equal(tensor, published[key]), key
 
 
 def changed(reference: Path, folder: Path, name: str, change: Tensor) -> str:

@@ -108,7 +108,7 @@ def test_what_is_traced_depends_on_no_thread_and_no_rank(dataset: Dataset) -> No
     }
     for rank in range(3):
         part = {"workers": 3, "rank": rank, "world_size": 3}
-        ((other,),) = take(dataset, loader_settings(hits_run()), 1, first=3, **part)  # type: ignore[arg-type]
+        ((other,),) = take(dataset, loader_settings(hits_run()), 1, first=3, **part)
         a, b = alone.pop(other.key), other.tensors.traced
         assert a is not None
         assert b is not None

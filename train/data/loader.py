@@ -1,11 +1,13 @@
 """DataLoader of training datasets, as an IterableDataset: endless batches, decoded by threads.
 
 Batch i holds the same scenes with the same augmentation wherever the stream starts, for any number
-of ranks and threads: a run resumes by the number of its step.
+of ranks and threads: a run resumes by the number of its step, and every start chooses the number of
+threads again, from the free cores and memory of the machine.
 """
 
 import dataclasses
 import itertools
+import os
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -13,6 +15,7 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -20,6 +23,7 @@ import numpy as np
 from model.scene_tensors import lit_sky, require_known_sky
 from storage.dataset.shard_set import OpenShard, ShardSet
 from storage.errors import TrilightError
+from storage.machine import allowed_cores, free_memory
 from storage.records.stored_sample import StoredSample
 from storage.seeds import rng_for
 from train.data.augment import augment_scene, withhold_inputs
@@ -41,7 +45,8 @@ from train.data.scenes import (
 
 if TYPE_CHECKING:
     from model.config import ModelConfig
-    from train.settings import AugmentationSettings
+    from train.settings import AugmentationSettings, TrainSettings
+
 
 PREFETCHED_SCENES = 16
 """Number of scenes decoded ahead of the network; at least one batch is."""
@@ -361,3 +366,60 @@ def prefetch(items: Iterator[Item], depth: int) -> Generator[Item, None, None]:
                 yield item
         finally:
             thread.shutdown(cancel_futures=True)
+
+
+MAX_THREADS = 8
+"""Maximum number of threads; more would wait for Python's lock. When threads only decode, two to
+three saturate it (study S56); tracing for the view stage `hits` releases it."""
+
+SCENES_AT_WORK = 4
+"""Memory of a thread, in scenes as a batch holds them: decoded and waiting ones."""
+
+_BYTES_OF_PIXEL = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Machine:
+    """Resources of this node that the processes of a run share."""
+
+    cores: float
+    """Number of allowed cores, or the smaller CPU quota of their control group."""
+    free_bytes: int | None = None
+    """Free memory in bytes; None if unknown."""
+    processes: int = 1
+    """Number of the run's processes on this node."""
+
+
+def detect_machine(root: Path = Path("/")) -> Machine:
+    """Detect cores, memory and processes of this node; `root` is that of the file system."""
+    return Machine(
+        cores=allowed_cores(root),
+        free_bytes=free_memory(root),
+        processes=max(int(os.environ.get("LOCAL_WORLD_SIZE", "1")), 1),
+    )
+
+
+def choose_workers(
+    machine: Machine, settings: "TrainSettings", *, on_gpu: bool, busy_threads: int
+) -> tuple[int, str]:
+    """Return the number of decoding threads, 1 or more, and its reason as a sentence.
+
+    Args:
+        settings: settings of the run, which determine the memory of its scenes.
+        on_gpu: True if the network is on a GPU, for which the main thread needs a core.
+        busy_threads: CPU threads of a network that is not on a GPU.
+    """
+    cores = machine.cores / machine.processes
+    spare = cores - (1 if on_gpu else busy_threads)
+    threads = min(max(int(spare), 1), MAX_THREADS)
+    reason = f"{machine.cores:g} cores"
+    if machine.processes > 1:
+        reason += f" for {machine.processes} processes"
+    if machine.free_bytes is not None:
+        scene = _BYTES_OF_PIXEL * settings.views_per_scene * settings.resolution**2
+        fits = machine.free_bytes // 2 // machine.processes // (SCENES_AT_WORK * scene)
+        if fits < threads:
+            threads = max(fits, 1)
+            reason += f" and {machine.free_bytes / 2**30:.1f} GiB of free memory"
+    decision = "1 thread decodes" if threads == 1 else f"{threads} threads decode"
+    return threads, f"{decision} samples, by {reason}"

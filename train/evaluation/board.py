@@ -274,18 +274,14 @@ def judge_all(board: Board, on_progress: OnProgress) -> None:
         judged = functools.cache(functools.partial(validation_scene, sample, width))
         for method in board.present(width):
             timed = row < board.timed_scenes and not isinstance(method, PictureSource)
-            if not _has_all(board, method, sample, timed=timed):
+            views = range(sample.scene.num_views)
+            keys = [board.key_of(method, sample.key, view) for view in views]
+            is_priced = not timed or board.rows.price(keys[0], board.machine) is not None
+            if not is_priced or any(board.rows.get(key) is None for key in keys):
                 on_progress(done, total, f"{width} px, {method.name}")
                 _judge(board, method, sample, judged, timed=timed)
         _judge_noise(board, sample, width, judged)
     on_progress(total, total, "")
-
-
-def _has_all(board: Board, method: Method, sample: Sample, *, timed: bool) -> bool:
-    """Return whether a method has the rows of a scene, and its price if it is timed there."""
-    keys = [board.key_of(method, sample.key, view) for view in range(sample.scene.num_views)]
-    is_priced = not timed or board.rows.price(keys[0], board.machine) is not None
-    return is_priced and all(board.rows.get(key) is not None for key in keys)
 
 
 def _judge(

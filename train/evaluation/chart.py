@@ -2,11 +2,10 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from train.evaluation.board import NOISE, Standing, WidthStandings
+from train.evaluation.board import NOISE, WidthStandings
 from train.evaluation.cost_charts import SeriesPoint, draw_panels
 from train.evaluation.judged_view import METRIC, NETWORK, JudgedView
 
@@ -40,7 +39,18 @@ def plot_leaderboard(widths: Sequence[WidthStandings], title: str, path: Path) -
             groups.append(list[SeriesPoint]())
             for each in one.standings:
                 if each.first_s is None or each.further_s is None:
-                    _line_across(axes, each)
+                    style = "--" if each.name == NOISE else ":"
+                    axes.axhline(each.median_db, color="0.45", linewidth=1, linestyle=style)
+                    axes.annotate(
+                        each.name,
+                        (1, each.median_db),
+                        xycoords=("axes fraction", "data"),
+                        xytext=(-4, 3),
+                        textcoords="offset points",
+                        fontsize=_FONT,
+                        color="0.3",
+                        horizontalalignment="right",
+                    )
                     continue
                 costs = [each.first_s, each.further_s]
                 groups[-1].append(
@@ -50,21 +60,6 @@ def plot_leaderboard(widths: Sequence[WidthStandings], title: str, path: Path) -
         draw_panels(figure, list(panels.flat), groups, _COSTS)
         figure.savefig(path, metadata={"Software": None})
     plt.close(figure)
-
-
-def _line_across(axes: Any, standing: Standing) -> None:
-    is_noise = standing.name == NOISE
-    axes.axhline(standing.median_db, color="0.45", linewidth=1, linestyle="--" if is_noise else ":")
-    axes.annotate(
-        standing.name,
-        (1, standing.median_db),
-        xycoords=("axes fraction", "data"),
-        xytext=(-4, 3),
-        textcoords="offset points",
-        fontsize=_FONT,
-        color="0.3",
-        horizontalalignment="right",
-    )
 
 
 _COLUMNS = 3

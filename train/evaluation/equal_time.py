@@ -100,17 +100,13 @@ Level = tuple[int, Filter]
 
 
 @dataclass(frozen=True, kw_only=True)
-class TracerTimes:
+class TracerTimes(Price):
     """Settings and times of the path tracer at equal time."""
 
     samples: int
     """Number of samples per pixel."""
     denoiser: Filter
     """Name of the denoiser's filter."""
-    first_s: float
-    """CPU seconds of the first view of a scene."""
-    further_s: float
-    """CPU seconds of each further view."""
     note: str
     """Remark about the machine's path tracer; empty if there is none."""
 

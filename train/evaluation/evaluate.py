@@ -245,8 +245,7 @@ def grouped_pictures(
     Returns:
         Linear radiance [V, R, R, 3] of at least 0, or None if one pass takes every light.
     """
-    by_hits = network.config.by_hits
-    if by_hits or len(light_groups(scene, MAX_LIGHTS)) == 1:
+    if network.config.by_hits or len(light_groups(scene, MAX_LIGHTS)) == 1:
         return None
     renderer = NeuralRenderer(network)
     prepared = renderer.prepare(scene)

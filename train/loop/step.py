@@ -9,7 +9,6 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -110,20 +109,16 @@ class Stepper:
         except Exception as error:
             if not (self.is_compiled and is_compiler_error(error)):
                 raise
-            self._leave_compiler(error)
-        return self._launch_once(batches, learning_rate, asked_to_stop=asked_to_stop)
-
-    def _leave_compiler(self, error: Exception) -> None:
-        """Switch compilation off, before the weights have moved; raise if it was required."""
-        reason = f"torch {torch.__version__} cannot compile the network ({type(error).__name__})"
-        if self._settings.compile == "yes" or self._dist_context.world_size > 1:
-            raise TrilightError(
-                f"training: {reason}; expected a version that can. Say --set compile=no, with "
-                "--resume where there is a checkpoint, or install another torch."
-            ) from error
-        undo_compiling(self._state.model, self._objective)
+            what = f"torch {torch.__version__} cannot compile the network ({type(error).__name__})"
+            if self._settings.compile == "yes" or self._dist_context.world_size > 1:
+                raise TrilightError(
+                    f"training: {what}; expected a version that can. Say --set compile=no, with "
+                    "--resume where there is a checkpoint, or install another torch."
+                ) from error
+        undo_compiling(self._state.model, self._objective)  # the weights have not moved yet
         self.is_compiled = False
-        self.remarks.append(f"{reason}: it runs kernel by kernel, which takes longer")
+        self.remarks.append(f"{what}: it runs kernel by kernel, which takes longer")
+        return self._launch_once(batches, learning_rate, asked_to_stop=asked_to_stop)
 
     def _launch_once(
         self, batches: Sequence[TrainingBatch], learning_rate: float, *, asked_to_stop: bool
@@ -135,7 +130,9 @@ class Stepper:
         sums = torch.zeros(4, dtype=torch.float64, device=self._dist_context.device)
         for index, batch in enumerate(batches):
             last = index == len(batches) - 1
-            with contextlib.nullcontext() if last else self._without_exchange():
+            net = self._net  # the gradients are exchanged with the last batch's
+            apart = not last and isinstance(net, DistributedDataParallel) and net
+            with apart.no_sync() if apart else contextlib.nullcontext():
                 sums += self._add_gradient(
                     batch.to(self._dist_context.device), num_views, last=last
                 )
@@ -208,12 +205,6 @@ class Stepper:
         """
         queue = torch.autograd.Variable._execution_engine.queue_callback
         queue(lambda: self.activity.begin("exchange"))
-
-    def _without_exchange(self) -> contextlib.AbstractContextManager[Any]:
-        """Return a context without the exchange of gradients, for all batches but the last."""
-        if isinstance(self._net, DistributedDataParallel):
-            return self._net.no_sync()
-        return contextlib.nullcontext()
 
 
 def _report(figures: Sequence[float]) -> StepReport:

@@ -29,9 +29,8 @@ from train.loop.step import PendingStats, Stepper, StepReport, explain_out_of_me
 from train.loop.train_state import TrainState
 from train.loss.training_loss import TrainingLoss
 from train.monitoring.process_monitor import ProcessMonitor
-from train.monitoring.settings import WatchSettings
 from train.progress import TrainProgress
-from train.settings import TrainSettings
+from train.settings import TrainSettings, WatchSettings
 
 
 class Window:
@@ -303,7 +302,10 @@ class Trainer:
             batches = self.copies.send(scenes.batches)
             rate = learning_rate(step, settings)
             stats = self.stepper.launch(batches, rate, asked_to_stop=asked_to_stop())
-        self._note_unusable()
+        messages = self.state.bad_samples.messages
+        for message in messages[self.num_reported_bad :]:
+            self._note(f"left out: {message.rstrip('.')}")
+        self.num_reported_bad = len(messages)
         while self.stepper.remarks:
             self._note(self.stepper.remarks.pop(0))
         self.window.views += settings.scenes_per_step * settings.views_per_scene
@@ -337,13 +339,6 @@ class Trainer:
             learning_rate=learning_rate(self.state.step - 1, self.settings),
             views_per_s=self.window.views_per_s,
         )
-
-    def _note_unusable(self) -> None:
-        """Report each damaged sample or shard once, after it was left out."""
-        messages = self.state.bad_samples.messages
-        for message in messages[self.num_reported_bad :]:
-            self._note(f"left out: {message.rstrip('.')}")
-        self.num_reported_bad = len(messages)
 
     def _skip(self, pending: _PendingStep) -> None:
         """Count a skipped step and report its scenes; raise after too many in a row."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from storage.errors import TrilightError
 from train.loop.distributed import DistributedContext
 from train.monitoring.activity import PHASES, Activity
-from train.monitoring.settings import WatchSettings
+from train.settings import WatchSettings
 
 MIN_SAMPLES = 3
 """Number of measured sections of a kind from which their usual time is known."""

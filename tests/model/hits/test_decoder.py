@@ -26,7 +26,7 @@ from model.hits.tracing import traced_scene, traced_views, with_traced
 from model.hits.view_inputs import Channel
 from model.inference import NeuralRenderer
 from model.renderformer import RenderFormer, radiance
-from model.scene_tensors import SceneBatch, SceneTensors, batch_scenes, scene_tensors
+from model.scene_tensors import SceneTensors, batch_scenes, map_tensors, scene_tensors
 from model.weights import decode_weights, encode_weights
 from storage.errors import TrilightError
 from storage.raycast.caster import RayHits
@@ -49,16 +49,6 @@ def network(**changes: Any) -> RenderFormer:
 
 def tensors(scene: Scene, config: ModelConfig | None = None) -> SceneTensors:
     return with_traced(scene_tensors(scene), PX, config or hits_config(), 0)
-
-
-def in_double(batch: SceneBatch) -> SceneBatch:
-    def real(value: object) -> bool:
-        return isinstance(value, Tensor) and value.is_floating_point()
-
-    whole = {name: value.double() for name, value in vars(batch).items() if real(value)}
-    assert batch.traced is not None
-    traced = batch.traced.convert_tensors(lambda x: x.double() if real(x) else x)
-    return dataclasses.replace(batch, **whole, traced=traced)
 
 
 @torch.no_grad()
@@ -101,7 +91,9 @@ def test_all_views_at_once_are_the_views_one_by_one(monkeypatch: pytest.MonkeyPa
 
     What a bias of keys is told is zero but for rounding, hence a least scale for all.
     """
-    model, batch = network().double(), in_double(batch_scenes([tensors(corner())] * 2))
+    batch = batch_scenes([tensors(corner())] * 2)
+    batch = map_tensors(batch, lambda each: each.double() if each.is_floating_point() else each)
+    model = network().double()
     results = []
     for _ in range(2):
         model.zero_grad()

@@ -52,10 +52,10 @@ from train.monitoring.process_monitor import (
     spike_bound,
 )
 from train.monitoring.rows import read_rows
-from train.monitoring.settings import WatchSettings
 from train.monitoring.watchdog import Watchdog
 from train.progress import TrainProgress
 from train.run_training import train_run
+from train.settings import WatchSettings
 
 
 def until(done: Callable[[], object]) -> None:
