@@ -46,12 +46,11 @@ from train.evaluation.evaluate import (
     worst_of_each_excursion,
 )
 from train.evaluation.judged_view import NETWORK, JudgedView
-from train.evaluation.pages import evaluation_page
-from train.evaluation.report import record
+from train.evaluation.pages import evaluation_page, record
 from train.evaluation.sheet import draw_sheet, write_picture
+from train.folder import pretty_json
 from train.loop.distributed import choose_device
 from train.loss.lpips import load_lpips
-from train.result import pretty_json
 
 FILTERS: tuple[Filter, ...] = ("fast", "high")
 
@@ -64,7 +63,7 @@ class Judgement:
     """Result of an evaluation."""
 
     record: dict[str, Any]
-    """All figures as JSON values (train.evaluation.report)."""
+    """All figures as JSON values (train.evaluation.pages)."""
     views: tuple[JudgedView, ...]
     contest: EvalConfig
     """Network, data and baselines of the evaluation."""

@@ -31,13 +31,19 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.safe_read import read_plain
 from storage.records.sample import Sample
-from train.evaluation.board import Board, OnProgress, first_keys, judge_all
+from train.evaluation.board import (
+    Board,
+    OnProgress,
+    WidthStandings,
+    first_keys,
+    judge_all,
+    standings_of,
+)
 from train.evaluation.chart import plot_leaderboard
 from train.evaluation.evaluate import BASELINE_SCENES, make_baselines, stored_resolution
 from train.evaluation.options import LeaderboardOptions
 from train.evaluation.pages import leaderboard_page, pairs_csv, standings_csv
-from train.evaluation.standings import WidthStandings, standings_of
-from train.evaluation.stored_pictures import PictureSource, nearest_view
+from train.evaluation.validation import PictureSource, nearest_view
 from train.loss.lpips import load_lpips
 
 USUAL_WIDTHS = (64, 256, 512)

@@ -1,4 +1,4 @@
-"""Configuration of the network: all sizes, from which every module is built.
+"""Configuration of the network: all sizes, from which every module is built. Imports no torch.
 
 The architecture is fixed: two stages, QK-norm over the full width, SwiGLU, RMSNorm before each
 block. `SIZES` has the named configurations.
@@ -6,7 +6,6 @@ block. `SIZES` has the named configurations.
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
 from typing import Annotated, Any, ClassVar, Literal, NoReturn
 
 from storage.errors import TrilightError
@@ -36,34 +35,9 @@ LAYERS = 256
 """Maximum number of layers of a stage: twenty times the largest published network's."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class BundleStage:
-    """View stage of ray bundles, as published."""
-
-    albedo_rays: int
-    """Rays along a side of each pixel that trace its albedo; 0 where radiance is predicted."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class HitStage:
-    """View stage of traced visible surfaces; ModelConfig describes the fields."""
-
-    hit_rays: int
-    hit_anchors: int
-    gather_rays: int
-    pixel_width: int
-    filter_width: int
-    sky_rays: int
-    denoise_from_px: int
-
-    def denoises(self, resolution: int) -> bool:
-        """Return whether the light of pictures of a width is denoised before the network."""
-        return 0 < self.denoise_from_px <= resolution
-
-
 @checked("model config")
 class ModelConfig:
-    """Configuration of one network. Files store it flat; `stage` is the view stage in use."""
+    """Configuration of one network."""
 
     PRESETS: ClassVar[Mapping[str, Callable[[], "ModelConfig"]]] = {}
     """Named sizes, which a setting of this type accepts (storage.settings.overrides)."""
@@ -161,7 +135,7 @@ class ModelConfig:
 
     def _check_hits(self) -> None:
         required = {"hit_anchors": self.hit_anchors, "pixel_width": self.pixel_width}
-        if self.view_stage == "hits":
+        if self.by_hits:
             for name, value in {"hit_rays": self.hit_rays, **required}.items():
                 if value < 1:
                     _wrong(f"{name} {value} with view_stage hits", "1 or more")
@@ -185,11 +159,13 @@ class ModelConfig:
             _wrong(f"hit_rays {self.hit_rays} with view_stage bundles", expected)
 
     @property
-    def stage(self) -> BundleStage | HitStage:
-        """Sizes of the view stage."""
-        if self.view_stage == "bundles":
-            return BundleStage(albedo_rays=self.hit_rays)
-        return HitStage(**{field.name: getattr(self, field.name) for field in fields(HitStage)})
+    def by_hits(self) -> bool:
+        """True for the view stage `hits`, whose views are traced before the network runs."""
+        return self.view_stage == "hits"
+
+    def denoises(self, resolution: int) -> bool:
+        """Return whether the light of pictures of a width is denoised before the network."""
+        return 0 < self.denoise_from_px <= resolution
 
     @property
     def head_width(self) -> int:
@@ -322,13 +298,8 @@ SIZES: Registry[Callable[[], ModelConfig]] = Registry(
     "size",
     Callable,
     {
-        "smoke": smoke,
-        "hits-smoke": hits_smoke,
-        "tiny": tiny,
-        "small": small,
-        "base": base,
-        "hits-base": hits_base,
-        "large": large,
+        size.__name__.replace("_", "-"): size
+        for size in (smoke, hits_smoke, tiny, small, base, hits_base, large)
     },
     decides=("weights",),
 )
@@ -336,13 +307,6 @@ SIZES: Registry[Callable[[], ModelConfig]] = Registry(
 and no name, so that it opens without its size being registered."""
 
 ModelConfig.PRESETS = SIZES
-
-
-def hit_stage(config: ModelConfig) -> HitStage:
-    """Return the view stage `hits`; raises TrilightError where the network has another one."""
-    if not isinstance(config.stage, HitStage):
-        _wrong(f"view_stage {config.view_stage}", "hits")
-    return config.stage
 
 
 def _check_columns(names: tuple[str, ...]) -> None:
@@ -358,3 +322,50 @@ def _check_columns(names: tuple[str, ...]) -> None:
 
 def _wrong(got: str, expected: str) -> NoReturn:
     raise TrilightError(f"model config: {got}; expected {expected}.")
+
+
+@checked("base widths")
+class BaseWidths:
+    """Widths of the network at which learning rates and initial weights are stated."""
+
+    width: Annotated[int, Within(0, 16_384)] = 0
+    """Width of tokens at which the rates were measured; at other widths they and the initial
+    weights follow the maximal update parametrisation (Yang et al. 2021), and with 0 no width."""
+    head_width: Annotated[int, Within(2 * VERTEX_COORDINATES, 16_384)] = 64
+    """Width of an attention head there; it divides `width`."""
+    pixel_width: Annotated[int, Within(1, 4096)] = 64
+    """hits: width of the network that each pixel passes there."""
+    filter_width: Annotated[int, Within(1, 1024)] = 32
+    """hits: width of the filter's network there."""
+
+    def __post_init__(self) -> None:
+        if self.head_width % 2 or self.width % self.head_width:
+            raise TrilightError(
+                f"base widths: width is {self.width} and head_width {self.head_width}; expected "
+                "an even head_width that divides width."
+            )
+
+    def of(self, config: ModelConfig) -> ModelConfig:
+        """Return the configuration `config` at these widths.
+
+        Widths without a field here keep their ratio to the tokens' width. The number of
+        frequencies, on which no weight's shape depends, is 1, so that it fits any head.
+
+        Args:
+            config: network that is trained; `self.width` is above 0.
+        """
+
+        def in_proportion(wide: int) -> int:
+            return 2 * max(1, round(wide * self.width / config.width / 2)) if wide else 0
+
+        return dataclasses.replace(
+            config,
+            width=self.width,
+            num_heads=self.width // self.head_width,
+            hidden_width=in_proportion(config.hidden_width),
+            rope_num_freqs=1,
+            dpt_features=in_proportion(config.dpt_features),
+            dpt_channels=tuple(map(in_proportion, config.dpt_channels)),
+            pixel_width=self.pixel_width if config.pixel_width else 0,
+            filter_width=self.filter_width if config.filter_width else 0,
+        )

@@ -12,14 +12,13 @@ from dataclasses import dataclass
 
 import torch
 
-from model.config import HitStage, ModelConfig
+from model.attention import cut_windows
+from model.config import ModelConfig
 from model.hits.decoder import view_flops
-from model.image_head import LAST_CHANNELS, picture_channels
 from model.positions import encoded_normal_width
 from model.precision import PRECISIONS, rounded_parts
-from model.renderformer import RenderFormer, count_parameters
-from model.triangle_encoder import SIDE_LIGHTS
-from model.windows import cut_windows
+from model.renderformer import SIDE_LIGHTS, RenderFormer, count_parameters
+from model.view_decoder import LAST_CHANNELS, picture_channels
 from storage.records.material import material_width
 
 TRAINING_BYTES = 16
@@ -92,7 +91,7 @@ def flops(config: ModelConfig, workload: Workload) -> dict[str, int]:
     token_inputs = material_width(config.material_columns) + encoded_normal_width(
         config.normal_octaves
     )
-    if isinstance(config.stage, HitStage):
+    if config.by_hits:
         token_inputs += SIDE_LIGHTS
     stage = {
         "triangle tokens": 2 * workload.triangles * token_inputs * d,
@@ -100,7 +99,7 @@ def flops(config: ModelConfig, workload: Workload) -> dict[str, int]:
         "triangle feed-forward": config.encoder_layers * 6 * n * d * f,
         "keys and values": config.decoder_layers * 4 * n * d * d,
     }
-    if isinstance(config.stage, HitStage):
+    if config.by_hits:
         view = view_flops(config, n, workload.resolution)
         scene_stage = stage if config.scene_tokens else {}
         return scene_stage | {name: views * count for name, count in view.items()}

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from model.hits.camera import Rays
+from model.hits.anchors import Rays
 from model.hits.lit_scene import LitScene
 from model.hits.tracing import like, lit_scene_of
 from model.precision import without_autocast

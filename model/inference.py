@@ -4,6 +4,12 @@ renderer = NeuralRenderer.load("runs/smoke/model.safetensors")
 picture = renderer.render(read_scene_file("scene.safetensors"), resolution=512)
 
 All of the network that is used here is in `_encode` and `_decode`.
+
+A network trained on few lights renders many, one group after the other. Light is linear: the
+picture of a scene is the sum of its pictures by each group of lights alone. A group's scene has no
+other emitter. This is exact except for light that emitters block and reflect, which is little for a
+few small triangles (study S32). Keeping the others as black triangles is worse, since emitters are
+hidden from the camera and black triangles are not.
 """
 
 import dataclasses
@@ -18,12 +24,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from model.config import HitStage, hit_stage
-from model.encoded_scene import EncodedScene
-from model.hits.denoised import denoise_traced
-from model.hits.traced import Traced
-from model.light_groups import LightGroup, light_groups
+from model.hits.traced import Traced, denoise_traced
 from model.open import find_network
+from model.positions import EncodedScene
 from model.precision import set_precision
 from model.renderformer import RenderFormer, radiance
 from model.replayed import Replayed
@@ -31,8 +34,123 @@ from model.scene_tensors import Cameras, batch_scenes, map_tensors, scene_tensor
 from model.weights import MAX_LIGHTS, TrainedRange, network_digest
 from storage.errors import TrilightError
 from storage.machine import free_memory
-from storage.records.material import unread_columns
+from storage.records.material import EMISSION, unread_columns
 from storage.records.scene import Scene
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LightGroup:
+    """Scene with some of its lights, and the fraction of the light that they are."""
+
+    scene: Scene
+    """Scene with these lights only, scaled to the power of all lights: a tenth of the light would
+    be darker than any training scene."""
+    fraction: float
+    """Factor of the group's picture in the sum, 0 to 1."""
+
+
+def light_groups(scene: Scene, most: int) -> list[LightGroup]:
+    """Return groups whose pictures, each times its fraction, add up to that of the scene.
+
+    Emitting triangles that touch are one lamp and stay together, since the faces of a lamp block
+    each other's light. Lamps within the bounding box of an object are never grouped with others,
+    since networks are trained on lights outside of objects. Triangles without area emit no light
+    and are left out.
+
+    Args:
+        scene: scene that passes `Scene.check`, without an environment.
+        most: maximum number of emitting triangles of a group; only a single lamp may have more.
+
+    Returns:
+        The groups; a single one with the unchanged scene and a fraction of 1 if that suffices.
+    """
+    emitting_E = np.flatnonzero(scene.triangle_emits)
+    if not len(emitting_E):
+        return [LightGroup(scene=scene, fraction=1.0)]
+    corners_E33 = scene.vertex_positions[scene.faces[emitting_E]].astype(np.float64)
+    lamp_E = _lamps(corners_E33)
+    groups = _pack_lamps(lamp_E, _is_inside(scene, corners_E33, lamp_E), most)
+    a, b, c = np.moveaxis(corners_E33, 1, 0)
+    area_E = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    emission_E3 = scene.materials[scene.material_index[emitting_E], EMISSION]
+    power_E = area_E * emission_E3.mean(axis=1, dtype=np.float64)  # up to a constant factor
+    powers = [float(power_E[np.isin(lamp_E, lamps)].sum()) for lamps in groups]
+    if len(groups) == 1 or not any(powers):
+        return [LightGroup(scene=scene, fraction=1.0)]
+    lit_groups = [
+        (lamps, power / sum(powers)) for lamps, power in zip(groups, powers, strict=True) if power
+    ]
+    return [
+        _group(scene, emitting_E[~np.isin(lamp_E, lamps)], share) for lamps, share in lit_groups
+    ]
+
+
+def _lamps(corners_E33: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the lamp of each triangle: the lowest index among its connected triangles."""
+    points, point_E3 = np.unique(corners_E33.reshape(-1, 3), axis=0, return_inverse=True)
+    point_E3 = point_E3.reshape(-1, 3)
+    lamp_E = np.arange(len(corners_E33))
+    while True:
+        least = np.full(len(points), len(lamp_E))
+        np.minimum.at(least, point_E3, lamp_E[:, None])
+        now_E = least[point_E3].min(axis=1)
+        if np.array_equal(now_E, lamp_E):
+            return lamp_E
+        lamp_E = now_E
+
+
+def _is_inside(
+    scene: Scene, corners_E33: NDArray[np.float64], lamp_E: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Return for each lamp whether its center is in the bounding box of an object."""
+    count_E = np.maximum(np.bincount(lamp_E, minlength=len(lamp_E)), 1)
+    middle_E3 = np.zeros((len(lamp_E), 3))
+    np.add.at(middle_E3, lamp_E, corners_E33.mean(axis=1))
+    middle_E3 /= count_E[:, None]
+    rows = len(scene.objects)
+    low = np.full((rows, 3), np.inf)
+    high = np.full((rows, 3), -np.inf)
+    corners_T33 = scene.vertex_positions[scene.faces]
+    np.minimum.at(low, scene.object_index, corners_T33.min(axis=1))
+    np.maximum.at(high, scene.object_index, corners_T33.max(axis=1))
+    is_inside = np.zeros(len(lamp_E), bool)
+    for row, entry in enumerate(scene.objects):
+        if entry.kind == "object":
+            is_inside |= ((low[row] <= middle_E3) & (middle_E3 <= high[row])).all(axis=1)
+    return is_inside
+
+
+def _pack_lamps(
+    lamp_E: NDArray[np.int64], is_inside: NDArray[np.bool_], most: int
+) -> list[list[int]]:
+    """Return the lamps in their order, packed greedily into groups."""
+    lamps, counts = np.unique(lamp_E, return_counts=True)
+    groups = list[list[int]]()
+    for where in (False, True):
+        room = 0
+        for lamp, count in zip(lamps, counts, strict=True):
+            if is_inside[lamp] != where:
+                continue
+            if count > room:
+                groups.append([])
+                room = most
+            groups[-1].append(int(lamp))
+            room -= count
+    return groups
+
+
+def _group(scene: Scene, removed_faces: NDArray[np.int64], fraction: float) -> LightGroup:
+    materials = scene.materials.copy()
+    materials[:, EMISSION] /= fraction
+    alone = dataclasses.replace(
+        scene,
+        faces=np.delete(scene.faces, removed_faces, axis=0),
+        material_index=np.delete(scene.material_index, removed_faces),
+        object_index=np.delete(scene.object_index, removed_faces),
+        materials=materials,
+    )
+    return LightGroup(scene=alone, fraction=fraction)
+
 
 _FLOAT_BYTES = 4
 
@@ -42,7 +160,7 @@ class PreparedScene:
     """A scene that is ready for any number of cameras."""
 
     groups: tuple[tuple[EncodedScene, float], ...]
-    """Each group of lights and its share of the picture (model.light_groups)."""
+    """Each group of lights and its share of the picture (model.inference)."""
     notes: tuple[str, ...]
     """Sentences on what this network cannot render of this scene, for `warnings`."""
     views: dict[int, Callable[[Tensor, Tensor], Tensor]] = field(default_factory=dict)
@@ -138,7 +256,7 @@ class NeuralRenderer:
 
         Args:
             scene: passes `Scene.check`; its cameras do not matter.
-            lights_per_pass: most emitting triangles of a group (model.light_groups). The lamps of
+            lights_per_pass: most emitting triangles of a group (model.inference). The lamps of
                 a network of hits are traced, any number at a time.
 
         Raises:
@@ -151,7 +269,7 @@ class NeuralRenderer:
             knows_sky = self._model.config.sky_rays
             sky = dataclasses.replace(sky, is_seen=False) if knows_sky else None
             scene = dataclasses.replace(scene, environment=sky)
-        by_hits = isinstance(self._model.config.stage, HitStage)
+        by_hits = self._model.config.by_hits
         all_lights = [LightGroup(scene=scene, fraction=1.0)]
         groups = [
             (_encode(self._model, group.scene, self.device), group.fraction)
@@ -182,7 +300,7 @@ class NeuralRenderer:
         angle = torch.tensor(fov_deg, dtype=torch.float32, device=self.device)
         views = prepared.views
         if resolution not in views:
-            if isinstance(self._model.config.stage, HitStage):
+            if self._model.config.by_hits:
                 ((encoded, _),) = prepared.groups
                 views[resolution] = _TracedView(self._model, encoded, resolution)
             else:
@@ -204,8 +322,7 @@ class NeuralRenderer:
     def resolution_notes(self, resolution: int) -> tuple[str, ...]:
         """Return sentences on what pictures of this width by this network lack."""
         trained = self.trained.resolution
-        by_pixel = isinstance(self._model.config.stage, HitStage)
-        if trained is None or resolution == trained or by_pixel:
+        if trained is None or resolution == trained or self._model.config.by_hits:
             return ()
         return (
             f"pictures of {resolution} pixels, and the network was trained on {trained}: expect "
@@ -244,7 +361,8 @@ class NeuralRenderer:
         """Refuse a scene of which one layer's tokens alone exceed the free memory."""
         config = self._model.config
         least = num_triangles * (2 * config.hidden_width + 2 * config.width) * _FLOAT_BYTES
-        free = _free_bytes(self.device)
+        on_card = self.device.type == "cuda"
+        free = int(torch.cuda.mem_get_info(self.device)[0]) if on_card else free_memory()
         if free is not None and least > free:
             raise TrilightError(
                 f"{num_triangles} triangles need more than {least / 1e9:.1f} GB of memory, and "
@@ -267,18 +385,11 @@ def _predict_picture(
 ) -> Tensor:
     """Return linear radiance [R, R, 3] of at least 0, the sum over groups of lights."""
     total = torch.zeros(resolution, resolution, 3, dtype=torch.float64, device=c2w_44.device)
+    camera = Cameras(c2w_BV44=c2w_44[None, None], fov_deg_BV=fov_deg[None, None])
     for encoded, share in groups:
-        log10_RR3 = _decode(model, encoded, c2w_44, fov_deg, resolution)
+        log10_RR3 = model.decode(encoded, camera, resolution)[0, 0]
         total += share * radiance(log10_RR3.double()).clamp(min=0)
     return total.float()
-
-
-def _decode(
-    model: RenderFormer, encoded: EncodedScene, c2w_44: Tensor, fov_deg: Tensor, resolution: int
-) -> Tensor:
-    """Return log10(1 + radiance) [R, R, 3] from one camera."""
-    camera = Cameras(c2w_BV44=c2w_44[None, None], fov_deg_BV=fov_deg[None, None])
-    return model.decode(encoded, camera, resolution)[0, 0]
 
 
 class _TracedView:
@@ -298,7 +409,7 @@ class _TracedView:
     def __call__(self, c2w_44: Tensor, fov_deg: Tensor) -> Tensor:
         """Return linear radiance [R, R, 3] of at least 0."""
         traced = Traced(*self._trace(c2w_44, fov_deg))
-        denoised = denoise_traced(traced, hit_stage(self._model.config))
+        denoised = denoise_traced(traced, self._model.config)
         (picture_RR3,) = self._decode(*denoised.tensors())
         return picture_RR3
 
@@ -309,10 +420,3 @@ class _TracedView:
     def _picture(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         log10_RR3 = self._model.decode_traced(self._encoded, Traced(*tensors))[0, 0]
         return (radiance(log10_RR3.double()).clamp(min=0).float(),)
-
-
-def _free_bytes(device: torch.device) -> int | None:
-    """Return the free memory of a device in bytes, or None where it is unknown."""
-    if device.type == "cuda":
-        return int(torch.cuda.mem_get_info(device)[0])
-    return free_memory()

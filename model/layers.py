@@ -10,12 +10,9 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from model.attention import Keys, attend
-from model.encoded_scene import KeysValues
-from model.positions import Rotation, rotate
-from model.precision import without_autocast
-from model.rounding import rounded_call, rounded_weights
-from model.windows import Windows, attend_in_windows
+from model.attention import Keys, Windows, attend, attend_in_windows
+from model.positions import KeysValues, Rotation, rotate
+from model.precision import rounded_call, rounded_weights, without_autocast
 
 LAYER_NORM_EPS = 1e-6
 """Epsilon of every norm inside a layer, as published."""

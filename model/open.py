@@ -115,14 +115,22 @@ def find_network(place: str | Path) -> NetworkFile:
     path = BUILTIN_NETWORKS.get(source, Path(source))
     is_finished = path.is_dir() and (path / WEIGHTS_NAME).is_file()
     if not is_finished and (checkpoint := find_checkpoint(path)):
-        return _network_of_checkpoint(checkpoint)
+        read = read_checkpoint(checkpoint)  # all of it: its digest verifies it
+        settings = read.header.get("settings")
+        width = settings.get("resolution") if isinstance(settings, dict) else None
+        return NetworkFile(
+            path=checkpoint,
+            trained=TrainedRange(resolution=width if isinstance(width, int) else None),
+            any_width=decode_config(read.header["model"], f"checkpoint {checkpoint}").by_hits,
+            open=read.network,
+        )
     weights = _weights_file(source, path)
     metadata = read_metadata(weights)
     if CONFIG_KEY in metadata:
         return NetworkFile(
             path=weights,
             trained=trained_range(metadata) or TrainedRange(),
-            any_width=decode_config(metadata[CONFIG_KEY], str(weights)).view_stage == "hits",
+            any_width=decode_config(metadata[CONFIG_KEY], str(weights)).by_hits,
             open=lambda: from_tensors(*read_tensors(weights), str(weights)),
         )
     return NetworkFile(
@@ -132,20 +140,6 @@ def find_network(place: str | Path) -> NetworkFile:
         open=lambda: load_published_weights(
             read_tensors(weights)[0], _read_config(weights.parent / CONFIG_NAME)
         ),
-    )
-
-
-def _network_of_checkpoint(path: Path) -> NetworkFile:
-    """Return the network of a checkpoint, whose bytes are all read: their digest verifies it."""
-    checkpoint = read_checkpoint(path)
-    settings = checkpoint.header.get("settings")
-    resolution = settings.get("resolution") if isinstance(settings, dict) else None
-    return NetworkFile(
-        path=path,
-        trained=TrainedRange(resolution=resolution if isinstance(resolution, int) else None),
-        any_width=decode_config(checkpoint.header["model"], f"checkpoint {path}").view_stage
-        == "hits",
-        open=checkpoint.network,
     )
 
 

@@ -1,17 +1,77 @@
-"""Position encodings: rotary angles of triangles (RoPE), and sines of their normals.
+"""Position encodings of tokens, and encoded scenes: the output of the view-independent stage.
 
-Queries and keys are rotated by angles proportional to the nine vertex coordinates, so that their
-product depends only on differences of positions: the network is invariant to translation (Zeng et
-al. 2025, section 3.1), but not to rotation.
+Queries and keys are rotated by angles proportional to the nine vertex coordinates (RoPE), so that
+their product depends only on differences of positions: the network is invariant to translation
+(Zeng et al. 2025, section 3.1), but not to rotation. Normals enter by their sines.
 """
 
 import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
-from model.encoded_scene import TokenPositions
-from model.packing import Packing, pack_tokens
+from model.attention import Keys, Packing, pack_lengths, pack_tokens, supports_packed
+
+if TYPE_CHECKING:
+    from model.hits.lit_scene import LitScene
+    from model.hits.tracing import TracedScene
+
+
+KeysValues = tuple[Tensor, Tensor]
+"""Keys, not yet rotated into a camera, and values of one layer; [B, H, N, D] each."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TokenPositions:
+    """Positions of the tokens of scenes: registers first, then triangles."""
+
+    positions_BN33: Tensor
+    """Three vertices each, world space; a register stands at the mean vertex, three times over."""
+    scale_BN11: Tensor
+    """Factor of the positions in any frame: 1 except for published registers, whose mean divides by
+    slightly more than the number of triangles."""
+    is_key_BN: Tensor | None
+    """bool, False in the padding; None where nothing is padded."""
+    lengths: tuple[int, ...] | None = None
+    """Number of tokens of each padded scene, as in `is_key_BN`, but known to the host without a
+    wait for the device; None if unknown."""
+
+    def packing(self, x: Tensor, head_width: int) -> Packing | None:
+        """Return the packing of the tokens, or None if attention uses masks.
+
+        Args:
+            x: tensor with the device and type of the attention.
+        """
+        if self.lengths is None or not supports_packed(x, head_width):
+            return None
+        return pack_lengths(self.lengths, self.positions_BN33.shape[1], x.device)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EncodedScene:
+    """A batch of encoded scenes, for any number of views.
+
+    Keys are stored before their rotation, since that depends on the camera.
+    """
+
+    places: TokenPositions
+    """Positions of all tokens, registers included."""
+    keys_values: tuple[KeysValues, ...]
+    """Keys and values for each layer of the view stage; for `hits`, keys are rotated into world
+    space."""
+    packing: Packing | None = None
+    """Packing of the tokens, scene after scene in one row [1, H, P, D]; None for padded scenes."""
+    traced: "tuple[TracedScene, ...]" = ()
+    """Scenes ready for ray casting, for `hits`; empty if the views are traced already."""
+    surfaces: "tuple[LitScene, ...]" = ()
+    """Scenes ready for albedo rays, for demodulated bundles; empty if the albedo is known."""
+
+    def keys(self, views: int = 1) -> Keys:
+        """Return the valid keys; packed ones are repeated for each view, view after view."""
+        return self.places.is_key_BN if self.packing is None else self.packing.of_views(views)
+
 
 Rotation = tuple[Tensor, Tensor]
 """cos and sin [..., N, D / 2]."""
@@ -98,17 +158,6 @@ def to_camera(points_BT33: Tensor, c2w_BV44: Tensor) -> Tensor:
     return (relative_BVT33[..., None] * rotation_BV1133).sum(dim=-2)
 
 
-def register_position(triangles_BT33: Tensor, is_triangle_BT: Tensor | None) -> Tensor:
-    """Return the mean vertex of each scene, repeated three times, [B, 1, 3, 3]."""
-    center_BT3 = triangles_BT33.mean(dim=-2)
-    if is_triangle_BT is None:
-        mean_B3 = center_BT3.mean(dim=1)
-    else:
-        weight_BT1 = is_triangle_BT[..., None].to(center_BT3.dtype)
-        mean_B3 = (center_BT3 * weight_BT1).sum(dim=1) / weight_BT1.sum(dim=1)
-    return mean_B3[:, None, None, :].expand(-1, 1, 3, 3)
-
-
 def token_positions(
     triangles_BT33: Tensor,
     is_triangle_BT: Tensor | None,
@@ -124,16 +173,19 @@ def token_positions(
     reproduces this for published weights; with 0 the network is exactly invariant to translation.
     """
     batch, longest = triangles_BT33.shape[:2]
-    register_B133 = register_position(triangles_BT33, is_triangle_BT)
-    registers_BR33 = register_B133.expand(-1, num_registers, -1, -1)
+    center_BT3 = triangles_BT33.mean(dim=-2)
     scale_BN11 = triangles_BT33.new_ones((batch, num_registers + longest, 1, 1))
     if is_triangle_BT is None:
+        mean_B3 = center_BT3.mean(dim=1)
         count_B = scale_BN11.new_full((batch,), longest)
         is_key_BN = None
     else:
+        weight_BT1 = is_triangle_BT[..., None].to(center_BT3.dtype)
+        mean_B3 = (center_BT3 * weight_BT1).sum(dim=1) / weight_BT1.sum(dim=1)
         count_B = is_triangle_BT.sum(dim=1).to(scale_BN11.dtype)
         is_key_BN = nn.functional.pad(is_triangle_BT, (num_registers, 0), value=True)
     scale_BN11[:, :num_registers] = (count_B / (count_B + eps))[:, None, None, None]
+    registers_BR33 = mean_B3[:, None, None, :].expand(-1, num_registers, 3, 3)
     return TokenPositions(
         positions_BN33=torch.cat([registers_BR33, triangles_BT33], dim=1),
         scale_BN11=scale_BN11,

@@ -154,10 +154,9 @@ def encode_published_config(config: PublishedConfig) -> dict[str, Any]:
             "one less than their number, or than twice their number",
         )
     same = {theirs: getattr(model, ours) for theirs, ours in _SAME.items()}
-    equal = {theirs: same[other] for theirs, other in _EQUAL}
-    got = {
+    fields = {
         **same,
-        **equal,
+        **{theirs: same[other] for theirs, other in _EQUAL},
         "rope_double_max_freq": doubled,
         "vertex_pe_num_freqs": 2 * model.rope_num_freqs,
         "texture_encode_patch_size": config.texture_patch,
@@ -165,7 +164,7 @@ def encode_published_config(config: PublishedConfig) -> dict[str, Any]:
         "dpt_out_channels": list(model.dpt_channels),
         "dpt_out_layers": list(model.dpt_taps),
     }
-    return _FIXED | {name: got[name] for name in _DEFAULTS}
+    return _FIXED | {name: fields[name] for name in _DEFAULTS}
 
 
 def _max_freq(num_freqs: int, *, doubled: bool) -> int:
@@ -219,23 +218,14 @@ def load_published_weights(tensors: Mapping[str, Tensor], config: PublishedConfi
             rotary frequencies do not.
     """
     with torch.device("meta"):
-        expected = export_published_weights(RenderFormer(config.model), config.texture_patch)
-    require_tensors(tensors, expected)
+        ours = RenderFormer(config.model)
+        require_tensors(tensors, export_published_weights(ours, config.texture_patch))
     single = {name: tensor.float() for name, tensor in tensors.items()}
-    weight, bias = fold(
-        single[f"{TEXTURE}.weight"], single[f"{TEXTURE}.bias"], config.texture_patch
-    )
-    state = {
-        "encoder.tokens.material.weight": weight,
-        "encoder.tokens.material.bias": bias,
-        "encoder.tokens.token_W": single[TRIANGLE_TOKEN][0, 0],
-        "encoder.registers_NW": single[REGISTERS][0],
-        "decoder.token_W": single[BUNDLE_TOKEN][0, 0],
-    }
-    for ours, theirs in module_names(config.model).items():
-        for kind in ("weight", "bias"):
-            if f"{theirs}.{kind}" in single:
-                state[f"{ours}.{kind}"] = single[f"{theirs}.{kind}"]
+    folded = fold(single[f"{TEXTURE}.weight"], single[f"{TEXTURE}.bias"], config.texture_patch)
+    state = dict(zip(MATERIAL, folded, strict=True))
+    for name, like in ours.state_dict().items():
+        if name not in MATERIAL:
+            state[name] = single[_published_name(name)].reshape(like.shape)
     model = network_of(config.model, state)
     for name in FREQUENCIES:
         _require_frequencies(name, single[name], model.encoder.rotary.freqs_F)
@@ -248,21 +238,16 @@ def export_published_weights(model: RenderFormer, texture_patch: int) -> dict[st
     Reading them back gives exactly the same network.
     """
     state = model.state_dict()
-    material = "encoder.tokens.material"
-    weight, bias = unfold(state[f"{material}.weight"], state[f"{material}.bias"], texture_patch)
-    published = {
+    weight, bias = unfold(state.pop(MATERIAL[0]), state.pop(MATERIAL[1]), texture_patch)
+    return {
         f"{TEXTURE}.weight": weight,
         f"{TEXTURE}.bias": bias,
         **{name: model.encoder.rotary.freqs_F.clone() for name in FREQUENCIES},
-        TRIANGLE_TOKEN: state["encoder.tokens.token_W"][None, None],
-        REGISTERS: state["encoder.registers_NW"][None],
-        BUNDLE_TOKEN: state["decoder.token_W"][None, None],
+        **{
+            _published_name(name): tensor.reshape(*[1] * _LEADING.get(name, 0), *tensor.shape)
+            for name, tensor in state.items()
+        },
     }
-    for ours, theirs in module_names(model.config).items():
-        for kind in ("weight", "bias"):
-            if f"{ours}.{kind}" in state:
-                published[f"{theirs}.{kind}"] = state[f"{ours}.{kind}"]
-    return published
 
 
 def _require_frequencies(name: str, got_F: Tensor, expected_F: Tensor) -> None:
@@ -276,85 +261,54 @@ def _require_frequencies(name: str, got_F: Tensor, expected_F: Tensor) -> None:
 TEXTURE = "texture_encoder"
 """Published name of the layer that is folded and not copied (`fold`)."""
 
+MATERIAL = ("encoder.tokens.material.weight", "encoder.tokens.material.bias")
+"""Our names of that layer's weights."""
+
 FREQUENCIES = ("transformer.rope_emb.freqs", "view_transformer.transformer.rope_emb.freqs")
 """Published names of the rotary frequencies of both stages, which our configuration determines."""
 
-TRIANGLE_TOKEN = "tri_token"
-REGISTERS = "reg_tokens"
-BUNDLE_TOKEN = "view_transformer.ray_map_patch_token"
-"""The learned vectors; the published ones have leading dimensions of size 1."""
+_LEADING = {"encoder.tokens.token_W": 2, "encoder.registers_NW": 1, "decoder.token_W": 2}
+"""Number of leading dimensions of size 1 that the published learned vectors have."""
 
-_VIEW = "view_transformer"
+_DPT = "view_transformer.out_dpt"
 
-
-def module_names(config: ModelConfig) -> dict[str, str]:
-    """Return the published name of every layer with weights by our name, without the material's."""
-    table = {
-        "encoder.tokens.material_norm": f"{TEXTURE}_norm",
-        "encoder.tokens.normal": "vn_encoding_proj",
-        "encoder.tokens.normal_norm": "vn_encoder_norm",
-        "decoder.rays": f"{_VIEW}.ray_map_encoder",
-        "decoder.rays_norm": f"{_VIEW}.ray_map_encoder_norm",
-    }
-    for layer in range(config.encoder_layers):
-        table |= _encoder_layer(f"encoder.layers.{layer}", f"transformer.layers.{layer}")
-    for layer in range(config.decoder_layers):
-        table |= _decoder_layer(f"decoder.layers.{layer}", f"{_VIEW}.transformer.layers.{layer}")
-    return table | _dpt("decoder.head", f"{_VIEW}.out_dpt")
-
-
-_SELF_ATTENTION = {"qkv": "in_proj", "q_norm": "q_norm", "k_norm": "k_norm", "out": "out_proj"}
-_CROSS_ATTENTION = {
-    "q": "q_proj", "k": "k_proj", "v": "v_proj", "out": "out_proj",
-    "q_norm": "q_norm", "k_norm": "k_norm",
-}  # fmt: skip
-_FFN = {"ffn.gate": "ffn.w1", "ffn.up": "ffn.w3", "ffn.down": "ffn.w2", "ffn_norm": "ffn_norm"}
-
-
-def _below(ours: str, theirs: str, names: Mapping[str, str]) -> dict[str, str]:
-    return {f"{ours}.{a}": f"{theirs}.{b}" for a, b in names.items()}
-
-
-def _encoder_layer(ours: str, theirs: str) -> dict[str, str]:
-    return {
-        **_below(f"{ours}.attention", f"{theirs}.multihead_attn", _SELF_ATTENTION),
-        **_below(ours, theirs, {"attention_norm": "query_norm", **_FFN}),
-    }
+_NAMES = (
+    ("encoder.tokens.token_W", "tri_token"),
+    ("encoder.registers_NW", "reg_tokens"),
+    ("decoder.token_W", "view_transformer.ray_map_patch_token"),
+    ("encoder.tokens.material_norm", f"{TEXTURE}_norm"),
+    ("encoder.tokens.normal_norm", "vn_encoder_norm"),
+    ("encoder.tokens.normal", "vn_encoding_proj"),
+    ("decoder.rays", "view_transformer.ray_map_encoder"),
+    ("encoder.layers", "transformer.layers"),
+    ("decoder.layers", "view_transformer.transformer.layers"),
+    (".attention_norm.", ".query_norm."), (".attention.", ".multihead_attn."),
+    (".self_norm.", ".self_attn_norm."), (".self_attention.", ".self_attn."),
+    (".cross_norm.", ".query_norm."), (".cross.context_norm.", ".kv_norm."),
+    (".cross.", ".multihead_attn."),
+    (".qkv.", ".in_proj."), (".out.", ".out_proj."),
+    (".q.", ".q_proj."), (".k.", ".k_proj."), (".v.", ".v_proj."),
+    (".gate.", ".w1."), (".up.", ".w3."), (".down.", ".w2."),
+    ("decoder.head.project", f"{_DPT}.projects"),
+    ("decoder.head.resize", f"{_DPT}.resize_layers"),
+    ("decoder.head.halve", f"{_DPT}.scratch.output_conv1"),
+    ("decoder.head.widen", f"{_DPT}.scratch.output_conv2.0"),
+    ("decoder.head.last", f"{_DPT}.scratch.output_conv2.2"),
+    *((f"decoder.head.reassemble.{level}", f"{_DPT}.scratch.layer{level + 1}_rn")
+      for level in range(NUM_TAPS)),
+    *((f"decoder.head.fuse.{level}", f"{_DPT}.scratch.refinenet{level + 1}")
+      for level in range(NUM_TAPS)),
+    (".project.", ".out_conv."), (".skip.", ".resConvUnit1."), (".refine.", ".resConvUnit2."),
+    (".first.", ".conv1."), (".second.", ".conv2."),
+)  # fmt: skip
+"""Parts of our names of weights, with those that replace them in published names, in order."""
 
 
-def _decoder_layer(ours: str, theirs: str) -> dict[str, str]:
-    norms = {
-        "cross.context_norm": "kv_norm", "cross_norm": "query_norm", "self_norm": "self_attn_norm",
-    }  # fmt: skip
-    return {
-        **_below(f"{ours}.self_attention", f"{theirs}.self_attn", _SELF_ATTENTION),
-        **_below(f"{ours}.cross", f"{theirs}.multihead_attn", _CROSS_ATTENTION),
-        **_below(ours, theirs, norms | _FFN),
-    }
-
-
-def _dpt(ours: str, theirs: str) -> dict[str, str]:
-    scratch = f"{theirs}.scratch"
-    table = {
-        f"{ours}.halve": f"{scratch}.output_conv1",
-        f"{ours}.widen": f"{scratch}.output_conv2.0",
-        f"{ours}.last": f"{scratch}.output_conv2.2",
-    }
-    for level in range(NUM_TAPS):
-        fuse = f"{ours}.fuse.{level}"
-        block = f"{scratch}.refinenet{level + 1}"
-        table |= {
-            f"{ours}.project.{level}": f"{theirs}.projects.{level}",
-            f"{ours}.resize.{level}": f"{theirs}.resize_layers.{level}",
-            f"{ours}.reassemble.{level}": f"{scratch}.layer{level + 1}_rn",
-            f"{fuse}.project": f"{block}.out_conv",
-        }
-        for a, b in (("skip", "resConvUnit1"), ("refine", "resConvUnit2")):
-            table |= {
-                f"{fuse}.{a}.first": f"{block}.{b}.conv1",
-                f"{fuse}.{a}.second": f"{block}.{b}.conv2",
-            }
-    return table
+def _published_name(name: str) -> str:
+    """Return the published name of a weight other than MATERIAL."""
+    for ours, theirs in _NAMES:
+        name = name.replace(ours, theirs)
+    return name
 
 
 TEXTURE_CHANNELS = 13

@@ -1,18 +1,22 @@
-"""The whole network (RenderFormer, Zeng et al. 2025), assembled from its two stages."""
+"""The whole network (RenderFormer, Zeng et al. 2025): triangle encoder, and both stages assembled.
+
+The view-independent stage (encoder) computes light transport between triangles, once per scene.
+Every triangle is one token: the sum of a learned vector, its material and its normals. Its position
+enters only through rotary encodings. Registers are at the mean of all vertices.
+"""
 
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import pad
+from torch.nn.utils.rnn import pad_sequence
 
-from model.config import BundleStage, HitStage, ModelConfig, hit_stage
+from model.attention import Keys, Packing, pack_tokens
+from model.config import ModelConfig
 from model.demodulated import albedo_of_cameras, compose_radiance
-from model.encoded_scene import EncodedScene, KeysValues
 from model.hits.decoder import HitDecoder
-from model.hits.denoised import denoise_traced
 from model.hits.lit_scene import LitScene
-from model.hits.traced import Traced
+from model.hits.traced import Traced, denoise_traced
 from model.hits.tracing import (
     TracedScene,
     like,
@@ -20,12 +24,107 @@ from model.hits.tracing import (
     traced_batch,
     traced_cameras,
 )
-from model.positions import TriangleRotary, token_positions
-from model.precision import tf32
+from model.layers import TOKEN_NORM_EPS, EncoderLayer, Norm, dtype_of, run_layer
+from model.positions import (
+    EncodedScene,
+    KeysValues,
+    TokenPositions,
+    TriangleRotary,
+    encode_normals,
+    encoded_normal_width,
+    packed_rotation,
+    token_positions,
+    world_rotation,
+)
+from model.precision import tf32, without_autocast
 from model.scene_tensors import Cameras, SceneBatch, in_light_units, require_known_sky
-from model.triangle_encoder import TriangleEncoder
 from model.view_decoder import ViewDecoder
 from storage.errors import TrilightError
+from storage.records.material import material_width
+
+SIDE_LIGHTS = 12
+"""Number of light values of the two sides of a triangle (model.hits.traced)."""
+
+
+class TriangleTokens(nn.Module):
+    """Embedding of material and normals as tokens.
+
+    The published network reads a 13 x 32 x 32 texture whose cells are all equal; that is a linear
+    map of the ten numbers (its tangent-space normal is constant), at a thousandth of the input.
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.octaves = config.normal_octaves
+        self.token_W = nn.Parameter(torch.zeros(config.width))
+        self.material = nn.Linear(material_width(config.material_columns), config.width)
+        self.material_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
+        self.normal = nn.Linear(encoded_normal_width(self.octaves), config.width)
+        self.normal_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
+        self.light = nn.Linear(SIDE_LIGHTS, config.width) if config.by_hits else None
+
+    def forward(
+        self, material_BTM: Tensor, normals_BT33: Tensor, light_BTL: Tensor | None = None
+    ) -> Tensor:
+        """Return tokens [B, T, W], float32 under autocast too.
+
+        `light` is what the triangles' sides receive, in units of the scene's mean light, as an
+        input of networks with the view stage `hits`. It is compressed to log1p(4 x), since it spans
+        orders of magnitude; the curve is linear below a quarter of the mean, and logarithmic above.
+        """
+        with without_autocast(material_BTM.device):
+            material_BTW = self.material_norm(self.material(material_BTM))
+            normal_BTW = self.normal_norm(self.normal(encode_normals(normals_BT33, self.octaves)))
+            tokens_BTW = self.token_W + material_BTW + normal_BTW
+            if self.light is None or light_BTL is None:
+                return tokens_BTW
+            return tokens_BTW + self.light(torch.log1p(4 * light_BTL))
+
+
+class TriangleEncoder(nn.Module):
+    """Encoder of a batch of scenes to context tokens, registers first."""
+
+    def __init__(self, config: ModelConfig, rotary: TriangleRotary) -> None:
+        super().__init__()
+        self.rotary = rotary
+        self.recompute = False
+        self.columns = config.material_columns
+        self.tokens = TriangleTokens(config)
+        self.registers_NW = nn.Parameter(torch.zeros(config.num_registers, config.width))
+        self.layers = nn.ModuleList(
+            EncoderLayer(config.width, config.num_heads, config.hidden_width)
+            for _ in range(config.encoder_layers)
+        )
+
+    def forward(
+        self,
+        batch: SceneBatch,
+        places: TokenPositions,
+        light_BTL: Tensor | None = None,
+        packing: Packing | None = None,
+    ) -> Tensor:
+        """Return the context [B, N, W] with N = registers + triangles.
+
+        `light_BTL` is as in TriangleTokens. With a packing the context is one row of all valid
+        tokens, [1, P, W].
+        """
+        materials = batch.material_of(self.columns)
+        tokens_BTW = self.tokens(materials, batch.normals_BT33, light_BTL)
+        registers_BRW = self.registers_NW.expand(len(tokens_BTW), -1, -1)
+        x_BNW = torch.cat([registers_BRW, tokens_BTW], dim=1).to(dtype_of(self.layers))
+        rotation = world_rotation(self.rotary, places)
+        keys: Keys = places.is_key_BN
+        if packing is not None:
+            x_BNW = pack_tokens(x_BNW, packing)[None]
+            keys = packing.sequences
+            rotation = packed_rotation(rotation, packing)
+        due_BNW = None
+        for layer in self.layers:
+            x_BNW, due_BNW = run_layer(
+                layer, x_BNW, due_BNW, rotation, keys, recompute=self.recompute
+            )
+        return x_BNW if due_BNW is None else x_BNW + due_BNW
+
 
 ELU_ALPHA = 1e-3
 """Slope of the output's ELU, as published: a picture's radiance stays above -0.0023."""
@@ -51,7 +150,7 @@ class RenderFormer(nn.Module):
             head_width=config.head_width,
         )
         self.encoder: Any = TriangleEncoder(config, rotary) if config.scene_tokens else None
-        stage = HitDecoder if isinstance(config.stage, HitStage) else ViewDecoder
+        stage = HitDecoder if config.by_hits else ViewDecoder
         self.decoder: Any = stage(config, rotary)
 
     def forward(self, batch: SceneBatch, resolution: int) -> Tensor:
@@ -61,33 +160,29 @@ class RenderFormer(nn.Module):
             TrilightError: the resolution is not a multiple of `config.picture_px`, or the network
                 does not support the sky of a scene.
         """
-        stage = self.config.stage
-        if batch.albedo_BVRR6 is None and isinstance(stage, BundleStage):
-            return self.decode(self.encode(batch), batch.cameras, resolution)
+        albedo_BVRR6 = batch.albedo_BVRR6
+        if not self.config.by_hits and albedo_BVRR6 is None:
+            return self.decode(self.encode(batch), batch, resolution)
         self._require_resolution(resolution)
-        if isinstance(stage, BundleStage):
-            return self._bundles(
-                self._encode_scenes(batch), batch.cameras, resolution, batch.albedo_BVRR6
-            )
+        if not self.config.by_hits:
+            return self._bundles(self._encode_scenes(batch), batch, resolution, albedo_BVRR6)
         scenes: tuple[TracedScene, ...] = ()
         traced = batch.traced
         if traced is None:
             scenes = traced_batch(batch)
-            traced = traced_cameras(scenes, batch.cameras, resolution, stage)
-            traced = denoise_traced(traced, stage)
+            traced = traced_cameras(scenes, batch, resolution, self.config)
+            traced = denoise_traced(traced, self.config)
         encoded = self._encode_scenes(batch, scenes, traced.sides_T12, traced.unit_3)
         return self.decode_traced(encoded, traced)
 
     def encode(self, batch: SceneBatch) -> EncodedScene:
         """Return the encoded scenes of a batch; its cameras are ignored."""
-        stage = self.config.stage
-        if isinstance(stage, BundleStage):
-            surfaces = lit_scenes(batch) if stage.albedo_rays else ()
+        if not self.config.by_hits:
+            surfaces = lit_scenes(batch) if self.config.demodulated else ()
             return self._encode_scenes(batch, surfaces=surfaces)
         scenes = traced_batch(batch)
-        longest = batch.triangles_BT33.shape[1]
-        sides = [pad(each.sides_T12, (0, 0, 0, longest - len(each.sides_T12))) for each in scenes]
-        sides_BT12 = like(torch.stack(sides), batch.triangles_BT33)
+        sides_BT12 = pad_sequence([each.sides_T12 for each in scenes], True)
+        sides_BT12 = like(sides_BT12, batch.triangles_BT33)
         units_B3 = like(torch.stack([each.unit_3 for each in scenes]), batch.triangles_BT33)
         scenes = tuple(each.on(batch.triangles_BT33.device) for each in scenes)
         return self._encode_scenes(batch, scenes, sides_BT12, units_B3)
@@ -143,22 +238,21 @@ class RenderFormer(nn.Module):
             TrilightError: the resolution is no such multiple.
         """
         self._require_resolution(resolution)
-        stage = self.config.stage
-        if isinstance(stage, HitStage):
+        if self.config.by_hits:
             traced = self.trace(scene, cameras, resolution)
-            return self.decode_traced(scene, denoise_traced(traced, stage))
+            return self.decode_traced(scene, denoise_traced(traced, self.config))
         albedo_BVRR6 = None
-        if rays := stage.albedo_rays:
+        if rays := self.config.hit_rays:
             albedo_BVRR6 = albedo_of_cameras(scene.surfaces, cameras, resolution, rays)
         return self._bundles(scene, cameras, resolution, albedo_BVRR6)
 
     def trace(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Traced:
         """Return the traced inputs of views, for `hits`; arguments are as of `decode`."""
         with tf32(self.tf32):
-            return traced_cameras(scene.traced, cameras, resolution, hit_stage(self.config))
+            return traced_cameras(scene.traced, cameras, resolution, self.config)
 
     def decode_traced(self, scene: EncodedScene, traced: Traced) -> Tensor:
-        """Return the pictures [B, V, R, R, 3] of traced views, denoised where the stage asks."""
+        """Return the pictures [B, V, R, R, 3] of traced views, denoised where the network asks."""
         with tf32(self.tf32):
             pictures: Tensor = self.decoder(scene, traced)
         return pictures

@@ -14,11 +14,12 @@ the padding is zero, because a mask hides finite values but not NaN (0 * NaN is 
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from model.hits.textures import SurfaceTextures, surface_textures
 from model.hits.traced import Traced, stack_traced
@@ -81,14 +82,12 @@ class Cameras:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SceneBatch:
+class SceneBatch(Cameras):
     """Scenes of equal view count, padded with zeros to the longest; fields as in SceneTensors."""
 
     triangles_BT33: Tensor
     normals_BT33: Tensor
     material_BTM: Tensor
-    c2w_BV44: Tensor
-    fov_deg_BV: Tensor
     is_triangle_BT: Tensor | None
     """bool, False in the padding; None without padding, so that attention needs no mask."""
     columns: tuple[str, ...] = PUBLISHED_COLUMNS
@@ -102,10 +101,6 @@ class SceneBatch:
     """Textures of each scene; None if no scene has any."""
     skies: tuple[Environment | None, ...] | None = None
     """Environment light of each scene; None if no scene has any."""
-
-    @property
-    def cameras(self) -> Cameras:
-        return Cameras(c2w_BV44=self.c2w_BV44, fov_deg_BV=self.fov_deg_BV)
 
     def material_of(self, columns: tuple[str, ...]) -> Tensor:
         """Return the material [B, T, M] with only these columns, in this order.
@@ -126,7 +121,7 @@ class SceneBatch:
         )
 
 
-Scenes = TypeVar("Scenes", SceneTensors, SceneBatch)
+Mapped = TypeVar("Mapped")
 
 
 def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> SceneTensors:
@@ -170,12 +165,14 @@ def tensors_of(scenes: SceneTensors | SceneBatch) -> dict[str, Tensor]:
     return {name: value for name, value in vars(scenes).items() if isinstance(value, Tensor)}
 
 
-def map_tensors(scenes: Scenes, convert: Callable[[Tensor], Tensor]) -> Scenes:
-    """Return the same scenes with each tensor converted, such as moved to a device."""
-    fields: dict[str, Any] = {name: convert(each) for name, each in tensors_of(scenes).items()}
-    if scenes.traced is not None:
-        fields["traced"] = scenes.traced.convert_tensors(convert)
-    return dataclasses.replace(scenes, **fields)
+def map_tensors(whole: Mapped, convert: Callable[[Tensor], Tensor]) -> Mapped:
+    """Return the same scenes, or what holds them, with each tensor converted, as to a device."""
+    fields = {
+        name: convert(each) if isinstance(each, Tensor) else map_tensors(each, convert)
+        for name, each in vars(whole).items()
+        if isinstance(each, Tensor | SceneBatch | Traced)
+    }
+    return dataclasses.replace(whole, **fields)  # type: ignore[type-var]
 
 
 def in_light_units(batch: SceneBatch, unit_B3: Tensor) -> SceneBatch:
@@ -199,26 +196,19 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
     textures = tuple(scene.textures for scene in scenes)
     skies = tuple(scene.sky for scene in scenes)
     return SceneBatch(
-        triangles_BT33=_stack_padded([scene.triangles_T33 for scene in scenes], longest),
-        normals_BT33=_stack_padded([scene.normals_T33 for scene in scenes], longest),
-        material_BTM=_stack_padded([scene.material_TM for scene in scenes], longest),
+        triangles_BT33=pad_sequence([scene.triangles_T33 for scene in scenes], True),
+        normals_BT33=pad_sequence([scene.normals_T33 for scene in scenes], True),
+        material_BTM=pad_sequence([scene.material_TM for scene in scenes], True),
         c2w_BV44=torch.stack([scene.c2w_V44 for scene in scenes]),
         fov_deg_BV=torch.stack([scene.fov_deg_V for scene in scenes]),
         is_triangle_BT=torch.arange(longest) < torch.tensor(lengths)[:, None] if padded else None,
         columns=scenes[0].columns,
         num_triangles=tuple(lengths) if padded else None,
-        traced=stack_traced(traced, longest) if len(traced) == len(scenes) else None,
+        traced=stack_traced(traced) if len(traced) == len(scenes) else None,
         albedo_BVRR6=torch.stack(albedo) if len(albedo) == len(scenes) else None,
         textures=None if all(each is None for each in textures) else textures,
         skies=None if all(each is None for each in skies) else skies,
     )
-
-
-def _stack_padded(rows: Sequence[Tensor], length: int) -> Tensor:
-    stacked = rows[0].new_zeros((len(rows), length, *rows[0].shape[1:]))
-    for index, row in enumerate(rows):
-        stacked[index, : len(row)] = row
-    return stacked
 
 
 def lit_sky(sky: Environment | None) -> Environment | None:

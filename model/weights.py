@@ -151,27 +151,23 @@ def _open_tensors(path: Path) -> Iterator[Any]:
     try:
         with open_plain(path) as file:
             start = file.read(8)
-        _require_safetensors(path, start)
+        if start[:2] in (b"PK", b"\x80\x02", b"\x80\x04"):
+            raise TrilightError(
+                f"{path}: pickled code, which a checkpoint could run; expected safetensors. "
+                "Convert it with the tool that wrote it."
+            )
+        length = int.from_bytes(start, "little")
+        if len(start) < 8 or length > min(MAX_HEADER_BYTES, path.stat().st_size - 8):
+            raise TrilightError(
+                f"{path}: the header claims {length} bytes; expected a safetensors file with at "
+                f"most {MAX_HEADER_BYTES}."
+            )
         with safe_open(path, "pt") as tensors:
             yield tensors
     except OSError as error:
         raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
     except (SafetensorError, KeyError) as error:
         raise TrilightError(f"{path}: unreadable ({error}).") from error
-
-
-def _require_safetensors(path: Path, start: bytes) -> None:
-    if start[:2] in (b"PK", b"\x80\x02", b"\x80\x04"):
-        raise TrilightError(
-            f"{path}: pickled code, which a checkpoint could run; expected safetensors. Convert "
-            "it with the tool that wrote it."
-        )
-    length = int.from_bytes(start, "little")
-    if len(start) < 8 or length > min(MAX_HEADER_BYTES, path.stat().st_size - 8):
-        raise TrilightError(
-            f"{path}: the header claims {length} bytes; expected a safetensors file with at most "
-            f"{MAX_HEADER_BYTES}."
-        )
 
 
 def network_of(config: ModelConfig, tensors: Mapping[str, Tensor]) -> RenderFormer:

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from model.base_widths import BaseWidths
+from model.config import BaseWidths
 from model.hits.decoder import PixelHead
 from model.layers import CrossAttention, SelfAttention
 from model.renderformer import RenderFormer

@@ -1,8 +1,8 @@
 """Paths in the folder of a run, and the lock of the trainer that writes them."""
 
 import contextlib
+import json
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,62 +13,32 @@ if TYPE_CHECKING:
     from train.loop.distributed import DistributedContext
 
 
-@dataclass(frozen=True)
 class RunFolder:
     """Paths of the files of one run."""
 
-    root: Path
-    """Folder that the user names, such as by --out."""
-
-    @property
-    def checkpoints(self) -> Path:
+    def __init__(self, root: Path) -> None:
+        """Take the folder that the user names, such as by --out."""
+        self.root = root
+        self.checkpoints = root / "checkpoints"
         """Folder of the checkpoints, one file per saved step; model.checkpoint_format reads it."""
-        return self.root / "checkpoints"
-
-    @property
-    def weights(self) -> Path:
+        self.weights = root / "model.safetensors"
         """Weights of the finished network (model.weights), as inference reads them."""
-        return self.root / "model.safetensors"
-
-    @property
-    def settings(self) -> Path:
+        self.settings = root / "settings.json"
         """The settings in full, the dataset digest, and versions."""
-        return self.root / "settings.json"
-
-    @property
-    def metrics(self) -> Path:
+        self.metrics = root / "metrics.jsonl"
         """One JSON line per `log_every` steps, and one per validation."""
-        return self.root / "metrics.jsonl"
-
-    @property
-    def sheet(self) -> Path:
+        self.sheet = root / "validation_sheet.png"
         """Target, prediction and error of validation scenes."""
-        return self.root / "validation_sheet.png"
-
-    @property
-    def tensorboard(self) -> Path:
+        self.tensorboard = root / "tensorboard"
         """Folder of TensorBoard's files: the log's numbers and the sheets."""
-        return self.root / "tensorboard"
-
-    @property
-    def notes(self) -> Path:
+        self.notes = root / "notes.jsonl"
         """Dated notes: starts, resumes, warnings (monitoring.rows)."""
-        return self.root / "notes.jsonl"
-
-    @property
-    def monitoring(self) -> Path:
+        self.monitoring = root / "watching"
         """Folder of the stacks of hung steps, and of the profiler's traces."""
-        return self.root / "watching"
-
-    @property
-    def summary(self) -> Path:
+        self.summary = root / "summary.json"
         """The result as JSON."""
-        return self.root / "summary.json"
-
-    @property
-    def claim(self) -> Path:
+        self.claim = root / "train.claim"
         """Lock file of the running trainer; a killed trainer leaves it behind."""
-        return self.root / "train.claim"
 
 
 @contextlib.contextmanager
@@ -102,3 +72,8 @@ def claim_run(folder: RunFolder, dist_context: "DistributedContext") -> Iterator
                 for remove in (folder.claim.unlink, *(place.rmdir for place in new)):
                     with contextlib.suppress(OSError):
                         remove()
+
+
+def pretty_json(record: object) -> bytes:
+    """Return indented, sorted JSON with a final newline."""
+    return json.dumps(record, indent=1, sort_keys=True).encode() + b"\n"

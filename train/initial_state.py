@@ -20,8 +20,8 @@ from storage.errors import TrilightError
 from storage.extensions import extension_digests
 from storage.records.safe_read import read_plain
 from storage.typed_json import read_json
-from train.data.mixture import RECORD, plan_mixture
-from train.folder import RunFolder
+from train.data.order import RECORD, plan_mixture
+from train.folder import RunFolder, pretty_json
 from train.loop.checkpoints import (
     newest_checkpoint,
     read_checkpoint,
@@ -29,12 +29,11 @@ from train.loop.checkpoints import (
     save_checkpoint,
 )
 from train.loop.distributed import DistributedContext
-from train.loop.muon import choose_muon_precision
+from train.loop.optimizer import choose_muon_precision
 from train.loop.recorder import MetricsLog
 from train.loop.train_state import TrainState, new_state
 from train.monitoring.rows import read_rows
 from train.progress import TrainProgress
-from train.result import pretty_json
 from train.resume import Event, ResumePlan, StartOptions, event_records, plan_resume
 from train.settings import TrainSettings, stored_settings
 
@@ -141,36 +140,23 @@ def init_or_resume_state(
     for note in plan.resume_plan.notes:
         progress.note(note)
     _record_execution_changes(plan.checkpoint, dist_context, state, progress)
-    if dist_context.is_first:
-        _write_resumed_run(plan, folder, state, data_digest, dist_context)
+    if dist_context.is_first:  # on disk, so that a kill before the next checkpoint loses nothing
+        if plan.branch is not None:
+            root = plan.branch if plan.branch.is_dir() else plan.branch.parent.parent
+            log = MetricsLog(folder.metrics, first_step=0)
+            for row in read_rows(RunFolder(root).metrics):
+                if row["step"] <= state.step:
+                    log.append(row)
+        _write_settings(folder, plan.settings, state, data_digest, dist_context)
+        if plan.branch is not None or plan.resume_plan.changes_meaning:
+            save_checkpoint(
+                folder.checkpoints,
+                state,
+                plan.settings,
+                data_digest=data_digest,
+                world_size=dist_context.world_size,
+            )
     return state
-
-
-def _write_resumed_run(
-    plan: StartPlan,
-    folder: RunFolder,
-    state: TrainState,
-    data_digest: str,
-    dist_context: DistributedContext,
-) -> None:
-    """Write how a run resumes, so that a kill before its next checkpoint loses nothing."""
-    if plan.branch is not None:
-        root = plan.branch if plan.branch.is_dir() else plan.branch.parent.parent
-        log = MetricsLog(folder.metrics, first_step=0)
-        for row in read_rows(RunFolder(root).metrics):
-            if row["step"] <= state.step:
-                log.append(row)
-    _write_settings(folder, plan.settings, state, data_digest, dist_context)
-    if plan.branch is not None or (
-        plan.resume_plan is not None and plan.resume_plan.changes_meaning
-    ):
-        save_checkpoint(
-            folder.checkpoints,
-            state,
-            plan.settings,
-            data_digest=data_digest,
-            world_size=dist_context.world_size,
-        )
 
 
 def _origin(step: int, name: str, header: Mapping[str, Any]) -> Event:

@@ -13,9 +13,8 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from model.base_widths import BaseWidths
+from model.config import BaseWidths, hits_base, hits_smoke
 from model.config import base as base_model
-from model.config import hits_base, hits_smoke
 from model.config import large as large_model
 from model.config import smoke as smoke_model
 from storage.aliases import PRESET_ALIASES
@@ -256,23 +255,15 @@ def finetune() -> TrainSettings:
     )
 
 
+_OURS = (
+    smoke, builtin, hits, hits_tokens, hits_256, pretrain, finetune, paper_pretrain,
+    paper_pretrain_launcher, paper_finetune, paper_pretrain_large, paper_finetune_large,
+)  # fmt: skip
+
 TRAINING_PRESETS: Registry[Callable[[], TrainSettings]] = Registry(
     "training preset",
     Callable,
-    {
-        "smoke": smoke,
-        "builtin": builtin,
-        "hits": hits,
-        "hits-tokens": hits_tokens,
-        "hits-256": hits_256,
-        "pretrain": pretrain,
-        "finetune": finetune,
-        "paper-pretrain": paper_pretrain,
-        "paper-pretrain-launcher": paper_pretrain_launcher,
-        "paper-finetune": paper_finetune,
-        "paper-pretrain-large": paper_pretrain_large,
-        "paper-finetune-large": paper_finetune_large,
-    },
+    {preset.__name__.replace("_", "-"): preset for preset in _OURS},
     decides=("weights",),
     aliases=PRESET_ALIASES,
 )

@@ -158,7 +158,11 @@ def plan_resume(
     }
     settings = apply_overrides(before, execution_changes | named_decisions)
     new_values = differences(old_record, settings_record(settings))
-    stated = _original_values(past_events)
+    # by setting, the earlier values that a command may still state
+    stated: dict[str, list[Any]] = {}
+    for event in past_events:
+        values = [event.before, event.after] if event.kind == "earlier" else [event.before]
+        stated.setdefault(event.name, values)
     events = list[Event]()
     undecided = dict[str, Any]()
     for name, value in typed_otherwise.items():
@@ -188,15 +192,6 @@ def plan_resume(
 def event_records(events: Sequence[Event]) -> list[dict[str, Any]]:
     """Return events as the JSON records of checkpoints, settings.json and summary.json."""
     return [dataclasses.asdict(event) for event in events]
-
-
-def _original_values(past: Sequence[Event]) -> dict[str, list[Any]]:
-    """Return, by setting, the earlier values that a command may still state."""
-    stated: dict[str, list[Any]] = {}
-    for event in past:
-        values = [event.before, event.after] if event.kind == "earlier" else [event.before]
-        stated.setdefault(event.name, values)
-    return stated
 
 
 def _data_event(header: Mapping[str, Any], digest: str, decided: Any) -> Iterator[Event]:

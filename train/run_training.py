@@ -2,8 +2,9 @@
 
 import dataclasses
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -12,16 +13,18 @@ import torch
 from model.checkpoint_format import saved_steps
 from model.renderformer import count_parameters
 from model.scene_tensors import lit_sky, require_known_sky
+from model.weights import TrainedRange, encode_weights
+from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_mixture
 from storage.errors import TrilightError
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.buckets import decodes_on_device, step_scenes
-from train.data.loader import LoaderSettings, load_batches
-from train.data.scenes import TrainingScene, training_scene
-from train.data.workers import choose_workers, detect_machine
-from train.evaluation.stored_pictures import median_picture
-from train.evaluation.validation import Judge
-from train.folder import RunFolder, claim_run
+from train.data.loader import LoaderSettings, choose_workers, detect_machine, load_batches
+from train.data.scenes import training_scene
+from train.evaluation.metrics import Lead
+from train.evaluation.sheet import draw_validation_sheet, write_picture
+from train.evaluation.validation import Judge, median_picture
+from train.folder import RunFolder, claim_run, pretty_json
 from train.initial_state import init_or_resume_state, plan_start
 from train.loop.distributed import DistributedContext
 from train.loop.recorder import Recorder
@@ -30,12 +33,86 @@ from train.loop.trainer import Trainer, scene_flops
 from train.loss.lpips import load_lpips
 from train.loss.training_loss import TrainingLoss
 from train.monitoring.boards import require_wandb
-from train.monitoring.rows import add_note
-from train.monitoring.settings import WatchSettings
+from train.monitoring.rows import add_note, read_rows
 from train.progress import TrainProgress
-from train.result import TrainResult, finish_run
-from train.resume import StartOptions
-from train.settings import TrainSettings
+from train.resume import Event, StartOptions
+from train.settings import TrainSettings, WatchSettings
+
+LOSS_SHARE = 20
+"""Divisor of the log's rows: the start and end losses average the first and last twentieth."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainResult:
+    """Result of a finished run."""
+
+    folder: RunFolder
+    """Folder that holds all files of the run."""
+    num_parameters: int
+    """Numbers in the network's weights."""
+    num_steps: int
+    """Steps done, including skipped ones."""
+    skipped_steps: int
+    """Steps that were not finite and changed nothing."""
+    loss_at_start: float
+    """Mean training loss over the first twentieth of the run."""
+    loss_at_end: float
+    """The same over the last twentieth."""
+    scores: dict[str, float] | None
+    """The network on the validation split (evaluation.validation); None where the data has none."""
+    median_scores: dict[str, float] | None
+    """The median picture of the training views on the same split."""
+    lead: Lead | None
+    """Advantage of the network over the median picture."""
+    unusable: tuple[str, ...]
+    """Error messages of the damaged data that this call left out."""
+    history: tuple[Event, ...]
+    """Origin, decisions and execution changes of the run, oldest first."""
+    seconds: float
+    """Wall time of this call, from opening the data to writing the sheet."""
+
+    @property
+    def beats_median(self) -> bool | None:
+        """True if the network beats the median picture by more than two standard errors."""
+        return None if self.lead is None else self.lead.is_sure
+
+
+def finish_run(
+    state: TrainState,
+    settings: TrainSettings,
+    folder: RunFolder,
+    data: TrainingData,
+    judge: Judge | None,
+    seconds: float,
+) -> TrainResult:
+    """Evaluate the finished network, and write its weights, sheet and summary."""
+    trained = TrainedRange(max_triangles=data.max_triangles, resolution=settings.resolution)
+    write_atomically(folder.weights, encode_weights(state.eval_model, trained))
+    losses = [row["loss"] for row in read_rows(folder.metrics) if row.get("loss") is not None]
+    count = max(len(losses) // LOSS_SHARE, 1)
+    validation = None
+    if judge is not None:
+        validation = judge.judge(state.eval_model)
+        write_picture(folder.sheet, draw_validation_sheet(settings, judge, validation, state.step))
+    result = TrainResult(
+        folder=folder,
+        num_parameters=count_parameters(state.model),
+        num_steps=state.step,
+        skipped_steps=state.skipped_steps,
+        loss_at_start=sum(losses[:count]) / count,
+        loss_at_end=sum(losses[-count:]) / count,
+        scores=validation.scores if validation else None,
+        median_scores=judge.median_scores if judge else None,
+        lead=validation.lead if validation else None,
+        unusable=tuple(state.bad_samples.messages),
+        history=state.history,
+        seconds=seconds,
+    )
+    record = dataclasses.asdict(result) | {"beats_median": result.beats_median}
+    del record["folder"]
+    write_atomically(folder.summary, pretty_json(record))
+    return result
+
 
 MEDIAN_SCENES = 256
 """Number of training scenes for the median picture; more would not change it."""
@@ -108,12 +185,19 @@ def _train(
     """Train and evaluate in a folder that is locked; arguments as in `train_run`."""
     began = time.monotonic()
     dataset = open_mixture(data)
-    start = _resolve_restart(start, folder, dist_context)
+    # alike in all processes: torchrun counts restarts for each machine separately, and a network
+    # file system shows a new file to one machine before another
+    found = dist_context.any(start.restartable and bool(saved_steps(folder.checkpoints)))
+    start = dataclasses.replace(start, resume=start.resume or found, restartable=False)
     early_notes = _NoteBuffer(progress)
     for note in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
         early_notes.note(note)
     if workers is None:
-        workers = _choose_workers(settings, dist_context, early_notes)
+        machine = detect_machine()
+        threads = torch.get_num_threads()
+        on_gpu = dist_context.device.type == "cuda"
+        workers, reason = choose_workers(machine, settings, on_gpu=on_gpu, busy_threads=threads)
+        early_notes.note(reason)
     plan = plan_start(settings, folder, dataset.digest, start, dist_context, early_notes)
     settings = plan.settings
     lpips = dist_context.run_once_per_machine(partial(load_lpips, start.lpips))
@@ -123,7 +207,7 @@ def _train(
     judge = recorder = None
     if dist_context.is_first:
         judge = _make_judge(dataset, settings, state.bad_samples)
-        recorder = _begin_records(state, settings, folder, judge, progress, watched)
+        recorder = Recorder(folder, settings, judge, progress, state, wandb=watched.wandb)
         how = "went on" if start.resume else "began"
         many = "process" if dist_context.world_size == 1 else "processes"
         where = f"{how} on {dist_context.device}, {dist_context.world_size} {many}"
@@ -139,7 +223,19 @@ def _train(
         recorder=recorder,
         watched=watched,
     )
-    with closing(_batches(dataset, settings, state, dist_context, workers)) as batches:
+    stream = dataclasses.replace(
+        loader_settings(settings), lookup_in_threads=not decodes_on_device(dist_context.device)
+    )
+    scenes = load_batches(
+        dataset.split("train"),
+        stream,
+        state.step,
+        rank_slice=dist_context,
+        workers=workers,
+        unusable=state.bad_samples,
+        mixture=state.mixture,
+    )
+    with closing(scenes) as batches:
         cost = partial(scene_flops, settings)
         most = settings.scenes_per_pass
         with closing(step_scenes(batches, cost, most, dist_context.device)) as steps:
@@ -148,54 +244,6 @@ def _train(
         return None
     recorder.close()
     return finish_run(state, settings, folder, dataset, judge, time.monotonic() - began)
-
-
-def _choose_workers(
-    settings: TrainSettings, dist_context: DistributedContext, progress: TrainProgress
-) -> int:
-    """Return the number of decoding threads, and report the reason."""
-    choice = choose_workers(
-        detect_machine(),
-        settings,
-        on_gpu=dist_context.device.type == "cuda",
-        busy_threads=torch.get_num_threads(),
-    )
-    progress.note(choice.reason)
-    return choice.threads
-
-
-def _resolve_restart(
-    start: StartOptions, folder: RunFolder, dist_context: DistributedContext
-) -> StartOptions:
-    """Decide in all processes alike whether a restartable run resumes.
-
-    All processes must call it: torchrun counts restarts for each machine separately, and a network
-    file system shows a new file to one machine before another.
-    """
-    has_checkpoint = dist_context.any(start.restartable and bool(saved_steps(folder.checkpoints)))
-    return dataclasses.replace(start, resume=start.resume or has_checkpoint, restartable=False)
-
-
-def _batches(
-    data: TrainingData,
-    settings: TrainSettings,
-    state: TrainState,
-    dist_context: DistributedContext,
-    workers: int,
-) -> Generator[list[TrainingScene], None, None]:
-    """Return the scenes of this process for each step, beginning with the state's step."""
-    stream = dataclasses.replace(
-        loader_settings(settings), lookup_in_threads=not decodes_on_device(dist_context.device)
-    )
-    return load_batches(
-        data.split("train"),
-        stream,
-        state.step,
-        rank_slice=dist_context.rank_slice,
-        workers=workers,
-        unusable=state.bad_samples,
-        mixture=state.mixture,
-    )
 
 
 class _NoteBuffer(TrainProgress):
@@ -259,20 +307,3 @@ def _make_judge(
     for sample in samples:  # before any step, not at the first validation
         require_known_sky(lit_sky(sample.scene.environment), settings.model)
     return Judge(samples, settings.resolution, median_picture(training))
-
-
-def _begin_records(
-    state: TrainState,
-    settings: TrainSettings,
-    folder: RunFolder,
-    judge: Judge | None,
-    progress: TrainProgress,
-    watched: WatchSettings,
-) -> Recorder:
-    progress.begin(
-        step=state.step,
-        num_steps=settings.num_steps,
-        num_parameters=count_parameters(state.model),
-        median_scores=judge.median_scores if judge else None,
-    )
-    return Recorder(folder, settings, judge, progress, first_step=state.step, wandb=watched.wandb)

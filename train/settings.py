@@ -1,18 +1,17 @@
-"""Settings of a training run: everything that decides the weights. Imports no torch.
+"""Settings of a training run, everything that decides the weights, and of its monitoring.
 
-A run is a Python function that returns all settings (train.presets); the command line picks one and
-may replace fields. Fields marked EXECUTION may differ at every resume: the weights are equal up to
-rounding, or do not depend on them. All other fields are the meaning of the run, and change only by
-a decision that the run records (train.resume).
+Imports no torch. A run is a Python function that returns all settings (train.presets); the command
+line picks one and may replace fields. Fields marked EXECUTION may differ at every resume: the
+weights are equal up to rounding, or do not depend on them. All other fields are the meaning of the
+run, and change only by a decision that the run records (train.resume).
 """
 
 from collections.abc import Mapping
 from dataclasses import field
 from typing import Annotated, Any, ClassVar, Literal
 
-from model.base_widths import BaseWidths
 from model.config import REMOVED as REMOVED_FROM_MODEL
-from model.config import ModelConfig
+from model.config import BaseWidths, ModelConfig
 from storage.errors import TrilightError
 from storage.removed import without_removed
 from storage.settings.described import checked, settings_record
@@ -75,17 +74,6 @@ Compile = Literal["auto", "yes", "no"]
 """Compilation of layers, head and LPIPS by torch: `auto` compiles on a GPU with Triton, `yes` also
 on a CPU, where it takes minutes and gains little."""
 
-Decayed = Literal["all", "matrices"]
-"""Weights that decay: `all`, or `matrices` without norms, biases and learned tokens."""
-
-MuonTakes = Literal["matrices", "hidden"]
-"""Weights that Muon updates: all `matrices`, or only the `hidden` ones of the layers, with queries,
-keys and values as separate matrices, as its authors do."""
-
-Schedule = Literal["wsd", "cosine"]
-"""Course of the learning rate after its warm-up. `wsd` (warm-up, stable, decay) stays at the peak
-and falls over the last steps by 1 - sqrt; `cosine` falls along half a wave from the first."""
-
 Count = Annotated[int, Within(1, 10**9)]
 """Number of steps or of scenes; no run reaches a billion."""
 
@@ -142,11 +130,11 @@ class TrainSettings:
     base_widths: BaseWidths = field(default_factory=BaseWidths)
     """Widths for which the rates above and the initial weights are stated; no other width of the
     network changes them unless `width` is one."""
-    muon_takes: MuonTakes = "matrices"
+    muon_takes: Literal["matrices", "hidden"] = "matrices"
     """Weights that Muon updates: all matrices, or only the hidden ones of the layers."""
     warmup_steps: Annotated[int, Within(0, 10**9 - 1, unit="steps")]
     """Steps of linear warm-up to the peak learning rate."""
-    schedule: Schedule = "cosine"
+    schedule: Literal["wsd", "cosine"] = "cosine"
     """Course of the learning rate after the warm-up: `wsd` stays at the peak until the last steps,
     so that a run can be extended or branched; `cosine`, the value of runs that store none, falls
     from the start."""
@@ -157,7 +145,7 @@ class TrainSettings:
     """Learning rate at the last step, as a fraction of the peak."""
     weight_decay: Annotated[float, Within(0, 10)] = 0.01
     """Decoupled weight decay (Loshchilov and Hutter 2019) of the weights that `decayed` names."""
-    decayed: Decayed = "all"
+    decayed: Literal["all", "matrices"] = "all"
     """Weights that decay: all, or matrices without norms, biases and learned tokens."""
     betas: Annotated[tuple[float, float], BelowOne] = (0.9, 0.99)
     """Decay rates of AdamW's running means of the gradient and of its square."""
@@ -247,3 +235,29 @@ def known_settings(record: Mapping[str, Any], source: str) -> dict[str, Any]:
         if isinstance(record.get(group), Mapping)
     }
     return {**record, **known}
+
+
+OnHang = Literal["wait", "stop"]
+"""Action when a step does not end."""
+
+
+@checked("watch settings")
+class WatchSettings:
+    """Monitoring of a run; decides no weight."""
+
+    hang_after_s: Annotated[float, Within(0.1, 1e6, unit="seconds")] = 120.0
+    """Time after which a step may count as hanging; before three of its kind are known, five times
+    as long."""
+    hang_factor: Annotated[float, Within(1, 1e6, unit="x the usual")] = 10.0
+    """Multiple of the usual time from which on a step counts as hanging."""
+    on_hang: OnHang = "wait"
+    """Action on a hang, after it is reported and the stacks of all threads are written: wait, or
+    stop the run, which --resume continues from the last checkpoint."""
+    spike_bound: Annotated[float, Within(1, 1e6, unit="deviations")] = 8.0
+    """Robust standard deviations above the recent median at which a loss or gradient is recorded
+    with the scenes of its step."""
+    profile: Annotated[int, Within(0, 1000, unit="steps")] = 0
+    """Number of steps to trace with PyTorch's profiler, after the first three; 0 traces none."""
+    wandb: str | None = None
+    """Project of Weights & Biases that the log is written to as well, if the package is installed;
+    offline unless WANDB_MODE says otherwise. By default nothing is."""

@@ -41,10 +41,10 @@ if TYPE_CHECKING:
     from storage.records.sample import Sample as Sample
     from storage.records.scene import Scene as Scene
     from storage.records.scene import SceneObject as SceneObject
-    from train.monitoring.settings import WatchSettings as WatchSettings
     from train.presets import training_preset as training_preset
-    from train.result import TrainResult as TrainResult
+    from train.run_training import TrainResult as TrainResult
     from train.settings import TrainSettings as TrainSettings
+    from train.settings import WatchSettings as WatchSettings
     from trilight.compose import SceneBuilder as SceneBuilder
     from trilight.datasets import generate as generate
     from trilight.learning import train_network as train_network

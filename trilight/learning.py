@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from infra.torch_library import require_torch
-from train.monitoring.settings import WatchSettings
 from train.presets import override_training_preset
 from train.resume import StartOptions
+from train.settings import WatchSettings
 
 if TYPE_CHECKING:
     from train.progress import TrainProgress
-    from train.result import TrainResult
+    from train.run_training import TrainResult
     from train.settings import TrainSettings
 
 

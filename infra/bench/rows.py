@@ -14,8 +14,7 @@ from infra.bench.store import Run
 from pipeline.documents.figures import drawing
 from storage.errors import TrilightError
 from storage.intervals import mean_interval
-from train.evaluation.cost_charts import SeriesPoint, draw_panels, plain_log
-from train.evaluation.cost_tables import number_text, on_front
+from train.evaluation.cost_charts import SeriesPoint, draw_panels, number_text, on_front, plain_log
 
 _OVER: Mapping[str, Callable[[Sequence[float]], Any]] = {
     "median": np.median,

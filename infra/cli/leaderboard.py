@@ -50,8 +50,8 @@ def judge_methods(options: LeaderboardOptions, *, silent: bool) -> dict[str, Any
 
 
 def _row(standing: Any) -> dict[str, str]:
-    from train.evaluation.cost_tables import number_text
-    from train.evaluation.pairs import METRIC, interval_text
+    from train.evaluation.cost_charts import number_text
+    from train.evaluation.judged_view import METRIC, interval_text
 
     lead = standing.lead
     scores = standing.scores[METRIC]

@@ -20,13 +20,12 @@ from infra.train_options import TrainOptions
 from storage.errors import TrilightError
 from storage.installation import child_environment
 from storage.settings.overrides import option_words
-from train.monitoring.settings import WatchSettings
 from train.presets import scale_intervals, training_preset
 from train.progress import TrainProgress
-from train.settings import TrainSettings
+from train.settings import TrainSettings, WatchSettings
 
 if TYPE_CHECKING:
-    from train.result import TrainResult
+    from train.run_training import TrainResult
 
 
 class _BarProgress(TrainProgress):

@@ -70,7 +70,7 @@ class NetworkRenderer(RendererHere):
     resolution: int
     name: str = "neural"
     lights_per_pass: int = 8
-    """Maximum number of emitting triangles in a pass (model.light_groups), as in training."""
+    """Maximum number of emitting triangles in a pass (model.inference), as in training."""
     precision: str = "float32"
     """Name of the precision of matrix products (model.precision)."""
     threads: int | None = None

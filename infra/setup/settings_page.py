@@ -22,8 +22,7 @@ from storage.settings.fields import (
     parts_of,
 )
 from train.evaluation.options import EvaluationOptions, LeaderboardOptions
-from train.monitoring.settings import WatchSettings
-from train.settings import TrainSettings
+from train.settings import TrainSettings, WatchSettings
 
 ROOTS: dict[str, tuple[type, ...]] = {
     "Scene": (Scene,),

@@ -72,6 +72,11 @@ class MaskedRows:
         return DeviceArray(torch.where(self.counts, values.tensor, zero), values.place)
 
 
+def _method(operation: Callable[..., Tensor]) -> Any:
+    """Return a method that does what a function of torch does, which takes `axis` for `dim`."""
+    return lambda self, *inputs, **named: self._like(operation(self.tensor, *inputs, **named))
+
+
 class DeviceArray(NDArrayOperatorsMixin):
     """A tensor in the place of a numpy array; its methods are those of numpy's that rays need."""
 
@@ -150,35 +155,20 @@ class DeviceArray(NDArrayOperatorsMixin):
     def copy(self) -> "DeviceArray":
         return self._like(self.tensor.clone(memory_format=torch.contiguous_format))
 
-    def reshape(self, *shape: Any) -> "DeviceArray":
-        return self._like(self.tensor.reshape(*shape))
-
-    def swapaxes(self, first: int, second: int) -> "DeviceArray":
-        return self._like(self.tensor.swapaxes(first, second))
-
-    def ravel(self) -> "DeviceArray":
-        return self._like(self.tensor.flatten())
-
     def cross(self, other: "DeviceArray") -> "DeviceArray":
         return self._like(torch.linalg.cross(self.tensor, other.tensor, dim=0))
 
-    def sum(self, axis: int) -> "DeviceArray":
-        return self._like(self.tensor.sum(dim=axis))
+    def reshape(self, *shape: Any) -> "DeviceArray":
+        return self._like(self.tensor.reshape(*shape))
 
-    def mean(self, axis: int | None = None) -> "DeviceArray":
-        return self._like(self.tensor.mean() if axis is None else self.tensor.mean(dim=axis))
-
-    def max(self, axis: int) -> "DeviceArray":
-        return self._like(self.tensor.amax(dim=axis))
-
-    def argmax(self, axis: int) -> "DeviceArray":
-        return self._like(self.tensor.argmax(dim=axis))
-
-    def clip(self, least: float, most: float) -> "DeviceArray":
-        return self._like(self.tensor.clamp(least, most))
-
-    def all(self, axis: int) -> "DeviceArray":
-        return self._like(self.tensor.all(dim=axis))
+    swapaxes = _method(torch.swapaxes)
+    ravel = _method(torch.flatten)
+    sum = _method(torch.sum)
+    mean = _method(torch.mean)
+    max = _method(torch.amax)
+    argmax = _method(torch.argmax)
+    clip = _method(torch.clamp)
+    all = _method(torch.all)
 
     def any(self) -> bool:
         """Return True, without asking the device: some may be."""

@@ -1,10 +1,10 @@
 """`LitScene`: the triangles of a scene as rays need them, with their lobes and their emission."""
 
 import copy
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
@@ -29,7 +29,22 @@ MaterialName = Literal["diffuse", "specular", "alpha", "multiscatter", "roughnes
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Reflectance:
+class PerPoint:
+    """Arrays [..., P] of P points, triangles or pixels, or None."""
+
+    def only(self, rows: Any) -> Self:
+        """Return some of them; of None, all with an axis before that of points."""
+        index = (..., None, slice(None)) if rows is None else (..., rows)
+        some = {
+            name: each.only(rows) if isinstance(each, PerPoint) else each[index]
+            for name, each in vars(self).items()
+            if each is not None
+        }
+        return replace(self, **some)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reflectance(PerPoint):
     """Reflectance of N triangles or points; all float32."""
 
     diffuse: Floats
@@ -42,16 +57,6 @@ class Reflectance:
     """[3, N] Fms of storage.optics.multiscatter."""
     roughness: Floats
     """[N] roughness of the material, 0 to 1."""
-
-    def only(self, rows: NDArray[np.intp]) -> "Reflectance":
-        """Return some of them."""
-        return Reflectance(**some_rows(vars(self), rows))
-
-
-def some_rows(arrays: Mapping[str, Any], rows: Any) -> dict[str, Any]:
-    """Return the same rows of arrays [..., P]; of None, all with an axis before that of rows."""
-    index = (..., None, slice(None)) if rows is None else (..., rows)
-    return {name: each[index] for name, each in arrays.items()}
 
 
 def reflectance_of(materials: NDArray[np.float32]) -> Reflectance:
@@ -68,7 +73,7 @@ def reflectance_of(materials: NDArray[np.float32]) -> Reflectance:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Points:
+class Points(PerPoint):
     """P points of surfaces, each seen from one side; all float32."""
 
     triangle: NDArray[np.intp]
@@ -88,14 +93,6 @@ class Points:
     """[P] True: the viewer is on the side from which the triangle's corners run clockwise."""
     reflectance: Reflectance | None = None
     """Reflectance of the points in textured scenes; None: the mean one of their triangles."""
-
-    def only(self, rows: NDArray[np.intp] | None) -> "Points":
-        """Return some of the points; of None, all of them with an axis before that of points."""
-        fields = {name: each for name, each in vars(self).items() if name != "reflectance"}
-        reflectance = None
-        if rows is not None and self.reflectance is not None:
-            reflectance = self.reflectance.only(rows)
-        return Points(**some_rows(fields, rows), reflectance=reflectance)
 
     def start(self, direction: Floats) -> Floats:
         """Return the starts of rays [3, P] that leave the surface."""
@@ -222,6 +219,10 @@ class LitScene:
         # as the renderer: the triangle's own normal goes with the shading normal, then both turn
         plane = plane * np.where(dot(plane, normal) < 0, np.float32(-1), np.float32(1))
         flip = np.where(dot(plane, direction) > 0, np.float32(-1), np.float32(1))
+        reflectance = None
+        if self.textures is not None:
+            materials = self.textures.materials(triangle, weights, self._materials_TM)
+            reflectance = reflectance_of(materials)
         return Points(
             triangle=triangle,
             position=position,
@@ -230,15 +231,8 @@ class LitScene:
             to_viewer=-direction,
             edge=np.take(self.edge, triangle, axis=1),
             back=back,
-            reflectance=self._textured_reflectance(triangle, weights),
+            reflectance=reflectance,
         )
-
-    def _textured_reflectance(
-        self, triangle: NDArray[np.intp], weights: Floats
-    ) -> Reflectance | None:
-        if self.textures is None:
-            return None
-        return reflectance_of(self.textures.materials(triangle, weights, self._materials_TM))
 
     def first_hits(self, origin: Floats, direction: Floats) -> RayHits:
         """Return the first hits of rays [3, P] from one camera [3]."""

@@ -117,7 +117,7 @@ def _mean_of_sides(
     scene: LitScene, on_triangle: Floats, light_at: Callable[[Points, slice, int], Floats]
 ) -> Floats:
     """Return the mean [2, T, 3] of the light [3, P] at some points of each side, block by block."""
-    rows = _sides(scene)
+    rows = np.arange(2 * scene.num_triangles)  # all sides, T front ones first
     total = np.zeros((3, len(rows)), np.float32)
     for trial in range(DIRECT_POINTS):
         places = spread(on_triangle, trial)
@@ -130,7 +130,7 @@ def _mean_of_sides(
 
 def _bounce_light(scene: LitScene, direct_2T3: Floats, rng: np.random.Generator) -> Floats:
     """Return the light that arrives after one or more bounces."""
-    rows = _sides(scene)
+    rows = np.arange(2 * scene.num_triangles)  # all sides, T front ones first
     on_triangle = rng.random((2, len(rows)), np.float32)
     towards = rng.random((2, len(rows)), np.float32)
     faced = np.zeros((RAYS, len(rows)), np.int64)
@@ -147,11 +147,6 @@ def _bounce_light(scene: LitScene, direct_2T3: Floats, rng: np.random.Generator)
         sent = np.append((received + arrived) * reflects, np.zeros((1, 3), np.float32), axis=0)
         arrived = sent[faced].mean(axis=0)
     return arrived.reshape(2, -1, 3)
-
-
-def _sides(scene: LitScene) -> NDArray[np.intp]:
-    """Return the sides of all triangles: front sides first, T of each."""
-    return np.arange(2 * scene.num_triangles)
 
 
 def _points(scene: LitScene, sides: NDArray[np.intp], u: Floats) -> Points:

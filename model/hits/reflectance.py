@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.lit_scene import LitScene, Points, some_rows
+from model.hits.lit_scene import LitScene, PerPoint, Points
 from model.hits.vectors import Floats, dot, tangents, unit
 from storage.optics.multiscatter import ROUGHNESS_STEPS, X_STEPS, albedo_table
 
@@ -18,7 +18,7 @@ _LEAST_COSINE = np.float32(1e-4)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Gloss:
+class Gloss(PerPoint):
     """The specular lobes of P points, each as its viewer sees it."""
 
     color: Floats
@@ -31,10 +31,6 @@ class Gloss:
     """[P] length of the viewer's direction on stretched facets."""
     faces: NDArray[np.bool_]
     """[P] True: the viewer is above the shading normal's horizon; below there is no lobe."""
-
-    def only(self, rows: NDArray[np.intp] | None) -> "Gloss":
-        """Return some of the points, as `Points.only`."""
-        return Gloss(**some_rows(vars(self), rows))
 
 
 def gloss_at(scene: LitScene, points: Points, least_alpha: Floats | None = None) -> Gloss:

@@ -1,12 +1,18 @@
-"""`Traced`: traced inputs of scenes and views, as the tensors that a network of hits reads."""
+"""`Traced`: traced inputs of scenes and views, as tensors that a network of hits reads."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from model.hits.view_inputs import Channel
+from storage.denoiser import Features, denoise, gpu_is_supported
+
+if TYPE_CHECKING:  # it loads pydantic
+    from model.config import ModelConfig
 
 INPUTS = ("open", "direct", "mirrored", "gathered", "tokens")
 """Inputs that a network of hits may lack: light from lamps as if nothing stood between, with its
@@ -41,10 +47,6 @@ class Traced:
         """Return the tensors in the order of the fields."""
         return tuple(getattr(self, each.name) for each in fields(self))
 
-    def convert_tensors(self, convert: Callable[[Tensor], Tensor]) -> "Traced":
-        """Return the same with each tensor converted, such as moved to a device."""
-        return Traced(*map(convert, self.tensors()))
-
     def without(self, kept_VI: Tensor) -> "Traced":
         """Return the same for views that lack the inputs whose number in `kept_VI` is 0."""
         pixels = self.pixels_VRRC.clone()
@@ -67,14 +69,55 @@ def with_others_tokens(traced: Traced, other: Traced | None) -> Traced:
     return replace(traced, sides_T12=sides_T12)
 
 
-def stack_traced(scenes: Sequence[Traced], longest: int) -> Traced:
+def stack_traced(scenes: Sequence[Traced]) -> Traced:
     """Return the batch of scenes, their triangles padded with zeros."""
-    padded = [
-        torch.nn.functional.pad(each.sides_T12, (0, 0, 0, longest - len(each.sides_T12)))
-        for each in scenes
-    ]
     names = [each.name for each in fields(Traced) if each.name != "sides_T12"]
     return Traced(
-        sides_T12=torch.stack(padded),
+        sides_T12=pad_sequence([each.sides_T12 for each in scenes], True),
         **{name: torch.stack([getattr(each, name) for each in scenes]) for name in names},
     )
+
+
+_SUMMED = (Channel.SHOWN_DIFFUSE, Channel.DIRECT_SPECULAR, Channel.MIRRORED)
+
+
+def denoise_traced(traced: Traced, config: "ModelConfig") -> Traced:
+    """Return views whose direct and mirrored light is filtered as one picture, if a network asks.
+
+    It is in SHOWN_DIFFUSE; DIRECT_SPECULAR and MIRRORED become 0: two filters cost twice as much
+    and were no better. Light is filtered in units of the scene's, so that pictures scale with the
+    lamps.
+
+    Args:
+        traced: views of one scene, or of a batch; on any device.
+        config: of the network.
+    """
+    resolution = traced.pixels_VRRC.shape[-2]
+    if not config.denoises(resolution):
+        return traced
+    unit = traced.unit_3[..., None, None, None, :].expand(*traced.pixels_VRRC.shape[:-3], 1, 1, 3)
+    views = traced.pixels_VRRC.clone()
+    for view_RRC, unit_113 in zip(views.flatten(0, -4), unit.flatten(0, -4), strict=True):
+        _denoise_view(view_RRC, unit_113)
+    return replace(traced, pixels_VRRC=views)
+
+
+def _denoise_view(view_RRC: Tensor, unit_113: Tensor) -> None:
+    """Filter the light of a view in place, on its GPU where the denoiser runs there."""
+    light = torch.zeros_like(view_RRC[..., Channel.SHOWN_DIFFUSE])
+    for part in _SUMMED:
+        light += view_RRC[..., part]
+        view_RRC[..., part] = 0
+    coverage = view_RRC[..., Channel.COVERAGE]
+    albedo = coverage * (view_RRC[..., Channel.DIFFUSE] + view_RRC[..., Channel.SPECULAR])
+    normal = coverage * view_RRC[..., Channel.NORMAL]
+    color, *guides = (each.float().cpu().numpy() for each in (light / unit_113, albedo, normal))
+    on_gpu = view_RRC.is_cuda and gpu_is_supported()
+    filtered = denoise(
+        color,
+        Features(albedo=guides[0], normal=guides[1]),
+        "fast",
+        threads=1,
+        device="CUDA" if on_gpu else None,
+    )
+    view_RRC[..., Channel.SHOWN_DIFFUSE] = unit_113 * torch.from_numpy(filtered).to(view_RRC)

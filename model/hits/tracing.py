@@ -11,15 +11,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.config import HitStage, ModelConfig, hit_stage
-from model.hits.denoised import denoise_traced
+from model.config import ModelConfig
 from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import DeviceTriangles, compiled_kernel
 from model.hits.lit_scene import LitScene
 from model.hits.radiosity import SceneLight, scene_light
-from model.hits.traced import INPUTS, Traced, stack_traced
+from model.hits.traced import INPUTS, Traced, denoise_traced, stack_traced
 from model.hits.view_inputs import ViewInputs, view_inputs
-from model.scene_tensors import Cameras, SceneBatch, SceneTensors, batch_scenes, require_known_sky
+from model.scene_tensors import (
+    Cameras,
+    SceneBatch,
+    SceneTensors,
+    batch_scenes,
+    map_tensors,
+    require_known_sky,
+)
 from storage.conventions import radiance_from_log10
 from storage.raycast.caster import RayCaster
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
@@ -63,7 +69,7 @@ class TracedScene:
         )
 
     def view(
-        self, c2w_44: Tensor, fov_deg: Tensor, resolution: int, stage: HitStage, seed: int
+        self, c2w_44: Tensor, fov_deg: Tensor, resolution: int, config: ModelConfig, seed: int
     ) -> ViewInputs:
         """Trace the inputs of one view."""
         place = self.lit.place
@@ -75,10 +81,10 @@ class TracedScene:
             c2w,
             angle,
             resolution,
-            rays_a_side=stage.hit_rays,
-            anchors_a_side=math.gcd(stage.hit_anchors, resolution),  # it divides the width
-            gather_rays=stage.gather_rays,
-            sky_rays=stage.sky_rays,
+            rays_a_side=config.hit_rays,
+            anchors_a_side=math.gcd(config.hit_anchors, resolution),  # it divides the width
+            gather_rays=config.gather_rays,
+            sky_rays=config.sky_rays,
             seed=seed,
         )
 
@@ -145,30 +151,26 @@ def with_traced(
     if device is not None:
         ready = ready.on(device)
     cameras = [each.to(ready.unit_3.device) for each in (scene.c2w_V44, scene.fov_deg_V)]
-    stage = hit_stage(config)
-    traced = traced_views(ready, cameras[0], cameras[1], resolution, stage, seed)
+    traced = traced_views(ready, cameras[0], cameras[1], resolution, config, seed)
     place = scene.c2w_V44.device
-    traced = denoise_traced(traced, stage).convert_tensors(lambda each: each.to(place))
+    traced = map_tensors(denoise_traced(traced, config), lambda each: each.to(place))
     return dataclasses.replace(scene, traced=traced)
 
 
 def traced_cameras(
-    scenes: tuple[TracedScene, ...], cameras: Cameras, resolution: int, stage: HitStage
+    scenes: tuple[TracedScene, ...], cameras: Cameras, resolution: int, config: ModelConfig
 ) -> Traced:
     """Trace the inputs of any cameras of the scenes of a batch.
 
     It is where the cameras are, and of their type.
     """
     traced = [
-        traced_views(scene, c2w_V44, fov_deg_V, resolution, stage)
+        traced_views(scene, c2w_V44, fov_deg_V, resolution, config)
         for scene, c2w_V44, fov_deg_V in zip(
             scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True
         )
     ]
-    longest = max(scene.lit.num_triangles for scene in scenes)
-    return stack_traced(traced, longest).convert_tensors(
-        lambda each: like(each, cameras.fov_deg_BV)
-    )
+    return map_tensors(stack_traced(traced), lambda each: like(each, cameras.fov_deg_BV))
 
 
 def like(numbers: Tensor, other: Tensor) -> Tensor:
@@ -181,12 +183,12 @@ def traced_views(
     c2w_V44: Tensor,
     fov_deg_V: Tensor,
     resolution: int,
-    stage: HitStage,
+    config: ModelConfig,
     seed: int = 0,
 ) -> Traced:
     """Return the tensors of some views of a scene, where its rays are traced."""
     views = [
-        scene.view(c2w_44, fov_deg, resolution, stage, seed)
+        scene.view(c2w_44, fov_deg, resolution, config, seed)
         for c2w_44, fov_deg in zip(c2w_V44, fov_deg_V, strict=True)
     ]
     return Traced(

@@ -11,14 +11,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.anchors import anchor_pixels, gathered_at
-from model.hits.camera import CameraHits, Rays, camera_hits
+from model.hits.anchors import (
+    DIMMEST,
+    SMOOTH_ALPHA,
+    CameraHits,
+    Rays,
+    anchor_pixels,
+    blocks,
+    camera_hits,
+    gathered_at,
+    outgoing_radiance,
+)
 from model.hits.device_arrays import DeviceArray, MaskedRows
 from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
-from model.hits.lit_scene import LitScene, Points
+from model.hits.lit_scene import LitScene, PerPoint, Points
 from model.hits.radiosity import SceneLight
 from model.hits.reflectance import Gloss, gloss_at, lobe, sample_lobe
-from model.hits.second_hits import DIMMEST, SMOOTH_ALPHA, blocks, outgoing_radiance
 from model.hits.sky_light import add_sky_light, escaped_light
 from model.hits.vectors import Floats, brightest, dot, spread
 from model.replayed import aside
@@ -111,7 +119,9 @@ def view_inputs(
     noise = _Noise(
         on_lamps=scene.here(rng.random((2, len(scene.lamps), resolution**2), np.float32)),
         chance=scene.here(rng.random((6, resolution**2), np.float32)),
-        to_sky=_towards_sky(scene, resolution, seed),
+        to_sky=None  # a generator of its own: scenes without a sky keep their noise
+        if scene.sky is None
+        else rng_for(seed, "hits of a sky", resolution).random((2, resolution**2), np.float32),
     )
     sums = np.zeros_like(noise.chance, shape=(NUM_CHANNELS, resolution**2))
     for part in blocks(scene, resolution**2):
@@ -127,15 +137,8 @@ def view_inputs(
     )
 
 
-def _towards_sky(scene: LitScene, resolution: int, seed: int) -> NDArray[np.float32] | None:
-    """Return uniform numbers [2, pixels]; None without a sky. Other scenes keep their noise."""
-    if scene.sky is None:
-        return None
-    return rng_for(seed, "hits of a sky", resolution).random((2, resolution**2), np.float32)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Noise:
+class _Noise(PerPoint):
     """Uniform numbers of P pixels."""
 
     on_lamps: Floats
@@ -144,13 +147,6 @@ class _Noise:
     """[6, P] for the rays that lobes draw, and for the one ray of each pixel."""
     to_sky: Floats | None
     """[2, P] for rays to the sky; None without a sky."""
-
-    def only(self, part: slice) -> "_Noise":
-        """Return the numbers of some pixels."""
-        to_sky = None if self.to_sky is None else self.to_sky[:, part]
-        return _Noise(
-            on_lamps=self.on_lamps[:, :, part], chance=self.chance[:, part], to_sky=to_sky
-        )
 
 
 def _add_pixels(
@@ -164,29 +160,30 @@ def _add_pixels(
     lobe_rays: int,
 ) -> None:
     """Add what rays find of a block of pixels to its sums [40, P]; on a GPU, in two branches."""
-    shaded = _shading_points(scene, hits, noise.chance[5])
-    if not len(shaded.pixel):
+    block = _shading_points(scene, hits, noise.chance[5], sums)
+    pixel = block.pixel
+    if not len(pixel):
         return
-    block = _Block(
-        points=shaded.points,
-        gloss=gloss_at(scene, shaded.points),
-        sums=sums,
-        pixel=shaded.pixel,
-        weight=shaded.weight,
-        of_pixels=shaded.of_pixels,
-    )
-    pixel = shaded.pixel
+    points = block.points
+    gloss = block.gloss
     with aside(scene.device) as join_direct:
         _add_surface(block, scene, rays.origin)
-        on_lamps = spread(noise.on_lamps[:, :, pixel], shaded.ray_index)
-        _add_direct(block, scene, on_lamps, lobe_rays)
+        on_lamps = spread(noise.on_lamps[:, :, pixel], block.ray_index)
+        lit = direct_light(scene, points, gloss, on_lamps, lobe_rays=lobe_rays)
+        _add_light(block, scene, lit)
         if noise.to_sky is not None:
-            _add_sky(block, scene, noise.to_sky[:, pixel], shaded.ray_index, sky_rays, lobe_rays)
-    by_lobe = block if scene.place is None else block.with_own_sums()
+            lit = no_light(points)
+            shift = noise.to_sky[:, pixel]
+            index = block.ray_index
+            add_sky_light(
+                lit, scene, points, gloss, shift, index, rays=sky_rays, lobe_rays=lobe_rays
+            )
+            _add_light(block, scene, lit)
+    by_lobe = block if scene.place is None else replace(block, sums=np.zeros_like(sums))
     if lobe_rays:
         u = noise.chance[:5, pixel]
-        u[:2] = spread(u[:2], shaded.ray_index)
-        shading = shaded.chosen * np.float32(rays.rays_per_pixel)
+        u[:2] = spread(u[:2], block.ray_index)
+        shading = block.chosen * np.float32(rays.rays_per_pixel)
         _add_lobe_rays(by_lobe, scene, light, u, shading, sky_rays)
     join_direct()
     if by_lobe is not block:
@@ -194,16 +191,19 @@ def _add_pixels(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _ShadingPoints:
-    """Points at which light is computed.
+class _Block:
+    """Points that are shaded together, and where their light is added up.
 
     One of a pixel whose rays all meet one triangle without textures stands for all of them; else
     each ray has its own.
     """
 
     points: Points
+    gloss: Gloss
+    sums: Floats
+    """[40, pixels of the block]"""
     pixel: NDArray[np.intp]
-    """[P] number of its pixel in the block."""
+    """[P] number of each point's pixel in the block."""
     ray_index: NDArray[np.intp]
     """[P] number of its ray among those of the pixel."""
     weight: NDArray[np.float32]
@@ -212,58 +212,6 @@ class _ShadingPoints:
     """[pixels] of all rays of the block, counted ray by ray: the one drawn of each pixel."""
     chosen: NDArray[np.float32]
     """[P] 1 for one point of each pixel, drawn evenly from its rays; 0 for others."""
-
-
-def _shading_points(
-    scene: LitScene,
-    hits: CameraHits,
-    chance: NDArray[np.float32],
-) -> _ShadingPoints:
-    """Return the points of a block of pixels."""
-    triangle = hits.triangle
-    rays_per_pixel, count = triangle.shape
-    drawn_ray = np.minimum((chance * rays_per_pixel).astype(np.intp), rays_per_pixel - 1)
-    alone = np.arange(rays_per_pixel)[:, None] == drawn_ray
-    is_one = (triangle == triangle[0]).all(axis=0)
-    if scene.textures is not None:
-        is_one &= ~scene.textures.is_textured[triangle[0]]
-    stands = (triangle >= 0) & (alone | ~is_one)
-    ray_index, pixel = np.nonzero(stands)
-    ray = ray_index * count + pixel
-    points = scene.points(
-        np.maximum(triangle.reshape(-1)[ray], 0),
-        hits.uv.reshape(2, -1)[:, ray],
-        hits.along[ray_index, :, pixel].T.copy(),
-    )
-    return _ShadingPoints(
-        points=points,
-        pixel=pixel,
-        ray_index=ray_index,
-        weight=np.where(is_one[pixel], np.float32(rays_per_pixel), np.float32(1))
-        * stands[ray_index, pixel],
-        chosen=alone[ray_index, pixel].astype(np.float32),
-        of_pixels=drawn_ray * count + np.arange(count),
-    )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Block:
-    """Points that are shaded together, and where their light is added up."""
-
-    points: Points
-    gloss: Gloss
-    sums: Floats
-    """[40, pixels of the block]"""
-    pixel: NDArray[np.intp]
-    """[P] number of each point's pixel in the block."""
-    weight: NDArray[np.float32]
-    """[P] number of rays that each stands for."""
-    of_pixels: Floats
-    """[pixels] on a GPU: the point of each pixel that stands for all in what one ray brings."""
-
-    def with_own_sums(self) -> "_Block":
-        """Return the same points with new sums, to be added to those of this block later."""
-        return replace(self, sums=np.zeros_like(self.sums))
 
     def add(
         self, channel: slice, values: NDArray[np.float32], rows: NDArray[np.intp] | None = None
@@ -286,6 +234,38 @@ class _Block:
         self.sums[channel] += weighed.reshape(shape).sum(axis=1)
 
 
+def _shading_points(
+    scene: LitScene, hits: CameraHits, chance: NDArray[np.float32], sums: Floats
+) -> _Block:
+    """Return the points of a block of pixels, whose light is added to `sums`."""
+    triangle = hits.triangle
+    rays_per_pixel, count = triangle.shape
+    drawn_ray = np.minimum((chance * rays_per_pixel).astype(np.intp), rays_per_pixel - 1)
+    alone = np.arange(rays_per_pixel)[:, None] == drawn_ray
+    is_one = (triangle == triangle[0]).all(axis=0)
+    if scene.textures is not None:
+        is_one &= ~scene.textures.is_textured[triangle[0]]
+    stands = (triangle >= 0) & (alone | ~is_one)
+    ray_index, pixel = np.nonzero(stands)
+    ray = ray_index * count + pixel
+    points = scene.points(
+        np.maximum(triangle.reshape(-1)[ray], 0),
+        hits.uv.reshape(2, -1)[:, ray],
+        hits.along[ray_index, :, pixel].T.copy(),
+    )
+    return _Block(
+        points=points,
+        gloss=gloss_at(scene, points),
+        sums=sums,
+        pixel=pixel,
+        ray_index=ray_index,
+        weight=np.where(is_one[pixel], np.float32(rays_per_pixel), np.float32(1))
+        * stands[ray_index, pixel],
+        chosen=alone[ray_index, pixel].astype(np.float32),
+        of_pixels=drawn_ray * count + np.arange(count),
+    )
+
+
 def _add_surface(block: _Block, scene: LitScene, origin: NDArray[np.float32]) -> None:
     points = block.points
     from_camera = points.position - origin[:, None]
@@ -297,28 +277,6 @@ def _add_surface(block: _Block, scene: LitScene, origin: NDArray[np.float32]) ->
     block.add(Channel.DIFFUSE, scene.material_at(points, "diffuse"))
     block.add(Channel.SPECULAR, block.gloss.color)
     block.add(Channel.ROUGHNESS, scene.material_at(points, "roughness")[None])
-
-
-def _add_direct(
-    block: _Block, scene: LitScene, on_lamps: NDArray[np.float32], lobe_rays: int
-) -> None:
-    lit = direct_light(scene, block.points, block.gloss, on_lamps, lobe_rays=lobe_rays)
-    _add_light(block, scene, lit)
-
-
-def _add_sky(
-    block: _Block,
-    scene: LitScene,
-    shift: NDArray[np.float32],
-    ray_index: NDArray[np.intp],
-    rays: int,
-    lobe_rays: int,
-) -> None:
-    lit = no_light(block.points)
-    add_sky_light(
-        lit, scene, block.points, block.gloss, shift, ray_index, rays=rays, lobe_rays=lobe_rays
-    )
-    _add_light(block, scene, lit)
 
 
 def _add_light(block: _Block, scene: LitScene, lit: DirectLight) -> None:

@@ -1,7 +1,7 @@
 """Data that `--data` names: datasets by their roots, or shards by a list.
 
 The shards of several datasets are numbered one dataset after another, and each dataset stays a part
-of its own. What share of a stream comes from which, the trainer decides (train.data.mixture).
+of its own. What share of a stream comes from which, the trainer decides (train.data.order).
 """
 
 import os

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from model.check_reference import differences, read_reference
+from model.check_reference import differences
 from model.inference import NeuralRenderer
 from model.open import BUILTIN, BUILTIN_NETWORKS
 from pipeline.assets.recipe import RECIPE
@@ -168,8 +168,8 @@ def published_differences() -> dict[str, bool]:
     found = {}
     for name in ("base_tiny", "swin_tiny"):
         path = _shared() / "renderformer_reference" / f"{name}.safetensors"
-        apart = differences(read_reference(path))
-        found[name] = max(apart.padded, apart.unpadded) < 1e-7
+        apart = differences(path)
+        found[name] = max(apart["padded"], apart["unpadded"]) < 1e-7
     return found
 
 

@@ -5,6 +5,7 @@ is one `generate` as a user starts it, watched from outside: memory, open files 
 everything that it started, and what is left when it has ended.
 """
 
+import itertools
 import os
 import shutil
 import signal
@@ -29,7 +30,7 @@ from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from tests.for_each import case
 from tests.pipeline.generation.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
-from train.data.order import OrderSettings, batch_visits, visits_from, windows_from
+from train.data.order import visits_from
 
 
 @pytest.fixture
@@ -111,9 +112,8 @@ def test_a_range_beyond_the_end_is_refused_and_one_that_reaches_beyond_makes_wha
 
 
 def test_batches_stand_in_distant_epochs() -> None:
-    first, order = 3 * 10**12, OrderSettings(seed=2**63, window=2)
-    windows = windows_from(3, lambda shard: 7, order, first)
-    far = next(batch_visits(visits_from(windows, first), 64))
+    first = 3 * 10**12
+    far = itertools.islice(visits_from(3, lambda shard: 7, first, seed=2**63, window=2), 64)
     assert [place.position for place in far] == list(range(first, first + 64))
 
 

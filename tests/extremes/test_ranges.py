@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from infra.render.options import RenderOptions
 from infra.serving.train_model import TrainOptions
 from infra.setup.settings_page import ROOTS, reachable
-from model.base_widths import BaseWidths
-from model.config import ModelConfig, smoke, tiny
+from model.config import BaseWidths, ModelConfig, smoke, tiny
 from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSettings
 from pipeline.flows.forms import DatasetInRuns
 from pipeline.generation.price import CorePrice
@@ -55,9 +54,8 @@ from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import bumpy_scene
 from train.evaluation.options import EvaluationOptions, LeaderboardOptions
-from train.monitoring.settings import WatchSettings
 from train.presets import training_preset
-from train.settings import AugmentationSettings, LossSettings, TrainSettings
+from train.settings import AugmentationSettings, LossSettings, TrainSettings, WatchSettings
 
 End = Literal["low", "high"]
 
@@ -260,7 +258,6 @@ def test_no_number_is_without_a_range() -> None:
 
 INTERNAL = {
     "LoaderSettings": "made of TrainSettings",
-    "OrderSettings": "made of LoaderSettings",
     "PublishedConfig": "a ModelConfig, and one number that the published code fixes",
     "PreviewSettings": "made of RenderOptions",
     "StorageSettings": "has no number",

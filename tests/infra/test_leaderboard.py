@@ -35,14 +35,20 @@ from tests.for_each import case
 from tests.model.kit import awake, publishable
 from tests.train.toy import VIEWS, toy_sample, write_toy_dataset
 from train.evaluation import board as board_module
-from train.evaluation.board import NOISE, UNKNOWN_MACHINE, Row, RowKey, Rows
+from train.evaluation.board import (
+    NOISE,
+    UNKNOWN_MACHINE,
+    Row,
+    RowKey,
+    Rows,
+    Standing,
+    WidthStandings,
+)
 from train.evaluation.chart import plot_leaderboard
-from train.evaluation.judged_view import NETWORK
+from train.evaluation.equal_time import Price
+from train.evaluation.judged_view import METRIC, NETWORK
 from train.evaluation.options import LeaderboardOptions
-from train.evaluation.pairs import METRIC
-from train.evaluation.standings import Standing, WidthStandings
-from train.evaluation.stored_pictures import PictureSource, nearest_view
-from train.evaluation.timing import Price
+from train.evaluation.validation import PictureSource, nearest_view
 
 PX = 16
 SHIPPED = {"network builtin:", "network builtin:tokens"}

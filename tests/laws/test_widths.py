@@ -14,8 +14,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from model.base_widths import BaseWidths
-from model.config import ModelConfig
+from model.config import BaseWidths, ModelConfig
 from model.hits.tracing import with_traced
 from tests.model.kit import hits_config
 from tests.train.kit import TINY_MODEL, tiny_run

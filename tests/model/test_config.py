@@ -14,11 +14,10 @@ from torch import Tensor
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from model import encoded_scene, rounding
-from model.base_widths import BaseWidths
-from model.config import SIZES, ModelConfig, base, hits_smoke, smoke
+from model import positions, precision
+from model.attention import pack_lengths, pack_tokens
+from model.config import SIZES, BaseWidths, ModelConfig, base, hits_smoke, smoke
 from model.costs import Workload, costs, flops
-from model.packing import pack_lengths, pack_tokens
 from model.precision import rounded_parts, set_precision, tf32
 from model.renderformer import RenderFormer, count_parameters
 from model.scene_tensors import SceneBatch, batch_scenes, map_tensors, scene_tensors, tensors_of
@@ -341,7 +340,7 @@ def test_rounding_together_changes_no_bit(
     model.recompute_activations(recompute)
     batch = batch_of(3, 5, dtype=torch.float32)
     rounded: list[int] = []
-    together = rounding._copy_as
+    together = precision._copy_as
 
     def counted(tensors: tuple[Tensor, ...], to: torch.dtype) -> tuple[Tensor, ...]:
         rounded.append(len(tensors))
@@ -351,11 +350,11 @@ def test_rounding_together_changes_no_bit(
     def results() -> dict[str, Tensor]:
         return picture_and_gradients(model, batch)
 
-    monkeypatch.setattr(rounding, "_copy_as", counted)
+    monkeypatch.setattr(precision, "_copy_as", counted)
     found = results()
     layers = len(model.encoder.layers) + len(model.decoder.layers) + (family == "dpt")
     assert len(rounded) == 2 * layers, "once forth and once back for each layer, and the head"
-    monkeypatch.setattr(rounding, "_round_weights", lambda *_: {})
+    monkeypatch.setattr(precision, "_round_weights", lambda *_: {})
     alone = results()
     assert found.keys() == alone.keys()
     for name, value in found.items():
@@ -364,8 +363,8 @@ def test_rounding_together_changes_no_bit(
 
 def test_without_autocast_nothing_is_rounded() -> None:
     layer = torch.nn.Linear(3, 3)
-    assert rounding.rounded_weights(layer, torch.device("cpu")) == {}
-    assert rounding.rounded_weights(layer, torch.device("meta")) == {}
+    assert precision.rounded_weights(layer, torch.device("cpu")) == {}
+    assert precision.rounded_weights(layer, torch.device("meta")) == {}
 
 
 def test_every_triangle_carries_its_own_vertices_normals_and_material() -> None:
@@ -430,14 +429,14 @@ def test_a_packed_batch_is_the_padded_one(family: str, monkeypatch: pytest.Monke
     """On a card the kernel is torch's; here its slow twin, sequence after sequence."""
     model, batch = awake(tiny_config(family)), batch_of(*LENGTHS)
     padded = picture_and_gradients(model, batch)
-    monkeypatch.setattr(encoded_scene, "supports_packed", lambda *_: True)
+    monkeypatch.setattr(positions, "supports_packed", lambda *_: True)
     monkeypatch.setattr("model.attention.scaled_dot_product_attention", _forbid_masks)
     for name, found in picture_and_gradients(model, batch).items():
         wanted = padded[name]
         assert (found - wanted).abs().max() <= 1e-11 * wanted.abs().max().clamp(min=1), name
 
 
-def _forbid_masks(q: Tensor, k: Tensor, v: Tensor, attn_mask: Tensor | None) -> Tensor:
+def _forbid_masks(q: Tensor, k: Tensor, v: Tensor, attn_mask: Tensor | None = None) -> Tensor:
     assert attn_mask is None, "nothing that is padded is attended with a mask"
     return torch.nn.functional.scaled_dot_product_attention(q, k, v)
 

@@ -6,7 +6,6 @@ Light of groups adds up to the scene's. Demodulated pictures: what reflects noth
 import dataclasses
 import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,16 +19,14 @@ from torch.nn.functional import interpolate
 from model import inference
 from model.config import ModelConfig, smoke
 from model.demodulated import compose_radiance, with_albedo
-from model.image_head import BilinearUpsample, DptHead, Fusion
-from model.inference import NeuralRenderer
-from model.light_groups import LightGroup, light_groups
+from model.inference import LightGroup, NeuralRenderer, light_groups
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
+from model.view_decoder import BilinearUpsample, DptHead, Fusion
 from model.weights import RANGE_KEY, TrainedRange, encode_weights, trained_range
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.raycast.first_hits import first_hits
-from storage.records.environment import Environment
 from storage.records.material import DIFFUSE, EMISSION, SPECULAR
 from storage.records.scene import Scene
 from tests.for_each import for_each
@@ -38,8 +35,25 @@ from tests.model.kit import RESOLUTION, awake, random_scene, render, tiny_config
 from tests.pipeline.renders.scene_kit import Part, box, flat, join, light, material, quad
 from tests.scenes_by_hand import tiny_scene
 
+FLOOR = quad(
+    [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]], material(diffuse=0.5)
+)
+CUBE = box([0, 0, 0.2], 0.4, material(diffuse=0.3))
+
+
 TRIANGLE = 0.05 * np.array([[-1.0, 1, 0], [1, -1, 0], [1, 1, 0]])
-ABOVE = np.array([0.0, 0, 2])
+
+
+def lamp(centre: tuple[float, float, float], radiance: float = 300.0) -> Part:
+    return light(TRIANGLE + np.array(centre), radiance)
+
+
+def row_of_lamps(count: int) -> list[Part]:
+    return [lamp((0.2 * at, 0, 2), 100 + at) for at in range(count)]
+
+
+def many_lights(count: int) -> Scene:
+    return join([FLOOR, *row_of_lamps(count)])
 
 
 def network() -> RenderFormer:
@@ -51,12 +65,6 @@ def network() -> RenderFormer:
         last.weight *= 0.1
         last.bias.fill_(0.3)
     return model
-
-
-def many_lights(count: int) -> Scene:
-    floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], material(diffuse=0.5))
-    lamps = [light(TRIANGLE + ABOVE + 0.2 * at * np.eye(3)[0], 100.0 + at) for at in range(count)]
-    return join([floor, *lamps])
 
 
 def test_three_lines_are_enough(tmp_path: Path) -> None:
@@ -89,45 +97,12 @@ def test_other_cameras_see_the_same_prepared_scene() -> None:
     )
 
 
-def _light_of(model: RenderFormer, scene: Scene, device: torch.device) -> Tensor:
-    """Stand for the first stage of an exactly linear network: the light of each channel."""
-    tensors = scene_tensors(scene)
-    a, b, c = tensors.triangles_T33.double().unbind(dim=1)
-    area_T = torch.linalg.cross(b - a, c - a).norm(dim=-1) / 2
-    emission_T3 = torch.pow(10.0, tensors.material_TM[:, EMISSION].double()) - 1
-    return (area_T[:, None] * emission_T3).sum(dim=0)
-
-
-def _flat_picture(_: RenderFormer, light_3: Tensor, *camera: Any) -> Tensor:
-    """Stand for its second stage: every pixel shows that light."""
-    return torch.log10(1 + light_3).expand(camera[-1], camera[-1], 3)
-
-
-@for_each(("count", "most"), [(64, 8), (64, 1), (9, 8), (20, 3)])
-def test_groups_give_what_a_linear_network_gives_at_once(
-    monkeypatch: pytest.MonkeyPatch, count: int, most: int
-) -> None:
-    """Emission goes through log10 in float32: 1e-6 relative."""
-    monkeypatch.setattr(inference, "_encode", _light_of)
-    monkeypatch.setattr(inference, "_decode", _flat_picture)
-    scene, renderer = many_lights(count), NeuralRenderer(network())
-
-    def picture(lights_per_pass: int) -> NDArray[np.float32]:
-        prepared = renderer.prepare(scene, lights_per_pass=lights_per_pass)
-        assert len(prepared.groups) == -(-count // lights_per_pass)
-        return renderer.view(prepared, scene.c2w[0], 40.0, 8)
-
-    at_once = picture(count)
-    assert at_once.min() > 0.1
-    np.testing.assert_allclose(picture(most), at_once, rtol=1e-6)
-
-
 def test_extremes_give_finite_pictures() -> None:
     model = awake(smoke(), torch.float32)
     with torch.no_grad():
         model.decoder.head.last.weight *= 0.1
     renderer = NeuralRenderer(model)
-    one = join([flat(TRIANGLE * 10, material(diffuse=0.5)), light(TRIANGLE + ABOVE, 1e4)])
+    one = join([flat(TRIANGLE * 10, material(diffuse=0.5)), lamp((0, 0, 2), 1e4)])
     for scene in (one, many_lights(64), tiny_scene()):
         for fov_deg in (1.0, 170.0):
             picture = renderer.view(renderer.prepare(scene), scene.c2w[0], fov_deg, 8)
@@ -195,30 +170,6 @@ def test_pictures_are_as_wide_as_those_that_it_was_trained_on() -> None:
         NeuralRenderer(network()).render(tiny_scene())
 
 
-def test_a_sky_that_is_left_out_is_said() -> None:
-    renderer = NeuralRenderer(network())
-    scene = tiny_scene()
-    environment = Environment(radiance_rgb=np.ones((2, 4, 3), np.float32))
-    below_sky = renderer.prepare(dataclasses.replace(scene, environment=environment))
-    assert any("has an environment" in note for note in below_sky.notes)
-    assert not any("environment" in note for note in renderer.prepare(scene).notes)
-
-
-FLOOR = quad(
-    [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]], material(diffuse=0.5)
-)
-CUBE = box([0, 0, 0.2], 0.4, material(diffuse=0.3))
-
-
-def lamp(centre: tuple[float, float, float], radiance: float = 300.0) -> Part:
-    triangle = 0.05 * np.array([[-1.0, 1, 0], [1, -1, 0], [1, 1, 0]])
-    return light(triangle + np.array(centre), radiance)
-
-
-def row_of_lamps(count: int) -> list[Part]:
-    return [lamp((0.2 * at, 0, 2), 100 + at) for at in range(count)]
-
-
 def emission_of(scene: Scene) -> dict[bytes, NDArray[np.float32]]:
     """Return the radiance of each emitting triangle by its corners."""
     corners = scene.vertex_positions[scene.faces[scene.triangle_emits]]
@@ -240,7 +191,7 @@ def test_a_scene_within_limits_is_rendered_as_it_is(count: int) -> None:
 
 @given(count=st.integers(9, 64), most=st.integers(1, 8))
 def test_the_light_of_the_groups_is_that_of_the_scene(count: int, most: int) -> None:
-    scene = join([FLOOR, *row_of_lamps(count)])
+    scene = many_lights(count)
     groups = light_groups(scene, most)
     assert max(counts(groups)) <= most
     assert len(groups) == -(-count // most)

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 
-from model.windows import cut_windows
+from model.attention import cut_windows
 
 CARD = torch.device("cuda", 0)
 GUARD = Path(__file__).with_name("guard.cpp")

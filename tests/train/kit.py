@@ -19,7 +19,6 @@ from tests.train.toy import toy_sample
 from train.data.bad_samples import BadSampleCounter
 from train.data.buckets import TrainingBatch, collate_batch
 from train.data.loader import LoaderSettings, load_batches
-from train.data.mixture import Mixture
 from train.data.order import RankSlice
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.evaluate import EvalConfig
@@ -28,9 +27,8 @@ from train.loop.step import Stepper
 from train.loop.train_state import TrainState, new_state
 from train.loss.training_loss import TrainingLoss
 from train.progress import TrainProgress
-from train.result import TrainResult
 from train.resume import StartOptions
-from train.run_training import train_run
+from train.run_training import TrainResult, train_run
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
 
 CPU = torch.device("cpu")
@@ -157,9 +155,7 @@ def take(
     first: int = 0,
     rank: int = 0,
     world_size: int = 1,
-    workers: int = 1,
-    unusable: BadSampleCounter | None = None,
-    mixture: Mixture | None = None,
+    **changes: Any,
 ) -> list[list[TrainingScene]]:
     """Return the batches first, first + 1, ... of the training split."""
     opened = open_training_data([str(data.folder.root)]) if isinstance(data, Dataset) else data
@@ -168,9 +164,7 @@ def take(
         settings,
         first,
         rank_slice=RankSlice(rank=rank, world_size=world_size),
-        workers=workers,
-        unusable=unusable or BadSampleCounter(0),
-        mixture=mixture,
+        **{"workers": 1, "unusable": BadSampleCounter(0), **changes},
     )
     with closing(batches):
         return list(itertools.islice(batches, count))

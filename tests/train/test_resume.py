@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from model.base_widths import BaseWidths
-from model.config import SIZES, large
+from model.config import SIZES, BaseWidths, large
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.removed import LAST_COMMIT

@@ -11,6 +11,7 @@ import re
 import shutil
 import signal
 import socket
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -41,8 +42,8 @@ from train.loop.checkpoints import read_checkpoint
 from train.loop.interrupts import Stopped
 from train.monitoring.rows import read_rows
 from train.progress import TrainProgress
-from train.result import TrainResult
 from train.resume import StartOptions
+from train.run_training import TrainResult
 from train.settings import LossSettings
 
 TIMINGS = {"views_per_s", "data_wait_share", "flops_per_s", "peak_share", "time_s", "memory_mb"}
@@ -346,13 +347,6 @@ def have_bfloat16(patch: pytest.MonkeyPatch, quick: bool) -> None:
     patch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: quick)
 
 
-class StopAfterEachStep(TrainProgress):
-    """A scheduler whose time is up after one step."""
-
-    def advance(self, **_: object) -> None:
-        os.kill(os.getpid(), signal.SIGTERM)
-
-
 @for_each("muon_rate, quick", [(0.0, True), (3.0, True), (3.0, False)])
 def test_resumed_after_every_step_is_uninterrupted(
     dataset: Dataset,
@@ -375,7 +369,8 @@ def test_resumed_after_every_step_is_uninterrupted(
     whole = trained(settings, dataset, tmp_path / "whole")
     for step in (1, 2, 3):
         with pytest.raises(TrilightError, match=f"stopped at step {step} "):
-            trained(settings, dataset, out, resume=step > 1, progress=StopAfterEachStep())
+            stop = SignalAt(step, signal.SIGTERM)
+            trained(settings, dataset, out, resume=step > 1, progress=stop)
     again = trained(settings, dataset, out, resume=True)
     assert again.folder.weights.read_bytes() == whole.folder.weights.read_bytes()
 
@@ -501,6 +496,9 @@ def test_a_second_trainer_is_refused_and_changes_nothing(dataset: Dataset, tmp_p
     class Second(Heard):
         def advance(self, *, step: int, **_: Any) -> None:
             if step == 6:
+                end = time.monotonic() + 60
+                while not saved_steps(out / "checkpoints") and time.monotonic() < end:
+                    time.sleep(0.01)  # it is written in the background
                 before = files()
                 for start in (
                     StartOptions(),

@@ -27,8 +27,8 @@ from train.loop.checkpoints import read_checkpoint
 from train.loop.recorder import read_rows
 from train.loop.step import PendingStats, Stepper
 from train.progress import TrainProgress
-from train.result import TrainResult
 from train.resume import StartOptions
+from train.run_training import TrainResult
 from train.settings import TrainSettings
 
 

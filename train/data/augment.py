@@ -20,7 +20,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.hits.textures import SurfaceTextures
 from model.scene_tensors import SceneTensors
 from storage.records.environment import Environment
 from storage.records.material import laid_out
@@ -93,7 +92,7 @@ def move_scene(scene: TrainingScene, rotation_33: Tensor, shift_3: Tensor) -> Tr
         triangles_T33=(old.triangles_T33.double() @ rotation_33.T + shift_3).float(),
         normals_T33=(old.normals_T33.double() @ rotation_33.T).float(),
         c2w_V44=(motion_44 @ old.c2w_V44.double()).float(),
-        sky=None if old.sky is None else rotate_sky(old.sky, rotation_33.numpy()),
+        sky=old.sky and rotate_sky(old.sky, rotation_33.numpy()),
     )
     return dataclasses.replace(scene, tensors=tensors)
 
@@ -108,16 +107,15 @@ def mirror_scene(scene: TrainingScene) -> TrainingScene:
     old = scene.tensors
     sides_3 = np.array([-1, 1, 1], np.float32)
     sides_4 = np.array([-1, 1, 1, 1], np.float32)
+    reversed_T3 = np.tile(np.array([2, 1, 0]), (old.num_triangles, 1))
     tensors = dataclasses.replace(
         old,
         triangles_T33=_tensor((old.triangles_T33.numpy() * sides_3)[:, ::-1]),
         normals_T33=_tensor((old.normals_T33.numpy() * sides_3)[:, ::-1]),
         # the reflection before and after: row and column of x change their signs
         c2w_V44=_tensor(sides_4[:, None] * old.c2w_V44.numpy() * sides_4),
-        textures=_reorder_texture_vertices(
-            old, np.tile(np.array([2, 1, 0]), (old.num_triangles, 1))
-        ),
-        sky=None if old.sky is None else mirror_sky(old.sky, sides_3),
+        textures=old.textures and old.textures.with_vertices(reversed_T3),
+        sky=old.sky and mirror_sky(old.sky, sides_3),
     )
     target_VRR3 = torch.from_numpy(_flip_columns(scene.target_VRR3.numpy()))
     return dataclasses.replace(scene, tensors=tensors, target_VRR3=target_VRR3, lights_VLRR3=None)
@@ -125,22 +123,20 @@ def mirror_scene(scene: TrainingScene) -> TrainingScene:
 
 def permute_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
     """Return the scene with permuted color channels. Drops the pictures of single lights."""
-    numbers = np.arange(scene.tensors.material_TM.shape[1])
-    for column, part in laid_out(scene.tensors.columns):
+    old = scene.tensors
+    numbers = np.arange(old.material_TM.shape[1])
+    for column, part in laid_out(old.columns):
         if column.is_colour:
             numbers[part] = numbers[part][order]
-    material_TM = _tensor(scene.tensors.material_TM.numpy()[:, numbers])
-    textures = scene.tensors.textures
-    if textures is not None:
-        textures = textures.with_channels(order)
-    sky = scene.tensors.sky
-    if sky is not None:
-        sky = permute_sky_channels(sky, order)
+    tensors = dataclasses.replace(
+        old,
+        material_TM=_tensor(old.material_TM.numpy()[:, numbers]),
+        textures=old.textures and old.textures.with_channels(order),
+        sky=old.sky and permute_sky_channels(old.sky, order),
+    )
     return dataclasses.replace(
         scene,
-        tensors=dataclasses.replace(
-            scene.tensors, material_TM=material_TM, textures=textures, sky=sky
-        ),
+        tensors=tensors,
         target_VRR3=torch.from_numpy(_reorder_channels(scene.target_VRR3.numpy(), order)),
         lights_VLRR3=None,
     )
@@ -158,20 +154,13 @@ def rotate_vertex_order(scene: TrainingScene, first_T: np.ndarray) -> TrainingSc
         old,
         triangles_T33=_take_vertices(old.triangles_T33, order_T3),
         normals_T33=_take_vertices(old.normals_T33, order_T3),
-        textures=_reorder_texture_vertices(old, order_T3),
+        textures=old.textures and old.textures.with_vertices(order_T3),
     )
     return dataclasses.replace(scene, tensors=tensors)
 
 
 def _take_vertices(values_T33: Tensor, order_T3: NDArray[np.int64]) -> Tensor:
     return _tensor(np.take_along_axis(values_T33.numpy(), order_T3[..., None], axis=1))
-
-
-def _reorder_texture_vertices(
-    tensors: SceneTensors, order_T3: NDArray[np.int64]
-) -> SurfaceTextures | None:
-    textures = tensors.textures
-    return None if textures is None else textures.with_vertices(order_T3)
 
 
 def _flip_columns(pictures_VRR3: NDArray) -> NDArray:
@@ -199,9 +188,7 @@ LN_10 = math.log(10.0)
 def scale_light(scene: TrainingScene, factor: float) -> TrainingScene:
     """Return the scene with all light scaled. Drops the pictures of single lights."""
     factor_T = torch.full((scene.tensors.num_triangles,), factor)
-    tensors = _scale_emission(scene.tensors, factor_T)
-    if tensors.sky is not None:
-        tensors = dataclasses.replace(tensors, sky=scale_sky(tensors.sky, factor))
+    tensors = _scale_emission(scene.tensors, factor_T, factor)
     lit = dataclasses.replace(scene, tensors=tensors, lights_VLRR3=None)
     if scene.levels_L is not None:
         return dataclasses.replace(lit, levels_L=_log10(factor * _linear(scene.levels_L)))
@@ -216,9 +203,7 @@ def mix_lights(scene: TrainingScene, factor_L: Tensor) -> TrainingScene:
     assert scene.lights_VLRR3 is not None
     factor_T = torch.cat([factor_L, torch.ones(1)])[scene.light_T]  # -1: belongs to no light
     mixed_VRR3 = torch.einsum("l,vlijc->vijc", factor_L, scene.lights_VLRR3)
-    tensors = _scale_emission(scene.tensors, factor_T)
-    if tensors.sky is not None:
-        tensors = dataclasses.replace(tensors, sky=scale_sky(tensors.sky, float(factor_L[-1])))
+    tensors = _scale_emission(scene.tensors, factor_T, float(factor_L[-1]))
     return dataclasses.replace(
         scene,
         tensors=tensors,
@@ -228,15 +213,16 @@ def mix_lights(scene: TrainingScene, factor_L: Tensor) -> TrainingScene:
     )
 
 
-def _scale_emission(tensors: SceneTensors, factor_T: Tensor) -> SceneTensors:
-    """Return the tensors with the radiance of each triangle multiplied by its factor."""
+def _scale_emission(tensors: SceneTensors, factor_T: Tensor, sky_factor: float) -> SceneTensors:
+    """Return the tensors with the radiance of each triangle and the sky times their factors."""
     material_TM = tensors.material_TM.clone()
     for column, part in laid_out(tensors.columns):
         if column.is_radiance and column.is_log_encoded:
             material_TM[:, part] = _log10(factor_T[:, None] * _linear(material_TM[:, part]))
         elif column.is_radiance:
             material_TM[:, part] *= factor_T[:, None]
-    return dataclasses.replace(tensors, material_TM=material_TM)
+    sky = tensors.sky and scale_sky(tensors.sky, sky_factor)
+    return dataclasses.replace(tensors, material_TM=material_TM, sky=sky)
 
 
 def _linear(log10: Tensor) -> Tensor:

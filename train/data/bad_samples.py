@@ -77,31 +77,25 @@ def first_samples(shards: ShardSet, limit: int, unusable: BadSampleCounter) -> I
         TrilightError: more samples are damaged than `unusable` allows.
     """
     count = len(shards.parts)
-    for row, part in enumerate(shards.parts):
-        yield from _first_of_source(shards, part, limit // count + (row < limit % count), unusable)
-
-
-def _first_of_source(
-    shards: ShardSet, part: range, limit: int, unusable: BadSampleCounter
-) -> Iterator[Sample]:
-    remaining = limit
-    for number in part:
-        if not remaining:
-            return
-        try:
-            shard = shards.open(number)
-        except TrilightError as error:
-            unusable.add(shards.names[number], count_lost_samples(shards, number), error)
-            continue
-        with closing(shard):
-            for row, key in enumerate(shard.keys[:remaining]):
-                try:
-                    sample = shard.sample(row)
-                except TrilightError as error:
-                    unusable.add(f"{shard.name}: sample {key}", 1, error)
-                    continue
-                yield sample
-                remaining -= 1
+    for source, part in enumerate(shards.parts):
+        remaining = limit // count + (source < limit % count)
+        for number in part:
+            if not remaining:
+                break
+            try:
+                shard = shards.open(number)
+            except TrilightError as error:
+                unusable.add(shards.names[number], count_lost_samples(shards, number), error)
+                continue
+            with closing(shard):
+                for row, key in enumerate(shard.keys[:remaining]):
+                    try:
+                        sample = shard.sample(row)
+                    except TrilightError as error:
+                        unusable.add(f"{shard.name}: sample {key}", 1, error)
+                        continue
+                    yield sample
+                    remaining -= 1
 
 
 def count_lost_samples(shards: ShardSet, number: int) -> int:

@@ -40,27 +40,18 @@ class TrainingBatch:
     arrived: torch.cuda.Event | None = None
     """Event at the end of the copy to the GPU; None if no copy was started."""
 
-    def map_tensors(self, convert: Callable[[Tensor], Tensor]) -> "TrainingBatch":
-        """Return the batch with each tensor converted."""
-        return dataclasses.replace(
-            self,
-            scenes=map_tensors(self.scenes, convert),
-            target_BVRR3=convert(self.target_BVRR3),
-            noise_BV=convert(self.noise_BV),
-            levels_BL=None if self.levels_BL is None else convert(self.levels_BL),
-        )
-
     def to(self, device: torch.device) -> "TrainingBatch":
         """Return the batch on a device, with its targets; waits for a copy that was started."""
         if self.arrived is not None:
             stream = torch.cuda.current_stream(device)
             stream.wait_event(self.arrived)
             # the memory belongs to another stream, which must not reuse it too early
-            self.map_tensors(lambda tensor: _record_use(tensor, stream))
+            map_tensors(self, lambda tensor: _record_use(tensor, stream))
             return dataclasses.replace(self, arrived=None)._with_targets()
         if device.type == "cpu":
             return self._with_targets()
-        return self.map_tensors(lambda tensor: tensor.to(device, non_blocking=True))._with_targets()
+        moved = map_tensors(self, lambda tensor: tensor.to(device, non_blocking=True))
+        return moved._with_targets()
 
     def _with_targets(self) -> "TrainingBatch":
         """Look targets up if not done yet; the numbers equal those of `with_target`."""
@@ -158,7 +149,7 @@ def _make_step_scenes(
 ) -> StepScenes:
     batches = bucket_scenes(scenes, cost, max_scenes)
     if pins:
-        batches = [batch.map_tensors(torch.Tensor.pin_memory) for batch in batches]
+        batches = [map_tensors(batch, Tensor.pin_memory) for batch in batches]
     return StepScenes(
         batches=batches,
         keys=tuple(scene.key for scene in scenes),
@@ -180,9 +171,7 @@ class CopyStream:
         sent = []
         with torch.cuda.stream(self._stream):
             for batch in batches:
-                copied = batch.map_tensors(
-                    lambda tensor: tensor.to(self._device, non_blocking=True)
-                )
+                copied = map_tensors(batch, lambda each: each.to(self._device, non_blocking=True))
                 sent.append(dataclasses.replace(copied, arrived=self._stream.record_event()))
         return sent
 

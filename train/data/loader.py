@@ -1,19 +1,21 @@
 """DataLoader of training datasets, as an IterableDataset: endless batches, decoded by threads.
 
 Batch i holds the same scenes with the same augmentation wherever the stream starts, for any number
-of ranks and threads: a run resumes by the number of its step.
+of ranks and threads: a run resumes by the number of its step, and every start chooses the number of
+threads again, from the free cores and memory of the machine.
 """
 
 import dataclasses
 import itertools
-import queue
+import os
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import closing, nullcontext, suppress
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
-from types import TracebackType
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -21,19 +23,18 @@ import numpy as np
 from model.scene_tensors import lit_sky, require_known_sky
 from storage.dataset.shard_set import OpenShard, ShardSet
 from storage.errors import TrilightError
+from storage.machine import allowed_cores, free_memory
 from storage.records.sample import StoredSample
 from storage.seeds import rng_for
 from train.data.augment import augment_scene, withhold_inputs
 from train.data.bad_samples import BadSampleCounter, count_lost_samples
-from train.data.mixture import Mixture, mix_visits
 from train.data.order import (
-    OrderSettings,
+    Mixture,
     RankSlice,
     Visit,
-    batch_visits,
+    mix_visits,
     shuffled_shards,
     visits_from,
-    windows_from,
 )
 from train.data.scenes import (
     TrainingScene,
@@ -44,7 +45,8 @@ from train.data.scenes import (
 
 if TYPE_CHECKING:
     from model.config import ModelConfig
-    from train.settings import AugmentationSettings
+    from train.settings import AugmentationSettings, TrainSettings
+
 
 PREFETCHED_SCENES = 16
 """Number of scenes decoded ahead of the network; at least one batch is."""
@@ -74,10 +76,6 @@ class LoaderSettings:
     """True to look targets up in the decoding threads, False to do it on the device."""
     network: "ModelConfig | None" = None
     """Configuration of the network, whose traced inputs are computed here; None traces none."""
-
-    @property
-    def order(self) -> OrderSettings:
-        return OrderSettings(seed=self.seed, window=self.window)
 
 
 def load_batches(
@@ -111,14 +109,14 @@ def load_batches(
     pool = ThreadPoolExecutor(workers, "decode") if workers else _InlineExecutor()
     with OpenShards(shards) as opened, pool as decoders:
         maker = _SceneMaker(shards, opened, settings, unusable)
-        counted = _SampleCounts(shards, unusable)
-        plan = _plan_batches(counted, settings, mixture, first, rank_slice, opened)
+        counts = [partial(_count_samples, shards, unusable, part) for part in shards.parts]
+        plan = _plan_batches(shards, counts, settings, mixture, first, rank_slice, opened)
         waiting: deque[tuple[list[Visit], list[Future[TrainingScene]]]] = deque()
         depth = (
             -(-PREFETCHED_SCENES * rank_slice.world_size // settings.batch_size) if workers else 0
         )
         try:
-            with closing(prefetch(plan, _plan_ahead(counted, settings, mixture))) as batches:
+            with closing(prefetch(plan, _plan_ahead(shards, counts, settings, mixture))) as batches:
                 for mine in batches:
                     waiting.append((mine, [decoders.submit(maker.scene, p) for p in mine]))
                     if len(waiting) > depth:
@@ -147,12 +145,7 @@ class OpenShards:
     def __enter__(self) -> "OpenShards":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close all shards; wait for those being opened, whose files must not be left open."""
         self._opening.shutdown(wait=True, cancel_futures=True)
         with self._lock:
@@ -202,28 +195,19 @@ class _InlineExecutor(Executor):
         return done
 
 
-class _SampleCounts:
-    """Sizes of the shards of each dataset; an unusable shard counts as empty."""
-
-    def __init__(self, shards: ShardSet, unusable: BadSampleCounter) -> None:
-        self._shards = shards
-        self._unusable = unusable
-        self.parts = shards.parts
-
-    def in_part(self, part: range) -> Callable[[int], int]:
-        """Return a function from a shard's number in its dataset to its number of samples."""
-        return lambda number: self._count(part.start + number)
-
-    def _count(self, number: int) -> int:
-        try:
-            return self._shards.num_samples(number)
-        except TrilightError as error:
-            self._unusable.add(self._shards.names[number], 1, error)
-            return 0
+def _count_samples(shards: ShardSet, unusable: BadSampleCounter, part: range, number: int) -> int:
+    """Return the size of a dataset's shard; an unusable one counts as empty."""
+    number += part.start
+    try:
+        return shards.num_samples(number)
+    except TrilightError as error:
+        unusable.add(shards.names[number], 1, error)
+        return 0
 
 
 def _plan_batches(
-    counted: _SampleCounts,
+    shards: ShardSet,
+    counts: Sequence[Callable[[int], int]],
     settings: LoaderSettings,
     mixture: Mixture | None,
     first: int,
@@ -234,29 +218,32 @@ def _plan_batches(
     position = first * settings.batch_size
     begin = (position,) if mixture is None else mixture.counts_before(position)
     streams = [
-        visits_from(windows_from(len(part), counted.in_part(part), settings.order, start), start)
-        for part, start in zip(counted.parts, begin, strict=True)
+        visits_from(len(part), count, start, seed=settings.seed, window=settings.window)
+        for part, count, start in zip(shards.parts, counts, begin, strict=True)
     ]
-    if mixture is None:
-        visits = streams[0]
-    else:
-        visits = mix_visits(mixture, streams, counted.parts, position)
-    for batch in batch_visits(visits, settings.batch_size):
-        mine = rank_slice.of_batch(batch)
+    visits = streams[0]
+    if mixture is not None:
+        visits = mix_visits(mixture, streams, shards.parts, position)
+    while True:
+        mine = rank_slice.of_batch(tuple(itertools.islice(visits, settings.batch_size)))
         opened.plan(visit.shard for visit in mine)
         yield mine
 
 
-def _plan_ahead(counted: _SampleCounts, settings: LoaderSettings, mixture: Mixture | None) -> int:
+def _plan_ahead(
+    shards: ShardSet,
+    counts: Sequence[Callable[[int], int]],
+    settings: LoaderSettings,
+    mixture: Mixture | None,
+) -> int:
     """Return the number of batches to plan ahead: about a window, to open its shards in time.
 
     With several datasets it is the window that ends first.
     """
     weights = (1.0,) if mixture is None else mixture.weights
     ahead = []
-    for part, weight in zip(counted.parts, weights, strict=True):
-        some = shuffled_shards(len(part), settings.order, 0)[0]
-        window = counted.in_part(part)(some) * settings.window
+    for part, count, weight in zip(shards.parts, counts, weights, strict=True):
+        window = count(shuffled_shards(len(part), settings.seed, 0)[0]) * settings.window
         ahead.append(int(window * sum(weights) / weight) // settings.batch_size)
     return max(min(ahead), 1)
 
@@ -293,16 +280,14 @@ class _SceneMaker:
         if settings.network is None:
             return seen
         # imported here since they load pydantic
-        from model.config import BundleStage
         from model.demodulated import with_albedo
         from model.hits.tracing import with_traced
 
-        stage = settings.network.stage
         # after the augmentation, which therefore need not transform traced inputs
-        if isinstance(stage, BundleStage):
-            if not stage.albedo_rays:
+        if not settings.network.by_hits:
+            if not settings.network.demodulated:
                 return seen
-            tensors = with_albedo(seen.tensors, settings.resolution, stage.albedo_rays)
+            tensors = with_albedo(seen.tensors, settings.resolution, settings.network.hit_rays)
             return dataclasses.replace(seen, tensors=tensors)
         noise = int(rng.integers(2**31))
         tensors = with_traced(seen.tensors, settings.resolution, settings.network, noise)
@@ -372,39 +357,69 @@ def prefetch(items: Iterator[Item], depth: int) -> Generator[Item, None, None]:
     Args:
         depth: maximum number of items to compute ahead.
     """
-    ready: queue.Queue[tuple[Item] | BaseException | None] = queue.Queue(depth)
-    closed = threading.Event()
-    worker = threading.Thread(target=_fill, args=(items, ready, closed), daemon=True)
-    worker.start()
-    try:
-        while (item := ready.get()) is not None:
-            if isinstance(item, BaseException):
-                raise item
-            yield item[0]
-    finally:
-        closed.set()
-        with suppress(queue.Empty):
-            while True:
-                ready.get_nowait()
-        worker.join()
-
-
-def _fill(
-    items: Iterator[Item],
-    ready: "queue.Queue[tuple[Item] | BaseException | None]",
-    closed: threading.Event,
-) -> None:
-    made: tuple[Item] | BaseException | None
-    while not closed.is_set():
+    end: Any = object()
+    with ThreadPoolExecutor(1, "prefetch") as thread:
+        ahead = deque(thread.submit(next, items, end) for _ in range(depth + 1))
         try:
-            made = (next(items),)
-        except StopIteration:
-            made = None
-        except Exception as error:
-            made = error
-        while not closed.is_set():
-            with suppress(queue.Full):
-                ready.put(made, timeout=0.1)
-                break
-        if not isinstance(made, tuple):
-            return
+            while (item := ahead.popleft().result()) is not end:
+                ahead.append(thread.submit(next, items, end))
+                yield item
+        finally:
+            thread.shutdown(cancel_futures=True)
+
+
+MAX_THREADS = 8
+"""Maximum number of threads; more would wait for Python's lock. When threads only decode, two to
+three saturate it (study S56); tracing for the view stage `hits` releases it."""
+
+SCENES_AT_WORK = 4
+"""Memory of a thread, in scenes as a batch holds them: decoded and waiting ones."""
+
+_BYTES_OF_PIXEL = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Machine:
+    """Resources of this node that the processes of a run share."""
+
+    cores: float
+    """Number of allowed cores, or the smaller CPU quota of their control group."""
+    free_bytes: int | None = None
+    """Free memory in bytes; None if unknown."""
+    processes: int = 1
+    """Number of the run's processes on this node."""
+
+
+def detect_machine(root: Path = Path("/")) -> Machine:
+    """Detect cores, memory and processes of this node; `root` is that of the file system."""
+    return Machine(
+        cores=allowed_cores(root),
+        free_bytes=free_memory(root),
+        processes=max(int(os.environ.get("LOCAL_WORLD_SIZE", "1")), 1),
+    )
+
+
+def choose_workers(
+    machine: Machine, settings: "TrainSettings", *, on_gpu: bool, busy_threads: int
+) -> tuple[int, str]:
+    """Return the number of decoding threads, 1 or more, and its reason as a sentence.
+
+    Args:
+        settings: settings of the run, which determine the memory of its scenes.
+        on_gpu: True if the network is on a GPU, for which the main thread needs a core.
+        busy_threads: CPU threads of a network that is not on a GPU.
+    """
+    cores = machine.cores / machine.processes
+    spare = cores - (1 if on_gpu else busy_threads)
+    threads = min(max(int(spare), 1), MAX_THREADS)
+    reason = f"{machine.cores:g} cores"
+    if machine.processes > 1:
+        reason += f" for {machine.processes} processes"
+    if machine.free_bytes is not None:
+        scene = _BYTES_OF_PIXEL * settings.views_per_scene * settings.resolution**2
+        fits = machine.free_bytes // 2 // machine.processes // (SCENES_AT_WORK * scene)
+        if fits < threads:
+            threads = max(fits, 1)
+            reason += f" and {machine.free_bytes / 2**30:.1f} GiB of free memory"
+    decision = "1 thread decodes" if threads == 1 else f"{threads} threads decode"
+    return threads, f"{decision} samples, by {reason}"

@@ -1,19 +1,33 @@
-"""Shuffled order of a run's scenes: a pure function of seed, epoch and sizes of the shards.
+"""Order of a run's scenes: a pure function of seed, epoch, and sizes of the shards.
 
 Shards are shuffled; then the samples of each window of a few consecutive shards are shuffled.
 Epochs follow one another without a gap, and global batch i is the samples at positions i B to
 (i + 1) B - 1 of that endless order, for any number of ranks and workers. A resume needs only the
-number of the batch.
+number of the batch. A batch is split over the ranks by shard, so that each rank reads few shards of
+a window.
 
-A batch is split over the ranks by shard, so that each rank reads few shards of a window.
+In a mixture of several datasets, each keeps the order that it would have alone, repeats it after
+its last scene, and advances only when it is chosen. Datasets alternate as evenly as the weights
+allow: the k-th scene of a dataset is due at time (k + 1/2) / weight, and the earliest is next, so
+that every section of the stream holds each dataset's fraction to within a scene or two. The number
+of scenes of each before a position follows from the weights alone.
 """
 
+import dataclasses
+import heapq
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
+from typing import TYPE_CHECKING, Annotated, Any
 
+from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
 from storage.seeds import rng_for
+from storage.settings.ranges import FLOAT32_MAX, Within
+
+if TYPE_CHECKING:
+    from train.settings import TrainSettings
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -30,26 +44,6 @@ class Visit:
     """Position of the shard in the order of its epoch."""
     source: int = 0
     """Number of the dataset if several are mixed, from 0."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShardWindow:
-    """Shards that are open at the same time, and the shuffled order of their samples."""
-
-    shards: tuple[int, ...]
-    """Numbers of the shards, in the order of the epoch."""
-    visits: tuple[Visit, ...]
-    """Every sample of these shards exactly once, shuffled."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class OrderSettings:
-    """Settings that determine the order, besides the shards."""
-
-    seed: int
-    """Seed of the run's order."""
-    window: int
-    """Number of shards whose samples are shuffled together, at least 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,19 +78,20 @@ class RankSlice:
         return sorted(mine, key=lambda visit: visit.position)
 
 
-def shuffled_shards(num_shards: int, settings: OrderSettings, epoch: int) -> list[int]:
+def shuffled_shards(num_shards: int, seed: int, epoch: int) -> list[int]:
     """Return the shard numbers in the order of an epoch."""
-    rng = rng_for(settings.seed, "shards", epoch)
-    return [int(shard) for shard in rng.permutation(num_shards)]
+    return [int(shard) for shard in rng_for(seed, "shards", epoch).permutation(num_shards)]
 
 
-def windows_from(
-    num_shards: int, num_samples: Callable[[int], int], settings: OrderSettings, first: int
-) -> Iterator[ShardWindow]:
-    """Yield endless windows, beginning with the one that holds position `first`.
+def visits_from(
+    num_shards: int, num_samples: Callable[[int], int], first: int, *, seed: int, window: int
+) -> Iterator[Visit]:
+    """Yield endless visits, from position `first` on.
 
     Args:
         num_samples: returns the size of a shard; called only for shards that are reached.
+        seed: of the run's order.
+        window: number of shards whose samples are shuffled together, at least 1.
 
     Raises:
         TrilightError: all shards are empty.
@@ -105,30 +100,174 @@ def windows_from(
     epoch, start = (first // total, first // total * total) if total else (0, 0)
     while True:
         epoch_start = start
-        order = shuffled_shards(num_shards, settings, epoch)
-        for number, at in enumerate(range(0, num_shards, settings.window)):
-            shards = order[at : at + settings.window]
+        order = shuffled_shards(num_shards, seed, epoch)
+        for number, at in enumerate(range(0, num_shards, window)):
+            shards = order[at : at + window]
             sizes = [num_samples(shard) for shard in shards]
             if any(sizes) and start + sum(sizes) > first:
-                rng = rng_for(settings.seed, "samples", epoch, number)
+                drawn = rng_for(seed, "samples", epoch, number).permutation(sum(sizes))
                 arrivals = [(a, row) for a, size in enumerate(sizes) for row in range(size)]
-                visits = (
-                    Visit(position=start + p, shard=shards[a], row=row, arrival=at + a)
-                    for p, (a, row) in enumerate(arrivals[i] for i in rng.permutation(sum(sizes)))
-                )
-                yield ShardWindow(shards=tuple(shards), visits=tuple(visits))
+                for position, (a, row) in enumerate((arrivals[i] for i in drawn), start):
+                    if position >= first:
+                        yield Visit(position=position, shard=shards[a], row=row, arrival=at + a)
             start += sum(sizes)
         if start == epoch_start:
             raise TrilightError(f"all {num_shards} shards are empty; expected a sample.")
         epoch += 1
 
 
-def visits_from(windows: Iterator[ShardWindow], first: int) -> Iterator[Visit]:
-    """Yield endless visits, from position `first` on."""
-    return (visit for window in windows for visit in window.visits if visit.position >= first)
+RECORD = "mixture"
+"""Name of the entry in a checkpoint's header and in settings.json."""
 
 
-def batch_visits(visits: Iterator[Visit], batch_size: int) -> Iterator[tuple[Visit, ...]]:
-    """Yield endless batches of visits."""
-    while True:
-        yield tuple(itertools.islice(visits, batch_size))
+@dataclass(frozen=True, kw_only=True)
+class Mixture:
+    """Weights of datasets in a stream from some position on."""
+
+    digests: tuple[str, ...]
+    """Digest of each dataset, in their order."""
+    names: tuple[str, ...]
+    """Display name of each dataset."""
+    weights: Annotated[tuple[float, ...], Within(0, FLOAT32_MAX, low_open=True)]
+    """Relative number of scenes of each dataset."""
+    first: Annotated[int, Within(0, 2**63 - 1, unit="scenes")] = 0
+    """First position of the stream with this mixture: 0, or where the run's data, weights or batch
+    size changed."""
+    before: Annotated[tuple[int, ...], Within(0, 2**63 - 1, unit="scenes")]
+    """Number of scenes of each dataset before that position."""
+    scenes_per_step: Annotated[int, Within(1, 10**9, unit="scenes")]
+    """Number of scenes of a global batch."""
+
+    def __post_init__(self) -> None:
+        if len({len(self.digests), len(self.names), len(self.weights), len(self.before)}) > 1:
+            raise TrilightError("mixture: expected as many names, weights and counts as digests.")
+
+    def counts_before(self, position: int) -> tuple[int, ...]:
+        """Return the number of scenes of each dataset before a position, `first` or later.
+
+        The time does not depend on the position.
+        """
+        exact = self._exact_weights
+        number = position - self.first
+        time = max(number - len(exact), 0) / sum(exact)  # lower bounds of the counts, then the rest
+        counts = [int(time * weight + Fraction(1, 2)) for weight in exact]
+        for source in itertools.islice(self._source_order(counts), number - sum(counts)):
+            counts[source] += 1
+        return tuple(now + then for now, then in zip(counts, self.before, strict=True))
+
+    def sources_from(self, position: int) -> Iterator[int]:
+        """Yield the number of the dataset at each position, from one on without end."""
+        counts = [
+            now - then for now, then in zip(self.counts_before(position), self.before, strict=True)
+        ]
+        return self._source_order(counts)
+
+    def _source_order(self, counts: Sequence[int]) -> Iterator[int]:
+        """Yield the number of the next dataset, without end, after `counts` scenes of each."""
+        waits = [1 / weight for weight in self._exact_weights]
+        due = [
+            ((count + Fraction(1, 2)) * wait, source)
+            for source, (count, wait) in enumerate(zip(counts, waits, strict=True))
+        ]
+        heapq.heapify(due)
+        while True:
+            time, source = due[0]
+            yield source
+            heapq.heapreplace(due, (time + waits[source], source))
+
+    @property
+    def _exact_weights(self) -> list[Fraction]:
+        """Exact decimal weights as fractions, so that rounding does not accumulate."""
+        return [Fraction(repr(weight)) for weight in self.weights]
+
+    def __str__(self) -> str:
+        """Return percentages and names, for a note."""
+        total = sum(self.weights)
+        shares = zip(self.names, self.digests, self.weights, strict=True)
+        return ", ".join(
+            f"{weight / total:.1%} {name} ({digest.rpartition(':')[2][:8]})"
+            for name, digest, weight in shares
+        )
+
+    def record(self) -> dict[str, Any]:
+        """Return the mixture as JSON values."""
+        return dataclasses.asdict(self)
+
+
+def mix_visits(
+    mixture: Mixture, visits: Sequence[Iterator[Visit]], parts: Sequence[range], first: int
+) -> Iterator[Visit]:
+    """Yield the visits of the stream without end, from position `first` on.
+
+    Args:
+        visits: endless visits of each dataset, after the scenes of `mixture.counts_before`.
+        parts: shard numbers of each dataset among all.
+    """
+    for position, source in enumerate(mixture.sources_from(first), first):
+        visit = next(visits[source])
+        shard = parts[source].start + visit.shard
+        yield dataclasses.replace(visit, position=position, shard=shard, source=source)
+
+
+def plan_mixture(
+    data: TrainingData, settings: "TrainSettings", header: Mapping[str, Any] | None
+) -> Mixture | None:
+    """Return the mixture of a run from here on; None if it has only had one dataset.
+
+    Args:
+        header: header of the checkpoint that is resumed; None for a new run. A dataset that the run
+            has used before continues at its position.
+
+    Raises:
+        TrilightError: the number of weights is not that of the datasets.
+    """
+    sources = data.sources
+    old = None if header is None else _mixture_of_header(header)
+    if settings.data_weights and len(settings.data_weights) != len(sources):
+        raise TrilightError(
+            f"data_weights holds {len(settings.data_weights)} numbers, but --data names "
+            f"{len(sources)} {'dataset' if len(sources) == 1 else 'datasets'}; expected one for "
+            "each, in their order, or none for shares in proportion to their numbers of scenes."
+        )
+    if len(sources) == 1 and (old is None or old.digests == (sources[0].digest,)):
+        if header is None or RECORD not in header:
+            return None
+    position = 0 if header is None else header["step"] * settings.scenes_per_step
+    seen_counts = dict[str, int]()
+    if old is not None and header is not None:
+        counts = old.counts_before(header["step"] * old.scenes_per_step)
+        seen_counts = dict(zip(old.digests, counts, strict=True))
+    shards = data.split("train")
+    weights = tuple(map(float, settings.data_weights)) or tuple(
+        float(sum(map(shards.num_samples, part))) for part in shards.parts
+    )
+    new = Mixture(
+        digests=tuple(source.digest for source in sources),
+        names=tuple(source.name for source in sources),
+        weights=weights,
+        first=position,
+        before=tuple(seen_counts.get(source.digest, 0) for source in sources),
+        scenes_per_step=settings.scenes_per_step,
+    )
+    identity_fields = ("digests", "weights", "scenes_per_step")
+    unchanged = old is not None and all(
+        getattr(old, name) == getattr(new, name) for name in identity_fields
+    )
+    return old if unchanged else new
+
+
+def _mixture_of_header(header: Mapping[str, Any]) -> Mixture:
+    """Return the mixture of a checkpoint, or that of its single dataset."""
+    if RECORD in header:
+        record: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in header[RECORD].items()
+        }
+        return Mixture(**record)
+    return Mixture(
+        digests=(header["data_digest"],),
+        names=("",),
+        weights=(1.0,),
+        before=(0,),
+        scenes_per_step=header["settings"]["scenes_per_step"],
+    )

@@ -48,22 +48,18 @@ class TrainingScene:
     (`with_target`); None otherwise."""
 
 
-def training_scene(
-    sample: Sample, resolution: int, *, most_triangles: int = 0, lights_apart: bool = False
-) -> TrainingScene:
+def training_scene(sample: Sample, resolution: int, *, lights_apart: bool = False) -> TrainingScene:
     """Return a sample at the resolution of the run.
 
     Args:
         sample: sample that passes `Sample.check`.
         resolution: width of the pictures in pixels.
-        most_triangles: maximum number of triangles; 0 sets no limit.
         lights_apart: True to include the pictures of each light.
 
     Raises:
-        TrilightError: the resolution does not divide the sample's, or the scene has too many
-            triangles or no pictures of single lights.
+        TrilightError: the resolution does not divide the sample's, or the scene has no pictures of
+            single lights.
     """
-    require_few_triangles(sample.key, sample.scene, most_triangles)
     scene = _scene_of(sample.key, sample.scene, sample.views, sample.radiance_rgb, resolution)
     if not lights_apart:
         return scene

@@ -1,4 +1,4 @@
-"""Judges every method on every view of a split, and adds the missing rows.
+"""Judges every method on every view of a split, adds the missing rows, and makes tables of them.
 
 The evaluation is that of one network (`train.evaluation.evaluate`): targets, masks, metrics and
 stated errors are equal. Scores are stored in rows.jsonl, so that no view is evaluated twice; its
@@ -7,6 +7,7 @@ first line names the dataset, each other one is a `Row`.
 
 import dataclasses
 import functools
+import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -26,11 +27,18 @@ from storage.records.sample import Sample
 from storage.renderer import Camera, Renderer, fingerprint
 from storage.typed_json import read_json_lines
 from train.data.bad_samples import BadSampleCounter, first_samples
-from train.evaluation.judged_view import JudgedView, scene_facts
+from train.evaluation.cost_charts import on_front
+from train.evaluation.equal_time import Price, median_price, time_scene
+from train.evaluation.judged_view import (
+    METRIC,
+    JudgedView,
+    PairedLead,
+    paired_lead,
+    scene_facts,
+    summarize_views,
+)
 from train.evaluation.metrics import METRICS, noise_floors, picture_scores
-from train.evaluation.stored_pictures import PictureSource
-from train.evaluation.timing import Price, time_scene
-from train.evaluation.validation import ValidationScene, validation_scene
+from train.evaluation.validation import PictureSource, ValidationScene, validation_scene
 from train.loss.lpips import Lpips
 
 UNKNOWN_MACHINE = "a machine that is not named"
@@ -266,18 +274,14 @@ def judge_all(board: Board, on_progress: OnProgress) -> None:
         judged = functools.cache(functools.partial(validation_scene, sample, width))
         for method in board.present(width):
             timed = row < board.timed_scenes and not isinstance(method, PictureSource)
-            if not _has_all(board, method, sample, timed=timed):
+            views = range(sample.scene.num_views)
+            keys = [board.key_of(method, sample.key, view) for view in views]
+            is_priced = not timed or board.rows.price(keys[0], board.machine) is not None
+            if not is_priced or any(board.rows.get(key) is None for key in keys):
                 on_progress(done, total, f"{width} px, {method.name}")
                 _judge(board, method, sample, judged, timed=timed)
         _judge_noise(board, sample, width, judged)
     on_progress(total, total, "")
-
-
-def _has_all(board: Board, method: Method, sample: Sample, *, timed: bool) -> bool:
-    """Return whether a method has the rows of a scene, and its price if it is timed there."""
-    keys = [board.key_of(method, sample.key, view) for view in range(sample.scene.num_views)]
-    is_priced = not timed or board.rows.price(keys[0], board.machine) is not None
-    return is_priced and all(board.rows.get(key) is not None for key in keys)
 
 
 def _judge(
@@ -329,3 +333,88 @@ def _show(
     cameras = [Camera.of_scene(scene, view) for view in range(scene.num_views)]
     pictures = [loaded.render(camera).radiance_rgb for camera in cameras]
     return pictures, measured.price if measured else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Standing:
+    """Figures of one method at one width."""
+
+    name: str
+    """Name of the method, or NOISE."""
+    kind: str
+    """Kind of method; empty for NOISE."""
+    first_s: float | None
+    """Median CPU seconds of a scene's first view; None without times."""
+    further_s: float | None
+    """Median CPU seconds of a further view; None without times."""
+    timed_scenes: int
+    """Number of scenes behind these medians."""
+    scores: Mapping[str, Any]
+    """Summary of each metric by name (train.evaluation.judged_view.summarize_views)."""
+    lead: PairedLead | None
+    """Paired difference from the rival; None for the rival and for NOISE."""
+    on_front: bool | None
+    """True on the Pareto front of error and costs; None without costs."""
+
+    @property
+    def median_db(self) -> float:
+        """Median of METRIC over the views, by which the table is sorted."""
+        return float(self.scores[METRIC]["median"])
+
+
+@dataclass(frozen=True, kw_only=True)
+class WidthStandings:
+    """Table of one width."""
+
+    width: int
+    """Width of the pictures in pixels."""
+    num_views: int
+    """Number of views that all methods rendered."""
+    triangles: Mapping[str, int]
+    """Number of triangles of each scene by its key."""
+    standings: tuple[Standing, ...]
+    """Rows, NOISE first, then sorted from the best to the worst."""
+    pairs: Mapping[tuple[str, str], PairedLead]
+    """Paired difference of the first from the second, for every pair of names."""
+
+    @property
+    def num_scenes(self) -> int:
+        """Number of scenes of these views."""
+        return len(self.triangles)
+
+
+def standings_of(board: Board, width: int, rival: str) -> WidthStandings | None:
+    """Return the table of a width, compared with `rival`; None without a judged view."""
+    views = list(board.views(width))
+    if not views:
+        return None
+    names = [name for name in views[0].scores if name != NOISE]
+    pairs = {two: paired_lead(views, *two) for two in itertools.permutations(names, 2)}
+    scores = {name: summarize_views(views, name) for name in [NOISE, *names]}
+    prices = board.prices(width)
+    costs = {name: median_price(each) for name, each in prices.items()}
+    figures = [
+        (-float(scores[name][METRIC]["median"]), (cost.first_s, cost.further_s))
+        for name, cost in costs.items()
+    ]
+    front = dict(zip(costs, on_front(figures), strict=True))
+    standings = [
+        Standing(
+            name=name,
+            kind=board.kinds.get(name, ""),
+            first_s=costs[name].first_s if name in costs else None,
+            further_s=costs[name].further_s if name in costs else None,
+            timed_scenes=len(prices.get(name, ())),
+            scores=summary,
+            lead=pairs.get((name, rival)),
+            on_front=front.get(name),
+        )
+        for name, summary in scores.items()
+    ]
+    return WidthStandings(
+        width=width,
+        num_views=len(views),
+        triangles={view.key: view.num_triangles for view in views},
+        standings=tuple(sorted(standings, key=lambda one: (one.name != NOISE, -one.median_db))),
+        pairs=pairs,
+    )

@@ -2,15 +2,12 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from train.evaluation.board import NOISE
+from train.evaluation.board import NOISE, WidthStandings
 from train.evaluation.cost_charts import SeriesPoint, draw_panels
-from train.evaluation.judged_view import NETWORK, JudgedView
-from train.evaluation.pairs import METRIC
-from train.evaluation.standings import Standing, WidthStandings
+from train.evaluation.judged_view import METRIC, NETWORK, JudgedView
 
 _PANEL = (7.4, 6.2)
 _DPI = 110
@@ -23,60 +20,46 @@ def plot_leaderboard(widths: Sequence[WidthStandings], title: str, path: Path) -
     import matplotlib
 
     matplotlib.use("Agg")  # before pyplot: no display is needed
-    with matplotlib.rc_context({"text.parse_math": False}):  # names may hold dollar signs
-        _plot(widths, title, path)
-
-
-def _plot(widths: Sequence[WidthStandings], title: str, path: Path) -> None:
     import matplotlib.pyplot as plt
 
-    figure, panels = plt.subplots(
-        1,
-        len(widths),
-        figsize=(_PANEL[0] * len(widths), _PANEL[1]),
-        dpi=_DPI,
-        squeeze=False,
-        layout="constrained",
-    )
-    figure.suptitle(title, fontsize=12)
-    for axes, one in zip(panels.flat, widths, strict=True):
-        axes.set_title(f"{one.width} x {one.width} pixels, {one.num_views} views", fontsize=11)
-        axes.set_xlabel("CPU seconds, one thread", fontsize=_FONT)
-        axes.set_ylabel(f"median {METRIC}, higher is better", fontsize=_FONT)
-        for standing in one.standings:
-            if standing.first_s is None:
-                _line_across(axes, standing)
-    draw_panels(figure, list(panels.flat), [_points(one) for one in widths], _COSTS)
-    figure.savefig(path, metadata={"Software": None})
-    plt.close(figure)
-
-
-def _points(one: WidthStandings) -> list[SeriesPoint]:
-    return [
-        SeriesPoint(
-            name=each.name,
-            kind=each.kind,
-            costs=[each.first_s, each.further_s],
-            error=each.median_db,
+    with matplotlib.rc_context({"text.parse_math": False}):  # names may hold dollar signs
+        figure, panels = plt.subplots(
+            1,
+            len(widths),
+            figsize=(_PANEL[0] * len(widths), _PANEL[1]),
+            dpi=_DPI,
+            squeeze=False,
+            layout="constrained",
         )
-        for each in one.standings
-        if each.first_s is not None and each.further_s is not None
-    ]
-
-
-def _line_across(axes: Any, standing: Standing) -> None:
-    is_noise = standing.name == NOISE
-    axes.axhline(standing.median_db, color="0.45", linewidth=1, linestyle="--" if is_noise else ":")
-    axes.annotate(
-        standing.name,
-        (1, standing.median_db),
-        xycoords=("axes fraction", "data"),
-        xytext=(-4, 3),
-        textcoords="offset points",
-        fontsize=_FONT,
-        color="0.3",
-        horizontalalignment="right",
-    )
+        groups = []
+        for axes, one in zip(panels.flat, widths, strict=True):
+            axes.set_title(f"{one.width} x {one.width} pixels, {one.num_views} views", fontsize=11)
+            axes.set_xlabel("CPU seconds, one thread", fontsize=_FONT)
+            axes.set_ylabel(f"median {METRIC}, higher is better", fontsize=_FONT)
+            groups.append(list[SeriesPoint]())
+            for each in one.standings:
+                if each.first_s is None or each.further_s is None:
+                    style = "--" if each.name == NOISE else ":"
+                    axes.axhline(each.median_db, color="0.45", linewidth=1, linestyle=style)
+                    axes.annotate(
+                        each.name,
+                        (1, each.median_db),
+                        xycoords=("axes fraction", "data"),
+                        xytext=(-4, 3),
+                        textcoords="offset points",
+                        fontsize=_FONT,
+                        color="0.3",
+                        horizontalalignment="right",
+                    )
+                    continue
+                costs = [each.first_s, each.further_s]
+                groups[-1].append(
+                    SeriesPoint(name=each.name, kind=each.kind, costs=costs, error=each.median_db)
+                )
+        figure.suptitle(title, fontsize=12)
+        draw_panels(figure, list(panels.flat), groups, _COSTS)
+        figure.savefig(path, metadata={"Software": None})
+    plt.close(figure)
 
 
 _COLUMNS = 3

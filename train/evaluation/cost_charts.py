@@ -1,14 +1,50 @@
 """Charts of errors against costs: a marker for each cost, a color for each kind, and names.
 
-A point is drawn at each of its costs, always at the height of its error, with a line between.
+A point is drawn at each of its costs, always at the height of its error, with a line between. Also
+numbers as text for tables, and the Pareto front.
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from storage.palette import METHOD_COLORS, OTHERS
+
+COST_NOISE = 0.03
+"""Relative difference below which costs count as equal: CPU seconds vary by that much."""
+
+
+def number_text(value: float) -> str:
+    """Return a number with two or three significant digits, mostly without powers of ten."""
+    size = abs(value)
+    if value == 0 or size >= 100:
+        return f"{value:.0f}"
+    if size >= 10:
+        return f"{value:.1f}"
+    return f"{value:.2f}" if size >= 0.1 else f"{value:.2g}"
+
+
+def on_front(figures: Sequence[tuple[float, Sequence[float]]]) -> list[bool]:
+    """Return for each point whether it is on the Pareto front: no other point dominates it.
+
+    A point with less error dominates if none of its costs is more than COST_NOISE higher; one with
+    the same error, if none of its costs is higher and one is more than COST_NOISE lower. The front
+    is never empty, since a dominating point has less error, or the same error and less cost.
+
+    Args:
+        figures: error (smaller is better) and costs above 0 of each point, equally many costs.
+    """
+    return [not any(_dominates(other, mine) for other in figures) for mine in figures]
+
+
+def _dominates(other: tuple[float, Sequence[float]], mine: tuple[float, Sequence[float]]) -> bool:
+    costs = list(zip(other[1], mine[1], strict=True))
+    if other[0] < mine[0]:
+        return all(a <= (1 + COST_NOISE) * b for a, b in costs)
+    lower = any((1 + COST_NOISE) * a < b for a, b in costs)
+    return other[0] == mine[0] and lower and all(a <= b for a, b in costs)
+
 
 _FONT = 9
 
@@ -37,51 +73,41 @@ def draw_panels(
 
     What else the panels show must be drawn before, since names avoid it.
     """
+    from matplotlib.lines import Line2D
+
     next_colors = itertools.cycle(OTHERS)
     kinds = dict.fromkeys(one.kind for points in groups for one in points)
     colors = {
         name: METHOD_COLORS.get(name.partition(",")[0]) or next(next_colors) for name in kinds
     }
     for axes, points in zip(panels, groups, strict=True):
-        _draw_points(axes, points, colors)
-    _draw_legend(figure, costs, colors)
-    figure.canvas.draw()  # places are known from here on
-    for axes, points in zip(panels, groups, strict=True):
-        names = [(one.name, (one.costs[0], one.error)) for one in points]
-        further_costs = [(cost, one.error) for one in points for cost in one.costs[1:]]
-        _place_labels(axes, names, further_costs)
-
-
-def _draw_points(axes: Any, points: Sequence[SeriesPoint], colors: Mapping[str, str]) -> None:
-    """Draw each point at each of its costs, on a logarithmic axis."""
-    axes.grid(alpha=0.25)
-    axes.set_xscale("log")
-    axes.margins(x=0.14, y=0.12)
-    axes.tick_params(labelsize=_FONT)
-    for one in points:
-        color = colors[one.kind]
-        heights = [one.error] * len(one.costs)
-        axes.plot(one.costs, heights, "-", color=color, linewidth=1, alpha=0.5)
-        for row, cost in enumerate(one.costs):
-            face = color if row == 0 else "white"
-            axes.plot(cost, one.error, "o", color=color, markerfacecolor=face, markersize=6)
-    plain_log(axes.xaxis)
-
-
-def _draw_legend(figure: Any, costs: Sequence[str], colors: Mapping[str, str]) -> None:
-    """Draw the legend of markers (costs) and colors (kinds) below the axes."""
-    from matplotlib.lines import Line2D
-
+        axes.grid(alpha=0.25)
+        axes.set_xscale("log")
+        axes.margins(x=0.14, y=0.12)
+        axes.tick_params(labelsize=_FONT)
+        for one in points:
+            color = colors[one.kind]
+            heights = [one.error] * len(one.costs)
+            axes.plot(one.costs, heights, "-", color=color, linewidth=1, alpha=0.5)
+            for row, cost in enumerate(one.costs):
+                face = color if row == 0 else "white"
+                axes.plot(cost, one.error, "o", color=color, markerfacecolor=face, markersize=6)
+        plain_log(axes.xaxis)
     grey = [
         Line2D([], [], linestyle="", marker="o", color="0.35", label=cost,
                markerfacecolor="0.35" if row == 0 else "white")
         for row, cost in enumerate(costs)
     ]  # fmt: skip
-    kinds = [Line2D([], [], linewidth=4, color=color, label=name) for name, color in colors.items()]
+    lines = [Line2D([], [], linewidth=4, color=color, label=name) for name, color in colors.items()]
     figure.legend(
-        handles=[*kinds, *(grey if len(costs) > 1 else ())],
+        handles=[*lines, *(grey if len(costs) > 1 else ())],
         loc="outside lower center", ncols=3, fontsize=_FONT, frameon=False,
     )  # fmt: skip
+    figure.canvas.draw()  # places are known from here on
+    for axes, points in zip(panels, groups, strict=True):
+        names = [(one.name, (one.costs[0], one.error)) for one in points]
+        further_costs = [(cost, one.error) for one in points for cost in one.costs[1:]]
+        _place_labels(axes, names, further_costs)
 
 
 _PLACES = (

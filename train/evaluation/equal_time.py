@@ -1,4 +1,4 @@
-"""Equal-time baseline: the path tracer with as many CPU seconds as a network.
+"""CPU seconds of renderers, and the path tracer with as many of them as a network.
 
 A network is timed on a few scenes of its evaluation, and so are previews of 1, 2, 4, ... samples
 per pixel with either filter. The baseline is the preview of the most samples whose further view
@@ -12,12 +12,73 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from storage.errors import TrilightError, Unrenderable
 from storage.records.sample import Sample
-from storage.renderer import Renderer
-from train.evaluation.judged_view import NETWORK, JudgedView, summarize_views
-from train.evaluation.pairs import interval_text, paired_lead
-from train.evaluation.timing import Price, median_price, time_scene
+from storage.records.scene import Scene
+from storage.renderer import Camera, ReadyScene, Renderer
+from train.evaluation.judged_view import (
+    NETWORK,
+    JudgedView,
+    interval_text,
+    paired_lead,
+    summarize_views,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Price:
+    """CPU seconds of a renderer."""
+
+    first_s: float
+    """CPU seconds of the first view of a scene, loading included."""
+    further_s: float
+    """CPU seconds of a further view."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TimedScene:
+    """Scene that a renderer has loaded, with what that and its pictures take."""
+
+    loaded: ReadyScene
+    radiance_rgb: NDArray[np.float32]
+    """[R, R, 3] linear radiance of the first view."""
+    price: Price
+    """Medians over the measured rounds."""
+
+
+def time_scene(renderer: Renderer, scene: Scene, name: str, rounds: int = 1) -> TimedScene:
+    """Load a scene and render its first view twice, in rounds after one that warms everything up.
+
+    Args:
+        renderer: a renderer that states its CPU seconds.
+        name: name of the scene in messages.
+
+    Raises:
+        Unrenderable, TrilightError: as `Renderer.load` and `ReadyScene.render`.
+    """
+    camera = Camera.of_scene(scene, 0)
+    prices = []
+    for _ in range(1 + rounds):
+        loaded = renderer.load(scene, name)
+        first = loaded.render(camera)
+        further = loaded.render(camera)
+        first_s = (loaded.cpu_seconds or 0.0) + (first.cpu_seconds or 0.0)
+        prices.append(Price(first_s=first_s, further_s=further.cpu_seconds or 0.0))
+    return TimedScene(
+        loaded=loaded, radiance_rgb=further.radiance_rgb, price=median_price(prices[1:])
+    )
+
+
+def median_price(prices: Sequence[Price]) -> Price:
+    """Return the medians of prices."""
+    return Price(
+        first_s=float(np.median([price.first_s for price in prices])),
+        further_s=float(np.median([price.further_s for price in prices])),
+    )
+
 
 TRACER = "path tracer, same time"
 """Name of the path tracer among the evaluated methods."""
@@ -39,17 +100,13 @@ Level = tuple[int, Filter]
 
 
 @dataclass(frozen=True, kw_only=True)
-class TracerTimes:
+class TracerTimes(Price):
     """Settings and times of the path tracer at equal time."""
 
     samples: int
     """Number of samples per pixel."""
     denoiser: Filter
     """Name of the denoiser's filter."""
-    first_s: float
-    """CPU seconds of the first view of a scene."""
-    further_s: float
-    """CPU seconds of each further view."""
     note: str
     """Remark about the machine's path tracer; empty if there is none."""
 

@@ -10,8 +10,7 @@ from pydantic import SkipValidation
 
 from model.hits.traced import INPUTS, with_others_tokens
 from model.hits.tracing import with_traced
-from model.inference import NeuralRenderer
-from model.light_groups import light_groups
+from model.inference import NeuralRenderer, light_groups
 from model.renderformer import RenderFormer
 from model.scene_tensors import SceneTensors
 from model.weights import MAX_LIGHTS
@@ -30,8 +29,7 @@ from train.evaluation.judged_view import GROUPED, NETWORK, JudgedView, scene_fac
 from train.evaluation.metrics import noise_floors, picture_scores
 from train.evaluation.options import SceneCount, Width
 from train.evaluation.sheet import SheetView
-from train.evaluation.stored_pictures import Baselines
-from train.evaluation.validation import ValidationScene, predict, validation_scene
+from train.evaluation.validation import Baselines, ValidationScene, predict, validation_scene
 from train.loss.lpips import Lpips
 
 BASELINE_SCENES = 256
@@ -99,7 +97,7 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
     every, first = spread_views(config.tracer_views, config.num_scenes)
     for number, sample in enumerate(config.samples()):
         scene = validation_scene(sample, config.resolution)
-        if config.network.config.view_stage == "hits":
+        if config.network.config.by_hits:
             tensors = with_traced(
                 scene.scene.tensors,
                 config.resolution,
@@ -247,8 +245,7 @@ def grouped_pictures(
     Returns:
         Linear radiance [V, R, R, 3] of at least 0, or None if one pass takes every light.
     """
-    by_hits = network.config.view_stage == "hits"
-    if by_hits or len(light_groups(scene, MAX_LIGHTS)) == 1:
+    if network.config.by_hits or len(light_groups(scene, MAX_LIGHTS)) == 1:
         return None
     renderer = NeuralRenderer(network)
     prepared = renderer.prepare(scene)

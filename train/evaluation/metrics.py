@@ -16,8 +16,7 @@ from storage.records.sample import Sample, ViewRecord
 from storage.registry import Registry
 from storage.seeds import rng_for
 from train.loss.lpips import Lpips
-from train.loss.ms_ssim import ssim
-from train.loss.training_loss import tone_map
+from train.loss.training_loss import ssim, tone_map
 
 
 @dataclass(frozen=True, kw_only=True)

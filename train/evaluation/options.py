@@ -14,12 +14,6 @@ Width = Annotated[int, Within(1, 8192, unit="pixels")]
 """Width of an image in pixels."""
 SceneCount = Annotated[int, Within(1, 10**9, unit="scenes")]
 """Maximum number of scenes to evaluate."""
-TracedViews = Annotated[int, Within(0, 10**6, unit="views")]
-"""Maximum number of views for the path tracer."""
-
-
-TimedScenes = Annotated[int, Within(1, 10**6, unit="scenes")]
-"""Maximum number of scenes on which everything is timed."""
 
 
 @checked()
@@ -40,7 +34,7 @@ class LeaderboardOptions:
     that divide it, else the dataset's own."""
     scenes: SceneCount = 10**6
     """Maximum number of scenes, from the start of the split."""
-    timed_scenes: TimedScenes = 20
+    timed_scenes: Annotated[int, Within(1, 10**6, unit="scenes")] = 20
     """Maximum number of scenes on which CPU seconds are measured."""
     split: Literal["train", "validation", "test"] = "test"
     """Split of the dataset for the evaluation."""
@@ -82,7 +76,7 @@ class EvaluationOptions:
     else the dataset's."""
     most_scenes: SceneCount = 10**6
     """Maximum number of scenes to evaluate, taken from the start of the split."""
-    tracer_views: TracedViews = 64
+    tracer_views: Annotated[int, Within(0, 10**6, unit="views")] = 64
     """Maximum number of views on which the denoised path tracer is judged in the network's own
     time; 0 leaves it out."""
     lpips: str | None = None

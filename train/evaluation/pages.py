@@ -1,19 +1,116 @@
-"""Evaluation and leaderboard as Markdown for people, and as CSV tables for programs."""
+"""Evaluation and leaderboard as JSON values, as Markdown for people, and as CSV for programs."""
 
 import csv
+import dataclasses
 import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from storage.markdown import inert, table, text
-from train.evaluation.board import NOISE
-from train.evaluation.cost_tables import number_text
+from train.evaluation.board import NOISE, WidthStandings
+from train.evaluation.cost_charts import number_text
 from train.evaluation.equal_time import TRACER, sentences
-from train.evaluation.judged_view import NEAR_DB, NETWORK
+from train.evaluation.judged_view import (
+    GROUPED,
+    METRIC,
+    NEAR_DB,
+    NETWORK,
+    JudgedView,
+    PairedLead,
+    by_group,
+    interval_text,
+    summarize_views,
+)
 from train.evaluation.metrics import METRICS
-from train.evaluation.pairs import METRIC, PairedLead, interval_text
-from train.evaluation.report import PUBLISHED, PUBLISHED_ROWS, PUBLISHED_WHERE
-from train.evaluation.standings import WidthStandings
+
+BENCHMARK = "benchmark-v1"
+"""Name of our public test set (pipeline.presets.judging)."""
+
+_METRICS = ("psnr_linear_db", "ssim", "lpips", "hdr_flip")
+
+_SHOWN = {
+    "RenderFormer, 12 + 6 layers, 205 M (the paper's)": (29.77, 0.9526, 0.0551, 0.1751),
+    "9 + 9 layers": (30.11, 0.9554, 0.0512, 0.1735),
+    "6 + 12 layers": (30.38, 0.9560, 0.0504, 0.1685),
+    "view stage in world space": (28.98, 0.9420, 0.0631, 0.1904),
+    "without DPT": (29.75, 0.9476, 0.0552, 0.1806),
+    "without self-attention of rays": (29.70, 0.9503, 0.0570, 0.1766),
+    "without either": (29.15, 0.9396, 0.0641, 0.1836),
+}
+
+PUBLISHED_ROWS: Mapping[str, Mapping[str, float]] = {
+    name: dict(zip(_METRICS, figures, strict=True)) for name, figures in _SHOWN.items()
+}
+"""Zeng et al. 2025, Table 1: means over 400 scenes of four views each, 256 x 256."""
+
+PUBLISHED = next(iter(PUBLISHED_ROWS.values()))
+"""Scores of the network whose weights were published."""
+
+PUBLISHED_WHERE = (
+    "The paper's figures (Zeng et al. 2025, Table 1) are of 400 scenes of its own with four views "
+    "each at 256 x 256, which were never released, and it does not say how it tone-mapped: same "
+    "kind of set, not the same set."
+)
+
+
+def record(
+    views: Sequence[JudgedView],
+    about: Mapping[str, Any],
+    traced: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Return all measurements of an evaluation as JSON values.
+
+    Args:
+        about: network, data, split and resolution, as the report shows them.
+        traced: comparison at equal time (evaluation.equal_time); None if it was not measured.
+    """
+    ours = summarize_views(views)
+    both = [view for view in views if GROUPED in view.scores]  # one pass, and groups of lights
+    published = {
+        metric: {"published": figure, "ours": ours[metric]["mean"]}
+        for metric, figure in PUBLISHED.items()
+    }
+    return {
+        "about": dict(about),
+        "metrics": {name: metric.meaning for name, metric in METRICS.items()},
+        "contestants": {
+            name: summarize_views(views, name)
+            for name in views[0].scores
+            if all(name in view.scores for view in views)
+        },
+        "path tracer": traced,
+        "swapped scenes": loss_by_swapping(views),
+        "light passes": {
+            "one pass": summarize_views(both, NETWORK),
+            "groups": summarize_views(both, GROUPED),
+        }
+        if both
+        else None,
+        "published": published if about.get("build") == BENCHMARK else None,
+        "groups": by_group(views),
+        "views": [dataclasses.asdict(view) for view in views],
+    }
+
+
+def loss_by_swapping(views: Sequence[JudgedView]) -> dict[str, Any] | None:
+    """Return the loss of psnr_log_db with another scene's triangles; None for a single scene."""
+    losses_db = [
+        own_db - view.swapped_psnr_log_db
+        for view in views
+        if view.swapped_psnr_log_db is not None
+        and (own_db := view.scores[NETWORK]["psnr_log_db"]) is not None
+    ]
+    if not losses_db:
+        return None
+    return {
+        "views": len(losses_db),
+        "median_db": float(np.median(losses_db)),
+        "mean_db": float(np.mean(losses_db)),
+        "share_lost": float(np.mean(np.array(losses_db) > 0)),
+    }
+
 
 _NONE = "n/a"
 _PAPER_PX = 256
@@ -21,7 +118,7 @@ _PARTS = ("median", "worse_5_percent", "mean", "median_worse_than_noise")
 
 
 def evaluation_page(report: Mapping[str, Any]) -> str:
-    """Return evaluation.md of a report (train.evaluation.report.record)."""
+    """Return evaluation.md of a report (train.evaluation.pages.record)."""
     contestants = report["contestants"]
     network = contestants[NETWORK]
     lines = ["# Evaluation", "", *_facts(report["about"])]
@@ -31,7 +128,25 @@ def evaluation_page(report: Mapping[str, Any]) -> str:
         "",
         scores_table(contestants),
     ]
-    lines += ["", *_noise_lines(network), *_equal_time_lines(report["path tracer"])]
+    gaps = [_score(name, network[name]["median_worse_than_noise"]) for name in METRICS]
+    drawn = ", ".join(name for name, metric in METRICS.items() if metric.floor is None)
+    lines += [
+        "",
+        "Median of how much worse the network's picture is than the noise of its own target. The "
+        "noise of the PSNRs was measured, at the resolution of the data; log_l1 stands against an "
+        f"upper bound of it, and against independent noise of that size stand {drawn}:",
+        "",
+        table(["", *METRICS], [["worse than noise", *gaps]], numbers=len(gaps)),
+        "",
+        f"{network['near_floor']:.1%} of {network['views']} views are within {NEAR_DB:g} dB of "
+        "their floor.",
+    ]
+    if traced := report["path tracer"]:
+        lines += ["", "## Beside the path tracer, in the network's own time", ""]
+        lines += [text(" ".join(sentences(traced)))]
+        if "tracer" in traced:
+            both = {NETWORK: traced["network"], TRACER: traced["tracer"]}
+            lines += ["", scores_table(both)]
     if loss := report["swapped scenes"]:
         lines += ["", swapped_text(loss)]
     if report["published"]:
@@ -105,31 +220,6 @@ def _meanings(meanings: Mapping[str, str]) -> list[str]:
         "",
         *(f"- `{name}` ({better[name]} is better): {text(meanings[name])}" for name in meanings),
     ]
-
-
-def _noise_lines(network: Mapping[str, Any]) -> list[str]:
-    gaps = [_score(name, network[name]["median_worse_than_noise"]) for name in METRICS]
-    drawn = ", ".join(name for name, metric in METRICS.items() if metric.floor is None)
-    return [
-        "Median of how much worse the network's picture is than the noise of its own target. The "
-        "noise of the PSNRs was measured, at the resolution of the data; log_l1 stands against an "
-        f"upper bound of it, and against independent noise of that size stand {drawn}:",
-        "",
-        table(["", *METRICS], [["worse than noise", *gaps]], numbers=len(gaps)),
-        "",
-        f"{network['near_floor']:.1%} of {network['views']} views are within {NEAR_DB:g} dB of "
-        "their floor.",
-    ]
-
-
-def _equal_time_lines(traced: Mapping[str, Any] | None) -> list[str]:
-    if traced is None:
-        return []
-    lines = ["", "## Beside the path tracer, in the network's own time", ""]
-    lines += [text(" ".join(sentences(traced)))]
-    if "tracer" not in traced:
-        return lines
-    return [*lines, "", scores_table({NETWORK: traced["network"], TRACER: traced["tracer"]})]
 
 
 def _medians_table(parts: Mapping[str, Any]) -> str:

@@ -36,7 +36,7 @@ from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions
 from storage.settings.ranges import Within
 from storage.typed_json import FINITE, Sha256, read_json
-from train.data.mixture import RECORD, Mixture
+from train.data.order import RECORD, Mixture
 from train.loop.distributed import DistributedContext
 from train.loop.schedule import decay_start_step
 from train.loop.step import StepReport
@@ -184,8 +184,20 @@ def newest_checkpoint(
         raise TrilightError(
             f"{folder.parent}: no checkpoint here to resume from; start the run without --resume."
         )
-    checkpoint = _newest_readable(folder, steps, note)
-    step = checkpoint.header["step"]
+    damaged = []
+    for step in reversed(steps):
+        try:
+            checkpoint = read_checkpoint(path_of_step(folder, step))
+            break
+        except TrilightError as error:
+            damaged.append(str(error))
+    else:
+        raise TrilightError(
+            f"{folder.parent}: none of its checkpoints can be resumed from. {' '.join(damaged)} "
+            "Restore one from a copy, or start the run again in another folder."
+        )
+    if damaged:
+        note(f"{' '.join(damaged)} The run goes on from that of step {step}")
     # bit by bit: a float32 mean of large numbers is rounded, and all processes must agree
     if any(0 < share < 1 for share in dist_context.mean([step >> bit & 1 for bit in range(32)])):
         raise TrilightError(
@@ -194,23 +206,6 @@ def newest_checkpoint(
             "again."
         )
     return checkpoint
-
-
-def _newest_readable(folder: Path, steps: list[int], note: Callable[[str], None]) -> Checkpoint:
-    damaged = []
-    for step in reversed(steps):
-        try:
-            checkpoint = read_checkpoint(path_of_step(folder, step))
-        except TrilightError as error:
-            damaged.append(str(error))
-            continue
-        if damaged:
-            note(f"{' '.join(damaged)} The run goes on from that of step {step}")
-        return checkpoint
-    raise TrilightError(
-        f"{folder.parent}: none of its checkpoints can be resumed from. {' '.join(damaged)} "
-        "Restore one from a copy, or start the run again in another folder."
-    )
 
 
 def save_checkpoint(
@@ -237,17 +232,17 @@ def save_checkpoint(
     """
     step = state.step
     data = _encode_checkpoint(state, settings, data_digest, world_size)
-    submit(lambda: _write_and_prune(folder, step, data, settings))
 
+    def write_and_prune() -> None:
+        _write_sealed(path_of_step(folder, step), data)
+        remove_leftovers(folder)
+        passed = [saved for saved in saved_steps(folder) if saved <= step]
+        for old in passed[: -settings.checkpoints_kept]:
+            milestone = settings.keep_every and old % settings.keep_every == 0
+            if not milestone and old != decay_start_step(settings):
+                path_of_step(folder, old).unlink(missing_ok=True)
 
-def _write_and_prune(folder: Path, newest: int, data: bytes, settings: TrainSettings) -> None:
-    _write_sealed(path_of_step(folder, newest), data)
-    remove_leftovers(folder)
-    passed = [step for step in saved_steps(folder) if step <= newest]
-    for step in passed[: -settings.checkpoints_kept]:
-        milestone = settings.keep_every and step % settings.keep_every == 0
-        if not milestone and step != decay_start_step(settings):
-            path_of_step(folder, step).unlink(missing_ok=True)
+    submit(write_and_prune)
 
 
 class BackgroundWriter:

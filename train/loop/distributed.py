@@ -21,15 +21,11 @@ Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistributedContext:
+class DistributedContext(RankSlice):
     """Rank and device of this process, and collective operations over all processes."""
 
     device: torch.device
     """Device of this process's copy of the network."""
-    rank: int = 0
-    """Number of this process, from 0."""
-    world_size: int = 1
-    """Number of processes that train together."""
     local_rank: int = 0
     """Number of this process on its machine, from 0."""
 
@@ -37,11 +33,6 @@ class DistributedContext:
     def is_first(self) -> bool:
         """True in the process that logs, validates and saves."""
         return self.rank == 0
-
-    @property
-    def rank_slice(self) -> RankSlice:
-        """Slice of every global batch that this process takes."""
-        return RankSlice(rank=self.rank, world_size=self.world_size)
 
     def mean(self, values: Sequence[float]) -> list[float]:
         """Return the means over all processes, equal on each; all must call it."""

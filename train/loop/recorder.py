@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from model.renderformer import count_parameters
 from storage.atomic import append_line, write_atomically
 from storage.settings.described import settings_record
 from train.evaluation.sheet import draw_validation_sheet
@@ -26,17 +27,24 @@ class Recorder:
         settings: TrainSettings,
         judge: Judge | None,
         progress: TrainProgress,
+        state: TrainState,
         *,
-        first_step: int,
         wandb: str | None = None,
     ) -> None:
+        """Report the start of the run at `state`, whose step is the last one of the log."""
+        progress.begin(
+            step=state.step,
+            num_steps=settings.num_steps,
+            num_parameters=count_parameters(state.model),
+            median_scores=judge.median_scores if judge else None,
+        )
         self.progress = progress
         self._folder = folder
         self._settings = settings
         self._judge = judge
-        self._log = MetricsLog(folder.metrics, first_step=first_step)
+        self._log = MetricsLog(folder.metrics, first_step=state.step)
         self._boards: list[TensorBoardLogger | WandbLogger] = [
-            TensorBoardLogger(folder.tensorboard, first_step=first_step)
+            TensorBoardLogger(folder.tensorboard, first_step=state.step)
         ]
         if wandb is not None:
             self._boards.append(WandbLogger(wandb, folder.root, settings_record(settings)))

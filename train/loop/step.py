@@ -9,7 +9,6 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -19,12 +18,11 @@ from model.precision import fast_float32_products
 from storage.errors import TrilightError
 from train.data.buckets import TrainingBatch
 from train.loop.compiled import compile_parts, is_compiler_error, undo_compiling
-from train.loop.decision import defers_sync, make_decision
 from train.loop.distributed import DistributedContext
+from train.loop.optimizer import Decision, defers_sync
 from train.loop.train_state import TrainState
 from train.loss.training_loss import TrainingLoss
-from train.monitoring.activity import Activity
-from train.monitoring.layers import LayerNorms
+from train.monitoring.activity import Activity, LayerNorms
 from train.settings import Precision, TrainSettings
 
 
@@ -47,16 +45,6 @@ class StepReport:
 PendingStats = Tensor
 """Statistics of a step, float64 [7] on the device: loss, L1, predicted and target brightness,
 gradient norm, 1 if it was applied, above 0 if a process was asked to stop."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SyncedSteps:
-    """Statistics of several steps, on the host."""
-
-    reports: list[StepReport]
-    """Report of each step, in their order."""
-    asked_to_stop: bool
-    """True if any process received a signal before one of the steps; equal in all processes."""
 
 
 class Stepper:
@@ -94,7 +82,7 @@ class Stepper:
 
     def step(self, batches: Sequence[TrainingBatch], learning_rate: float) -> StepReport:
         """Launch a step, wait for it, and return its report; see `launch`."""
-        (report,) = self.sync([self.launch(batches, learning_rate)]).reports
+        (report,), _ = self.sync([self.launch(batches, learning_rate)])
         return report
 
     def launch(
@@ -121,20 +109,16 @@ class Stepper:
         except Exception as error:
             if not (self.is_compiled and is_compiler_error(error)):
                 raise
-            self._leave_compiler(error)
-        return self._launch_once(batches, learning_rate, asked_to_stop=asked_to_stop)
-
-    def _leave_compiler(self, error: Exception) -> None:
-        """Switch compilation off, before the weights have moved; raise if it was required."""
-        reason = f"torch {torch.__version__} cannot compile the network ({type(error).__name__})"
-        if self._settings.compile == "yes" or self._dist_context.world_size > 1:
-            raise TrilightError(
-                f"training: {reason}; expected a version that can. Say --set compile=no, with "
-                "--resume where there is a checkpoint, or install another torch."
-            ) from error
-        undo_compiling(self._state.model, self._objective)
+            what = f"torch {torch.__version__} cannot compile the network ({type(error).__name__})"
+            if self._settings.compile == "yes" or self._dist_context.world_size > 1:
+                raise TrilightError(
+                    f"training: {what}; expected a version that can. Say --set compile=no, with "
+                    "--resume where there is a checkpoint, or install another torch."
+                ) from error
+        undo_compiling(self._state.model, self._objective)  # the weights have not moved yet
         self.is_compiled = False
-        self.remarks.append(f"{reason}: it runs kernel by kernel, which takes longer")
+        self.remarks.append(f"{what}: it runs kernel by kernel, which takes longer")
+        return self._launch_once(batches, learning_rate, asked_to_stop=asked_to_stop)
 
     def _launch_once(
         self, batches: Sequence[TrainingBatch], learning_rate: float, *, asked_to_stop: bool
@@ -146,7 +130,9 @@ class Stepper:
         sums = torch.zeros(4, dtype=torch.float64, device=self._dist_context.device)
         for index, batch in enumerate(batches):
             last = index == len(batches) - 1
-            with contextlib.nullcontext() if last else self._without_exchange():
+            net = self._net  # the gradients are exchanged with the last batch's
+            apart = not last and isinstance(net, DistributedDataParallel) and net
+            with apart.no_sync() if apart else contextlib.nullcontext():
                 sums += self._add_gradient(
                     batch.to(self._dist_context.device), num_views, last=last
                 )
@@ -166,17 +152,23 @@ class Stepper:
         """Update weights and EMA if the step is finite; return whether it is, bool []."""
         state = self._state
         updates = self._updates if self.defer_sync else state.updates
-        decision = make_decision(loss, norm, updates, defer_sync=self.defer_sync)
+        applied = torch.isfinite(loss) & torch.isfinite(norm)
+        decision = Decision(applied=applied, updates=updates, defer_sync=self.defer_sync)
         state.updater.step(learning_rate, decision)
         state.update_ema(self._settings.ema_decay, decision)
-        self._updates += decision.applied
+        self._updates += applied
         self.layers.record_update()
-        return decision.applied
+        return applied
 
-    def sync(self, steps: Sequence[PendingStats]) -> SyncedSteps:
-        """Wait for steps, and for pending layer statistics, with a single copy to the host."""
+    def sync(self, steps: Sequence[PendingStats]) -> tuple[list[StepReport], bool]:
+        """Wait for steps, and for pending layer statistics, with a single copy to the host.
+
+        Returns:
+            The report of each step, in their order, and whether any process received a signal
+            before one of them, which is equal in all processes.
+        """
         self.activity.begin("device")
-        layers = self.layers.pending()
+        layers = self.layers.pending
         parts = [*steps, *([] if layers is None else [layers.to(steps[0]).flatten()])]
         values = torch.cat(parts).tolist()
         self.activity.begin("other")
@@ -184,9 +176,7 @@ class Stepper:
         rows = [values[width * row : width * (row + 1)] for row in range(len(steps))]
         if layers is not None:
             self.layers.set_values(values[width * len(steps) :])
-        return SyncedSteps(
-            reports=[_report(row) for row in rows], asked_to_stop=any(row[-1] > 0 for row in rows)
-        )
+        return [_report(row) for row in rows], any(row[-1] > 0 for row in rows)
 
     def _add_gradient(self, batch: TrainingBatch, num_views: int, *, last: bool) -> Tensor:
         """Add one batch's gradient; return its sums of loss, L1, and both brightnesses."""
@@ -215,12 +205,6 @@ class Stepper:
         """
         queue = torch.autograd.Variable._execution_engine.queue_callback
         queue(lambda: self.activity.begin("exchange"))
-
-    def _without_exchange(self) -> contextlib.AbstractContextManager[Any]:
-        """Return a context without the exchange of gradients, for all batches but the last."""
-        if isinstance(self._net, DistributedDataParallel):
-            return self._net.no_sync()
-        return contextlib.nullcontext()
 
 
 def _report(figures: Sequence[float]) -> StepReport:
@@ -264,23 +248,20 @@ def explain_out_of_memory(settings: TrainSettings, step: int) -> Iterator[None]:
         of_memory = isinstance(error, torch.OutOfMemoryError | MemoryError)
         if not of_memory and _SAID_ON_CPU not in str(error):
             raise
+        most = min(settings.scenes_per_pass, settings.scenes_per_step)
+        advice = (
+            "One scene at a time and without its activations needs less than any setting can save; "
+            "expected a machine with more memory."
+        )
+        if most > 1:
+            advice = (
+                f"Go on with --resume --set scenes_per_pass={most // 2} instead of {most}, which "
+                "adds up the same gradients; --set recompute_activations=true takes less memory "
+                "too."
+            )
+        elif not settings.recompute_activations:
+            advice = "Go on with --resume --set recompute_activations=true, which takes longer."
         raise TrilightError(
             f"training: too little memory in step {step + 1}; the newest checkpoint is safe. "
-            f"{_memory_advice(settings)}"
+            f"{advice}"
         ) from error
-
-
-def _memory_advice(settings: TrainSettings) -> str:
-    """Return advice on execution settings that need less memory."""
-    most = min(settings.scenes_per_pass, settings.scenes_per_step)
-    if most > 1:
-        return (
-            f"Go on with --resume --set scenes_per_pass={most // 2} instead of {most}, which adds "
-            "up the same gradients; --set recompute_activations=true takes less memory too."
-        )
-    if not settings.recompute_activations:
-        return "Go on with --resume --set recompute_activations=true, which takes longer."
-    return (
-        "One scene at a time and without its activations needs less than any setting can save; "
-        "expected a machine with more memory."
-    )

@@ -16,9 +16,8 @@ from model.renderformer import RenderFormer
 from model.width_scales import scale_start, width_scales
 from storage.seeds import seed_for
 from train.data.bad_samples import BadSampleCounter
-from train.data.mixture import Mixture
-from train.loop.decision import Decision, Updates, move_towards
-from train.loop.optimizer import Updater
+from train.data.order import Mixture
+from train.loop.optimizer import Decision, Updater, Updates, move_towards
 from train.resume import Event
 from train.settings import Precision, TrainSettings
 
@@ -104,7 +103,7 @@ def new_state(
         settings: settings of the run; they alone decide the random weights.
         device: device of the network; by default the CPU.
         begin_with: network of the same configuration whose weights are copied.
-        muon_precision: precision of Muon's products (loop.muon.choose_muon_precision).
+        muon_precision: precision of Muon's products (loop.optimizer.choose_muon_precision).
         bad_counts: damage that the run has met, as `BadSampleCounter.counts` has it.
     """
     model = RenderFormer(settings.model)

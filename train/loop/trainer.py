@@ -7,10 +7,13 @@ once on a CPU, at each row of the log on a GPU, and before every validation and 
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
+
+import torch
 
 from model.costs import Workload, training_flops
 from storage.errors import TrilightError
@@ -19,17 +22,91 @@ from train.folder import RunFolder
 from train.loop.checkpoints import BackgroundWriter, save_checkpoint
 from train.loop.distributed import DistributedContext
 from train.loop.interrupts import Stopped, ValidationInterrupted, deferred_interrupts
-from train.loop.muon import PRODUCTS
+from train.loop.optimizer import PRODUCTS
 from train.loop.recorder import Recorder
 from train.loop.schedule import decay_start_step, learning_rate
 from train.loop.step import PendingStats, Stepper, StepReport, explain_out_of_memory
 from train.loop.train_state import TrainState
-from train.loop.window import Window, device_peak
 from train.loss.training_loss import TrainingLoss
 from train.monitoring.process_monitor import ProcessMonitor
-from train.monitoring.settings import WatchSettings
 from train.progress import TrainProgress
-from train.settings import TrainSettings
+from train.settings import TrainSettings, WatchSettings
+
+
+class Window:
+    """Accumulates steps until a row of the log is written."""
+
+    def __init__(self, reports: list[StepReport]) -> None:
+        """Begin with steps of an earlier call, whose losses count and whose time does not.
+
+        Args:
+            reports: reports of those steps, to which the caller appends further ones.
+        """
+        self._reports = reports
+        self._began = time.monotonic()
+        self.views = 0
+        """Number of views over all processes."""
+        self.waited_s = 0.0
+        """Seconds in which the network waited for data."""
+        self.flops = 0.0
+        """FLOPs of this process's scenes, without padding."""
+
+    @contextmanager
+    def pause(self) -> Iterator[None]:
+        """Exclude the time of a block from the window's, for validation and checkpoints."""
+        began = time.monotonic()
+        try:
+            yield
+        finally:
+            self._began += time.monotonic() - began
+
+    @property
+    def views_per_s(self) -> float:
+        """Views of all processes per second so far."""
+        return self.views / self._seconds()
+
+    def row(self, peak_flops_per_s: float) -> dict[str, Any]:
+        """Return the log's values of these steps; a mean is None if no step was finite."""
+        return {
+            "loss": _finite_mean(report.loss for report in self._reports),
+            "l1": _finite_mean(report.l1 for report in self._reports),
+            "grad_norm": _finite_mean(report.grad_norm for report in self._reports),
+            "views_per_s": self.views_per_s,
+            "data_wait_share": self.waited_s / self._seconds(),
+            "flops_per_s": self.flops / self._seconds(),
+            "peak_share": self.flops / self._seconds() / peak_flops_per_s,
+        }
+
+    def _seconds(self) -> float:
+        return max(time.monotonic() - self._began, 1e-9)
+
+
+def _finite_mean(values: Iterable[float]) -> float | None:
+    finite = [value for value in values if math.isfinite(value)]
+    return sum(finite) / len(finite) if finite else None
+
+
+PEAK_WIDTH = {"cpu": 1024, "cuda": 8192}
+"""Width of the square matrix product that measures a device's peak speed, by device type."""
+
+
+@lru_cache
+def device_peak(device: torch.device, dtype: torch.dtype) -> float:
+    """Return the FLOPs per second of a large square matrix product: the best of five.
+
+    Measuring takes some milliseconds, once. The data sheet's figure is not used, since no program
+    reaches it.
+    """
+    width = PEAK_WIDTH[device.type]
+    matrix = torch.ones(width, width, dtype=dtype, device=device)
+    best = float("inf")
+    for _ in range(5):
+        began = time.perf_counter()
+        product = matrix @ matrix
+        product[0, 0].item()  # waits until it is done
+        best = min(best, time.perf_counter() - began)
+    return 2 * width**3 / best
+
 
 WATCHED_STEPS = 50
 """Number of steps after the warm-up whose pictures are checked, once."""
@@ -225,14 +302,15 @@ class Trainer:
             batches = self.copies.send(scenes.batches)
             rate = learning_rate(step, settings)
             stats = self.stepper.launch(batches, rate, asked_to_stop=asked_to_stop())
-        self._note_unusable()
+        messages = self.state.bad_samples.messages
+        for message in messages[self.num_reported_bad :]:
+            self._note(f"left out: {message.rstrip('.')}")
+        self.num_reported_bad = len(messages)
         while self.stepper.remarks:
             self._note(self.stepper.remarks.pop(0))
-        self.window.add_cost(
-            views=settings.scenes_per_step * settings.views_per_scene,
-            waited_s=waited_s,
-            flops=sum(scene_flops(settings, count) for count in scenes.num_triangles),
-        )
+        self.window.views += settings.scenes_per_step * settings.views_per_scene
+        self.window.waited_s += waited_s
+        self.window.flops += sum(scene_flops(settings, count) for count in scenes.num_triangles)
         self.state.step += 1
         self.watch.end_step()
         self.pending.append(_PendingStep(step=self.state.step, keys=scenes.keys, stats=stats))
@@ -246,10 +324,9 @@ class Trainer:
         self.pending = []
         if not pending:
             return
-        synced = self.stepper.sync([each.stats for each in pending])
-        self.asked_to_stop = synced.asked_to_stop
-        for each, report in zip(pending, synced.reports, strict=True):
-            self.window.add(report)
+        reports, self.asked_to_stop = self.stepper.sync([each.stats for each in pending])
+        for each, report in zip(pending, reports, strict=True):
+            self.state.reports.append(report)
             self.dead_start.add(each.step, report)
             self.watch.add_report(each.step, report, each.keys)
             if report.applied:
@@ -258,17 +335,10 @@ class Trainer:
                 self._skip(each)
         self.progress.advance(
             step=self.state.step,
-            loss=synced.reports[-1].loss,
+            loss=reports[-1].loss,
             learning_rate=learning_rate(self.state.step - 1, self.settings),
             views_per_s=self.window.views_per_s,
         )
-
-    def _note_unusable(self) -> None:
-        """Report each damaged sample or shard once, after it was left out."""
-        messages = self.state.bad_samples.messages
-        for message in messages[self.num_reported_bad :]:
-            self._note(f"left out: {message.rstrip('.')}")
-        self.num_reported_bad = len(messages)
 
     def _skip(self, pending: _PendingStep) -> None:
         """Count a skipped step and report its scenes; raise after too many in a row."""
@@ -326,24 +396,19 @@ class Trainer:
         """Exchange statistics with the other processes, and write the row of the log."""
         seen, spikes = self.watch.end_window()
         if self.recorder is not None:
-            self._write_window(self.recorder, seen, spikes)
+            for spike in spikes:
+                self.recorder.row(spike)
+            peak = device_peak(self.dist_context.device, PRODUCTS[self.settings.precision])
+            row = {
+                "step": self.state.step,
+                "learning_rate": learning_rate(self.state.step - 1, self.settings),
+                "skipped_steps": self.state.skipped_steps,
+                **self.window.row(peak),
+            }
+            assert all(value is None or math.isfinite(value) for value in row.values())
+            self.recorder.row({**row, **seen})
         self.state.reports = []
         self.window = Window(self.state.reports)
-
-    def _write_window(
-        self, recorder: Recorder, seen: Mapping[str, Any], spikes: Sequence[Mapping[str, Any]]
-    ) -> None:
-        for spike in spikes:
-            recorder.row(spike)
-        peak = device_peak(self.dist_context.device, PRODUCTS[self.settings.precision])
-        row = {
-            "step": self.state.step,
-            "learning_rate": learning_rate(self.state.step - 1, self.settings),
-            "skipped_steps": self.state.skipped_steps,
-            **self.window.row(peak),
-        }
-        assert all(value is None or math.isfinite(value) for value in row.values())
-        recorder.row({**row, **seen})
 
     def _note(self, text: str, step: int | None = None) -> None:
         """Report a note in the first process; by default about the last step."""

@@ -1,9 +1,14 @@
-"""Current phase of a training process, and the time spent in each phase."""
+"""Measurements within a step: time by phase, and norms by layer once a window."""
 
+import math
+import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
 
 PHASES = {
     "data": "waiting for data",
@@ -67,3 +72,88 @@ class Activity:
         taken_s = self._taken_s
         self._taken_s = dict.fromkeys(PHASES, 0.0)
         return taken_s
+
+
+_GROUP = re.compile(r"[^.]+(\.[^.]+(\.\d+)?)?")
+_DIGITS = 4
+
+
+class LayerNorms:
+    """Norms of one expected update; other updates cost nothing.
+
+    The weights are copied during that update, after the activations were freed, so that peak memory
+    does not rise. The norms leave the device with the statistics of the steps (loop.step).
+    """
+
+    def __init__(self, model: nn.Module) -> None:
+        self._groups: dict[str, list[nn.Parameter]] = {}
+        for name, weight in model.named_parameters():
+            self._groups.setdefault(layer_of(name), []).append(weight)
+        self.expect_update(False)
+
+    def expect_update(self, due: bool) -> None:
+        """Set whether the next update is measured."""
+        self._due = due
+        self._grads: list[Tensor] = []
+        self._before: list[list[Tensor]] = []
+        self.pending: Tensor | None = None
+        """New norms [layers, LAYER_COLUMNS] on the device; None if there are none."""
+        self._row: dict[str, list[float | None]] = {}
+
+    @torch.no_grad()
+    def record_gradients(self) -> None:
+        """Record the gradient norms; call when gradients are complete and not clipped yet."""
+        if not self._due:
+            return
+        for weights in self._groups.values():
+            self._grads.append(_length([w.grad for w in weights if w.grad is not None], weights))
+            self._before.append([weight.clone() for weight in weights])
+
+    @torch.no_grad()
+    def record_update(self) -> None:
+        """Record weight and update norms after the update, without a wait for the device."""
+        columns = []
+        for grad, weights, before in zip(
+            self._grads, self._groups.values(), self._before, strict=False
+        ):
+            length = _length(before, weights)
+            moved = [weight - old for weight, old in zip(weights, before, strict=True)]
+            ratio = _length(moved, weights) / length.clamp(min=torch.finfo(length.dtype).tiny)
+            columns.append(torch.stack([grad, length, ratio]))
+        if columns:
+            self.expect_update(False)
+            self.pending = torch.stack(columns)
+
+    def set_values(self, values: Sequence[float]) -> None:
+        """Store the numbers of `pending` from the host, layer after layer."""
+        width = len(values) // len(self._groups)
+        rows = [values[width * row : width * (row + 1)] for row in range(len(self._groups))]
+        self.expect_update(False)
+        self._row = {
+            layer: [
+                float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None for value in row
+            ]
+            for layer, row in zip(self._groups, rows, strict=True)
+        }
+
+    def pop_row(self) -> dict[str, list[float | None]]:
+        """Return LAYER_COLUMNS by layer of the measured update once; empty if there is none.
+
+        A number that is not finite is None.
+        """
+        row = self._row
+        self._row = {}
+        return row
+
+
+def layer_of(parameter: str) -> str:
+    """Return the layer of a parameter, such as `encoder.layers.3` or `decoder.head`."""
+    match = _GROUP.match(parameter)
+    assert match is not None
+    return match[0]
+
+
+def _length(tensors: Sequence[Tensor], like: Sequence[Tensor]) -> Tensor:
+    if not tensors:
+        return torch.zeros((), device=like[0].device)
+    return nn.utils.get_total_norm(tensors)

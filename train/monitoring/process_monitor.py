@@ -1,11 +1,17 @@
-"""Monitoring of one training process: hooks for steps, pauses and windows of the loop."""
+"""Monitoring of one training process: hooks for steps, pauses and windows of the loop.
+
+Spikes in loss and gradient norm are recorded with the scenes that may cause them. Some steps are
+traced by PyTorch's profiler, in the folder of the run.
+"""
 
 import json
+import math
 import os
 import statistics
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +20,143 @@ import torch
 from train.folder import RunFolder
 from train.loop.distributed import DistributedContext
 from train.loop.step import Stepper, StepReport
-from train.monitoring.profiler import StepProfiler
-from train.monitoring.settings import WatchSettings
-from train.monitoring.spikes import Spike, SpikeDetector
 from train.monitoring.watchdog import Watchdog
-from train.settings import TrainSettings
+from train.settings import TrainSettings, WatchSettings
+
+REMEMBERED = 200
+"""Number of recent steps that a new one is compared with."""
+
+LEAST_REMEMBERED = 40
+"""Minimum number of recent steps; a median of fewer is unreliable."""
+
+LEAST_DEVIATION = 0.02
+"""Minimum standard deviation as a fraction of the median; otherwise a nearly constant loss would
+spike at the smallest change."""
+
+_MAD_TO_DEVIATION = 1.4826
+"""Ratio of standard deviation to median absolute deviation of normal numbers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spike:
+    """Loss or gradient norm of a step above its bound."""
+
+    step: int
+    """Number of the step, from 1."""
+    what: str
+    """Name of the value, `loss` or `grad_norm`."""
+    value: float
+    bound: float
+    """Upper bound that the value exceeds."""
+    keys: tuple[str, ...]
+    """Sample keys of this process's scenes in the step."""
+
+
+class SpikeDetector:
+    """Compares each step with the median of recent ones, in robust standard deviations.
+
+    A median is robust to earlier spikes, and a falling loss, as at the start of a training, is no
+    spike. Steps that are not finite are ignored here: they are skipped and reported elsewhere.
+    """
+
+    def __init__(self, deviations: float) -> None:
+        self._deviations = deviations
+        self._recent = {what: deque[float](maxlen=REMEMBERED) for what in ("loss", "grad_norm")}
+
+    def add(self, step: int, report: StepReport, keys: Sequence[str]) -> list[Spike]:
+        """Add a step, counted from 1, and return its spikes."""
+        spikes = []
+        for what, recent in self._recent.items():
+            value = getattr(report, what)
+            if not math.isfinite(value):
+                continue
+            bound = spike_bound(recent, self._deviations)
+            if bound is not None and value > bound:
+                spike = Spike(step=step, what=what, value=value, bound=bound, keys=tuple(keys))
+                spikes.append(spike)
+            recent.append(value)
+        return spikes
+
+
+def spike_bound(recent: Sequence[float], deviations: float) -> float | None:
+    """Return the median plus so many robust deviations, or None for too few values."""
+    if len(recent) < LEAST_REMEMBERED:
+        return None
+    median = statistics.median(recent)
+    spread = statistics.median(abs(value - median) for value in recent)
+    deviation = max(_MAD_TO_DEVIATION * spread, LEAST_DEVIATION * abs(median))
+    return median + deviations * deviation
+
+
+SKIPPED_STEPS = 3
+"""Number of warm-up steps of a call before the first one that is traced."""
+
+_ROWS = 40
+
+
+class StepProfiler:
+    """Traces steps of one process; costs nothing if there are none to trace."""
+
+    def __init__(
+        self, steps: int, device: torch.device, folder: Path, note: Callable[[str], None]
+    ) -> None:
+        """Create the profiler.
+
+        Args:
+            steps: number of steps; 0 traces none.
+            folder: folder of the trace and the table.
+            note: called with a message that names the files.
+        """
+        self._steps = steps
+        self._device = device
+        self._folder = folder
+        self._note = note
+        self._seen = 0
+        self._first = 0
+        self._profile: Any = None
+
+    def begin_step(self, step: int) -> None:
+        """Begin a step, counted from 1."""
+        if not self._steps:
+            return
+        self._seen += 1
+        if self._seen == SKIPPED_STEPS + 1:
+            from torch.profiler import ProfilerActivity, profile
+
+            on_card = [ProfilerActivity.CUDA] if self._device.type == "cuda" else []
+            self._profile = profile(activities=[ProfilerActivity.CPU, *on_card])
+            self._profile.start()
+            self._first = step
+
+    def end_step(self, step: int) -> None:
+        """End a step; write the trace after the last one."""
+        if self._profile is not None and step - self._first + 1 == self._steps:
+            self._write(step)
+
+    def close(self, step: int) -> None:
+        """Write an incomplete trace of a run that has ended."""
+        if self._profile is not None:
+            self._write(step)
+        elif self._steps and self._seen <= SKIPPED_STEPS:
+            self._note(
+                f"nothing was profiled: the run ended before step {SKIPPED_STEPS + 1} of this call"
+            )
+
+    def _write(self, last: int) -> None:
+        profiler = self._profile
+        self._profile = None
+        self._steps = 0
+        profiler.stop()
+        self._folder.mkdir(parents=True, exist_ok=True)
+        trace = self._folder / f"profile-steps-{self._first}-to-{last}.json.gz"
+        table = trace.with_name(trace.name.replace(".json.gz", ".txt"))
+        profiler.export_chrome_trace(str(trace))
+        order = f"self_{self._device.type}_time_total"
+        table.write_text(profiler.key_averages().table(sort_by=order, row_limit=_ROWS))
+        self._note(
+            f"steps {self._first} to {last} were profiled: open {trace} at chrome://tracing in "
+            f"Chromium or at ui.perfetto.dev; {table.name} beside it lists the dearest operators"
+        )
 
 
 class ProcessMonitor:
@@ -100,8 +238,8 @@ class ProcessMonitor:
     def end_window(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         """End a window; return additional values of its row, and rows of spikes.
 
-        All processes must call it. The values: `time_s`, seconds of the window by phase
-        (monitoring.activity); `memory_mb`; `layers` (monitoring.layers); and with several processes
+        All processes must call it. The values: `time_s`, seconds of the window by phase,
+        and `layers` (monitoring.activity); `memory_mb`; and with several processes
         `own_s`, the seconds of a step that each spent on its own work.
         """
         taken_s = self._activity.pop_seconds()
@@ -119,18 +257,16 @@ class ProcessMonitor:
         by_rank = [json.loads(text) for text in texts]
         if self._dist_context.world_size > 1:
             row["own_s"] = [said["own_s"] for said in by_rank]
-            self._note_slow_rank(row["own_s"])
+            # told once, until another one is the slowest
+            rank = slowest_rank(row["own_s"])
+            if rank is not None and rank != self._named_rank:
+                slow, fast = row["own_s"][rank], min(row["own_s"])
+                self._note(
+                    f"process {rank} of {len(by_rank)} is the slow one: {slow:.2g} s of its own in "
+                    f"each of the last steps, the fastest {fast:.2g} s; all wait for it"
+                )
+            self._named_rank = rank
         return row, _merge_spikes([said["spikes"] for said in by_rank])
-
-    def _note_slow_rank(self, own_s: Sequence[float]) -> None:
-        """Report a process that the others wait for, once until another one is the slowest."""
-        rank = slowest_rank(own_s)
-        if rank is not None and rank != self._named_rank:
-            self._note(
-                f"process {rank} of {len(own_s)} is the slow one: {own_s[rank]:.2g} s of its own "
-                f"in each of the last steps, the fastest {min(own_s):.2g} s; all wait for it"
-            )
-        self._named_rank = rank
 
 
 def _merge_spikes(by_rank: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from storage.errors import TrilightError
 from train.loop.distributed import DistributedContext
 from train.monitoring.activity import PHASES, Activity
-from train.monitoring.settings import WatchSettings
+from train.settings import WatchSettings
 
 MIN_SAMPLES = 3
 """Number of measured sections of a kind from which their usual time is known."""
@@ -31,31 +31,18 @@ GRACE_S = 5.0
 """Time that a run waits for the other processes' files before it stops on a hang."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True, eq=False)
 class _Stretch:
-    """A step, validation or saving in progress."""
+    """A step, validation or saving in progress, and what was reported if it hangs."""
 
     kind: str
     step: int
     since_s: float
     usual_s: float | None
     limit_s: float
-
-    @property
-    def name(self) -> str:
-        """Display name in messages."""
-        if self.kind == "step":
-            return f"step {self.step}"
-        return f"the {self.kind} after step {self.step}"
-
-
-@dataclass(kw_only=True)
-class _Hang:
-    """A hung section, and what was reported about it."""
-
-    stretch: _Stretch
-    began_s: float
-    next_s: float
+    hung_s: float | None = None
+    """time.monotonic() at which it was seen to hang; None if it does not."""
+    next_s: float = 0.0
     """time.monotonic() of the next report."""
     is_reported: bool = False
     """True after this process has reported the hang."""
@@ -63,6 +50,13 @@ class _Hang:
     """True after the run was asked to stop."""
     passed_on: set[Path] = field(default_factory=set)
     """Stack files of other processes whose first line was already reported."""
+
+    @property
+    def name(self) -> str:
+        """Display name in messages."""
+        if self.kind == "step":
+            return f"step {self.step}"
+        return f"the {self.kind} after step {self.step}"
 
 
 class Watchdog:
@@ -122,39 +116,41 @@ class Watchdog:
             known.append(now_s - before.since_s)
         known = self._usual_s.get(kind, deque())
         usual_s = statistics.median(known) if len(known) >= MIN_SAMPLES else None
+        limit_s = UNKNOWN_FACTOR * self._settings.hang_after_s
+        if usual_s is not None:
+            limit_s = max(self._settings.hang_after_s, self._settings.hang_factor * usual_s)
         self._stretch = _Stretch(
-            kind=kind, step=step, since_s=now_s, usual_s=usual_s, limit_s=self._limit_s(usual_s)
+            kind=kind, step=step, since_s=now_s, usual_s=usual_s, limit_s=limit_s
         )
 
-    def _limit_s(self, usual_s: float | None) -> float:
-        least_s = self._settings.hang_after_s
-        if usual_s is None:
-            return UNKNOWN_FACTOR * least_s
-        return max(least_s, self._settings.hang_factor * usual_s)
-
     def _watch(self) -> None:
-        hang: _Hang | None = None
+        hang: _Stretch | None = None
         while not self._closed.wait(min(POLL_S, self._settings.hang_after_s / 5)):
             now_s = time.monotonic()
             stretch = self._stretch
-            if hang is not None and stretch is not hang.stretch:
-                self._note_safely(f"{hang.stretch.name} went on after all")
+            if hang is not None and stretch is not hang:
+                self._note_safely(f"{hang.name} went on after all")
                 hang = None
             if stretch is None or now_s - stretch.since_s < stretch.limit_s:
                 continue
-            if hang is None:
-                hang = _Hang(stretch=stretch, began_s=now_s, next_s=now_s)
+            hang = stretch
+            if hang.hung_s is None:
+                hang.hung_s = now_s
                 self._files += 1
             if now_s >= hang.next_s:
-                hang.next_s = stretch.since_s + 2 * (now_s - stretch.since_s)  # ever more rarely
+                hang.next_s = hang.since_s + 2 * (now_s - hang.since_s)  # ever more rarely
                 self._report(hang, now_s)
             if self._dist_context.is_first:
                 self._forward_reports(hang, now_s)
-                self._stop_if_asked(hang, now_s)
+                should_stop = self._settings.on_hang == "stop" and not hang.is_stopped
+                if should_stop and now_s - hang.hung_s >= GRACE_S:
+                    hang.is_stopped = True
+                    self._report_hang(
+                        f"training: {hang.name} hangs, and the run was asked to stop then"
+                    )
 
-    def _report(self, hang: _Hang, now_s: float) -> None:
+    def _report(self, stretch: _Stretch, now_s: float) -> None:
         """Write the stacks, and report the current phase of this process."""
-        stretch = hang.stretch
         doing = self._activity.now
         path = self._path(stretch.step, self._dist_context.rank)
         usual = "" if stretch.usual_s is None else f", where {stretch.usual_s:.2g} s is usual"
@@ -166,9 +162,9 @@ class Watchdog:
         written = ""
         if self._files <= MAX_FILES:
             with suppress(OSError):
-                _write_stacks(path, line, appends=hang.is_reported)
+                _write_stacks(path, line, appends=stretch.is_reported)
                 written = f". Stacks of its threads: {path}"
-        hang.is_reported = True
+        stretch.is_reported = True
         self._note_safely(line + written)
 
     def _note_safely(self, text: str) -> None:
@@ -178,25 +174,17 @@ class Watchdog:
     def _path(self, step: int, rank: int | str) -> Path:
         return self._folder / f"hang-step-{step:09d}-rank-{rank}.txt"
 
-    def _forward_reports(self, hang: _Hang, now_s: float) -> None:
+    def _forward_reports(self, hang: _Stretch, now_s: float) -> None:
         """Report new stack files of the other processes about the same step."""
-        began_unix_s = time.time() - (now_s - hang.stretch.since_s)
-        hang.passed_on.add(self._path(hang.stretch.step, self._dist_context.rank))
-        pattern = self._path(hang.stretch.step, "*").name
+        began_unix_s = time.time() - (now_s - hang.since_s)
+        hang.passed_on.add(self._path(hang.step, self._dist_context.rank))
+        pattern = self._path(hang.step, "*").name
         for path in sorted(set(self._folder.glob(pattern)) - hang.passed_on):
             with suppress(OSError):
                 lines = path.read_text().splitlines()
                 if lines and path.stat().st_mtime >= began_unix_s:
                     hang.passed_on.add(path)
                     self._note_safely(f"{lines[0]}. Stacks of its threads: {path}")
-
-    def _stop_if_asked(self, hang: _Hang, now_s: float) -> None:
-        should_stop = self._settings.on_hang == "stop" and not hang.is_stopped
-        if should_stop and now_s - hang.began_s >= GRACE_S:
-            hang.is_stopped = True
-            self._report_hang(
-                f"training: {hang.stretch.name} hangs, and the run was asked to stop then"
-            )
 
 
 def _write_stacks(path: Path, line: str, *, appends: bool) -> None:

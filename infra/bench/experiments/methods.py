@@ -96,8 +96,8 @@ def _set_up(
 
 def judged_figures(renderer: Renderer, scene: Scene, reference: RawReference) -> Figures:
     """Return the figures of a picture; its decibels exclude the noise of the reference."""
+    from train.evaluation.equal_time import time_scene
     from train.evaluation.metrics import picture_scores
-    from train.evaluation.timing import time_scene
 
     picture = time_scene(renderer, scene, "scene", ROUNDS)
     radiance_rgb = picture.radiance_rgb

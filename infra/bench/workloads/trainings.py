@@ -18,7 +18,7 @@ from train.data.buckets import bucket_scenes
 from train.data.loader import load_batches
 from train.evaluation.validation import Judge
 from train.loop.distributed import DistributedContext
-from train.loop.muon import choose_muon_precision
+from train.loop.optimizer import choose_muon_precision
 from train.loop.schedule import learning_rate
 from train.loop.step import Stepper
 from train.loop.train_state import new_state
@@ -94,7 +94,7 @@ def _trained_network(
         shards,
         loader_settings(settings),
         0,
-        rank_slice=crew.rank_slice,
+        rank_slice=crew,
         workers=1,
         unusable=state.bad_samples,
     )

@@ -34,7 +34,7 @@ from storage.errors import Rejected, TrilightError
 from storage.intervals import mean_interval
 from tests.command_line import trilight
 from tests.for_each import case
-from train.evaluation.cost_tables import COST_NOISE, on_front
+from train.evaluation.cost_charts import COST_NOISE, on_front
 
 TINY = dataclasses.replace(
     QUICK, scenes=1, resolution=32, max_spp=128, reference_spp=128, picture_px=64, objects=1,

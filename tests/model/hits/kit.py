@@ -42,29 +42,11 @@ def corner(
     return join(parts, eye=(1.0, -3.0, 1.4), target=(0, 0, 0.4), fov_deg=38.0, sky=sky)
 
 
-def traced(
-    scene: Scene,
-    resolution: int = 32,
-    *,
-    rays_a_side: int = 2,
-    anchors_a_side: int = 8,
-    gather_rays: int = 16,
-    sky_rays: int = 4,
-    seed: int = 0,
-) -> ViewInputs:
-    lit = lit_scene(scene)
-    return view_inputs(
-        lit,
-        scene_light(lit),
-        scene.c2w[0],
-        float(scene.fov_deg[0]),
-        resolution,
-        rays_a_side=rays_a_side,
-        anchors_a_side=anchors_a_side,
-        gather_rays=gather_rays,
-        sky_rays=sky_rays,
-        seed=seed,
-    )
+def traced(scene: Scene, resolution: int = 32, **changes: int) -> ViewInputs:
+    numbers = {"rays_a_side": 2, "anchors_a_side": 8, "gather_rays": 16, "sky_rays": 4, "seed": 0}
+    lit, fov_deg = lit_scene(scene), float(scene.fov_deg[0])
+    numbers |= changes
+    return view_inputs(lit, scene_light(lit), scene.c2w[0], fov_deg, resolution, **numbers)
 
 
 def direct(inputs: ViewInputs) -> np.ndarray:

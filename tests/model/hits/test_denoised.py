@@ -6,9 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.config import hit_stage
-from model.hits.denoised import denoise_traced
-from model.hits.traced import Traced
+from model.hits.traced import Traced, denoise_traced
 from model.hits.tracing import with_traced
 from model.hits.view_inputs import Channel
 from model.inference import NeuralRenderer
@@ -30,7 +28,7 @@ def _traced(**changes: int) -> Tensor:
 def _denoise(pixels_VRRC: Tensor, unit_3: Tensor) -> Tensor:
     empty = torch.zeros(0)
     views = Traced(empty, unit_3, pixels_VRRC, empty, empty, empty)
-    return denoise_traced(views, hit_stage(hits_config(denoise_from_px=PX))).pixels_VRRC
+    return denoise_traced(views, hits_config(denoise_from_px=PX)).pixels_VRRC
 
 
 def _light(pixels: Tensor) -> Tensor:

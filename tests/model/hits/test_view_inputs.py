@@ -164,7 +164,7 @@ def test_extremes_are_finite_and_not_negative(name: str) -> None:
 
 
 def test_no_light_at_all_is_black() -> None:
-    """A scene has an emitter, but a group of its lights may have none (model.light_groups)."""
+    """A scene has an emitter, but a group of its lights may have none (model.inference)."""
     scene = corner()
     positions = scene.vertex_positions.copy()
     positions[-3:] = positions[-1]

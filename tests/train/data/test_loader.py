@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,16 +40,15 @@ from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.augment import augment_scene
 from train.data.buckets import MOST_WASTE, bucket_scenes
 from train.data.loader import LoaderSettings, OpenShards, prefetch
-from train.data.order import (
-    OrderSettings,
-    RankSlice,
-    ShardWindow,
-    Visit,
-    batch_visits,
-    visits_from,
-    windows_from,
+from train.data.order import RankSlice, Visit, visits_from
+from train.data.scenes import (
+    TrainingScene,
+    block_mean,
+    require_few_triangles,
+    scene_of_views,
+    training_scene,
+    with_target,
 )
-from train.data.scenes import TrainingScene, block_mean, scene_of_views, training_scene, with_target
 from train.settings import AugmentationSettings
 
 SETTINGS = LoaderSettings(
@@ -67,35 +67,15 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return write_toy_dataset(folder, train=14, validation=2, per_shard=3, resolution=16)
 
 
-def same(a: TrainingScene, b: TrainingScene) -> bool:
-    return (
-        a.key == b.key
-        and torch.equal(a.target_VRR3, b.target_VRR3)
-        and all(
-            torch.equal(value, getattr(b.tensors, name))
-            for name, value in tensors_of(a.tensors).items()
-        )
-    )
-
-
-def same_batches(a: list[list[TrainingScene]], b: list[list[TrainingScene]]) -> bool:
-    return len(a) == len(b) and all(
-        len(x) == len(y) and all(same(p, q) for p, q in zip(x, y, strict=True))
-        for x, y in zip(a, b, strict=True)
-    )
-
-
-def by_key(batch: list[TrainingScene]) -> list[TrainingScene]:
-    return sorted(batch, key=identity)
-
-
 def identity(scene: TrainingScene) -> tuple[str | bytes, ...]:
     """Key and bytes: two visits of a scene may differ in nothing that a sum would tell."""
-    tensors = [
-        scene.target_VRR3,
-        *(value for _, value in sorted(tensors_of(scene.tensors).items())),
-    ]
-    return (scene.key, *(tensor.contiguous().numpy().tobytes() for tensor in tensors))
+    tensors = {**tensors_of(scene.tensors), "target": scene.target_VRR3}
+    named = sorted(tensors.items())
+    return (scene.key, *(tensor.contiguous().numpy().tobytes() for _, tensor in named))
+
+
+def identities(batches: list[list[TrainingScene]]) -> list[list[tuple[str | bytes, ...]]]:
+    return [[identity(scene) for scene in batch] for batch in batches]
 
 
 WHOLE = 8
@@ -111,7 +91,8 @@ def whole(data: Dataset) -> list[list[TrainingScene]]:
 def test_resuming_after_every_batch_is_uninterrupted(
     data: Dataset, whole: list[list[TrainingScene]], first: int
 ) -> None:
-    assert same_batches(whole[first:], take(data, SETTINGS, WHOLE - first, first=first))
+    resumed = take(data, SETTINGS, WHOLE - first, first=first)
+    assert identities(resumed) == identities(whole[first:])
 
 
 @for_each("world_size", [2, 3, 6])
@@ -119,25 +100,15 @@ def test_resuming_after_every_batch_is_uninterrupted(
 def test_any_number_of_ranks_may_go_on(
     data: Dataset, whole: list[list[TrainingScene]], first: int, world_size: int
 ) -> None:
+    part: dict[str, Any] = {"first": first, "world_size": world_size}
     shares = [
-        take(
-            data,
-            SETTINGS,
-            WHOLE - first,
-            first=first,
-            rank=rank,
-            world_size=world_size,
-            workers=1 + rank % 2,
-        )
+        take(data, SETTINGS, WHOLE - first, rank=rank, workers=1 + rank % 2, **part)
         for rank in range(world_size)
     ]
     assert {len(batch) for share in shares for batch in share} == {6 // world_size}
-    together = [
-        [scene for share in parts for scene in share] for parts in zip(*shares, strict=True)
-    ]
-    assert same_batches(
-        [by_key(batch) for batch in together], [by_key(batch) for batch in whole[first:]]
-    )
+    together = [list(itertools.chain(*parts)) for parts in zip(*shares, strict=True)]
+    for got, wanted in zip(identities(together), identities(whole[first:]), strict=True):
+        assert sorted(got) == sorted(wanted)
 
 
 @for_each("workers", [0, 2, 5])
@@ -145,7 +116,7 @@ def test_the_number_of_threads_changes_nothing(
     data: Dataset, whole: list[list[TrainingScene]], workers: int
 ) -> None:
     before = threading.active_count()
-    assert same_batches(take(data, SETTINGS, WHOLE, workers=workers), whole)
+    assert identities(take(data, SETTINGS, WHOLE, workers=workers)) == identities(whole)
     assert threading.active_count() <= before, "closing the stream ends its threads"
 
 
@@ -154,8 +125,8 @@ def test_a_list_of_the_same_shards_gives_the_same_batches(
 ) -> None:
     listed = open_training_data([f"{data.folder.root}/train-{{000000..000004}}.tar"])
     assert "without a manifest" in listed.notes[0]
-    assert same_batches(take(listed, SETTINGS, 4), whole[:4])
-    assert same_batches(take(listed, SETTINGS, 2, first=3), whole[3:5])
+    assert identities(take(listed, SETTINGS, 4)) == identities(whole[:4])
+    assert identities(take(listed, SETTINGS, 2, first=3)) == identities(whole[3:5])
 
 
 def test_epochs_show_every_scene_and_differ(whole: list[list[TrainingScene]]) -> None:
@@ -165,7 +136,7 @@ def test_epochs_show_every_scene_and_differ(whole: list[list[TrainingScene]]) ->
     assert all(len(set(epoch)) == 14 for epoch in keys)
     assert len({tuple(epoch) for epoch in keys}) == 3
     visits = [scene for scene in scenes if scene.key == keys[0][0]]
-    assert not same(visits[0], visits[1]), "every visit draws its own views and symmetries"
+    assert identity(visits[0]) != identity(visits[1]), "each draws its views and symmetries"
 
 
 def test_views_are_drawn_without_repetition_and_equal_shares(data: Dataset) -> None:
@@ -200,7 +171,7 @@ def test_albedo_is_that_of_the_scene_after_its_symmetries(data: Dataset) -> None
         expected = with_albedo(other.tensors, 16, 2).albedo_VRR6
         assert expected is not None and scene.tensors.albedo_VRR6 is not None
         assert torch.equal(scene.tensors.albedo_VRR6, expected) and expected.max() > 0
-        assert same(other, dataclasses.replace(scene, tensors=other.tensors))
+        assert identity(other) == identity(dataclasses.replace(scene, tensors=other.tensors))
         assert other.tensors.albedo_VRR6 is None
 
 
@@ -243,9 +214,9 @@ def test_a_view_takes_its_target_and_noise_along_and_targets_are_logarithms() ->
     scene = training_scene(dataclasses.replace(sample, views=floors), 16)
     torch.testing.assert_close(scene.noise_V, torch.tensor([1e-2, 1e-5]))
     most = sample.scene.num_triangles
-    assert training_scene(sample, 16, most_triangles=most).tensors.num_triangles == most
+    require_few_triangles(sample.key, sample.scene, most)
     with pytest.raises(TrilightError, match=f"{most} triangles; the run takes at most {most - 1}"):
-        training_scene(sample, 16, most_triangles=most - 1)
+        require_few_triangles(sample.key, sample.scene, most - 1)
     with pytest.raises(TrilightError, match=r"not kept apart, which light_mix needs.*per_light"):
         training_scene(sample, 16, lights_apart=True)
 
@@ -329,55 +300,40 @@ WORLDS = (1, 2, 3, 8)
 BATCH = 24
 
 
-def windows(
-    sizes: list[int], first: int = 0, *, seed: int = 0, window: int = 2
-) -> list[ShardWindow]:
-    """Return the windows of two epochs from the one that holds `first`."""
-    chosen = OrderSettings(seed=seed, window=window)
-    stream = windows_from(len(sizes), lambda shard: sizes[shard], chosen, first)
-    end = 2 * sum(sizes)
-    return list(itertools.takewhile(lambda one: one.visits[0].position < end, stream))
-
-
-def places(found: list[ShardWindow]) -> list[Visit]:
-    return [place for window in found for place in window.visits]
+def places(
+    sizes: list[int], first: int = 0, *, seed: int = 0, window: int = 2, count: int | None = None
+) -> list[Visit]:
+    """Return the visits from `first` on to the end of two epochs, or so many."""
+    stream = visits_from(len(sizes), sizes.__getitem__, first, seed=seed, window=window)
+    return list(itertools.islice(stream, 2 * sum(sizes) - first if count is None else count))
 
 
 @settings(deadline=None)  # a busy machine is no failure
 @given(SIZES, st.integers(1, 12), st.integers(0, 3))
-def test_an_epoch_uses_every_sample_once_and_positions_count(
+def test_an_epoch_uses_every_sample_once_and_windows_of_shards_follow_each_other(
     sizes: list[int], window: int, seed: int
 ) -> None:
-    found = places(windows(sizes, seed=seed, window=window))
+    found = places(sizes, seed=seed, window=window)
     every = {(shard, row) for shard, size in enumerate(sizes) for row in range(size)}
     total = len(every)
     assert [place.position for place in found] == list(range(2 * total))
     for epoch in (found[:total], found[total:]):
         assert {(place.shard, place.row) for place in epoch} == every
-
-
-@settings(deadline=None)  # a busy machine is no failure
-@given(SIZES, st.integers(1, 12))
-def test_samples_stay_within_their_window_of_shards(sizes: list[int], window: int) -> None:
-    for one in windows(sizes, window=window):
-        assert len(one.shards) <= window
-        held = {(shard, row) for shard in one.shards for row in range(sizes[shard])}
-        assert {(place.shard, place.row) for place in one.visits} == held
+        windows = [place.arrival // window for place in epoch]
+        assert windows == sorted(windows) and len({p.shard for p in epoch}) <= len(sizes)
 
 
 @settings(deadline=None)  # a busy machine is no failure
 @given(SIZES, st.data())
 def test_entering_later_gives_the_rest(sizes: list[int], data: st.DataObject) -> None:
     first = data.draw(st.integers(0, 2 * sum(sizes) - 1))
-    whole = places(windows(sizes))
-    assert first in [place.position for place in windows(sizes, first)[0].visits]
-    assert [p for p in places(windows(sizes, first)) if p.position >= first] == whole[first:]
+    assert places(sizes, first) == places(sizes)[first:]
 
 
 def test_the_order_is_a_function_of_seed_and_epoch() -> None:
     sizes = [16, 16, 16]
-    assert windows(sizes, seed=3) == windows(sizes, seed=3)
-    both = [places(windows(sizes, seed=seed, window=3)) for seed in range(3)]
+    assert places(sizes, seed=3) == places(sizes, seed=3)
+    both = [places(sizes, seed=seed, window=3) for seed in range(3)]
     epochs = [epoch for found in both for epoch in (found[:48], found[48:])]
     assert len({tuple((p.shard, p.row) for p in epoch) for epoch in epochs}) == 6
     assert len({tuple(p.shard for p in epoch) for epoch in epochs}) == 6
@@ -387,25 +343,22 @@ def test_the_order_is_a_function_of_seed_and_epoch() -> None:
 @given(SIZES, st.integers(0, 40), st.integers(1, 5))
 def test_the_ranks_share_out_every_batch(sizes: list[int], first: int, window: int) -> None:
     """Whatever their number: each place with one rank, equally many each, nobody left out."""
-    chosen = OrderSettings(seed=1, window=window)
-    stream = windows_from(len(sizes), lambda shard: sizes[shard], chosen, first)
-    for batch in itertools.islice(batch_visits(visits_from(stream, first), BATCH), 3):
+    stream = places(sizes, first, seed=1, window=window, count=3 * BATCH)
+    for batch in (stream[at : at + BATCH] for at in range(0, 3 * BATCH, BATCH)):
         assert [place.position for place in batch] == list(range(first, first + BATCH))
         first += BATCH
         for world in WORLDS:
             shares = [RankSlice(rank=r, world_size=world).of_batch(batch) for r in range(world)]
             assert {len(share) for share in shares} == {BATCH // world}
-            assert sorted(itertools.chain(*shares), key=lambda p: p.position) == list(batch)
+            assert sorted(itertools.chain(*shares), key=lambda p: p.position) == batch
 
 
 def test_each_rank_reads_few_shards_of_a_window() -> None:
     """That is why batches are shared out by shard: 2 ranks of 8 shards need about 4 each."""
-    sizes = [64] * 8
-    chosen = OrderSettings(seed=0, window=8)
-    stream = windows_from(8, lambda shard: sizes[shard], chosen, 0)
+    stream = places([64] * 8, window=8, count=8 * 64)
     read: list[set[int]] = [set(), set()]
     samples: list[list[int]] = [[], []]
-    for batch in itertools.islice(batch_visits(visits_from(stream, 0), 64), 8):
+    for batch in (stream[at : at + 64] for at in range(0, 8 * 64, 64)):
         for rank in range(2):
             mine = RankSlice(rank=rank, world_size=2).of_batch(batch)
             read[rank] |= {place.shard for place in mine}
@@ -424,9 +377,8 @@ def test_ranks_that_do_not_exist_are_refused(rank: int, world_size: int) -> None
 def test_unequal_shares_and_empty_shards_are_refused() -> None:
     with pytest.raises(TrilightError, match="batch of 10 scenes is not divisible by 4 ranks"):
         RankSlice(rank=0, world_size=4).require_equal(10)
-    chosen = OrderSettings(seed=0, window=1)
     with pytest.raises(TrilightError, match="all 3 shards are empty"):
-        next(windows_from(3, lambda shard: 0, chosen, 0))
+        places([0, 0, 0], count=1)
 
 
 class _Shard(OpenShard):

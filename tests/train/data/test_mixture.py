@@ -24,17 +24,22 @@ from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import TrainingData, open_mixture, open_training_data
 from storage.errors import TrilightError
 from tests.for_each import for_each
-from tests.train.data.test_loader import by_key, identity, same_batches
+from tests.train.data.test_loader import identities
 from tests.train.fake_card import CARD, fake_card
 from tests.train.kit import CPU, keys_of, require_resumed_to_the_bit, take, tiny_run
 from tests.train.toy import write_toy_dataset
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.buckets import CopyStream, StepScenes, decodes_on_device, step_scenes
-from train.data.loader import LoaderSettings, load_batches
-from train.data.mixture import RECORD, Mixture, plan_mixture
-from train.data.order import RankSlice
+from train.data.loader import (
+    MAX_THREADS,
+    LoaderSettings,
+    Machine,
+    choose_workers,
+    detect_machine,
+    load_batches,
+)
+from train.data.order import RECORD, Mixture, RankSlice, plan_mixture
 from train.data.scenes import TrainingScene, stored_levels
-from train.data.workers import MAX_THREADS, Machine, choose_workers, detect_machine
 from train.loop.checkpoints import read_checkpoint
 from train.resume import StartOptions
 from train.run_training import train_run
@@ -117,11 +122,11 @@ def test_it_goes_on_anywhere_with_any_ranks_and_threads(
 ) -> None:
     part: dict[str, Any] = {"first": first, "mixture": mixture(*WEIGHTS)}
     count = WHOLE - first
-    assert same_batches(take(data, SETTINGS, count, workers=3, **part), whole[first:])
+    assert identities(take(data, SETTINGS, count, workers=3, **part)) == identities(whole[first:])
     shares = [take(data, SETTINGS, count, rank=rank, world_size=2, **part) for rank in (0, 1)]
-    for wanted, *parts in zip(whole[first:], *shares, strict=True):
-        got = by_key([scene for part in parts for scene in part])
-        assert [*map(identity, got)] == [*map(identity, by_key(wanted))]
+    together = [list(itertools.chain(*parts)) for parts in zip(*shares, strict=True)]
+    for got, wanted in zip(identities(together), identities(whole[first:]), strict=True):
+        assert sorted(got) == sorted(wanted)
 
 
 def test_first_samples_come_from_every_dataset(data: TrainingData) -> None:
@@ -271,8 +276,8 @@ def test_threads_are_what_is_spare(
     machine: Machine, on_card: bool, threads: int, said: str
 ) -> None:
     run = dataclasses.replace(tiny_run(resolution=256), views_per_scene=2)
-    found = choose_workers(machine, run, on_gpu=on_card, busy_threads=1)
-    assert found.threads == threads and said in found.reason
+    found, reason = choose_workers(machine, run, on_gpu=on_card, busy_threads=1)
+    assert found == threads and said in reason
 
 
 LIT = AugmentationSettings(mirror=True, channels=True, light_scale=3.0)
@@ -333,47 +338,44 @@ def test_batches_are_made_ahead_and_closing_ends_the_thread(dataset: Dataset) ->
     assert threading.active_count() == before
 
 
-class _Log:
-    """What a card is asked to do, in order."""
+def logged(patch: pytest.MonkeyPatch) -> list[tuple[str, Any]]:
+    """Return what a card is asked to do from now on, in order."""
+    said: list[tuple[str, Any]] = []
+    pinned: list[Tensor] = []
 
-    def __init__(self, patch: pytest.MonkeyPatch) -> None:
-        self.said: list[tuple[str, Any]] = []
-        self.pinned: list[Tensor] = []
-        log = self
+    class Stream:
+        def __init__(self, device: torch.device | None = None) -> None:
+            self.numbers = itertools.count(1)
 
-        class Stream:
-            def __init__(self, device: torch.device | None = None) -> None:
-                self.number = 0
+        def record_event(self) -> Any:
+            said.append(("event", next(self.numbers)))
+            return said[-1][1]
 
-            def record_event(self) -> int:
-                self.number += 1
-                log.said.append(("event", self.number))
-                return self.number
+        def wait_event(self, event: int) -> None:
+            said.append(("wait", event))
 
-            def wait_event(self, event: int) -> None:
-                log.said.append(("wait", event))
+    def pin(tensor: Tensor) -> Tensor:
+        pinned.append(tensor.clone())
+        return pinned[-1]
 
-        def pin(tensor: Tensor) -> Tensor:
-            found = tensor.clone()
-            log.pinned.append(found)
-            return found
+    plain = Tensor.to
 
-        plain = Tensor.to
+    def to(tensor: Tensor, device: torch.device, *, non_blocking: bool = False) -> Tensor:
+        is_pinned = any(tensor is each for each in pinned)
+        said.append(("copy" if is_pinned and non_blocking else "slow copy", None))
+        return plain(tensor, device)
 
-        def to(tensor: Tensor, device: torch.device, *, non_blocking: bool = False) -> Tensor:
-            is_pinned = any(tensor is each for each in log.pinned)
-            log.said.append(("copy" if is_pinned and non_blocking else "slow copy", None))
-            return plain(tensor, device)
+    def record_stream(tensor: Tensor, stream: Stream) -> None:
+        said.append(("kept", tensor.device.type))
 
-        patch.setattr(torch.backends.cuda, "is_built", lambda: True)
-        patch.setattr(torch.cuda, "Stream", Stream)
-        patch.setattr(torch.cuda, "stream", lambda _: contextlib.nullcontext())
-        patch.setattr(torch.cuda, "current_stream", lambda _: Stream())
-        patch.setattr(Tensor, "pin_memory", pin)
-        patch.setattr(Tensor, "to", to)
-        patch.setattr(
-            Tensor, "record_stream", lambda tensor, _: log.said.append(("kept", tensor.device.type))
-        )
+    patch.setattr(torch.backends.cuda, "is_built", lambda: True)
+    patch.setattr(torch.cuda, "Stream", Stream)
+    patch.setattr(torch.cuda, "stream", lambda _: contextlib.nullcontext())
+    patch.setattr(torch.cuda, "current_stream", lambda _: Stream())
+    for function in (to, record_stream):
+        patch.setattr(Tensor, function.__name__, function)
+    patch.setattr(Tensor, "pin_memory", pin)
+    return said
 
 
 def test_a_card_gets_copies_beside_its_kernels(
@@ -381,20 +383,21 @@ def test_a_card_gets_copies_beside_its_kernels(
 ) -> None:
     """From pinned memory, all queued at once, each waited for alone, kept until it is used."""
     assert decodes_on_device(CARD)
-    log = _Log(monkeypatch)
+    said = logged(monkeypatch)
     with steps(dataset, CARD, lookup_in_threads=False) as found:
         step = next(found)
     with fake_card():
         sent = CopyStream(CARD).send(step.batches)
         assert len(sent) > 1
-        queued, log.said = log.said, []
+        queued = said.copy()
+        said.clear()
         arrived = [batch.to(CARD) for batch in sent]
     kinds = [kind for kind, _ in queued]
     assert "slow copy" not in kinds and "wait" not in kinds
     assert [number for kind, number in queued if kind == "event"] == [*range(1, len(sent) + 1)]
-    assert [number for kind, number in log.said if kind == "wait"] == [*range(1, len(sent) + 1)]
-    assert {kind for kind, _ in log.said} == {"wait", "kept"}, "nothing is copied twice"
-    assert log.said.count(("kept", "cuda")) == kinds.count("copy")
+    assert [number for kind, number in said if kind == "wait"] == [*range(1, len(sent) + 1)]
+    assert {kind for kind, _ in said} == {"wait", "kept"}, "nothing is copied twice"
+    assert said.count(("kept", "cuda")) == kinds.count("copy")
     for batch in arrived:
         assert batch.target_BVRR3.device == CARD and batch.target_BVRR3.dtype == torch.float32
 

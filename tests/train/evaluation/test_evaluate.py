@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from infra import judging
-from model.light_groups import light_groups
+from model.inference import light_groups
 from model.weights import encode_weights
 from pipeline.presets.judging import PRESETS_FOR_JUDGING
 from storage.dataset.dataset import Dataset
@@ -41,10 +41,15 @@ from train.evaluation.evaluate import (
 from train.evaluation.judged_view import NETWORK, JudgedView, by_group, scene_facts, summarize_views
 from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
 from train.evaluation.options import EvaluationOptions
-from train.evaluation.pages import evaluation_page
-from train.evaluation.report import BENCHMARK, record
-from train.evaluation.stored_pictures import MEDIAN, NEAREST, Baselines, median_picture
-from train.evaluation.validation import predict, validation_scene
+from train.evaluation.pages import BENCHMARK, evaluation_page, record
+from train.evaluation.validation import (
+    MEDIAN,
+    NEAREST,
+    Baselines,
+    median_picture,
+    predict,
+    validation_scene,
+)
 from train.loop.train_state import new_state
 from train.loss.lpips import Lpips
 

@@ -1,4 +1,4 @@
-"""Laws of judging: hits against a ray tracer, scores against storage, a rival that is a median.
+"""Laws of judging: scores against storage, a rival that is a median.
 
 What noise alone would score; and the path tracer in the network's time: which samples are chosen,
 which views are traced, over views that have both.
@@ -13,15 +13,17 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from storage.conventions import camera_rays, log10_radiance, radiance_from_log10
+from infra.render.networks import RendererHere, SceneHere
+from storage.conventions import log10_radiance, radiance_from_log10
 from storage.errors import TrilightError, Unrenderable
 from storage.metrics import object_psnr_log_db, psnr_linear_db, psnr_log_db
+from storage.raycast.first_hits import first_hits
 from storage.records.sample import Sample
 from storage.records.scene import Scene
-from storage.renderer import Camera, OnProgress, Renderer, ignore_progress
+from storage.renderer import Camera, Renderer
 from storage.renderer import Image as Rendered
 from storage.seeds import rng_for
-from tests.for_each import case, for_each
+from tests.for_each import case
 from tests.train.kit import eval_config
 from tests.train.loss.test_training_loss import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
@@ -32,12 +34,14 @@ from train.evaluation.equal_time import (
     EqualTimeResult,
     Filter,
     Level,
+    Price,
     TracerTimes,
     equal_time,
     sentences,
     spread_text,
     spread_views,
     time_both,
+    time_scene,
 )
 from train.evaluation.error_colors import ERROR_WHITE, error_picture
 from train.evaluation.evaluate import EvalConfig, judge_views, sheet_views
@@ -52,8 +56,7 @@ from train.evaluation.metrics import (
     score_view,
     summarize_scores,
 )
-from train.evaluation.pages import evaluation_page
-from train.evaluation.report import record
+from train.evaluation.pages import evaluation_page, record
 from train.evaluation.sheet import (
     NOISE_WHITE,
     SheetView,
@@ -61,51 +64,17 @@ from train.evaluation.sheet import (
     noise_picture,
     write_picture,
 )
-from train.evaluation.stored_pictures import median_picture
-from train.evaluation.timing import Price, time_scene
-from train.evaluation.validation import hit_masks
+from train.evaluation.validation import hit_masks, median_picture
 from train.loss.lpips import Lpips
 
 
-def hits_one_by_one(scene: Scene, view: int, resolution: int) -> np.ndarray:
-    """Moeller and Trumbore 1997, one ray and one triangle at a time."""
-    origin, rays = camera_rays(scene.c2w[view], float(scene.fov_deg[view]), resolution)
-    mask = np.zeros((resolution, resolution), bool)
-    for corners in scene.vertex_positions[scene.faces[~scene.triangle_emits]].astype(np.float64):
-        edge1, edge2 = corners[1] - corners[0], corners[2] - corners[0]
-        for row, column in np.ndindex(mask.shape):
-            ray = rays[row, column]
-            p = np.cross(ray, edge2)
-            determinant = edge1 @ p
-            if abs(determinant) < 1e-15:
-                continue
-            s = (origin - corners[0]) / determinant
-            q = np.cross(s, edge1)
-            u, v, depth = s @ p, ray @ q, edge2 @ q
-            mask[row, column] |= u >= 0 and v >= 0 and u + v <= 1 and depth > 0
-    return mask
-
-
-@for_each("index", [0, 1])
-def test_hits_are_those_of_a_ray_tracer(index: int) -> None:
-    scene = toy_scene(index, boxes=1)
-    masks = hit_masks(scene, 12)
-    for view in range(scene.num_views):
-        np.testing.assert_array_equal(masks[view], hits_one_by_one(scene, view, 12))
-    assert 0 < masks.mean() < 1
-
-
-def test_geometry_behind_the_camera_and_emitters_are_not_hit() -> None:
+def test_masks_are_the_hits_of_each_view() -> None:
+    """What a hit is, tests/storage/raycast says; emitters are none."""
     scene = toy_scene(0)
-    behind = scene.c2w.copy()
-    behind[:, :3, [0, 2]] *= -1  # turned about: the scene is behind the camera now
-    assert not hit_masks(scene.with_cameras(behind, scene.fov_deg), 16).any()
-    emitter = scene.vertex_positions[scene.faces[scene.triangle_emits]][0].mean(axis=0)
-    looking_up = np.eye(4, dtype=np.float32)
-    looking_up[:3, :3] = np.diag([1.0, -1.0, -1.0])
-    looking_up[:3, 3] = emitter - [0, 0, 0.05]
-    at_light = scene.with_cameras(looking_up[None], np.array([20.0], np.float32))
-    assert not hit_masks(at_light, 8).any()
+    masks = hit_masks(scene, 12)
+    for view, mask in enumerate(masks):
+        np.testing.assert_array_equal(mask, first_hits(scene, view=view, resolution=12).met)
+    assert 0 < masks.mean() < 1 and not np.array_equal(masks[0], masks[1])
 
 
 def view_score(log_l1: float, db: float = 0.0) -> ViewScore:
@@ -227,29 +196,21 @@ TIMES = EqualTimeResult(
 )
 
 
-class StoredTargets:
+class StoredTargets(RendererHere):
     """Shows the stored pictures themselves."""
 
     name = TRACER
     resolution = 32
-    identity: Mapping[str, str] = {}
-    notes: Sequence[str] = ()
-    seconds = 0.0
-    cpu_seconds: float | None = None
 
     def __init__(self, samples: Sequence[Sample]) -> None:
-        self._samples = {sample.key: sample for sample in samples}
+        self._pictures = {sample.key: sample.radiance_rgb for sample in samples}
 
-    def load(self, scene: Scene, name: str) -> "StoredTargets":
-        return StoredTargets([self._samples[name]])
+    def load(self, scene: Scene, name: str) -> SceneHere:
+        def show(camera: Camera) -> Rendered:
+            assert camera.view is not None
+            return Rendered(radiance_rgb=self._pictures[name][camera.view], cpu_seconds=None)
 
-    def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Rendered:
-        (sample,) = self._samples.values()
-        assert camera.view is not None
-        return Rendered(radiance_rgb=sample.radiance_rgb[camera.view], cpu_seconds=None)
-
-    def close(self) -> None:
-        pass
+        return SceneHere(render_image=show)
 
 
 @pytest.fixture(scope="module")
@@ -326,36 +287,27 @@ def test_it_is_judged_on_no_more_views_than_asked_from_all_over_the_split() -> N
             assert ("each scene" in spread_text(every, first, 2)) == (most >= scenes)
 
 
-class Clocked:
+class Clocked(RendererHere):
     """Renderer that says what it takes; loading takes longest in the first round."""
 
     name = "clocked"
     resolution = 16
-    identity: Mapping[str, str] = {}
-    notes: Sequence[str] = ()
-    seconds = 0.0
 
     def __init__(self, further_s: float, *, dark: str = "", lacking: str = "") -> None:
-        self.further_s = further_s
-        self.cpu_seconds: float | None = None
+        black = np.zeros((16, 16, 3), np.float32)
+        self._picture = Rendered(radiance_rgb=black, cpu_seconds=further_s)
         self.loads = 0
         self._dark = dark
         self._lacking = lacking
 
-    def load(self, scene: Scene, name: str) -> "Clocked":
+    def load(self, scene: Scene, name: str) -> SceneHere:
         if self._lacking:
             raise TrilightError(self._lacking)
         if name == self._dark:
             raise Unrenderable(f"{name}: nothing shines")
-        self.cpu_seconds = [100.0, 3.0, 5.0, 4.0][self.loads % 4]
         self.loads += 1
-        return self
-
-    def render(self, camera: Camera, on_progress: OnProgress = ignore_progress) -> Rendered:
-        return Rendered(radiance_rgb=np.zeros((16, 16, 3), np.float32), cpu_seconds=self.further_s)
-
-    def close(self) -> None:
-        pass
+        loading_s = [100.0, 3.0, 5.0, 4.0][(self.loads - 1) % 4]
+        return SceneHere(render_image=lambda _: self._picture, cpu_seconds=loading_s)
 
 
 def test_the_first_view_pays_for_loading_and_the_round_that_warms_up_counts_not() -> None:

@@ -30,8 +30,7 @@ from train.loss.lpips import (
     Lpips,
     load_lpips,
 )
-from train.loss.ms_ssim import SCALE_WEIGHTS, ms_ssim, ssim
-from train.loss.training_loss import TrainingLoss, tone_map
+from train.loss.training_loss import SCALE_WEIGHTS, TrainingLoss, ms_ssim, ssim, tone_map
 from train.settings import LossSettings
 
 WIDTHS = (4, 5, 6, 7, 8)

@@ -38,18 +38,24 @@ from train.folder import RunFolder
 from train.loop.distributed import DistributedContext, join_processes
 from train.loop.step import StepReport
 from train.loop.train_state import new_state
-from train.monitoring import spikes, watchdog
-from train.monitoring.activity import PHASES, Activity
+from train.monitoring import process_monitor, watchdog
+from train.monitoring.activity import PHASES, Activity, LayerNorms, layer_of
 from train.monitoring.boards import WandbLogger, require_wandb, scalars
-from train.monitoring.layers import LayerNorms, layer_of
-from train.monitoring.process_monitor import OWN_PHASES, own_seconds, slowest_rank
-from train.monitoring.profiler import StepProfiler
+from train.monitoring.process_monitor import (
+    LEAST_REMEMBERED,
+    OWN_PHASES,
+    Spike,
+    SpikeDetector,
+    StepProfiler,
+    own_seconds,
+    slowest_rank,
+    spike_bound,
+)
 from train.monitoring.rows import read_rows
-from train.monitoring.settings import WatchSettings
-from train.monitoring.spikes import LEAST_REMEMBERED, Spike, SpikeDetector, spike_bound
 from train.monitoring.watchdog import Watchdog
 from train.progress import TrainProgress
 from train.run_training import train_run
+from train.settings import WatchSettings
 
 
 def until(done: Callable[[], object]) -> None:
@@ -127,8 +133,8 @@ def test_a_row_tells_parts_memory_and_layers_and_spikes_name_their_scenes(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Spikes by a bound so low that there are some."""
-    monkeypatch.setattr(spikes, "LEAST_REMEMBERED", 2)
-    monkeypatch.setattr(spikes, "LEAST_DEVIATION", 0.0)
+    monkeypatch.setattr(process_monitor, "LEAST_REMEMBERED", 2)
+    monkeypatch.setattr(process_monitor, "LEAST_DEVIATION", 0.0)
     watched = WatchSettings(spike_bound=1.0)
     result = trained(tiny_run(), dataset, tmp_path, watched=watched)
     rows = read_rows(result.folder.metrics)
@@ -287,7 +293,7 @@ def test_a_gradient_that_is_not_finite_is_none_and_a_missing_one_is_nothing() ->
     model[0].weight.grad = torch.full((1, 2), math.inf)
     layers.record_gradients()
     layers.record_update()
-    seen = layers.pending()
+    seen = layers.pending
     assert seen is not None
     layers.set_values(seen.flatten().tolist())
     row = layers.pop_row()
