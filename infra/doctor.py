@@ -15,11 +15,9 @@ from pathlib import Path
 from typing import Literal
 
 from pipeline.isolation.confinement import VARIABLE, confinement_mode, missing_features
-from pipeline.isolation.landlock import landlock_version
-from pipeline.isolation.seccomp import seccomp_works
+from pipeline.isolation.system_calls import landlock_version, seccomp_works
 from pipeline.renders.facts import VIEW_PX, VIEW_SPP, render_facts
-from pipeline.renders.mitsuba_variant import choose_variant
-from pipeline.renders.visible_gpus import query_gpus
+from pipeline.renders.mitsuba_variant import choose_variant, query_gpus
 from storage.cache import cache_folder
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.installation import IMPORT_ROOT, child_environment, module_name

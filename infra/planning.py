@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generation_run import MAX_TASKS, TASK_S, Piece
 from pipeline.generation.pipeline import make_task, prepare_dataset
 from pipeline.generation.render_workers import close_children
-from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.presets.settings import DatasetSettings
-from pipeline.renders.visible_gpus import visible_gpus
+from pipeline.renders.mitsuba_variant import visible_gpus
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
 from storage.dataset.progress import read_progress

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from pipeline.generation.generate_options import GenerateOptions as GenerateOptions
     from pipeline.generation.generate_options import generate_words as generate_words
     from pipeline.generation.generation_run import Outcome as Outcome
+    from pipeline.generation.generation_run import Runner as Runner
     from pipeline.generation.pipeline import make_dataset as make_dataset
     from pipeline.generation.pipeline import prepare_dataset as prepare_dataset
-    from pipeline.generation.runner import Runner as Runner
     from pipeline.objects.listing import Listing as Listing
     from pipeline.objects.ply import encode_ply as encode_ply
     from pipeline.objects.sources import SOURCES as SOURCES

@@ -129,7 +129,7 @@ def _print_report(
 
 
 def _unread_rows(report: "AssetReport", folder: "AssetFolder") -> list[tuple[str, str]]:
-    from pipeline.generation.unread_notes import format_unread
+    from pipeline.generation.prepare_isolated import format_unread
 
     lines = format_unread(report.unread, folder.logs)
     return [("" if row else "not read", line) for row, line in enumerate(lines)]
@@ -152,7 +152,7 @@ def _material_rows(
 ) -> list[tuple[str, str]]:
     if not settings.own_materials.keep:
         return []
-    from pipeline.generation.unread_notes import format_unread
+    from pipeline.generation.prepare_isolated import format_unread
 
     num_kept = sum(row.colours is not None for row in report.rows)
     reasons = {row.uid: row.materials.reason for row in report.rows if row.materials}

@@ -18,7 +18,7 @@ from infra.cli.console import first_words, next_step, note, print_json, print_ro
 from infra.cli.options import OutputOptions, command
 from infra.cli.overrides import BaseSettings, with_base_settings
 from pipeline.executors.registry import find_executor
-from pipeline.generation.begin_or_resume_dataset import require_its_extensions
+from pipeline.generation.dataset_writer import require_its_extensions
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.objects.licences import USER_PROVIDED
 from storage.dataset.layout import DatasetFolder, dataset_folder

@@ -17,10 +17,9 @@ from infra.cli.console import (
 )
 from infra.cli.everyday import HELP_FLAGS
 from infra.cli.options import OutputOptions, command
-from pipeline.shards.derive import DeriveOptions
+from pipeline.shards.derive import DeriveOptions, Selection
+from pipeline.shards.derive import list_scenes as read_scene_rows
 from pipeline.shards.finished_dataset import open_finished
-from pipeline.shards.listing import list_scenes as read_scene_rows
-from pipeline.shards.plans import Selection
 from storage.errors import TrilightError
 from storage.settings.described import checked
 from storage.settings.ranges import Within
@@ -109,19 +108,22 @@ def list_scenes(chosen: SelectOptions, output: OutputOptions) -> None:
     first_words(f"Reading {chosen.dataset}", silent=output.json)
     with progress_bars() as bars:
         task = bars.add_task("shards", total=None, note="", visible=not output.json)
-        scenes = read_scene_rows(
-            open_finished(str(chosen.dataset)),
+        source = open_finished(str(chosen.dataset))
+        rows = read_scene_rows(
+            source,
             chosen.selection,
             progress=lambda done, total: bars.update(task, completed=done, total=total),
         )
     if output.json:
-        print_json({"of": scenes.of, "scenes": list(scenes.rows)})
+        print_json({"of": source.manifest.num_samples, "scenes": rows})
         return
-    title = f"{len(scenes.rows)} of {scenes.of} scenes; of several views the least, most spp"
-    print_table(title, scenes.rows[:_MOST_LISTED])
-    if len(scenes.rows) > _MOST_LISTED:
+    of = source.manifest.num_samples
+    print_table(
+        f"{len(rows)} of {of} scenes; of several views the least, most spp", rows[:_MOST_LISTED]
+    )
+    if len(rows) > _MOST_LISTED:
         note(f"the first {_MOST_LISTED} are shown; --json lists all")
-    if scenes.rows:
+    if rows:
         words = ["shards", "select", str(chosen.dataset), "--out", f"{chosen.dataset}-selected"]
         options = {
             "--split": chosen.split,

@@ -19,14 +19,18 @@ from infra.cli.console import (
 from infra.cli.everyday import HELP_FLAGS
 from infra.cli.options import OutputOptions, command
 from infra.cli.overrides import BaseSettings, with_base_settings
-from pipeline.executors.array_job import ArrayJob, DatasetByArray, array_job
-from pipeline.executors.kubernetes_array import (
+from pipeline.executors.array_job import (
+    ArrayJob,
+    DatasetByArray,
     KubernetesOptions,
+    array_job,
     create_command,
+    sbatch_command,
+    sbatch_environment,
     submit_job,
+    submit_slurm_array,
     write_job_file,
 )
-from pipeline.executors.slurm_array import sbatch_command, sbatch_environment, submit_slurm_array
 from pipeline.flows.prefect_server import load_prefect
 from pipeline.generation.generate_options import GenerateOptions
 from storage.errors import TrilightError

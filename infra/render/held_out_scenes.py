@@ -7,14 +7,13 @@ Previews and methods are evaluated and timed on these scenes.
 import dataclasses
 from pathlib import Path
 
-from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
+from pipeline.generation.dataset_writer import begin_or_resume_dataset
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
-from pipeline.generation.software_environment import environment
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.settings import DatasetSettings
 from pipeline.presets.training import smoke
-from pipeline.renders.mitsuba_variant import Variant, choose_variant
+from pipeline.renders.mitsuba_variant import Variant, choose_variant, environment
 from scene_templates.settings import SceneSettings
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.splits import JUDGED_SPLIT

@@ -14,9 +14,8 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 from infra.render.quality import FixedSamples, ToStatedError
-from pipeline.generation.software_environment import environment
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
-from pipeline.renders.mitsuba_variant import Variant, activate
+from pipeline.renders.mitsuba_variant import Variant, activate, environment
 from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings, ProgressiveRenderer
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import GrowingPicture, RenderedView

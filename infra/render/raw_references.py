@@ -12,11 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import PixelCamera
-from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import Curve, secant_slope
 from pipeline.renders.settings import PASS_SPP, RenderSettings
-from pipeline.renders.tracer import Tracer
+from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer
 from storage.records.lights import light_rows, num_light_pictures
 from storage.records.scene import Scene
 from storage.seeds import seed_for

@@ -18,9 +18,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
-from pipeline.flows.prefect_server import load_prefect, prefect_client
-from pipeline.renders.visible_gpus import visible_gpus
+from pipeline.flows.prefect_server import DISK_LIMIT, GPU_LIMIT, load_prefect, prefect_client
+from pipeline.renders.mitsuba_variant import visible_gpus
 from storage.errors import TrilightError
 from storage.installation import FILES_ROOT
 

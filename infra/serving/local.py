@@ -39,7 +39,7 @@ from pipeline.flows.prefect_server import (
     quiet_prefect,
     wait_until_healthy,
 )
-from pipeline.renders.visible_gpus import visible_gpus
+from pipeline.renders.mitsuba_variant import visible_gpus
 from storage.atomic import write_atomically
 from storage.cache import open_private
 from storage.errors import TrilightError

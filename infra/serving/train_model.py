@@ -14,9 +14,8 @@ from prefect.logging import get_run_logger
 
 from infra.train_options import TrainOptions
 from pipeline.flows.forms import PublicUrl, options_of_form, overrides_form, parameters_of
-from pipeline.flows.limits import GPU_LIMIT
-from pipeline.flows.process import run_to_end
-from pipeline.renders.visible_gpus import visible_gpus
+from pipeline.flows.prefect_server import GPU_LIMIT, run_to_end
+from pipeline.renders.mitsuba_variant import visible_gpus
 from storage.aliases import PRESET_ALIASES
 from storage.errors import TrilightError
 from train.presets import TRAINING_PRESETS, smoke

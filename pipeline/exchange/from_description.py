@@ -27,8 +27,7 @@ from pipeline.exchange.description import (
     SceneDescription,
 )
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
-from pipeline.scenes.posing import without_slivers
-from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded, smooth_shaded
+from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded, smooth_shaded, without_slivers
 from scene_templates.rotations import rotate_points, rotation_xyz
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError

@@ -32,8 +32,7 @@ from pipeline.exchange.description import (
 from pipeline.exchange.from_description import SHELL_FOLDER, SMOOTH_ANGLE_DEG
 from pipeline.exchange.textured_triangles import group_triangles
 from pipeline.foreign.numbers import Malformed
-from pipeline.scenes.posing import without_slivers
-from pipeline.scenes.shading_normals import face_normals, smooth_shaded
+from pipeline.scenes.shading_normals import face_normals, smooth_shaded, without_slivers
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, ROUGHNESS, SPECULAR

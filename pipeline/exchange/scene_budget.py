@@ -10,8 +10,13 @@ from numpy.typing import NDArray
 from pipeline.assets.remesh import remesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
-from pipeline.scenes.posing import without_slivers
-from pipeline.scenes.shading_normals import ShadedMesh, face_normals, flat_shaded, smooth_shaded
+from pipeline.scenes.shading_normals import (
+    ShadedMesh,
+    face_normals,
+    flat_shaded,
+    smooth_shaded,
+    without_slivers,
+)
 from storage.errors import Rejected, TrilightError
 from storage.records.retextured import without_maps
 from storage.records.scene import Scene

@@ -1,8 +1,7 @@
 """The executors that run a dataset's tasks, by the name that `--runner` takes.
 
-Each executor is a module with a function `make`; the engine (pipeline.generation) imports none.
-`make` narrows the options or begins a flow, and then calls `make_dataset` with a `Runner`
-(pipeline.generation.runner).
+The engine (pipeline.generation) imports none of their modules. A `make` narrows the options or
+begins a flow, and then calls `make_dataset` with a `Runner` (pipeline.generation.generation_run).
 """
 
 from collections.abc import Callable
@@ -33,14 +32,14 @@ class Executor:
     """True if `--workers` sets how many tasks run at the same time."""
 
 
-def _load_on_use(module: str) -> Make:
-    """Return a function that imports a module when it is called, and calls its `make`.
+def _load_on_use(module: str, name: str = "make") -> Make:
+    """Return a function that imports a module when it is called, and calls a function of it.
 
     The import loads every stage, and for some executors packages that may not be installed.
     """
 
     def make(options: GenerateOptions, address: str | None) -> "Outcome":
-        outcome: Outcome = import_module(module_name(module)).make(options, address)
+        outcome: Outcome = getattr(import_module(module_name(module)), name)(options, address)
         return outcome
 
     return make
@@ -51,11 +50,13 @@ EXECUTORS: Registry[Executor] = Registry(
     Executor,
     {
         "threads": Executor(make=_load_on_use("pipeline.executors.threads")),
-        "slurm": Executor(make=_load_on_use("pipeline.executors.slurm")),
-        "kubernetes": Executor(make=_load_on_use("pipeline.executors.kubernetes")),
-        "prefect": Executor(make=_load_on_use("pipeline.flows.on_prefect")),
+        "slurm": Executor(make=_load_on_use("pipeline.executors.threads", "make_slurm")),
+        "kubernetes": Executor(make=_load_on_use("pipeline.executors.threads", "make_kubernetes")),
+        "prefect": Executor(make=_load_on_use("pipeline.flows.flow_executors", "make_on_prefect")),
         "dask": Executor(
-            make=_load_on_use("pipeline.flows.on_dask"), needs_address=True, takes_workers=False
+            make=_load_on_use("pipeline.flows.flow_executors"),
+            needs_address=True,
+            takes_workers=False,
         ),
     },
 )
@@ -64,10 +65,6 @@ EXECUTORS: Registry[Executor] = Registry(
 
 def find_executor(name: str, address: str | None, workers: int | None) -> Executor:
     """Return an executor.
-
-    Args:
-        name: value of `--runner`.
-        address, workers: values of `--address` and `--workers`.
 
     Raises:
         TrilightError: the name is unknown, or an option is missing or not supported.

@@ -33,7 +33,6 @@ def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
     """Return a decorator that gives a flow's function the signature of a settings class.
 
     Args:
-        settings: the settings class.
         annotations: types that replace those of some fields.
     """
 

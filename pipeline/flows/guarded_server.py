@@ -22,7 +22,7 @@ import os
 import sys
 from collections.abc import Awaitable, Callable, Collection, MutableMapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import urlsplit
 
 from pipeline.flows.prefect_server import PASSWORD, quiet_prefect
@@ -42,11 +42,8 @@ Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 
 
-class Application(Protocol):
-    """An ASGI application."""
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one connection."""
+Application = Callable[[Scope, Receive, Send], Awaitable[None]]
+"""An ASGI application, which serves one connection."""
 
 
 class RequestGuard:
@@ -56,7 +53,6 @@ class RequestGuard:
         """Guard an application.
 
         Args:
-            inner: the guarded application.
             names: host names of this server, beside localhost and addresses.
         """
         self._inner = inner
@@ -174,7 +170,6 @@ def serve(host: str, port: int) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Parse the arguments and serve."""
     parser = argparse.ArgumentParser(description="Prefect's server, behind a password.")
     parser.add_argument("--host", default="127.0.0.1", help="address to bind to")
     parser.add_argument("--port", type=int, default=4200, help="port to listen at")

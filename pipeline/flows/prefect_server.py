@@ -13,21 +13,29 @@ import json
 import os
 import re
 import secrets
+import signal
 import socket
 import subprocess
 import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.isolation import die_with_parent
 from storage.cache import cache_folder, open_private, private_folder
 from storage.errors import TrilightError
 from storage.file_locks import hold_lock
 from storage.installation import IMPORT_ROOT, child_environment
 from storage.remote.safe_url import safe_text
+
+DISK_LIMIT = "trilight-disk"
+"""Limit of runs that write documents at the same time."""
+GPU_LIMIT = "trilight-gpu"
+"""Limit of tasks that render or train on a GPU at the same time. A limit that does not exist at the
+server has no effect, so the setup of a server creates both (infra.serving.deployments)."""
 
 if TYPE_CHECKING:
     import httpx
@@ -184,7 +192,9 @@ def prefect_server() -> Iterator[str]:
     with contextlib.ExitStack() as starting, open_private(home / _LOG_NAME, "ab") as log:
         # two first starts at once would both migrate the database
         starting.enter_context(hold_lock(home / "start.lock", wait=True))
-        port = _free_port()
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
         server = subprocess.Popen(
             [*SERVER, "--port", str(port), "--with-parent"],
             env={**child_environment(), PASSWORD: password, **_NO_PAGE},
@@ -255,7 +265,39 @@ def wait_until_healthy(
     )
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+def run_to_end(command: Sequence[str], say: Callable[[str], None]) -> tuple[int, str]:
+    """Run a program and pass on its output.
+
+    If this call ends early (a canceled flow gets SIGTERM, which Prefect raises as an exception),
+    the program gets one SIGTERM, and the call waits for it. It has a session of its own, so that no
+    signal to the group of this process reaches it too: training ends at once after a second signal.
+    If this process is killed, the program is too.
+
+    Args:
+        say: called with each line of the output, without secrets.
+
+    Returns:
+        The exit status of the program, and its last line.
+    """
+    last = ""
+    with subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**child_environment(), STOPPED_BY_PARENT: "1"},
+        start_new_session=True,
+        preexec_fn=die_with_parent,
+    ) as process:
+        assert process.stdout is not None
+        try:
+            for line in process.stdout:
+                if line.strip():
+                    last = safe_text(line.strip())
+                    say(last)
+        except BaseException:
+            process.send_signal(signal.SIGTERM)
+            process.communicate()  # a full pipe would stop it before it has saved
+            raise
+    return process.returncode, last

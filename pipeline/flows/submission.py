@@ -1,7 +1,7 @@
 """Submits a flow run to a Prefect server and polls its state and artifacts.
 
 The deployment is found by the flow's name alone, while Prefect needs FLOW/DEPLOYMENT. Prefect shows
-only states; the progress of a run is in its artifacts (pipeline.flows.run_artifacts).
+only states; the progress of a run is in its artifacts (pipeline.flows.prefect_runner).
 """
 
 import json
@@ -43,7 +43,6 @@ class SubmittedRun:
     pool: str
     """Work pool whose workers execute the run."""
     page: str
-    """URL of the run's page."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,11 +80,7 @@ def server() -> Iterator[SyncPrefectClient]:
 
 
 def parameters(options: Any) -> dict[str, Any]:
-    """Return the preset and all fields that are not defaults, in the layout of the flow's form.
-
-    Args:
-        options: options of a class whose fields are the flow's parameters.
-    """
+    """Return the preset and all fields that are not defaults, in the layout of the flow's form."""
     kind: type = type(options)
     values: dict[str, Any] = {}
     for field in describe_fields(kind):
@@ -102,10 +97,7 @@ def submit(
     """Create a flow run; return as soon as the server has accepted it.
 
     Args:
-        client: client of the server.
-        flow: name of the flow.
         deployment: name of its deployment; None: the only one, or the one that make serve makes.
-        values: parameters of the flow run.
 
     Raises:
         TrilightError: the flow is not served there, or not by such a deployment.
@@ -135,7 +127,6 @@ def submit(
 
 
 def workers_online(client: SyncPrefectClient, pool: str) -> int:
-    """Return the number of online workers of a pool."""
     workers = client.read_workers_for_work_pool(pool) if pool else []
     return sum(worker.status == WorkerStatus.ONLINE for worker in workers)
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.render_sample import failure_of
 from pipeline.isolation import (
     ChildFailed,
     ChildLimits,
@@ -100,8 +101,6 @@ def accept_maps(
     """Prepare the textures and maps of folders.
 
     Args:
-        user_folders: the folders.
-        settings: the preset: sizes, licences and splits.
         workers: number of files that are decoded at the same time.
 
     Raises:
@@ -117,7 +116,14 @@ def accept_maps(
         outcomes = _prepare_maps(kind, listing.maps, settings, workers)
         usable = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
         failures += [
-            _unread_failure(locked, path) for locked, path in usable if _notes(path).exists()
+            Failure(
+                stage="objects",
+                item=locked.uid,
+                reason="not_read",
+                message=notes.read_text("utf-8"),
+            )
+            for locked, path in usable
+            if (notes := _notes(path)).exists()
         ]
         lost = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
         failures += [*listing.failures, *lost]
@@ -146,9 +152,7 @@ def _prepare_maps(
                 path = _prepare_file(MapFiles(kind=kind, files=user_map.files, size=size), child)
             return _lock_entry(kind, user_map, path, settings), path
         except Rejected as rejection:
-            uid = user_map.record.uid
-            reason = rejection.reason
-            return Failure(stage="objects", item=uid, reason=reason, message=rejection.message)
+            return failure_of("objects", user_map.record.uid, rejection)
 
     try:
         with ThreadPoolExecutor(workers) as threads:
@@ -160,11 +164,6 @@ def _prepare_maps(
 def _notes(prepared: Path) -> Path:
     """Return the path of the note on unread parts of a prepared file; absent if there are none."""
     return prepared.with_suffix(".txt")
-
-
-def _unread_failure(locked: LockedObject, path: Path) -> Failure:
-    message = _notes(path).read_text("utf-8")
-    return Failure(stage="objects", item=locked.uid, reason="not_read", message=message)
 
 
 def _prepare_file(map_files: MapFiles, child: IsolatedChild) -> Path:

@@ -2,15 +2,14 @@
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
 from pipeline.exchange.scene_files import SceneFiles, SceneFolder, build_scene, require_usable
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.freeze_objects import AcceptedObjects, read_frozen_objects
 from pipeline.generation.prepare_isolated import asset_child
+from pipeline.generation.revisited_scenes import AcceptedObjects
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
 from pipeline.objects.licences import StatedLicence, stated_licence
 from pipeline.presets.settings import DatasetSettings
@@ -55,10 +54,15 @@ def accept_scene_files(
         TrilightError: no scene at all can be built, the licence is not allowed, or the files are
             not those that the dataset was begun with.
     """
-    stated = _require_allowed(stated_licence(licence), settings)
+    stated = stated_licence(licence)
+    if stated.licence.casefold() not in {name.casefold() for name in settings.allowed_licences}:
+        raise TrilightError(
+            f"--licence is {stated.licence}, which is not on the allow-list; if you may use the "
+            f"scenes, add --allow-licence '{stated.licence}'."
+        )
     files = _build_all(folder, stated, settings, writer)
     locked = [_lock_entry(uid, digest, stated) for uid, digest in sorted(files.sha256.items())]
-    frozen = read_frozen_objects(writer)
+    frozen = writer.frozen_objects()
     if frozen is None:
         writer.lock_objects(locked)
     else:
@@ -83,9 +87,9 @@ def _build_all(
         for name in folder.names:
             if name not in unusable:
                 try:
-                    built = _build_in_child(child, folder, name, settings)
-                    sha256 |= built.sha256
-                    notes += built.notes
+                    digests, words = _build_in_child(child, folder, name, settings)
+                    sha256 |= digests
+                    notes += words
                 except EnvironmentFailure:
                     raise
                 except TrilightError as mistake:
@@ -105,20 +109,14 @@ def _build_all(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class BuiltScene:
-    """Digests and notes of a scene that was built once as a check."""
-
-    sha256: Mapping[str, str]
-    """Digest of every file of the scene, by path below the folder."""
-    notes: tuple[str, ...]
-    """Notes for the user, such as unread fields and scaled albedos."""
-
-
 def build_once(
     root: Path, name: str, settings: AssetSettings, num_views: int, over_one: AlbedoOverOne
-) -> BuiltScene:
-    """Build a scene; runs only in child processes. Raises TrilightError as `build_scene`."""
+) -> tuple[Mapping[str, str], tuple[str, ...]]:
+    """Build a scene once as a check; return the digests of its files, and notes for the user.
+
+    Files are named by their path below the folder. Runs only in child processes; raises as
+    `build_scene`.
+    """
     unread: list[str] = []
     scene, sha256 = build_scene(
         root,
@@ -131,25 +129,16 @@ def build_once(
         albedo_over_one=over_one,
         notes=unread,
     )
-    notes = tuple(f"{name}: {text}" for text in (*unread, *scaled_albedo_notes(scene)))
-    return BuiltScene(sha256=sha256, notes=notes)
+    return sha256, tuple(f"{name}: {text}" for text in (*unread, *scaled_albedo_notes(scene)))
 
 
 def _build_in_child(
     child: IsolatedChild, folder: SceneFolder, name: str, settings: DatasetSettings
-) -> BuiltScene:
+) -> tuple[Mapping[str, str], tuple[str, ...]]:
     """Build a scene in a child; raises TrilightError, or EnvironmentFailure for the machine."""
-    num_views = settings.scenes.num_views
+    arguments = (settings.assets, settings.scenes.num_views, folder.albedo_over_one)
     try:
-        return call_with_retries(
-            child,
-            build_once,
-            folder.root,
-            name,
-            settings.assets,
-            num_views,
-            folder.albedo_over_one,
-        )
+        return call_with_retries(child, build_once, folder.root, name, *arguments)
     except ChildFailed as failure:
         if failure.is_verdict:
             raise TrilightError(
@@ -159,15 +148,6 @@ def _build_in_child(
             f"{name}: its meshes could not be read this time ({failure}). Run the same command "
             "again; if that does not help, see `trilight doctor`."
         ) from failure
-
-
-def _require_allowed(stated: StatedLicence, settings: DatasetSettings) -> StatedLicence:
-    if stated.licence.casefold() not in {name.casefold() for name in settings.allowed_licences}:
-        raise TrilightError(
-            f"--licence is {stated.licence}, which is not on the allow-list; if you may use the "
-            f"scenes, add --allow-licence '{stated.licence}'."
-        )
-    return stated
 
 
 def _lock_entry(uid: str, sha256: str, stated: StatedLicence) -> LockedObject:

@@ -3,28 +3,39 @@
 A bucket has the same files as a folder, and is written by any number of machines. Manifest, lock
 and shards are each created once; the server refuses a second writer, which then reads the existing
 file. Each machine has a folder before the bucket, for what is not published yet, and with a copy of
-the head of the manifest.
+the head of the manifest. A dataset is begun, or resumed with the same settings, by
+`begin_or_resume_dataset`; `DatasetWriter.unfinished_shards` says which shards are left.
 """
 
 import contextlib
 import dataclasses
-import io
 import shutil
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.shards.pack import unpack_here
-from pipeline.shards.published import PublishedShards
+from pipeline.presets.settings import DatasetSettings, differences
+from pipeline.renders.mitsuba_variant import device_of
+from pipeline.shards.pack import (
+    PLANNED,
+    PublishedShards,
+    adopt,
+    fetch,
+    fetch_lock,
+    merge_failures,
+    publish_plan,
+    published_head,
+    unpack_here,
+)
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset, DatasetFiles, LocalFiles, RemoteDatasetFiles
-from storage.dataset.layout import DatasetFolder, in_parts, parts_of, shard_names_in
+from storage.dataset.derived import derivation_of
+from storage.dataset.layout import DatasetFolder, in_parts, parts_of, place_of_part, shard_names_in
 from storage.dataset.manifest import (
     Manifest,
     ShardEntry,
-    decode_head,
     number_of_shard,
     read_head,
     read_manifest,
@@ -32,21 +43,27 @@ from storage.dataset.manifest import (
 )
 from storage.dataset.settings import SplitSettings
 from storage.dataset.shard_notes import ShardNote, noted_names, rejections_of_shard
-from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, shards_for
-from storage.digests import sha256_hex, sha256_of_file
+from storage.dataset.splits import (
+    cut_splits,
+    planned_scenes,
+    scenes_of_shard,
+    shard_name,
+    shards_for,
+)
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from storage.extensions import extension_digests, require_same_extensions
 from storage.records.objects import (
     Failure,
     LockedObject,
-    decode_failures,
     encode_objects_lock,
     read_failures,
+    read_objects_lock,
     write_failures,
 )
 from storage.remote.store import BucketStore, Store
+from storage.settings.described import from_record
 
-PLANNED = ".staging/planned/"
-"""Folder of a bucket with one file for each requested number of scenes; the largest counts."""
 _LISTING = ".staging/listing/"
 _LISTED = ".staging/listed/"
 """Folders of a bucket with one file for each number of scenes whose shards some machine lists, and
@@ -55,13 +72,11 @@ _PATIENCE_S = 10.0
 """Seconds to wait for the machine that lists the shards, and again for each _NOTES_MEANWHILE."""
 _NOTES_MEANWHILE = 5_000
 _LONGEST_PAUSE_S = 8.0
-_HEAD_BYTES = 1 << 18
-"""Bytes of a manifest that are read to get its head, which takes about 6 kB."""
 _MAX_LOOKS = 7
 """Looks for a shard that a worker has packed; network file systems may show it a minute later."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class DatasetProgress:
     """Progress of the requested shards."""
 
@@ -119,11 +134,9 @@ class DatasetWriter:
 
     @property
     def num_shards(self) -> int:
-        """Number of shards of the finished dataset."""
         return shards_for(self.manifest.num_scenes, self._splits)
 
     def dataset(self) -> Dataset:
-        """Return a reader of the published dataset."""
         return Dataset(self._files, read_manifest(self.folder.manifest))
 
     def publish(self, *paths: Path) -> None:
@@ -147,7 +160,6 @@ class DatasetWriter:
         )
 
     def is_published(self, path: Path) -> bool:
-        """Return True if a file of the folder is published."""
         return path.exists() or self.store.get(self.folder.name_of(path), 1) is not None
 
     @contextlib.contextmanager
@@ -165,6 +177,12 @@ class DatasetWriter:
             if ours:
                 fetch(self.folder, self.store, path)  # its last holder may have published it
             yield ours
+
+    def frozen_objects(self) -> dict[str, LockedObject] | None:
+        """Return the frozen objects by uid, or None if nothing is frozen yet."""
+        if not self.manifest.objects_lock_sha256:
+            return None
+        return {entry.uid: entry for entry in read_objects_lock(self.folder.objects_lock)}
 
     def lock_objects(self, objects: list[LockedObject]) -> None:
         """Freeze the objects of the dataset: write their lock file and its digest.
@@ -216,12 +234,9 @@ class DatasetWriter:
             return
         num_scenes = self._num_scenes([number_of_shard(note.shard)])
         self.failures += note.failures
-        self.progress = dataclasses.replace(
-            self.progress,
-            shards=self.progress.shards + 1,
-            scenes=self.progress.scenes + num_scenes,
-            given_up=self.progress.given_up + num_scenes - note.shard.num_samples,
-        )
+        self.progress.shards += 1
+        self.progress.scenes += num_scenes
+        self.progress.given_up += num_scenes - note.shard.num_samples
 
     def _require_visible(self, name: str) -> None:
         number = int(name.removesuffix(".tar").rpartition("-")[2])
@@ -232,9 +247,8 @@ class DatasetWriter:
             time.sleep(2**look if look < _MAX_LOOKS - 1 else 0)
         raise TrilightError(
             f"{self.folder.display_name}: a worker has packed {name}, and it is not here: the "
-            "worker's "
-            "folder is not this one. Expected workers that see the same --out at the same place "
-            "(for a bucket, the same TRILIGHT_CACHE); share it, and run the same command again."
+            "worker's folder is not this one. Expected workers that see the same --out at the same "
+            "place (for a bucket, the same TRILIGHT_CACHE); share it, and run this command again."
         )
 
     def unfinished_shards(self, requested: range | None = None) -> list[int]:
@@ -248,13 +262,11 @@ class DatasetWriter:
         every = range(self.num_shards)
         selected = every if requested is None else every[requested.start : requested.stop]
         missing = self._missing_shards(selected)
-        self.progress = dataclasses.replace(
-            self.progress,
-            shards=len(selected) - len(missing),
-            scenes=self._num_scenes(selected) - self._num_scenes(missing),
-            shards_requested=len(selected),
-            scenes_requested=self._num_scenes(selected),
-        )
+        progress = self.progress
+        progress.shards_requested = len(selected)
+        progress.scenes_requested = self._num_scenes(selected)
+        progress.shards = len(selected) - len(missing)
+        progress.scenes = progress.scenes_requested - self._num_scenes(missing)
         return missing
 
     def _missing_shards(self, shards: range) -> list[int]:
@@ -311,8 +323,8 @@ class DatasetWriter:
             has_new_plan = self.refresh_plan()
         self.failures = []
         self.manifest = listed
-        given_up = self._num_scenes(range(self.num_shards)) - listed.num_samples
-        self.progress = dataclasses.replace(self.progress, given_up=given_up)
+        every = self._num_scenes(range(self.num_shards))
+        self.progress.given_up = every - listed.num_samples
         return listed
 
     def _wait_for_lister(self) -> None:
@@ -431,39 +443,136 @@ class DatasetWriter:
         self.manifest = dataclasses.replace(self.manifest, **changes)
 
 
-def published_head(folder: DatasetFolder, store: Store) -> Manifest | None:
-    """Return the published manifest without its shards, with the digest of the published lock."""
-    place = f"{folder.display_name}/manifest.json"
-    start = store.get("manifest.json", _HEAD_BYTES)
-    if start is None:
-        return None
-    try:
-        head = decode_head(io.BytesIO(start), place)
-    except TrilightError:  # the head is longer, or malformed: read it all
-        head = decode_head(io.BytesIO(store.get("manifest.json") or b""), place)
-    if head.objects_lock_sha256:
-        return head
-    lock = store.get(folder.objects_lock.name)
-    return dataclasses.replace(head, objects_lock_sha256=sha256_hex(lock) if lock else "")
+def require_its_extensions(folder: DatasetFolder) -> None:
+    """Refuse other extensions than a dataset has, before settings name what those add.
+
+    A dataset without frozen objects may begin again, and what a bucket holds is known only later.
+
+    Raises:
+        TrilightError: they differ, or the manifest cannot be read.
+    """
+    if not folder.bucket and folder.manifest.exists():
+        manifest = read_head(folder.manifest)
+        if manifest.objects_lock_sha256:
+            _require_extendable(folder, manifest)
 
 
-def fetch(folder: DatasetFolder, store: Store, path: Path) -> None:
-    """Take over a published file that is not in the folder."""
-    if not path.exists() and (data := store.get(folder.name_of(path))) is not None:
-        write_atomically(path, data)
+def _require_extendable(folder: DatasetFolder, manifest: Manifest) -> None:
+    if derivation := derivation_of(manifest.settings):
+        raise TrilightError(
+            f"{folder.display_name}: this dataset was made by `trilight shards "
+            f"{derivation.operation}` and cannot grow; extend its sources and make it again, or "
+            "choose another --out."
+        )
+    require_same_extensions(folder.display_name, manifest.extensions, extension_digests("data"))
 
 
-def fetch_lock(folder: DatasetFolder, store: Store, sha256: str) -> None:
-    """Take over the published lock, of a digest, and its index, unless it is here."""
-    lock = folder.objects_lock
-    if not sha256 or (lock.exists() and sha256_of_file(lock) == sha256):
-        return
-    for path in (lock, folder.staged_index):
-        if (data := store.get(folder.name_of(path))) is not None:
-            write_atomically(path, data)
+def begin_or_resume_dataset(
+    folder: DatasetFolder,
+    settings: DatasetSettings,
+    environment: Mapping[str, Any],
+    num_scenes: int,
+    *,
+    accept_environment: bool,
+) -> DatasetWriter:
+    """Begin a dataset in a folder or a bucket, or resume the one that is there.
+
+    The number of scenes never falls. Call while holding the dataset's lock.
+
+    Raises:
+        TrilightError: the dataset was begun with other settings, or in another environment and
+            `accept_environment` is False, and the message names what differs; the bucket cannot be
+            listed, read or written, or its server would let two workers create the same file.
+    """
+    if num_scenes < 1:
+        raise TrilightError(f"scenes is {num_scenes}; expected at least 1.")
+    num_planned = planned_scenes(num_scenes, settings.splits)
+    store = folder.store()
+    with folder.mutex("manifest"):
+        if is_new := store.get(folder.manifest.name, 1) is None:
+            _require_free(folder, store)
+            store.require_create()
+        if not folder.manifest.exists():
+            manifest = Manifest(
+                build=settings.build,
+                settings=settings.as_json(),
+                environment=environment,
+                num_scenes=num_planned,
+                num_views=settings.scenes.num_views,
+                objects_lock_sha256="",
+                shards=(),
+                extensions=extension_digests("data"),
+            )
+            write_manifest(folder.manifest, manifest)
+        if is_new and not store.create_if_absent(folder.manifest.name, folder.manifest):
+            adopt(folder, store)  # another machine was first
+        manifest = read_head(folder.manifest)
+        _require_same_dataset(folder, manifest, settings, environment, accept_environment)
+        writer = DatasetWriter(store, folder, manifest, settings.splits)
+        if num_planned > manifest.num_scenes:
+            writer.extend(num_planned)
+    publish_plan(store, writer.manifest.num_scenes)
+    writer.refresh_plan()
+    return writer
 
 
-def merge_failures(folder: DatasetFolder, store: Store) -> None:
-    """Add the published rejections to the folder's; call while holding the manifest's mutex."""
-    theirs = decode_failures(store.get(folder.failures.name) or b"")
-    write_failures(folder.failures, [*read_failures(folder.failures), *theirs])
+def _require_same_dataset(
+    folder: DatasetFolder,
+    manifest: Manifest,
+    settings: DatasetSettings,
+    environment: Mapping[str, Any],
+    accept_environment: bool,
+) -> None:
+    _require_extendable(folder, manifest)
+    stored = from_record(DatasetSettings, manifest.settings).as_json()  # fields may come later
+    _require_same(folder, "setting", stored, settings.as_json(), "choose another --out")
+    if not accept_environment:
+        before = device_of(manifest.environment)
+        now = device_of(environment)
+        if before != now:
+            raise TrilightError(
+                f"{folder.display_name}: this dataset was begun on a {before.upper()} and would "
+                f"go on with a {now.upper()}; choose --device {before} or another --out, or accept "
+                "pictures that agree only within their stated errors with --accept-environment."
+            )
+        _require_same(
+            folder,
+            "environment",
+            manifest.environment,
+            environment,
+            "choose another --out, or accept pictures that agree only within their noise "
+            "floors with --accept-environment",
+        )
+
+
+def _require_free(folder: DatasetFolder, store: Store) -> None:
+    """Raise if there are shards, or a document that the dataset's own would replace."""
+    existing = store.list() | store.list(place_of_part(1))
+    if any(name.endswith(".tar") for name in existing):
+        raise TrilightError(
+            f"{folder.display_name}: there are shards but no manifest.json; expected an empty "
+            "folder or a dataset. Choose another --out."
+        )
+    for path in (folder.card, folder.licences):
+        if path.name in existing:
+            raise TrilightError(
+                f"{folder.display_name}: {path.name} is there, and the dataset's own would replace "
+                "it; expected an empty folder or a dataset. Choose another --out."
+            )
+
+
+def _require_same(
+    folder: DatasetFolder,
+    what: str,
+    before: Mapping[str, Any],
+    now: Mapping[str, Any],
+    next_step: str,
+) -> None:
+    differing = list(differences(before, now))
+    if differing:
+        name, old, new = differing[0]
+        more = f" (and {len(differing) - 1} more)" if len(differing) > 1 else ""
+        raise TrilightError(
+            f"{folder.display_name}: this dataset was begun with another {what}: {name} was "
+            f"{old!r}, now {new!r}{more}; {next_step}."
+        )

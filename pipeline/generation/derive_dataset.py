@@ -29,8 +29,6 @@ def derive_dataset(
     """Make a dataset of finished ones by merging, selecting or resharding.
 
     Args:
-        paths: folders of the sources.
-        derive: operation and arguments.
         out: folder of the new dataset, which must not exist or be empty.
         progress: called with the number of shards read or written so far, and the total.
 

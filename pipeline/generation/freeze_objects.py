@@ -20,15 +20,15 @@ from pipeline.generation.accept_maps import (
     accept_maps,
 )
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.frozen_pool import ComposedScenes, FrozenPool
+from pipeline.generation.frozen_pool import ComposedScenes
 from pipeline.generation.object_batches import (
     ObjectWork,
     PrepareResult,
     cut_objects,
     prepare_in_batches,
 )
-from pipeline.generation.revisited_scenes import SceneOrigin
-from pipeline.generation.unread_notes import format_unread, write_unread
+from pipeline.generation.prepare_isolated import format_unread, write_unread
+from pipeline.generation.revisited_scenes import AcceptedObjects
 from pipeline.isolation import is_transient
 from pipeline.objects.sources import ListedObjects, list_objects
 from pipeline.presets.settings import DatasetSettings
@@ -45,23 +45,11 @@ from storage.records.objects import (
     LockRows,
     ObjectRecord,
     count_by_reason,
-    read_objects_lock,
 )
 from storage.records.safe_read import open_plain
 from storage.remote.safe_url import safe_url
 
 log = logging.getLogger("trilight.objects")
-
-
-@dataclass(frozen=True, kw_only=True)
-class AcceptedObjects:
-    """The frozen inputs of a dataset's scenes."""
-
-    num_objects: int
-    """Objects that scenes may draw from."""
-    num_found: int
-    """Objects in the source, refused ones included."""
-    origin: SceneOrigin
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -133,7 +121,7 @@ class ObjectLock:
         with folder.mutex("objects"):  # one worker writes built-in objects, the others load them
             self.writer.refresh()
             self.writer.fetch_lock()
-            if read_frozen_objects(self.writer) is not None:
+            if self.writer.frozen_objects() is not None:
                 return None
             listed = self._list_source()
             announce_objects(folder, len(listed.allowed))
@@ -158,7 +146,7 @@ class ObjectLock:
         folder = self.writer.folder
         if trusted := self.load():
             return trusted
-        frozen = read_frozen_objects(self.writer)
+        frozen = self.writer.frozen_objects()
         shared = listed is not None
         listed = listed or self._list_source()
         maps = accept_maps(self.user_folders, self.settings, workers=self.workers)
@@ -196,8 +184,6 @@ class ObjectLock:
         Args:
             prepared: objects that the mesh stage accepted; in later runs the frozen ones of them.
             rejected: rejections by the source and by the mesh stage.
-            num_found: number of objects in the source.
-            maps: the user's textures and maps, which are frozen with the objects.
 
         Raises:
             TrilightError: no object is accepted, a split has none, or the objects are not those
@@ -206,7 +192,7 @@ class ObjectLock:
         """
         writer = self.writer
         display_name = safe_url(self.source)
-        frozen = read_frozen_objects(writer)
+        frozen = writer.frozen_objects()
         transient = [failure for failure in rejected if is_transient(failure.reason)]
         if frozen is not None:
             for failure in transient:
@@ -257,13 +243,13 @@ class ObjectLock:
         self, num_objects: int, num_found: int, maps: tuple[tuple[LockedObject, Path], ...]
     ) -> AcceptedObjects:
         folder = self.writer.folder
-        pool = FrozenPool(
+        origin = ComposedScenes(
             lock=folder.objects_lock,
             index=folder.staged_index,
             source=self.source,
             licence=self.licence,
+            maps=maps,
         )
-        origin = ComposedScenes(pool=pool, maps=maps)
         return AcceptedObjects(num_objects=num_objects, num_found=num_found, origin=origin)
 
     @property
@@ -370,13 +356,6 @@ _DRAWN = (
     "have no materials of their own at every level and get drawn ones there. `trilight assets "
     "--own-materials` says what was found in each"
 )
-
-
-def read_frozen_objects(writer: DatasetWriter) -> dict[str, LockedObject] | None:
-    """Return the frozen objects by uid, or None if nothing is frozen yet."""
-    if not writer.manifest.objects_lock_sha256:
-        return None
-    return {entry.uid: entry for entry in read_objects_lock(writer.folder.objects_lock)}
 
 
 def require_tried(source: str, failure: Failure) -> None:

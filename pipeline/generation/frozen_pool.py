@@ -1,13 +1,13 @@
-"""`FrozenPool`: the frozen objects of a dataset, read by index and opened when a scene draws them.
+"""`ComposedScenes`: the frozen objects of a dataset, opened when a scene draws them.
 
 A worker trusts the lock and the asset store: it starts without opening any object. A render child
 opens the one to three objects of its scene, checks their digests against the lock, and keeps a few
 open. If an object's file is missing on this machine, the worker prepares it again
-(`pipeline.generation.restore_object`).
+(`pipeline.generation.render_workers.restore_object`).
 """
 
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.assets.asset_store import AssetStore
 from pipeline.objects.maps.prepared import decode_prepared
-from pipeline.scenes.pool import IndexedPool, PooledAsset
-from pipeline.scenes.triangle_budget import FitTable, least_triangles
+from pipeline.scenes.triangle_budget import FitTable, PooledAsset, least_triangles
 from scene_templates.user_maps import OwnMaps, UserMap, UserTexture
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -32,8 +31,8 @@ _MOST_OPEN = 8
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrozenPool:
-    """Paths of a dataset's frozen objects; can be sent to another machine."""
+class ComposedScenes:
+    """Scenes that layouts compose of frozen objects; can be sent to another machine."""
 
     lock: Path
     """Path of objects.lock.jsonl in the dataset's folder."""
@@ -43,17 +42,6 @@ class FrozenPool:
     """Source of the objects, for those that have to be prepared again."""
     licence: str | None
     """Licence that the user states for files without one."""
-
-    def open_split(self, split: str, store: AssetStore) -> "SplitPool":
-        """Return the objects of a split, sorted by uid; raises TrilightError without any."""
-        return SplitPool(self, split, store)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ComposedScenes:
-    """Scenes that layouts compose of frozen objects."""
-
-    pool: FrozenPool
     maps: tuple[tuple[LockedObject, Path], ...] = ()
     """The user's textures and skies with their prepared files."""
 
@@ -72,10 +60,10 @@ class AssetMissing(Exception):
         self.asset_name = asset_name
 
 
-class SplitPool(IndexedPool):
-    """The objects of one split, each opened on access."""
+class SplitPool(Sequence[PooledAsset]):
+    """The objects of one split, sorted by uid, each opened on access."""
 
-    def __init__(self, frozen: FrozenPool, split: str, store: AssetStore) -> None:
+    def __init__(self, frozen: ComposedScenes, split: str, store: AssetStore) -> None:
         index = ObjectIndex(frozen.index)
         if split not in index.facts.splits:
             raise TrilightError(f"split {split!r}: no frozen object belongs to it; expected one.")

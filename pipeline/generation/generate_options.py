@@ -94,15 +94,13 @@ class GenerateOptions:
 
     def __post_init__(self) -> None:
         DATASET_PRESETS.find(self.build)
-        if self.scenes_from is not None and (self.objects, self.scenes) != (None, None):
+        objects_and_scenes = (self.objects, self.scenes)
+        if self.scenes_from is not None and objects_and_scenes != (None, None):
             raise TrilightError(
                 f"--scenes-from {self.scenes_from} was given with --objects or --scenes; expected "
                 "neither: the files say both."
             )
-        if (
-            self.revisits is not None
-            and (self.objects, self.scenes, self.scenes_from) != (None,) * 3
-        ):
+        if self.revisits is not None and (*objects_and_scenes, self.scenes_from) != (None,) * 3:
             raise TrilightError(
                 f"--revisits {self.revisits} was given with --objects, --scenes or --scenes-from; "
                 "expected none of them: the dataset says all."
@@ -115,7 +113,6 @@ class GenerateOptions:
 
     @property
     def noise_targets(self) -> NoiseTargets:
-        """The target errors."""
         return NoiseTargets(
             log_db=self.noise_floor_db,
             linear_db=self.noise_floor_linear_db,
@@ -124,7 +121,6 @@ class GenerateOptions:
 
     @property
     def place(self) -> str:
-        """Path or URL of the dataset."""
         return f"data/{function_name(self.build)}" if self.out is None else self.out
 
     def shard_range(self) -> range | None:
@@ -166,8 +162,5 @@ def generate_words(options: GenerateOptions) -> list[str]:
     are passwords.
     """
     words = option_words(options, leave_out=_PER_MACHINE)
-    return ["generate", options.build, *map(_hide_secret, words)]
-
-
-def _hide_secret(word: str) -> str:
-    return safe_url(word) if "://" in word else word
+    safe_words = (safe_url(word) if "://" in word else word for word in words)
+    return ["generate", options.build, *safe_words]

@@ -1,25 +1,51 @@
-"""`Run` and other records that the steps of `pipeline.generation.pipeline` pass to each other."""
+"""`Run` and other records that the steps of `pipeline.generation.pipeline` pass to each other.
 
-from collections.abc import Callable, Mapping
+`TaskCutter` cuts the missing scenes into tasks, in rounds until nothing is missing. A piece is a
+range of scenes of one shard; a task is several pieces. Small shards are combined, large ones are
+cut. A task takes one to ten minutes, and a run has at most a thousand of them. How long a scene
+takes is known only as the run goes, so each task is cut when it is submitted.
+
+Several workers may share a dataset. A round skips the scenes that others have claimed; after it, a
+run waits until they are done, and makes the scenes that a killed worker left.
+
+`Runner` is the interface between the engine and the executors that run its tasks. The engine
+imports no executor: threads and arrays are in pipeline.executors, Prefect and Dask in
+pipeline.flows, and a user may add another. A runner takes tasks one by one as it has room, and
+yields their results as they end: memory does not grow with the number of tasks, and no finished
+task waits for a slow one.
+"""
+
+import itertools
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from pipeline.exchange.scene_files import SceneFiles, SceneFolder, find_scene_files
-from pipeline.generation.accept_revisited import settings_for_revisit
 from pipeline.generation.accept_scene_files import settings_for_files
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.freeze_objects import AcceptedObjects
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.revisited_scenes import AcceptedObjects, settings_for_revisit
 from pipeline.objects.sources import check_source
 from pipeline.presets.registry import DATASET_PRESETS, frozen_note, object_source, preset_settings
 from pipeline.presets.settings import DatasetSettings
-from pipeline.renders.mitsuba_variant import Device, Variant, choose_variant, device_of
-from pipeline.renders.visible_gpus import gpu_memory_bytes, visible_gpus
+from pipeline.renders.mitsuba_variant import (
+    Device,
+    Variant,
+    choose_variant,
+    device_of,
+    gpu_memory_bytes,
+    visible_gpus,
+)
+from pipeline.shards.pack import UnfinishedShard
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, read_head
-from storage.dataset.splits import keeps_scenes, lacks_validation
+from storage.dataset.settings import SplitSettings
+from storage.dataset.splits import keeps_scenes, lacks_validation, scenes_of_shard
 from storage.dataset.statistics import Statistics
-from storage.errors import TrilightError
+from storage.errors import EnvironmentFailure, TrilightError
+from storage.file_locks import WaitNotice
 from storage.records.objects import Failure
 
 _MOST_CHILDREN = 4
@@ -41,7 +67,6 @@ class Run:
     """A dataset that has begun, with its objects frozen: the input of every later step."""
 
     options: GenerateOptions
-    """The command's options."""
     settings: DatasetSettings
     """The preset with the options' changes."""
     scene_folder: SceneFolder | None
@@ -54,7 +79,6 @@ class Run:
     """Device that renders, `cpu` or `gpu`."""
 
     def unfinished_shards(self) -> list[int]:
-        """Return the numbers of the requested shards that are not finished."""
         return self.publication.unfinished_shards(self.options.shard_range())
 
     def num_workers(self) -> int:
@@ -124,8 +148,7 @@ class Run:
             writer.add_failures(writer.failures)
             raise TrilightError(
                 f"{writer.folder.display_name}: {given_up} of {num_scenes} scenes could not be "
-                "made, "
-                f"more than the failure budget of {budget:.0%}. The reasons are in "
+                f"made, more than the failure budget of {budget:.0%}. The reasons are in "
                 f"{writer.folder.failures.name}; fix them, or raise --failure-budget."
             )
 
@@ -168,11 +191,9 @@ class TaskResult:
     """The result of one task."""
 
     shards: tuple[ShardEntry, ...]
-    """The shards that the task packed."""
     scenes: int
     """Scenes that the task made or gave up, without those that were finished before."""
     seconds: float
-    """Wall time of the task."""
     core_s: float
     """Wall time multiplied by the cores of the render child."""
 
@@ -245,3 +266,174 @@ def choose_dataset_variant(options: GenerateOptions, folder: DatasetFolder) -> V
         default = device_of(read_head(folder.manifest).environment)
         device = default if device == "auto" else device
     return choose_variant(default, device=device)
+
+
+MAX_TASKS = 1000
+"""Most task runs of one flow run: Prefect's server accepts about 20 a second, of 19 kB each."""
+TASK_S = 240.0
+"""Target duration of a task, in seconds."""
+_FIRST_SCENES = 4
+"""Scenes of a task until the duration of one has been measured."""
+FIRST_PAUSE_S = 1.0
+_LONGEST_PAUSE_S = 60.0
+"""Most seconds between two looks at other workers' scenes; the pause doubles while none is free."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Piece:
+    """A range of scenes of one shard, which a task makes one after another."""
+
+    shard_index: int
+    """Number of the shard, from 0."""
+    first: int
+    """Index of the first scene in the dataset."""
+    last: int
+    """Index of the last scene plus 1."""
+
+
+class TaskCutter:
+    """Cuts missing scenes into tasks, sized by the durations of finished ones."""
+
+    def __init__(self, at_once: int = 1) -> None:
+        """Begin; `at_once` is the number of tasks that run at the same time."""
+        self._at_once = at_once
+        self._tasks_left = MAX_TASKS
+        self._scenes = 0
+        self._seconds = 0.0
+
+    def record(self, outcome: TaskResult) -> None:
+        """Record the duration of a finished task."""
+        if outcome.scenes:
+            self._scenes += outcome.scenes
+            self._seconds += outcome.seconds
+
+    def cut_round(
+        self, shards: Sequence[int], splits: SplitSettings
+    ) -> Iterator[tuple[Piece, ...]]:
+        """Yield the tasks that make some shards, but save a tenth of the tasks for later rounds.
+
+        Raises:
+            EnvironmentFailure: no task is left of the maximum over all rounds.
+        """
+        if self._tasks_left == 0:
+            raise EnvironmentFailure(
+                f"this run has handed out all of its {MAX_TASKS} tasks, and other runs hold "
+                "claims on the missing scenes. What was finished is safe: run the same command "
+                "again."
+            )
+        for task in self.iter_tasks(shards, splits, most=self._tasks_left - self._tasks_left // 10):
+            self._tasks_left -= 1
+            yield task
+
+    def iter_tasks(
+        self, shards: Sequence[int], splits: SplitSettings, *, most: int = MAX_TASKS
+    ) -> Iterator[tuple[Piece, ...]]:
+        """Yield at most `most` tasks that make some shards; each is sized when it is requested."""
+        scenes_left = sum(len(scenes_of_shard(index, splits)) for index in shards)
+        pieces: list[Piece] = []
+        room = self._next_size(scenes_left, most)
+        for index in shards:
+            scenes = scenes_of_shard(index, splits)
+            at = scenes.start
+            while at < scenes.stop:
+                last = min(scenes.stop, at + room)
+                pieces.append(Piece(shard_index=index, first=at, last=last))
+                room -= last - at
+                scenes_left -= last - at
+                at = last
+                if room == 0:
+                    yield tuple(pieces)
+                    pieces = []
+                    most -= 1
+                    room = self._next_size(scenes_left, most)
+        if pieces:
+            yield tuple(pieces)
+
+    def _next_size(self, scenes_left: int, tasks_left: int) -> int:
+        """Return the number of scenes of the next task, at least 1.
+
+        With several tasks at once, none gets more than half of an equal share of the remaining
+        scenes, so that all workers have work until the end (guided self-scheduling,
+        Polychronopoulos and Kuck 1987).
+        """
+        size: float = _FIRST_SCENES
+        if self._scenes:
+            size = TASK_S * self._scenes / max(self._seconds, 1e-3)
+        if self._at_once > 1:
+            size = min(size, scenes_left / (2 * self._at_once))
+        return max(1, int(size), -(-scenes_left // max(1, tasks_left)))
+
+
+def wait_for_others(run: Run, pause_s: float) -> float:
+    """Wait until nothing is missing or a claim is free; return the next pause in seconds.
+
+    No tasks are submitted meanwhile: each would be a row of a scheduler's database.
+    """
+    writer = run.publication
+    notice = WaitNotice()
+    while True:
+        time.sleep(pause_s)
+        pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+        missing = run.unfinished_shards()
+        splits = run.settings.splits
+        shards = [UnfinishedShard(writer.folder, splits, index) for index in missing]
+        if not missing or any(shard.is_free() for shard in shards):
+            return pause_s
+        notice.update(shards[0].missing_claims()[0])
+
+
+def shard_ranges(num_shards: int, num_ranges: int) -> list[str]:
+    """Return `num_ranges` nearly equal ranges A:B of shards; fewer if there are fewer shards."""
+    count = min(num_ranges, num_shards)
+    bounds = [num_shards * index // count for index in range(count + 1)]
+    return [f"{first}:{last}" for first, last in itertools.pairwise(bounds)]
+
+
+Future = TypeVar("Future", bound=Any)
+"""Has `result`, which returns the result of an ended task, or raises its error."""
+
+
+class Runner(ABC, Generic[Future]):
+    """Runs `pipeline.generation.pipeline.make_task` once for each task, on any machine."""
+
+    num_at_once: int | None = None
+    """Parallel tasks of one process; None leaves the number to the options."""
+    window: int | None = None
+    """Number of submitted, unfinished tasks; None means as many as run at once."""
+
+    @abstractmethod
+    def submit(self, task: tuple[Piece, ...], job: ShardJob) -> Future:
+        """Start a task, and return its future at once."""
+
+    @abstractmethod
+    def wait_any(self, running: list[Future]) -> Future:
+        """Wait until one of these tasks has ended, and return it."""
+
+    def close(self) -> None:
+        """Release what submitted tasks hold, also after an error."""
+
+    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskResult]:
+        """Yield the result of each task, in the order in which the tasks end.
+
+        The next task is submitted before a result is yielded: the caller may take long over it.
+
+        Raises:
+            TrilightError: a task failed permanently; finished scenes stay on disk.
+        """
+        waiting = iter(tasks)
+        window = self.window or job.num_at_once
+        try:
+            running = [self.submit(task, job) for task in itertools.islice(waiting, window)]
+            while running:
+                done = self.wait_any(running)
+                running.remove(done)
+                result = done.result()
+                free = window - len(running)
+                running += [self.submit(task, job) for task in itertools.islice(waiting, free)]
+                yield result
+        finally:
+            self.close()
+
+    def finish(self, write_documents: Callable[[], Statistics]) -> Statistics:
+        """Call `write_documents`; an executor may limit its parallel calls, which read all data."""
+        return write_documents()

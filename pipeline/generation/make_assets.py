@@ -21,8 +21,13 @@ from pipeline.documents.attribution import encode_attribution
 from pipeline.documents.quality_page import Pair, encode_quality_page
 from pipeline.exchange.gltf.write_gltf import encode_mesh_glb
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.generation.prepare_isolated import asset_child, asset_store, prepare_isolated
-from pipeline.generation.unread_notes import UnreadNotes, write_unread
+from pipeline.generation.prepare_isolated import (
+    UnreadNotes,
+    asset_child,
+    asset_store,
+    prepare_isolated,
+    write_unread,
+)
 from pipeline.isolation import ChildFailed, call_with_retries, reach
 from pipeline.objects.ply import encode_ply
 from pipeline.objects.sources import find_objects
@@ -63,7 +68,6 @@ class AssetReport:
     rows: tuple[AssetRow, ...]
     """The accepted objects, in the order of their uids."""
     failures: tuple[Failure, ...]
-    """The rejected objects with their reasons."""
     geometry_sha256: tuple[str, ...]
     """Digest of the geometry of each written mesh, by which `generate` assigns it to a split."""
     unread: UnreadNotes
@@ -107,9 +111,9 @@ def make_assets(
         allowed_licences: objects under other licences are rejected.
         licence: licence of files that state none.
         workers: number of objects that are prepared at the same time.
-        downloaded: called with the number of finished downloads and their total.
-        planned: called with the number of objects, once it is known.
-        done: called after each object, from any thread.
+        on_download: called with the number of finished downloads and their total.
+        on_plan: called with the number of objects, once it is known.
+        on_object: called after each object, from any thread.
 
     Raises:
         TrilightError: the source is unusable, or the folder holds other files or cannot be
@@ -117,7 +121,13 @@ def make_assets(
     """
     if workers < 1:
         raise TrilightError(f"workers is {workers}; expected at least 1.")
-    _require_ours(folder)
+    if folder.root.exists() and not folder.root.is_dir():
+        raise TrilightError(f"{folder.root}: is a file; expected a folder. Choose another --out.")
+    if folder.root.is_dir() and any(folder.root.iterdir()) and not folder.summary.exists():
+        raise TrilightError(
+            f"{folder.root}: holds files that `trilight assets` did not write; expected a new or "
+            "empty folder. Choose another --out."
+        )
     listed = find_objects(
         source,
         work_dir=cache_folder("objects"),
@@ -130,7 +140,8 @@ def make_assets(
     prepared, rejected = prepare_isolated(
         list(listed.records), settings, workers=workers, done=on_object
     )
-    assets = [_read_asset(each) for each in prepared]
+    store = asset_store()
+    assets = [decode_asset(store.asset_path(each.asset_name).read_bytes()) for each in prepared]
     levels = [asset.levels[0] for asset in assets]
     rows = [_row(each.record, asset) for each, asset in zip(prepared, assets, strict=True)]
     report = AssetReport(
@@ -139,46 +150,8 @@ def make_assets(
         geometry_sha256=tuple(map(_geometry_sha256, levels)),
         unread={asset.record.uid: asset.unread for asset in prepared if asset.unread},
     )
-    _write(folder, settings, report, levels)
-    pairs = _pairs(prepared, rows, levels, settings)
-    _write_page(folder, settings, report, pairs)
+    _write(folder, settings, report, levels, _pairs(prepared, rows, levels, settings))
     return report
-
-
-def _write_page(
-    folder: AssetFolder,
-    settings: AssetSettings,
-    report: AssetReport,
-    pairs: dict[str, list[Pair]],
-) -> None:
-    page = encode_quality_page(
-        report.rows,
-        report.failures,
-        pairs,
-        report.unread,
-        budget=settings.budgets[0],
-        target=_target(settings),
-    )
-    write_atomically(folder.page, page)
-
-
-def _require_ours(folder: AssetFolder) -> None:
-    if folder.root.exists() and not folder.root.is_dir():
-        raise TrilightError(f"{folder.root}: is a file; expected a folder. Choose another --out.")
-    if folder.root.is_dir() and any(folder.root.iterdir()) and not folder.summary.exists():
-        raise TrilightError(
-            f"{folder.root}: holds files that `trilight assets` did not write; expected a new or "
-            "empty folder. Choose another --out."
-        )
-
-
-def _target(settings: AssetSettings) -> str:
-    within = "" if settings.epsilon is None else f"fewest within {settings.epsilon:.2%}, "
-    return f"{settings.profile}, {within}at most {settings.budgets[0]} triangles"
-
-
-def _read_asset(prepared: PreparedObject) -> Asset:
-    return decode_asset(asset_store().asset_path(prepared.asset_name).read_bytes())
 
 
 def _geometry_sha256(level: Level) -> str:
@@ -190,9 +163,12 @@ def _geometry_sha256(level: Level) -> str:
 
 def _row(record: ObjectRecord, asset: Asset) -> AssetRow:
     (level,) = asset.levels
+    # a file name that is safe on every system: a uid is untrusted text
+    readable = re.sub(r"[^A-Za-z0-9]+", "-", record.uid).strip("-")[-60:]
+    digest = hashlib.sha256(record.uid.encode()).hexdigest()[:8]
     return AssetRow(
         **record.identity,
-        path=f"meshes/{_file_name(record.uid, '.ply' if level.skin is None else '.glb')}",
+        path=f"meshes/{readable}-{digest}{'.ply' if level.skin is None else '.glb'}",
         num_faces=len(level.faces),
         method=level.record.method,
         quality=level.record.quality,
@@ -202,24 +178,21 @@ def _row(record: ObjectRecord, asset: Asset) -> AssetRow:
     )
 
 
-def _file_name(uid: str, suffix: str) -> str:
-    """Return a file name that is safe on every system: a uid is untrusted text."""
-    readable = re.sub(r"[^A-Za-z0-9]+", "-", uid).strip("-")[-60:]
-    return f"{readable}-{hashlib.sha256(uid.encode()).hexdigest()[:8]}{suffix}"
-
-
-def _encode_mesh(level: Level) -> bytes:
-    """Return a mesh as a PLY file, or as GLB if it has its own materials."""
-    if level.skin is None:
-        return encode_ply(level.positions, level.faces)
-    return encode_mesh_glb(level.positions, level.faces, level.skin.uv, level.skin.textures)
-
-
 def _write(
-    folder: AssetFolder, settings: AssetSettings, report: AssetReport, levels: list[Level]
+    folder: AssetFolder,
+    settings: AssetSettings,
+    report: AssetReport,
+    levels: list[Level],
+    pairs: dict[str, list[Pair]],
 ) -> None:
     for row, level in zip(report.rows, levels, strict=True):
-        write_atomically(folder.root / row.path, _encode_mesh(level))
+        skin = level.skin
+        mesh = (
+            encode_ply(level.positions, level.faces)
+            if skin is None
+            else encode_mesh_glb(level.positions, level.faces, skin.uv, skin.textures)
+        )
+        write_atomically(folder.root / row.path, mesh)
     written = {folder.root / row.path for row in report.rows}
     for path in (*folder.meshes.glob("*.ply"), *folder.meshes.glob("*.glb")):
         if path not in written:
@@ -238,6 +211,16 @@ def _write(
         "settings": settings_record(settings),
     }
     write_atomically(folder.summary, json.dumps(summary, indent=1, sort_keys=True).encode())
+    within = "" if settings.epsilon is None else f"fewest within {settings.epsilon:.2%}, "
+    page = encode_quality_page(
+        report.rows,
+        report.failures,
+        pairs,
+        report.unread,
+        budget=settings.budgets[0],
+        target=f"{settings.profile}, {within}at most {settings.budgets[0]} triangles",
+    )
+    write_atomically(folder.page, page)
 
 
 def _pairs(

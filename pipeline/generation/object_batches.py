@@ -54,7 +54,6 @@ class ObjectWork:
     """The input that all batches of a dataset share."""
 
     settings: AssetSettings
-    """Settings of the mesh stage."""
     writer: DatasetWriter
     """Writer of the dataset that the objects are prepared for."""
     fetch: Fetch | None = None
@@ -64,11 +63,34 @@ class ObjectWork:
 
     def name(self, records: Sequence[ObjectRecord], *, are_here: bool) -> str:
         """Return the file name of a batch's result; `are_here` says that its files are local."""
-        named = self.settings.own_materials.keep
-        of_objects = [_facts(record, are_here, self._folders, named) for record in records]
+        of_objects = [self._facts(record, are_here) for record in records]
         facts = [of_objects, asdict(self.settings), RECIPE, READERS]
         digest = sha256_hex(canonical_json(facts))[:32]
         return f"{digest[:2]}/{digest}.jsonl"
+
+    def _facts(self, record: ObjectRecord, is_here: bool) -> list[Any]:
+        """Return inputs of a result as JSON values: the record, and the state of a local file."""
+        facts = asdict(record)
+        path = Path(facts.pop("path"))
+        root = facts.pop("root")
+        if not is_here:
+            return [facts]
+        with_pictures = self.settings.own_materials.keep
+        fetched = path.is_relative_to(cache_folder(""))  # its time is that of the download
+        suffix = path.suffix.lower()
+        alone = fetched or suffix in _SELF_CONTAINED or (suffix == ".ply" and not with_pictures)
+        folder = Path(root) if root and with_pictures else path.parent
+        neighbors = "" if alone else self._digest_neighbors(folder, suffix in _LAYERS)
+        return [facts, path.suffix, *_state(path, fetched), neighbors]
+
+    def _digest_neighbors(self, folder: Path, layers: bool) -> str:
+        """Return a digest of the files of a folder that an object in it may refer to."""
+        if (folder, layers) not in self._folders:
+            files = sorted(path for path in folder.rglob("*") if path.is_file())
+            named = [path for path in files if layers or path.suffix.lower() not in SUFFIXES]
+            states = [[str(path.relative_to(folder)), *_state(path, False)] for path in named]
+            self._folders[folder, layers] = sha256_hex(canonical_json(states))
+        return self._folders[folder, layers]
 
 
 class ObjectBatch:
@@ -104,7 +126,6 @@ class ObjectBatch:
         """Prepare the objects unless another worker does or has done so; return True if done here.
 
         Args:
-            meshes: children for the mesh stage.
             done: called with the number of objects that were just prepared or rejected.
         """
         writer = self._work.writer
@@ -190,7 +211,6 @@ def prepare_in_batches(
 
     Args:
         records: objects, sorted by uid.
-        work: input that the batches share.
         workers: number of objects that are prepared here at the same time.
         done: called with a number of objects that are done, here or elsewhere; from any thread.
         should_stop: returns True if the remaining objects are no longer needed.
@@ -221,8 +241,11 @@ def prepare_in_batches(
         pause_s = _PAUSES_S[0]
         notice = WaitNotice()
         while True:
-            for number in _collect_results(batches, results) - ours:
-                done(len(batches[number].records))
+            for number, batch in enumerate(batches):
+                if number not in results and (result := batch.result()) is not None:
+                    results[number] = result
+                    if number not in ours:
+                        done(len(batch.records))
             missing = [number for number in order if number not in results]
             if not missing or should_stop():
                 break
@@ -238,16 +261,6 @@ def prepare_in_batches(
                 pause_s = min(2 * pause_s, _PAUSES_S[1])
     ordered = [result for _, result in sorted(results.items())]
     return [one for some, _ in ordered for one in some], [f for _, some in ordered for f in some]
-
-
-def _collect_results(batches: Sequence[ObjectBatch], results: dict[int, PrepareResult]) -> set[int]:
-    """Add the results that are new to `results`; return the numbers of their batches."""
-    new = set()
-    for number, batch in enumerate(batches):
-        if number not in results and (result := batch.result()) is not None:
-            results[number] = result
-            new.add(number)
-    return new
 
 
 def _may_change(failures: Iterable[Failure]) -> bool:
@@ -268,39 +281,9 @@ def _row(one: PreparedObject) -> dict[str, Any]:
     return {"uid": one.record.uid, **row}
 
 
-def _facts(
-    record: ObjectRecord, is_here: bool, folders: dict[tuple[Path, bool], str], with_pictures: bool
-) -> list[Any]:
-    """Return the inputs of a result as JSON values: the record, and the state of a local file.
-
-    `folders` caches digests of folders.
-    """
-    facts = asdict(record)
-    path = Path(facts.pop("path"))
-    root = facts.pop("root")
-    if not is_here:
-        return [facts]
-    fetched = path.is_relative_to(cache_folder(""))  # its time is that of the download
-    suffix = path.suffix.lower()
-    alone = fetched or suffix in _SELF_CONTAINED or (suffix == ".ply" and not with_pictures)
-    folder = Path(root) if root and with_pictures else path.parent
-    neighbors = "" if alone else _digest_neighbors(folder, suffix in _LAYERS, folders)
-    return [facts, path.suffix, *_state(path, fetched), neighbors]
-
-
 def _state(path: Path, fetched: bool) -> list[int]:
     try:
         status = path.stat()
     except OSError:
         return []
     return [status.st_size, 0 if fetched else status.st_mtime_ns]
-
-
-def _digest_neighbors(folder: Path, layers: bool, folders: dict[tuple[Path, bool], str]) -> str:
-    """Return a digest of the files of a folder that an object in it may refer to."""
-    if (folder, layers) not in folders:
-        files = sorted(path for path in folder.rglob("*") if path.is_file())
-        named = [path for path in files if layers or path.suffix.lower() not in SUFFIXES]
-        states = [[str(path.relative_to(folder)), *_state(path, False)] for path in named]
-        folders[folder, layers] = sha256_hex(canonical_json(states))
-    return folders[folder, layers]

@@ -19,7 +19,7 @@ crash costs one attempt.
 The files on disk are the only state, and every step may be killed at any moment. A mesh is kept in
 the asset store, a scene in the staging folder, a shard in the dataset; the next run looks for these
 and makes the rest. Several runs on one folder share the work (storage.file_locks), and those on one
-bucket share batches of objects (storage.remote.store) and shards (pipeline.shards.published).
+bucket share batches of objects (storage.remote.store) and shards (pipeline.shards.pack).
 """
 
 import contextlib
@@ -29,40 +29,44 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.sheets import write_first_pictures
 from pipeline.generation.accept_maps import map_folders
-from pipeline.generation.accept_revisited import accept_revisited
 from pipeline.generation.accept_scene_files import accept_scene_files
-from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
-from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions, generate_words
 from pipeline.generation.generation_run import (
+    FIRST_PAUSE_S,
     Outcome,
+    Piece,
     Run,
+    Runner,
     ShardJob,
+    TaskCutter,
     TaskResult,
     Watcher,
     choose_dataset_variant,
     resolve_settings,
+    wait_for_others,
 )
+from pipeline.generation.render_sample import failure_of
 from pipeline.generation.render_workers import (
     close_children,
     cores_of_child,
     render_child,
+    restore_object,
     scene_reader,
 )
-from pipeline.generation.restore_object import restore_object
-from pipeline.generation.runner import Runner
+from pipeline.generation.revisited_scenes import accept_revisited
 from pipeline.generation.scene_worker import MAX_ATTEMPTS, SceneAttempt, SceneWorker
-from pipeline.generation.software_environment import environment
-from pipeline.generation.tasks import FIRST_PAUSE_S, Piece, TaskCutter, wait_for_others
-from pipeline.generation.unfinished_shard import UnfinishedShard
 from pipeline.isolation import ChildFailed, IsolatedChild, with_retries
 from pipeline.presets.registry import DATASET_PRESETS, object_source
 from pipeline.presets.settings import DatasetSettings
+from pipeline.renders.mitsuba_variant import environment
+from pipeline.shards.pack import UnfinishedShard, hold_dataset_lock
 from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.progress import write_asked
@@ -276,36 +280,29 @@ def make_scene(
     it again for the same attempt.
     """
     failures: list[Failure] = []
+    key = sample_key(scene_index)
+
+    def attempt_in_child(*words: Any) -> SceneAttempt:
+        return with_retries(
+            lambda: child.call_method(SceneWorker.attempt, split, scene_index, *words)
+        )
+
     for attempt in range(attempts):
-        key = sample_key(scene_index)
         try:
             from_file = (read(scene_index),) if read else ()
-            arguments = (split, scene_index, attempt, *from_file)
-            tried = _attempt_with_retries(child, arguments)
-            while tried.missing_asset:
+            while (tried := attempt_in_child(attempt, *from_file)).missing_asset:
                 restore(*tried.missing_asset)
-                tried = _attempt_with_retries(child, arguments)
-        except (ChildFailed, Rejected) as error:
-            if isinstance(error, Rejected):
-                stage = "scenes"
-                reason = error.reason
-                why = error.message
-            else:
-                why = f"{error.reason}: {error.sentence}"
-                stage = "renders"
-                reason = "environmental_skip"
-            failures.append(
-                Failure(stage=stage, item=key, reason=reason, message=why, attempt=attempt)
-            )
+        except Rejected as rejection:
+            failures.append(failure_of("scenes", key, rejection, attempt))
+            continue
+        except ChildFailed as failure:
+            skip = Rejected("environmental_skip", f"{failure.reason}: {failure.sentence}")
+            failures.append(failure_of("renders", key, skip, attempt))
             continue
         failures += tried.failures
         if tried.sample:
             return tried.sample, failures
     return None, failures
-
-
-def _attempt_with_retries(child: IsolatedChild, arguments: tuple[object, ...]) -> SceneAttempt:
-    return with_retries(lambda: child.call_method(SceneWorker.attempt, *arguments))
 
 
 def make_documents(writer: DatasetWriter) -> Statistics:

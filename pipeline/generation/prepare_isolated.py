@@ -1,7 +1,8 @@
 """Runs the mesh stage in children with limits, with the shared asset store."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from pipeline.assets.asset_store import AssetStore
@@ -16,6 +17,7 @@ from pipeline.isolation import (
     preload,
     reach,
 )
+from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.errors import TrilightError
 from storage.installation import module_name
@@ -50,7 +52,6 @@ class MeshWork:
         """Configure the children; each starts when an object needs it.
 
         Args:
-            settings: settings of the mesh stage.
             workers: number of objects that are prepared at the same time.
         """
         self._settings = settings
@@ -111,3 +112,26 @@ def require_filters() -> None:
             f"pymeshlab lacks {', '.join(missing)}: a system library is missing. Run "
             "`trilight doctor`, which names it, or `make setup`."
         )
+
+
+UnreadNotes = Mapping[str, tuple[str, ...]]
+"""Unread parts of an object's file, as short sentences by the uid of the object."""
+
+_MOST_LINES = 5
+
+
+def write_unread(logs: Path, unread: UnreadNotes, name: str = "unread") -> Path:
+    """Write the sentences by uid to `NAME.json` of a folder; without any, delete the file."""
+    path = logs / f"{name}.json"
+    if unread:
+        write_atomically(path, json.dumps(unread, indent=1, sort_keys=True).encode())
+    else:
+        path.unlink(missing_ok=True)
+    return path
+
+
+def format_unread(unread: UnreadNotes, path: Path) -> list[str]:
+    """Return one line for each of the first objects, and the path that lists the others."""
+    lines = [f"{uid}: {', '.join(unread[uid])}" for uid in sorted(unread)[:_MOST_LINES]]
+    more = len(unread) - len(lines)
+    return [*lines, *([f"and {more} more objects: {path}"] if more > 0 else [])]

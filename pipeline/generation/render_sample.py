@@ -6,7 +6,7 @@ other; `cameras_of_view` proposes cameras and knows no picture.
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,10 @@ from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
-from pipeline.scenes.views import ViewCamera, cameras_of, cameras_of_view, with_cameras
-from pipeline.scenes.visibility import Visibility
+from pipeline.scenes.views import ViewCamera, Visibility, cameras_of, cameras_of_view, with_cameras
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import forget_views, tell_views
 from storage.errors import Rejected
-from storage.records.lights import Parts
 from storage.records.objects import Failure
 from storage.records.passes.pictures import passes_exr
 from storage.records.sample import PartFloor, Sample, ViewRecord
@@ -61,18 +59,6 @@ class ViewProgress:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class KeptPictures:
-    """Finished pictures of a scene's first `num_views` cameras."""
-
-    num_views: int
-    """Number of cameras whose pictures are kept."""
-    sample: Sample
-    """The sample that holds the pictures."""
-    members: Mapping[str, bytes]
-    """Packed files of the kept pictures, by suffix."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class RenderInput:
     """A scene to render, with the cameras and pictures that stay."""
 
@@ -80,19 +66,28 @@ class RenderInput:
     """The scene, with a camera for each view."""
     kept_cameras: int = 0
     """Number of first cameras that are never replaced: their rejection rejects the scene."""
-    kept_pictures: KeptPictures | None = None
-    """Pictures that need not be rendered again."""
+    kept_views: int = 0
+    """Number of first cameras whose pictures need not be rendered again."""
+    kept_sample: Sample | None = None
+    """The sample that holds the kept pictures."""
+    kept_members: Mapping[str, bytes] = field(default_factory=dict)
+    """Packed files of the kept pictures, by suffix."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _AcceptedView:
-    """An accepted picture."""
-
     camera: ViewCamera
     record: ViewRecord
-    radiance_rgb: NDArray[np.float32]
-    lights_rgb: NDArray[np.float32] | None
-    parts_rgb: Parts | None
+    pictures: Mapping[str, NDArray[np.float32]]
+    """`radiance_rgb`, `lights_rgb` if lights are apart, and parts by name."""
+
+
+def failure_of(stage: str, item: str, rejection: Rejected, attempt: int = 0) -> Failure:
+    """Return the row of a rejection."""
+    reason = rejection.reason
+    return Failure(
+        stage=stage, item=item, reason=reason, message=rejection.message, attempt=attempt
+    )
 
 
 def render_sample(
@@ -105,27 +100,24 @@ def render_sample(
     """Render every view of a scene.
 
     Args:
-        key: key of the sample.
-        render_input: the scene, and the cameras and pictures that stay.
-        settings: settings of the dataset.
         failures: receives a row for each camera that was rejected and replaced.
-        progress: reports the progress of the views.
 
     Raises:
         Rejected: the scene cannot be rendered, or a view has no camera left.
     """
     scene = render_input.scene
-    kept_pictures = render_input.kept_pictures
-    num_kept = kept_pictures.num_views if kept_pictures else 0
     visibility = Visibility(scene)
     renderer = None
-    if num_kept < scene.num_views:
+    if render_input.kept_views < scene.num_views:
         light_seed = seed_for(settings.seed, "light paths", int(key))
         renderer = SceneRenderer(scene, settings.renders, light_seed=light_seed)
 
     def render_view(view: int) -> _AcceptedView:
-        if kept_pictures and view < num_kept:
-            return _kept_view(kept_pictures.sample, view)
+        if render_input.kept_sample and view < render_input.kept_views:
+            sample = render_input.kept_sample
+            kept_pictures = {name: pictures[view] for name, pictures in _pictures(sample).items()}
+            camera = cameras_of(sample.scene)[view]
+            return _AcceptedView(camera=camera, record=sample.views[view], pictures=kept_pictures)
         assert renderer is not None
         for camera in cameras_of_view(scene, visibility, settings.scenes, view):
             seed = seed_for(settings.seed, "samples", int(key), view, camera.attempt)
@@ -135,22 +127,15 @@ def render_sample(
                     camera, progress.render_view(view, steps), seed, visibility, settings
                 )
             except Rejected as rejection:
-                reason = rejection.reason
-                message = rejection.message
-            if view < render_input.kept_cameras:
-                raise Rejected(reason, f"view {view}: {message}")
-            item = f"{key}.{view}"
-            attempt = camera.attempt
-            failures.append(
-                Failure(stage="renders", item=item, reason=reason, message=message, attempt=attempt)
-            )
+                if view < render_input.kept_cameras:
+                    raise Rejected(rejection.reason, f"view {view}: {rejection.message}") from None
+                failures.append(failure_of("renders", f"{key}.{view}", rejection, camera.attempt))
         raise AssertionError("cameras_of_view ends by raising Rejected")
 
     views = [render_view(view) for view in range(scene.num_views)]
     seen = with_cameras(scene, [view.camera for view in views])
     seen.check()
-    members = kept_pictures.members if kept_pictures else {}
-    return _stack_views(key, seen, views, settings, members)
+    return _stack_views(key, seen, views, settings, render_input.kept_members)
 
 
 def _stack_views(
@@ -160,40 +145,28 @@ def _stack_views(
     settings: DatasetSettings,
     members: Mapping[str, bytes],
 ) -> Sample:
-    lights = [view.lights_rgb for view in views if view.lights_rgb is not None]
-    parts = [view.parts_rgb for view in views if view.parts_rgb is not None]
+    stacked = {
+        name: np.stack([view.pictures[name] for view in views]) for name in views[0].pictures
+    }
+    names = settings.storage.passes
+    resolution = settings.renders.resolution
+    rows = range(scene.num_views)
+    passes = (passes_exr(scene, names, view=row, resolution=resolution) for row in rows)
     return Sample(
         key=key,
         scene=scene.with_provenance({**scene.provenance, "settings_sha256": settings.digest}),
-        radiance_rgb=np.stack([view.radiance_rgb for view in views]),
+        radiance_rgb=stacked.pop("radiance_rgb"),
         views=tuple(view.record for view in views),
-        lights_rgb=np.stack(lights) if lights else None,
-        parts_rgb=_stack_parts(parts) if parts else None,
-        passes_exr=_passes_exr(scene, settings),
+        lights_rgb=stacked.pop("lights_rgb", None),
+        parts_rgb=stacked or None,
+        passes_exr=tuple(passes) if names else None,
         kept_members=members,
     )
 
 
-def _kept_view(sample: Sample, view: int) -> _AcceptedView:
-    parts = {name: pictures[view] for name, pictures in (sample.parts_rgb or {}).items()}
-    return _AcceptedView(
-        camera=cameras_of(sample.scene)[view],
-        record=sample.views[view],
-        radiance_rgb=sample.radiance_rgb[view],
-        lights_rgb=None if sample.lights_rgb is None else sample.lights_rgb[view],
-        parts_rgb=parts or None,
-    )
-
-
-def _passes_exr(scene: Scene, settings: DatasetSettings) -> tuple[bytes, ...] | None:
-    names = settings.storage.passes
-    resolution = settings.renders.resolution
-    if not names:
-        return None
-    return tuple(
-        passes_exr(scene, names, view=view, resolution=resolution)
-        for view in range(scene.num_views)
-    )
+def _pictures(of: Sample | RenderedView) -> dict[str, NDArray[np.float32]]:
+    named = {"radiance_rgb": of.radiance_rgb, "lights_rgb": of.lights_rgb, **(of.parts_rgb or {})}
+    return {name: picture for name, picture in named.items() if picture is not None}
 
 
 def _accepted_view(
@@ -219,13 +192,7 @@ def _accepted_view(
         or None,
         lights=tuple(map(_part_floor, rendered.light_floors or ())) or None,
     )
-    return _AcceptedView(
-        camera=camera,
-        record=record,
-        radiance_rgb=rendered.radiance_rgb,
-        lights_rgb=rendered.lights_rgb,
-        parts_rgb=rendered.parts_rgb,
-    )
+    return _AcceptedView(camera=camera, record=record, pictures=_pictures(rendered))
 
 
 def _part_floor(floor: MeasuredFloor) -> PartFloor:
@@ -234,7 +201,3 @@ def _part_floor(floor: MeasuredFloor) -> PartFloor:
         noise_floor_linear_db=round(floor.linear_db, 3),
         object_noise_floor_db=round(floor.object_log_db, 3),
     )
-
-
-def _stack_parts(views: Sequence[Parts]) -> dict[str, NDArray[np.float32]]:
-    return {name: np.stack([parts[name] for parts in views]) for name in views[0]}

@@ -1,29 +1,38 @@
 """Pools of worker processes that make scenes, started by the first task of a job, then kept warm.
 
+A worker also prepares a frozen object again if its prepared file is missing on its machine.
 Render children get composed scenes, which are trusted. If scenes come from files, another child
 reads these, confined to their folder (pipeline.isolation.confinement).
 """
 
 import contextlib
+import functools
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.scene_files import SceneFiles
+from pipeline.generation.freeze_objects import object_changed_error, require_tried
+from pipeline.generation.frozen_pool import ComposedScenes
 from pipeline.generation.generation_run import ShardJob
-from pipeline.generation.prepare_isolated import asset_child
+from pipeline.generation.prepare_isolated import asset_child, asset_store, prepare_isolated
 from pipeline.generation.scene_worker import SceneRecipe, SceneWorker
-from pipeline.generation.software_environment import environment
 from pipeline.isolation import ChildLimits, ChildPool, IsolatedChild, call_with_retries, reach
+from pipeline.objects.sources import ListedObjects, list_objects
 from pipeline.presets.settings import differences
-from pipeline.renders.mitsuba_variant import choose_variant
-from pipeline.renders.visible_gpus import visible_gpus
+from pipeline.renders.mitsuba_variant import choose_variant, environment, visible_gpus
+from storage.atomic import write_atomically
+from storage.digests import sha256_of_file
 from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions
 from storage.machine import available_cores
+from storage.records.lock_rows import LockRows
+from storage.records.objects import ObjectRecord
 from storage.records.scene import Scene
+from storage.remote.safe_url import safe_url
 
 _RENDER_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child=200)
 """A scene at 4096 samples and 512 pixels takes minutes, and a render child holds below 1 GiB: the
@@ -31,7 +40,7 @@ limits on memory and wall time end only a child that leaks or hangs. After 200 c
 starts, so that leaks stay bounded."""
 
 _pools: dict[tuple[str, ...], ChildPool] = {}
-_pools_lock = threading.Lock()
+_pools_lock = threading.RLock()
 
 
 def close_children() -> None:
@@ -42,17 +51,12 @@ def close_children() -> None:
         _pools.clear()
 
 
-def close_idle_children() -> None:
-    """End the render children of this process that no task uses; other jobs may run here."""
+def close_idle_children(keep: tuple[str, ...] = ()) -> None:
+    """End the render children that no task uses; not those of a job to keep, if it is given."""
     with _pools_lock:
-        _close_idle()
-
-
-def _close_idle(keep: tuple[str, ...] = ()) -> None:
-    idle = [key for key, pool in _pools.items() if pool.num_users == 0]
-    for key in idle:
-        if not keep or key[: len(keep)] != keep:
-            _pools.pop(key).close()
+        for key in [key for key, pool in _pools.items() if pool.num_users == 0]:
+            if not keep or key[: len(keep)] != keep:
+                _pools.pop(key).close()
 
 
 @contextlib.contextmanager
@@ -106,7 +110,7 @@ def _borrow_child(
     key = (*of_job, *kind)
     with _pools_lock:
         if key not in _pools:
-            _close_idle(keep=of_job)
+            close_idle_children(keep=of_job)
             _pools[key] = make(job)
         pool = _pools[key]
         pool.num_users += 1
@@ -154,3 +158,62 @@ def require_environment(expected: Mapping[str, Any], actual: Mapping[str, Any]) 
             f"expected {old!r}. Use machines of one kind and one image, or accept pictures that "
             "agree only within their stated errors with --accept-environment."
         )
+
+
+def restore_object(job: ShardJob, uid: str, asset_name: str) -> None:
+    """Make the prepared file of an object again; its digest must be the one in the lock.
+
+    Args:
+        asset_name: name of its file in the dataset's index.
+
+    Raises:
+        TrilightError: the source has lost or changed the object.
+        EnvironmentFailure: it could not be prepared this time.
+    """
+    frozen = job.accepted.origin
+    assert isinstance(frozen, ComposedScenes), "only composed scenes draw objects"
+    store = asset_store()
+    display_name = safe_url(frozen.source)
+    locked = LockRows(frozen.lock).find(uid)
+    path = store.asset_path(asset_name)
+    settings = job.settings
+    with contextlib.suppress(FileNotFoundError):
+        if locked is not None and sha256_of_file(path) == locked.asset_sha256:
+            return  # another worker was faster
+    path.unlink(missing_ok=True)
+    work_dir = job.folder.staged_objects
+    record = find_object(frozen.source, frozen.licence, work_dir, settings.allowed_licences, uid)
+    if record is None or locked is None:
+        raise object_changed_error(display_name, uid, "is missing or no longer usable")
+    prepared, rejected = prepare_isolated(
+        [record], settings.mesh_settings, workers=1, done=lambda: None
+    )
+    if rejected:
+        require_tried(display_name, rejected[0])
+    if not prepared or prepared[0].asset_sha256 != locked.asset_sha256:
+        raise object_changed_error(
+            display_name, uid, "has changed" if prepared else "is no longer usable"
+        )
+    if prepared[0].asset_name != asset_name:  # a later recipe gives it another name
+        write_atomically(path, store.asset_path(prepared[0].asset_name).read_bytes())
+
+
+def find_object(
+    source: str, licence: str | None, work_dir: Path, allowed: tuple[str, ...], uid: str
+) -> ObjectRecord | None:
+    """Return an object of a source, with its file on this machine; None if the source lacks it."""
+    for _ in range(2):  # the cached list may be older than the file
+        listed = _list_source(source, licence, work_dir, allowed)
+        for record in listed.fetch_selected(lambda other: other == uid).records:
+            if Path(record.path).exists():
+                return record
+        _list_source.cache_clear()
+    return None
+
+
+@functools.lru_cache(maxsize=1)
+def _list_source(
+    source: str, licence: str | None, work_dir: Path, allowed: tuple[str, ...]
+) -> ListedObjects:
+    """Return the objects of a source; cached, so that many missing objects cost one listing."""
+    return list_objects(source, work_dir=work_dir, allowed_licences=allowed, licence=licence)

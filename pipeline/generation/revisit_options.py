@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pipeline.exchange.open_scene import load_cameras, scene_source
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.presets.revisit import MOST_CAMERAS, GivenCamera, RevisitSettings
+from pipeline.presets.settings import MOST_CAMERAS, GivenCamera, RevisitSettings
 from pipeline.renders.mitsuba_variant import Device
 from pipeline.renders.settings import NoiseFloor, Resolution
 from pipeline.shards.finished_dataset import open_finished

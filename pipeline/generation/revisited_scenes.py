@@ -1,7 +1,10 @@
-"""`RevisitedScenes`: reads scenes of a finished dataset and adds new cameras, lights, materials."""
+"""`RevisitedScenes`: reads scenes of a finished dataset and adds new cameras, lights, materials.
+
+A revisit takes scenes, objects and splits of a new dataset from the finished one.
+"""
 
 import contextlib
-from collections.abc import Mapping
+import dataclasses
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -10,13 +13,12 @@ from typing import Any
 import numpy as np
 
 from pipeline.exchange.scene_files import SceneFiles
+from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.frozen_pool import ComposedScenes
-from pipeline.generation.render_sample import KeptPictures, RenderInput
-from pipeline.presets.revisit import RevisitSettings
-from pipeline.presets.settings import DatasetSettings
+from pipeline.generation.render_sample import RenderInput
+from pipeline.presets.settings import DatasetSettings, RevisitSettings
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
-from pipeline.scenes.scene_checks import require_valid
-from pipeline.scenes.views import ViewCamera, cameras_of, with_first_cameras
+from pipeline.scenes.views import ViewCamera, cameras_of, require_valid, with_first_cameras
 from pipeline.shards.finished_dataset import (
     FinishedDataset,
     SampleReader,
@@ -24,8 +26,11 @@ from pipeline.shards.finished_dataset import (
     require_whole,
 )
 from storage.dataset.manifest import ShardEntry
+from storage.dataset.settings import ListedShard
+from storage.digests import canonical_json
 from storage.errors import TrilightError
-from storage.records.sample import Sample, decode_sample
+from storage.records.objects import OBJECT
+from storage.records.sample import decode_sample
 from storage.records.scene import Scene
 from storage.seeds import SceneKey
 
@@ -37,16 +42,13 @@ class RevisitedScenes:
     root: Path
     """Folder of the finished dataset."""
     digest: str
-    """Dataset digest of the finished dataset."""
     _checked: set[str] = field(default_factory=set, compare=False, repr=False)
 
     def scene(self, index: int, attempt: int, settings: DatasetSettings) -> RenderInput:
         """Return the scene of an index, which counts the scenes of the source shard by shard.
 
         Args:
-            index: index of the scene, from 0.
             attempt: number of earlier rejections of this scene; seeds what is drawn again.
-            settings: settings of the new dataset.
 
         Raises:
             Rejected: the changed scene is invalid, or no camera is found.
@@ -60,21 +62,32 @@ class RevisitedScenes:
         sample = decode_sample(key, members)
         origin = self._origin(sample.scene, key, revisit, settings.seed, attempt)
         scene = _redraw(sample.scene.with_provenance(origin), index, attempt, settings)
-        cameras = [*cameras_of(sample.scene)[: revisit.kept_cameras]]
+        given_cameras = [
+            ViewCamera(
+                c2w=np.array(camera.c2w, np.float32).reshape(4, 4),
+                fov_deg=np.float32(camera.fov_deg),
+                attempt=0,
+            )
+            for camera in revisit.given_cameras
+        ]
         scene = with_first_cameras(
             scene,
             settings.scenes.of_scene(origin["scene_index"]),
-            first_cameras=[*cameras, *_given_cameras(revisit)],
+            first_cameras=[*cameras_of(sample.scene)[: revisit.kept_cameras], *given_cameras],
         )
         if not revisit.keeps_light:
             # the triangles stay, except those of the requested lamps: no budget to check
             require_valid(scene, settings.scenes, in_budget=False)
+        stay = self._pictures_stay(settings)
+        count = min(revisit.kept_cameras, len(sample.views)) if stay else 0
+        kinds = ("", "lights.", "parts.")
+        suffixes = {f"{view}.{kind}exr" for view in range(count) for kind in kinds}
         return RenderInput(
             scene=scene,
-            kept_cameras=revisit.kept_cameras + len(revisit.given_cameras),
-            kept_pictures=_kept_pictures(sample, members, revisit)
-            if self._pictures_stay(settings)
-            else None,
+            kept_cameras=revisit.kept_cameras + len(given_cameras),
+            kept_views=count,
+            kept_sample=sample,
+            kept_members={suffix: data for suffix, data in members.items() if suffix in suffixes},
         )
 
     @cached_property
@@ -144,25 +157,86 @@ def _redraw(scene: Scene, index: int, attempt: int, settings: DatasetSettings) -
     return scene
 
 
-def _given_cameras(revisit: RevisitSettings) -> list[ViewCamera]:
-    return [
-        ViewCamera(
-            c2w=np.array(camera.c2w, np.float32).reshape(4, 4),
-            fov_deg=np.float32(camera.fov_deg),
-            attempt=0,
-        )
-        for camera in revisit.given_cameras
-    ]
-
-
-def _kept_pictures(
-    sample: Sample, members: Mapping[str, bytes], revisit: RevisitSettings
-) -> KeptPictures | None:
-    count = min(revisit.kept_cameras, len(sample.views))
-    names = {f"{view}.{kind}exr" for view in range(count) for kind in ("", "lights.", "parts.")}
-    of_views = {suffix: data for suffix, data in members.items() if suffix in names}
-    return KeptPictures(num_views=count, sample=sample, members=of_views) if count else None
-
-
 SceneOrigin = ComposedScenes | SceneFiles | RevisitedScenes
 """Layouts, scene files (then the objects are the files), or the scenes of a finished dataset."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AcceptedObjects:
+    """The frozen inputs of a dataset's scenes."""
+
+    num_objects: int
+    """Objects that scenes may draw from."""
+    num_found: int
+    """Objects in the source, refused ones included."""
+    origin: SceneOrigin
+
+
+def settings_for_revisit(settings: DatasetSettings, path: str | None) -> DatasetSettings:
+    """Return the settings of a dataset that has the views and shards of a finished one.
+
+    Without a path, the settings stay as they are.
+
+    Raises:
+        TrilightError: only one of path and `settings.revisit` is given, the dataset at the path is
+            unfinished or another one, or its scenes have fewer cameras than `kept_cameras`.
+    """
+    revisit = settings.revisit
+    if path is None and revisit is None:
+        return settings
+    if path is None or revisit is None:
+        raise TrilightError(
+            f"revisits is {path!r} and the settings of a revisit are "
+            f"{'missing' if revisit is None else 'there'}; expected both. Use `trilight revisit`."
+        )
+    source = open_finished(path)
+    require_digest(source, revisit.source_digest)
+    if revisit.kept_cameras > source.manifest.num_views:
+        raise TrilightError(
+            f"kept_cameras is {revisit.kept_cameras}; expected at most "
+            f"{source.manifest.num_views}, the views of each scene of {path}."
+        )
+    if settings.splits.listed_scenes is not None:
+        if revisit.new_cameras and revisit.camera_layout is None:
+            raise TrilightError(
+                f"{path}: its scenes are of files, whose own layout draws no cameras; expected a "
+                "layout and a number, such as --cameras plane:4, or a file with cameras."
+            )
+        if revisit.lights == "new":
+            raise TrilightError(
+                f"{path}: its scenes are of files, whose own layout draws no lights; expected "
+                "--lights keep."
+            )
+    scenes = dataclasses.replace(settings.scenes, num_views=revisit.num_views)
+    listed = tuple(
+        ListedShard(split=shard.split, scenes=shard.num_samples)
+        for shard in shards_with_scenes(source)
+    )
+    splits = dataclasses.replace(settings.splits, listed_shards=listed)
+    return dataclasses.replace(settings, scenes=scenes, splits=splits)
+
+
+def accept_revisited(
+    path: str, settings: DatasetSettings, writer: DatasetWriter
+) -> AcceptedObjects:
+    """Freeze the objects of a finished dataset for the new one, with their licences and splits.
+
+    Raises:
+        TrilightError: it is not the dataset that the new one was begun with.
+    """
+    source = open_finished(path)
+    assert settings.revisit is not None
+    require_digest(source, settings.revisit.source_digest)
+    locked = sorted(
+        (entry for entries in source.objects.values() for entry in entries),
+        key=lambda entry: canonical_json(dataclasses.asdict(entry)),
+    )
+    if writer.frozen_objects() is None:
+        writer.add_failures(())
+        writer.lock_objects(locked)
+    root = source.folder.root.resolve()
+    return AcceptedObjects(
+        num_objects=sum(entry.kind == OBJECT for entry in locked),
+        num_found=len(locked),
+        origin=RevisitedScenes(root=root, digest=source.manifest.dataset_digest),
+    )

@@ -9,15 +9,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from pipeline.assets.asset_store import AssetStore
-from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, user_maps
+from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, SplitPool, user_maps
 from pipeline.generation.prepare_isolated import asset_store
-from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
+from pipeline.generation.render_sample import RenderInput, ViewProgress, failure_of, render_sample
 from pipeline.generation.revisited_scenes import RevisitedScenes, SceneOrigin
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Variant, activate
 from pipeline.renders.renderer import set_threads
 from pipeline.scenes.compose import compose_scene
-from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.settings import SceneSettings
 from scene_templates.user_maps import OwnMaps
 from storage.dataset.layout import DatasetFolder
@@ -36,11 +36,9 @@ class SceneRecipe:
     """Configuration of a render child, sent once when it starts."""
 
     settings: DatasetSettings
-    """Settings of the dataset."""
     variant: Variant
     """Mitsuba variant and denoiser device."""
     threads: int
-    """Number of CPU threads of this child."""
     gpu: str | None = None
     """GPU of this child, as CUDA_VISIBLE_DEVICES names it; None without one."""
     origin: SceneOrigin
@@ -81,9 +79,6 @@ class SceneWorker:
         """Make one attempt at a scene; equal arguments give equal results in every child.
 
         Args:
-            split: split of the scene.
-            scene_index: index of the scene, from 0.
-            attempt: number of the attempt, from 0.
             from_file: the scene if it comes from a file, which a confined child has read.
         """
         key = sample_key(scene_index)
@@ -96,15 +91,7 @@ class SceneWorker:
             stage = "renders"
             sample = render_sample(key, render_input, settings, failures, progress)
         except Rejected as rejection:
-            failures.append(
-                Failure(
-                    stage=stage,
-                    item=key,
-                    reason=rejection.reason,
-                    message=rejection.message,
-                    attempt=attempt,
-                )
-            )
+            failures.append(failure_of(stage, key, rejection, attempt))
             return SceneAttempt(sample=None, failures=failures)
         except AssetMissing as missing:
             return SceneAttempt(
@@ -121,9 +108,6 @@ class SceneWorker:
 
         Args:
             settings: the ranges to draw from, which may differ from the dataset's.
-            scene_index: index of the scene, from 0.
-            seed: seed of the draws.
-            split: split of the objects.
         """
         for attempt in range(MAX_ATTEMPTS):
             with contextlib.suppress(Rejected):
@@ -156,8 +140,7 @@ class SceneWorker:
     def _pool(self, split: str) -> Sequence[PooledAsset]:
         """Return the objects of a split, sorted by uid; each is opened on first access."""
         if split not in self._pools:
-            pool = self._composed_scenes().pool
-            self._pools[split] = pool.open_split(split, self._recipe.assets)
+            self._pools[split] = SplitPool(self._composed_scenes(), split, self._recipe.assets)
         return self._pools[split]
 
     def _maps_of(self, split: str) -> OwnMaps:

@@ -1,38 +1,23 @@
 """Child processes for native code: a crash, a hang or a memory leak costs one item, not the run.
 
-- `child`: the owner's side: starts, calls, replaces and ends children.
-- `worker_pool`: the children, worker processes, that tasks share.
+- `child`: the owner's side: starts, calls, replaces and ends children, and lends them to tasks.
 - `child_main`: the child's side: applies its limits and never outlives its owner.
-- `waiting`: waits for an answer; a pause of the whole command does not count as time.
-- `confinement`: restricts children that read untrusted files, by `landlock` and `seccomp`.
+- `answers`: messages; waits for one, and a pause of the whole command does not count as time.
+- `confinement`: restricts children that read untrusted files, by `system_calls`.
 - `call_failures`: the ways a call can fail, the number of retries, and which failures are verdicts.
 """
 
-from pipeline.isolation.call_failures import ChildFailed, Result, is_transient, with_retries
-from pipeline.isolation.child import (
-    ChildClosed,
-    ChildLimits,
-    IsolatedChild,
-    call_with_retries,
-    preload,
-)
-from pipeline.isolation.child_main import die_with_parent
-from pipeline.isolation.confinement import NO_FILES, Reach, reach
-from pipeline.isolation.worker_pool import ChildPool
-
-__all__ = [
-    "ChildClosed",
-    "ChildFailed",
-    "ChildLimits",
-    "ChildPool",
-    "IsolatedChild",
-    "NO_FILES",
-    "Reach",
-    "Result",
-    "call_with_retries",
-    "die_with_parent",
-    "is_transient",
-    "preload",
-    "reach",
-    "with_retries",
-]
+from pipeline.isolation.call_failures import ChildFailed as ChildFailed
+from pipeline.isolation.call_failures import Result as Result
+from pipeline.isolation.call_failures import is_transient as is_transient
+from pipeline.isolation.call_failures import with_retries as with_retries
+from pipeline.isolation.child import ChildClosed as ChildClosed
+from pipeline.isolation.child import ChildLimits as ChildLimits
+from pipeline.isolation.child import ChildPool as ChildPool
+from pipeline.isolation.child import IsolatedChild as IsolatedChild
+from pipeline.isolation.child import call_with_retries as call_with_retries
+from pipeline.isolation.child import preload as preload
+from pipeline.isolation.child_main import die_with_parent as die_with_parent
+from pipeline.isolation.confinement import NO_FILES as NO_FILES
+from pipeline.isolation.confinement import Reach as Reach
+from pipeline.isolation.confinement import reach as reach

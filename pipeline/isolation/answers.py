@@ -5,13 +5,22 @@ Errors are sentences, and their types come from a list. The parts of an answer a
     words   JSON: `["result"]`, or the kind of an error and its sentences
     value   JSON: a dataclass by its fields, an array as `[number, dtype, shape, order]`
     bytes   of each array, path and `bytes`, whose number from 0 stands in the value
+
+A message is sent as parts, after their number and lengths. The owner waits for each piece within
+the time limit of one call, so that a child that sends half a message, or reads none, blocks it no
+longer than a silent one. Time is counted in polls, not by a clock, and a stopped process does not
+poll. So Ctrl-Z, which stops a command and all its children together, and a sleeping laptop take
+none of a child's time.
 """
 
 import dataclasses
 import json
+import logging
 import os
 import re
-from collections.abc import Callable, Mapping
+import select
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +79,6 @@ def decode_answer(parts: list[NDArray[np.uint8]], function: Callable[..., Any]) 
 
     Args:
         parts: untrusted bytes; the result's arrays share their memory.
-        function: the function that was called.
 
     Raises:
         Rejected, TrilightError: as the function raised them.
@@ -104,3 +112,122 @@ def decode_answer(parts: list[NDArray[np.uint8]], function: Callable[..., Any]) 
 def make_printable(text: str) -> str:
     """Return the beginning of a text, with control characters escaped."""
     return escape_lines(text[:_MOST_CHARACTERS])
+
+
+log = logging.getLogger("trilight.children")
+
+LOOK_S = 1.0
+"""Pause between two polls of a child that has not answered."""
+LOOKS_BEFORE_WORDS = 3
+"""Polls that find a child stopped before a warning is logged. A single one may see a child that is
+about to continue together with this process."""
+LOOKS_BEFORE_KILL = 60
+"""Polls that may find a child stopped before it is given up: time to continue it by hand."""
+
+
+_LENGTH = np.dtype("<u8")
+MOST_PARTS = 1 << 17
+
+Wait = Callable[[int, int], None]
+"""Waits until a file can be read or written: takes its number and an event of `select.poll`."""
+
+
+def wait_forever(file: int, event: int) -> None:
+    """Return at once: reads and writes of a blocking file wait by themselves."""
+
+
+class CallTime:
+    """A `Wait` for files that do not block, within one time limit of a call to a child."""
+
+    def __init__(self, process_id: int, wall_s: float) -> None:
+        self._process_id = process_id
+        self._wall_s = wall_s
+        self._waited_s = 0.0
+        self._stopped = 0
+
+    def __call__(self, file: int, event: int) -> None:
+        """Wait until an event happens.
+
+        Raises:
+            ChildFailed: `timeout_wall`, or `stopped` where the child was stopped and not continued.
+        """
+        poll = select.poll()
+        poll.register(file, event)
+        while self._waited_s < self._wall_s:
+            pause_s = min(LOOK_S, self._wall_s - self._waited_s)
+            began_s = time.monotonic()
+            if poll.poll(pause_s * 1000):  # many short waits count too
+                self._waited_s += min(pause_s, time.monotonic() - began_s)
+                return
+            self._waited_s += pause_s
+            self._check_stopped()
+        raise ChildFailed("timeout_wall", f"no answer within {self._wall_s:.0f} s")
+
+    def _check_stopped(self) -> None:
+        self._stopped = self._stopped + 1 if _is_stopped(self._process_id) else 0
+        if self._stopped == LOOKS_BEFORE_WORDS:
+            log.warning(
+                "child process %d has been stopped from outside. Continue it with `kill -CONT %d`; "
+                "otherwise it is ended in %.0f s and its work is done again.",
+                self._process_id,
+                self._process_id,
+                (LOOKS_BEFORE_KILL - self._stopped) * LOOK_S,
+            )
+        if self._stopped == LOOKS_BEFORE_KILL:
+            waited = f"{LOOKS_BEFORE_KILL * LOOK_S:.0f} s"
+            raise ChildFailed("stopped", f"stopped from outside (SIGSTOP) for {waited}")
+
+
+def _is_stopped(process_id: int) -> bool:
+    """Return whether a process is stopped until it is continued; False without /proc."""
+    try:
+        line = Path(f"/proc/{process_id}/stat").read_text()
+    except OSError:
+        return False
+    return line.rpartition(")")[2].split()[0] == "T"
+
+
+class TooLong(Exception):
+    """A message claims to be longer than the memory that a child may have."""
+
+
+def send(file: int, parts: Sequence[bytes | memoryview], wait: Wait) -> None:
+    """Write one message; raises OSError if the other side has ended."""
+    table = np.array([len(parts), *map(len, parts)], _LENGTH).tobytes()
+    for part in (table, *parts):
+        view = memoryview(part)
+        while view:
+            wait(file, select.POLLOUT)
+            view = view[os.write(file, view) :]
+
+
+def receive(file: int, wait: Wait, most: int) -> list[NDArray[np.uint8]]:
+    """Return the parts of one message, each in memory of its own.
+
+    Args:
+        most: most bytes of all parts together.
+
+    Raises:
+        EOFError: the other side has ended.
+        TooLong: the message claims more bytes, or more parts than `MOST_PARTS`.
+        MemoryError: this process has no memory for it.
+    """
+    (count,) = _receive_bytes(file, _LENGTH.itemsize, wait).view(_LENGTH).tolist()
+    if count > MOST_PARTS:
+        raise TooLong(f"{count} parts; expected at most {MOST_PARTS}")
+    lengths = _receive_bytes(file, count * _LENGTH.itemsize, wait).view(_LENGTH).tolist()
+    if sum(lengths) > most:
+        raise TooLong(f"{sum(lengths)} bytes; expected at most {most}")
+    return [_receive_bytes(file, length, wait) for length in lengths]
+
+
+def _receive_bytes(file: int, count: int, wait: Wait) -> NDArray[np.uint8]:
+    data = np.zeros(count, np.uint8)  # lazy: memory is used only as it is filled
+    rest = data.data
+    while rest:
+        wait(file, select.POLLIN)
+        read = os.readv(file, [rest])
+        if not read:
+            raise EOFError
+        rest = rest[read:]
+    return data

@@ -9,6 +9,7 @@ child: the kernel ends it with its parent, the fork server, which ends with the 
 import contextlib
 import multiprocessing
 import os
+import queue
 import signal
 import sys
 import tempfile
@@ -21,12 +22,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pipeline.isolation.answers import decode_answer
+from pipeline.isolation.answers import CallTime, TooLong, decode_answer, receive, send
 from pipeline.isolation.call_failures import ChildFailed, Result, with_retries
 from pipeline.isolation.child_main import CallKind, serve
 from pipeline.isolation.confinement import Reach, code_of, confine, should_confine
-from pipeline.isolation.frames import TooLong, receive, send, wait_within
-from pipeline.isolation.waiting import CallTime
 from storage.errors import EnvironmentFailure
 from storage.extensions import load_same, loaded_files
 from storage.installation import child_environment, order_installed_first
@@ -77,7 +76,6 @@ class IsolatedChild:
         """Configure the child; the first call starts it.
 
         Args:
-            limits: resource limits.
             factory: an importable class or function that makes the object which a new child
                 holds, for `call_method`; it may also load a library.
             args: picklable arguments of `factory`.
@@ -105,7 +103,7 @@ class IsolatedChild:
         """
         if self._reach is not None and not self._reach.covers(more):
             self._reach = self._reach.with_all_of(more)
-            self._stop()
+            self.retire()
 
     def call(self, function: Callable[..., Result], *args: Any) -> Result:
         """Run an importable function in the child and return its result.
@@ -130,19 +128,15 @@ class IsolatedChild:
             raise ChildClosed
         if self._reach is not None and not (code := code_of(function)) <= self._code:
             self._code |= code
-            self._stop()
+            self.retire()
         try:
             if self._calls_left == 0:
                 self._start()
             self._calls_left -= 1
             return self._exchange(kind, function, args, self._limits.wall_s)
         except ChildFailed:
-            self._stop()
+            self.retire()
             raise
-
-    def retire(self) -> None:
-        """End the child; the next call starts a fresh one. Not while another thread calls."""
-        self._stop()
 
     def close(self) -> None:
         """End the child at once and permanently; safe while another thread waits in `call`."""
@@ -150,7 +144,8 @@ class IsolatedChild:
         if self._process is not None:
             self._process.kill()
 
-    def _stop(self) -> None:
+    def retire(self) -> None:
+        """End the child; the next call starts a fresh one. Not while another thread calls."""
         if self._process is not None:
             self._process.kill()
             self._process.join()
@@ -166,7 +161,7 @@ class IsolatedChild:
             raise _cannot_be_set_up(failure) from failure
 
     def _launch_and_set_up(self) -> None:
-        self._stop()
+        self.retire()
         self._process, self._connection = _launch(self._limits)
         try:
             files = loaded_files()
@@ -201,7 +196,7 @@ class IsolatedChild:
         declared: Callable[..., Any] = _no_result if kind == "factory" else function
         result_reader(declared)  # raises first if the declared result type cannot be checked
         file = self._connection.fileno()
-        wait = wait_within(CallTime(self._process.pid, wall_s))
+        wait = CallTime(self._process.pid, wall_s)
         try:
             send(file, [ForkingPickler.dumps((kind, function, args))], wait)
             answer = receive(file, wait, min(self._limits.memory_bytes, _MOST_BYTES))
@@ -337,3 +332,35 @@ def call_with_retries(child: IsolatedChild, function: Callable[..., Result], *ar
         ChildFailed: the last failure; `is_verdict` is True if the call itself is to blame.
     """
     return with_retries(lambda: child.call(function, *args))
+
+
+class ChildPool:
+    """At most `size` children, each with its compiled kernels warm for the next task."""
+
+    def __init__(self, make_child: Callable[[int], IsolatedChild], size: int) -> None:
+        """Make the children; each starts its process when it is first called.
+
+        Args:
+            make_child: called with the number of each child, from 0.
+            size: number of children.
+        """
+        self._children = [make_child(number) for number in range(size)]
+        self._free: queue.SimpleQueue[IsolatedChild] = queue.SimpleQueue()
+        for child in self._children:
+            self._free.put(child)
+        self.num_users = 0
+        """Number of tasks that use the pool; counted by the owner of several pools."""
+
+    @contextlib.contextmanager
+    def borrow(self) -> Iterator[IsolatedChild]:
+        """Lend a free child; wait while all are lent."""
+        child = self._free.get()
+        try:
+            yield child
+        finally:
+            self._free.put(child)
+
+    def close(self) -> None:
+        """End all children at once."""
+        for child in self._children:
+            child.close()

@@ -12,8 +12,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, Literal
 
-from pipeline.isolation.answers import encode_error, encode_result
-from pipeline.isolation.frames import receive, send, wait_forever
+from pipeline.isolation.answers import encode_error, encode_result, receive, send, wait_forever
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from storage.extensions import mistake_in_extension
 
@@ -51,9 +50,7 @@ def serve(connection: Connection, output: Connection, memory_bytes: int, cpu_s: 
     """Answer calls until the owner closes the connection; ignores Ctrl-C: the owner decides.
 
     Args:
-        connection: connection to the owner.
         output: receives standard output and standard error.
-        memory_bytes: most address space.
         cpu_s: most CPU seconds of one call, or None for no limit.
     """
     _leave_owner(connection, output)
@@ -99,20 +96,14 @@ def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> list[bytes |
         return encode_result(function(*args))
     except Rejected as rejection:
         return encode_error("rejected", rejection.reason, rejection.message)
-    except EnvironmentFailure as failure:
-        return encode_error("EnvironmentFailure", str(failure))
     except TrilightError as mistake:
-        return encode_error("TrilightError", str(mistake))
+        kind = EnvironmentFailure if isinstance(mistake, EnvironmentFailure) else TrilightError
+        return encode_error(kind.__name__, str(mistake))
     except MemoryError:
         return encode_error("out_of_memory", "an allocation went over the limit of the child")
     except Exception as error:
         its_author = mistake_in_extension(error)
         if its_author is not None:  # a retry would fail too
             return encode_error("TrilightError", str(its_author))
-        return encode_error("exception", _last_error())
-
-
-def _last_error() -> str:
-    """Return the last lines of the current traceback, the innermost call and the error."""
-    lines = traceback.format_exc(limit=-1).strip().splitlines()
-    return " | ".join(line.strip() for line in lines[1:])
+        lines = traceback.format_exc(limit=-1).strip().splitlines()[1:]  # innermost call, error
+        return encode_error("exception", " | ".join(map(str.strip, lines)))

@@ -16,8 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast, get_args
 
-from pipeline.isolation.landlock import give_up_privileges, landlock_version, restrict_files
-from pipeline.isolation.seccomp import refuse_calls, seccomp_works
+from pipeline.isolation.system_calls import (
+    give_up_privileges,
+    landlock_version,
+    refuse_calls,
+    restrict_files,
+    seccomp_works,
+)
 from storage.errors import EnvironmentFailure, TrilightError, expected_one_of
 from storage.installation import FILES_ROOT, IMPORT_ROOT
 

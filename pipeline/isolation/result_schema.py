@@ -115,10 +115,6 @@ def _read_bytes(number: int, info: Any) -> bytes:
     return typing.cast(bytes, parts[number])
 
 
-def _read_path(number: int, info: Any) -> Path:
-    return Path(os.fsdecode(_read_bytes(number, info)))
-
-
 _COUNT = core.int_schema(ge=0)
 _INT = core.int_schema()
 _PLAIN: Mapping[Any, core.CoreSchema] = {
@@ -129,6 +125,8 @@ _PLAIN: Mapping[Any, core.CoreSchema] = {
     float: core.union_schema([_INT, core.float_schema()]),  # 1 does not become 1.0
     str: core.str_schema(),
     bytes: core.with_info_after_validator_function(_read_bytes, _COUNT),
-    Path: core.with_info_after_validator_function(_read_path, _COUNT),
+    Path: core.with_info_after_validator_function(
+        lambda number, info: Path(os.fsdecode(_read_bytes(number, info))), _COUNT
+    ),
     Any: core.any_schema(),
 }

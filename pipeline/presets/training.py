@@ -33,8 +33,8 @@ from scene_templates.sample_emitters import LightSettings
 from scene_templates.sample_material import MaterialSettings
 from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.skies.procedural_skies import SkyMapSettings, SkySettings
-from scene_templates.textures import TextureSettings
 from storage.dataset.settings import SplitSettings
+from storage.settings.overrides import apply_overrides
 
 
 def smoke() -> DatasetSettings:
@@ -59,44 +59,40 @@ def smoke() -> DatasetSettings:
 
 def pretrain_256() -> DatasetSettings:
     """The first training stage: 256 pixels, up to 1536 triangles, pictures to 46 dB."""
-    base = smoke()
-    return dataclasses.replace(
-        base,
-        build="pretrain-256",
-        assets=dataclasses.replace(base.assets, decimator="libigl"),
-        renders=dataclasses.replace(base.renders, noise_floor_db=46.0, max_spp=4096, aux_spp=64),
-        splits=SplitSettings(scenes_per_shard=256, shards_per_cycle=64, held_out_objects=0.02),
-    )
+    changes = {
+        "build": "pretrain-256",
+        "assets.decimator": "libigl",
+        "renders.noise_floor_db": 46.0,
+        "renders.max_spp": 4096,
+        "renders.aux_spp": 64,
+        "splits.scenes_per_shard": 256,
+        "splits.shards_per_cycle": 64,
+        "splits.held_out_objects": 0.02,
+    }
+    return apply_overrides(smoke(), changes)
 
 
 def finetune_512() -> DatasetSettings:
     """The second training stage: 512 pixels, up to 4096 triangles, pictures to 46 dB."""
-    base = pretrain_256()
-    return dataclasses.replace(
-        base,
-        build="finetune-512",
-        assets=dataclasses.replace(base.assets, budgets=(3900, 2600, 1700, 1100, 700, 400)),
-        scenes=dataclasses.replace(base.scenes, max_triangles=4096, enough_error=0.0025),
-        renders=dataclasses.replace(base.renders, resolution=512),
-        splits=dataclasses.replace(base.splits, scenes_per_shard=64),
-    )
+    changes = {
+        "build": "finetune-512",
+        "assets.budgets": [3900, 2600, 1700, 1100, 700, 400],
+        "scenes.max_triangles": 4096,
+        "scenes.enough_error": 0.0025,
+        "renders.resolution": 512,
+        "splits.scenes_per_shard": 64,
+    }
+    return apply_overrides(pretrain_256(), changes)
 
 
 def textured_256() -> DatasetSettings:
     """`pretrain-256` with procedural textures on half of the objects, floors and walls."""
-    base = pretrain_256()
-    return dataclasses.replace(
-        base,
-        build="textured-256",
-        scenes=dataclasses.replace(base.scenes, textures=TextureSettings(share=0.5)),
-    )
+    return apply_overrides(pretrain_256(), {"build": "textured-256", "scenes.textures.share": 0.5})
 
 
 def sky_256() -> DatasetSettings:
     """Scenes of `pretrain-256`, three in four below a sky as well."""
-    base = pretrain_256()
-    scenes = dataclasses.replace(base.scenes, skies=SkySettings(share=0.75))
-    return dataclasses.replace(base, build="sky-256", scenes=scenes)
+    return apply_overrides(pretrain_256(), {"build": "sky-256", "scenes.skies.share": 0.75})
 
 
 def object_views() -> DatasetSettings:
@@ -148,18 +144,16 @@ def olat() -> DatasetSettings:
 
     Lamps are white, so that a reader colors them.
     """
-    base = pretrain_256()
-    return dataclasses.replace(
-        base,
-        build="olat",
-        scenes=dataclasses.replace(
-            base.scenes, lights=LightSettings(count=(2, 6)), skies=SkySettings(share=0.5)
-        ),
-        renders=dataclasses.replace(
-            base.renders, noise_floor_db=42.0, max_spp=1024, per_light=True
-        ),
-        splits=dataclasses.replace(base.splits, scenes_per_shard=64),
-    )
+    changes = {
+        "build": "olat",
+        "scenes.lights.count": [2, 6],
+        "scenes.skies.share": 0.5,
+        "renders.noise_floor_db": 42.0,
+        "renders.max_spp": 1024,
+        "renders.per_light": True,
+        "splits.scenes_per_shard": 64,
+    }
+    return apply_overrides(pretrain_256(), changes)
 
 
 PRESETS_FOR_TRAINING = {

@@ -18,8 +18,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.adaptive_sampling import TILE_PX
-from pipeline.renders.denoise_corrections import (
+from pipeline.renders.noise_floor import BLOCK_PX, ErrorMeasures, MeasuredFloor
+from pipeline.renders.samples import TILE_PX, DualBuffer, gaps_db
+from pipeline.renders.settings import FIRST_SPP, PASS_SPP, RenderSettings
+from pipeline.renders.view_pictures import (
     DARKER,
     GLINT,
     LEAST_PASSES,
@@ -27,10 +29,6 @@ from pipeline.renders.denoise_corrections import (
     STANDARD_ERRORS,
     STANDS_OUT,
 )
-from pipeline.renders.noise_floor import BLOCK_PX, ErrorMeasures, MeasuredFloor
-from pipeline.renders.samples import DualBuffer
-from pipeline.renders.settings import FIRST_SPP, PASS_SPP, RenderSettings
-from pipeline.renders.stopping import gaps_db
 from storage.digests import canonical_json, sha256_hex
 from storage.metrics import MAX_DB
 from storage.settings.ranges import Within

@@ -1,5 +1,13 @@
-"""Between numpy's memory and Dr.Jit's: arrays that kernels gather from, and what comes back."""
+"""Dr.Jit's memory: arrays that kernels gather from, what comes back, and launches traced once.
 
+Functions with `record_launches` replay their launches. `dr.freeze` bakes in what a function finds
+outside of its arguments, without a word, and keeps its arguments for good. So the objects that
+kernels read come as `KernelInputs`: all of their arrays are inputs, all else that they hold tells
+recordings apart, and no recording keeps a scene.
+"""
+
+import gc
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -39,3 +47,76 @@ def read_back(values: Any) -> NDArray:
     and never in between.
     """
     return np.array(dr.ravel(values))
+
+
+_MOST_RECORDINGS = 64
+"""Maximum number of recordings of a function; the oldest are dropped and recorded again."""
+
+
+class KernelInputs:
+    """Objects that kernels read. Equal kinds of objects share recordings, whatever arrays hold.
+
+    Floats of Python and arrays of numpy in them are left out: no kernel may read those.
+    """
+
+    def __init__(self, *objects: Any) -> None:
+        """Collect the arrays of objects, of theirs, and so on."""
+        self.arrays: list[Any] = []
+        names = list[Any]()
+        self._collect(objects, names)
+        self.kind = _Kind(tuple(names), objects)
+
+    def _collect(self, value: Any, names: list[Any]) -> None:
+        names.append(type(value))
+        if dr.is_array_v(value) or isinstance(value, mi.Object):
+            self.arrays.append(value)
+        elif isinstance(value, list | tuple):
+            names.append(len(value))
+            for item in value:
+                self._collect(item, names)
+        elif type(value).__module__.startswith(f"{__package__}."):
+            for name, item in vars(value).items():
+                names.append(name)
+                self._collect(item, names)
+        elif not isinstance(value, np.ndarray | float):
+            names.append(value)
+
+
+class _Kind:
+    """Key of a recording, and the objects of the current call."""
+
+    def __init__(self, names: tuple[Any, ...], objects: tuple[Any, ...]) -> None:
+        self._names = names
+        self.objects = objects
+
+    def __hash__(self) -> int:
+        return hash(self._names)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Kind) and other._names == self._names
+
+
+def record_launches(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that takes `KernelInputs` where `function` takes their objects, first.
+
+    What differs from call to call comes in arrays. Numbers of Python among the arguments tell
+    recordings apart, and so must all sizes: a replay reads that of a launch off the largest array
+    of which each lane has one element, but other memory is as large as when it was recorded.
+    """
+
+    def call(kind: _Kind, _: list[Any], *arguments: Any) -> Any:
+        return function(kind.objects, *arguments)
+
+    frozen = dr.freeze(call, limit=_MOST_RECORDINGS, warn_after=1 << 30)
+
+    def replay(inputs: KernelInputs, *arguments: Any) -> Any:
+        collects = gc.isenabled()
+        gc.disable()  # to free an old scene cannot be recorded, and would end the process
+        try:
+            return frozen(inputs.kind, inputs.arrays, *arguments)
+        finally:
+            if collects:
+                gc.enable()
+            inputs.kind.objects = ()  # a recording keeps the kind that it was made with
+
+    return replay

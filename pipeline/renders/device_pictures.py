@@ -3,6 +3,7 @@
 What is read back are a few numbers of each tile at each look, and the pictures once.
 """
 
+import ctypes
 import functools
 import operator
 from collections.abc import Sequence
@@ -13,7 +14,6 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.adaptive_sampling import TILE_PX, tile_means
 from pipeline.renders.calibrated_error import (
     METRICS,
     CalibratedStatement,
@@ -21,9 +21,7 @@ from pipeline.renders.calibrated_error import (
     measures_of_totals,
     statement_for,
 )
-from pipeline.renders.camera import PixelCamera
-from pipeline.renders.denoise_corrections import LEAST_PASSES
-from pipeline.renders.denoiser import denoise_arrays
+from pipeline.renders.device_memory import KernelInputs, record_launches
 from pipeline.renders.noise_floor import (
     LINEAR_STANDARD_ERRORS,
     ErrorMeasures,
@@ -46,10 +44,11 @@ from pipeline.renders.pixel_arithmetic import (
     where_any,
     with_means_of,
 )
-from pipeline.renders.recorded_calls import KernelInputs, record_launches
-from pipeline.renders.samples import DualBuffer
+from pipeline.renders.samples import TILE_PX, DualBuffer, tile_means
 from pipeline.renders.settings import Filtered, RenderSettings
+from pipeline.renders.tracer import PixelCamera
 from pipeline.renders.view_pictures import (
+    LEAST_PASSES,
     Group,
     MeasuredLook,
     add_up,
@@ -59,6 +58,7 @@ from pipeline.renders.view_pictures import (
     require_finite,
     to_filter,
 )
+from storage.denoiser import INPUTS, Quality, open_filter
 
 Sums = Sequence[Sequence[Sequence[Any]]]
 """Of each half, and in it of each tracer: `DeviceSum.sums`."""
@@ -79,9 +79,6 @@ class DevicePictures:
 
         Args:
             samples: whose sums are `DeviceSum`.
-            tracer: a `VectorTracer`.
-            camera: the view.
-            settings: how well.
         """
         self._samples = samples
         self._resolution = camera.resolution
@@ -385,3 +382,58 @@ def _clean_pictures(
         with_means = functools.partial(with_means_of, resolution=resolution)
         denoised.append(put_together(pictures, cleaned, names, with_means, shares_of))
     return denoised
+
+
+def denoise_arrays(
+    pictures: Sequence[Any], guides: Sequence[tuple[Any, Any]], resolution: int, quality: Quality
+) -> list[Any]:
+    """Return what the filter makes of pictures in Dr.Jit's memory, where it runs on that.
+
+    Args:
+        pictures: [3 R^2] mi.Float, pixel by pixel.
+        guides: albedo and normal of each.
+    """
+    import drjit as dr  # only after `activate`
+
+    opened = open_filter(resolution, quality)
+    if (dr.backend_v(pictures[0]) == dr.JitBackend.CUDA) != opened.is_on_gpu:
+        kind = type(pictures[0])
+        shape = (resolution, resolution, 3)
+        inputs = [
+            [np.array(each).reshape(shape) for each in (p, *g)]
+            for p, g in zip(pictures, guides, strict=True)
+        ]
+        return [kind(opened.run(dict(zip(INPUTS, each, strict=True))).ravel()) for each in inputs]
+    outputs = [dr.opaque(type(picture), 0, len(picture)) for picture in pictures]
+    dr.eval(pictures, guides)
+    dr.sync_thread()
+    for picture, (albedo, normal), output in zip(pictures, guides, outputs, strict=True):
+        arrays = {"color": picture, "albedo": albedo, "normal": normal, "output": output}
+        opened.run_in_place({name: _address(array) for name, array in arrays.items()})
+    return outputs
+
+
+class _DLTensor(ctypes.Structure):
+    """The head of DLPack's structure of that name."""
+
+    _fields_ = (
+        ("data", ctypes.c_void_p),
+        ("device", ctypes.c_int32 * 2),
+        ("ndim", ctypes.c_int32),
+        ("dtype", ctypes.c_uint8 * 4),
+        ("shape", ctypes.c_void_p),
+        ("strides", ctypes.c_void_p),
+        ("byte_offset", ctypes.c_uint64),
+    )
+
+
+_capsule_pointer = ctypes.pythonapi.PyCapsule_GetPointer
+_capsule_pointer.restype = ctypes.c_void_p
+_capsule_pointer.argtypes = [ctypes.py_object, ctypes.c_char_p]
+
+
+def _address(array: Any) -> int:
+    """Return where an evaluated array of Dr.Jit is, in the memory of its device."""
+    capsule = array.__dlpack__()
+    tensor = _DLTensor.from_address(_capsule_pointer(capsule, b"dltensor"))
+    return int(tensor.data) + int(tensor.byte_offset)

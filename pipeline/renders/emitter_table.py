@@ -50,7 +50,6 @@ class EmitterTable:
         """Build the table.
 
         Args:
-            scene: the scene.
             order: rows of its emitting triangles.
             lit: which of `order` are switched on; all by default. The others stay black bodies.
             may_be_dark: whether something else lights the scene, so that a table of no light will

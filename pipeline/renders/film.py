@@ -12,8 +12,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from pipeline.renders.camera import PixelCamera
 from pipeline.renders.device_memory import opaque_vector
+from pipeline.renders.tracer import PixelCamera
 from storage.conventions import focal_px
 from storage.records.material import EMISSION
 from storage.records.scene import Scene

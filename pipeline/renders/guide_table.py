@@ -52,17 +52,16 @@ class GuideCells:
         first = np.cumsum(2 * cuts**2) - 2 * cuts**2
         self._rows = own_integers(np.column_stack([first, cuts]))
         triangle = np.repeat(np.arange(len(cuts)), 2 * cuts**2)
-        column, row, self._front = _places(
-            np.arange(len(triangle)) - first[triangle], cuts[triangle]
-        )
-        u, v = ((place + 0.5) / cuts[triangle] for place in (column, row))
+        number = np.arange(len(triangle)) - first[triangle]
+        places = number // 2 % cuts[triangle], number // 2 // cuts[triangle]
+        u, v = ((place + 0.5) / cuts[triangle] for place in places)
         is_beyond = u + v > 1
         u, v = np.where(is_beyond, (1 - v, 1 - u), (u, v))
         self.centres_m = (
             corners[triangle, 0] + u[:, None] * edge1[triangle] + v[:, None] * edge2[triangle]
         )
         """[C, 3] a point of each cell; of cells beyond the triangle's third edge, one nearby."""
-        outward = normal[triangle] * np.where(self._front, 1.0, -1.0)[:, None]
+        outward = normal[triangle] * np.where(number % 2 == 1, 1.0, -1.0)[:, None]
         axis = np.abs(outward).argmax(axis=1)
         self.facing = 2 * axis + (outward[np.arange(len(axis)), axis] > 0)
         """[C] 0 to 5: the axis and the sign of the largest component of the normal."""
@@ -77,14 +76,6 @@ class GuideCells:
             for weight in barycentric
         )
         return first + 2 * (line * cuts + column) + dr.select(front, mi.UInt32(1), mi.UInt32(0))
-
-
-def _places(
-    number: NDArray[np.int64], cuts: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Return column, row and side of cells from their numbers within their triangles."""
-    square = number // 2
-    return square % cuts, square // cuts, number % 2 == 1
 
 
 SIDE = 32

@@ -42,7 +42,6 @@ class KernelScene:
         """Load a scene.
 
         Args:
-            scene: the scene.
             max_depth: longest path in edges.
             rr_depth: edges after which a path goes on by Russian roulette.
 
@@ -80,7 +79,6 @@ def build_mitsuba_mesh(
     """Return a Mitsuba mesh; nothing else knows its constructor, which Mitsuba 3.10 changes.
 
     Args:
-        name: of the mesh.
         counts: vertices and faces.
         properties: a mi.Properties with BSDF and emitter, if any.
         fields: flat arrays `faces`, `vertex_positions`, `vertex_normals`, `vertex_texcoords`; the
@@ -231,7 +229,6 @@ def roulette(
     """Return the throughput (Color3f) of paths that go on after `depth` edges, and which do.
 
     Args:
-        scene: the scene.
         throughput: Color3f.
         depth: UInt32.
         u: Float, uniform.

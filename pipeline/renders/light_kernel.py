@@ -77,7 +77,6 @@ def trace_light(
     """Add the light that lands to `splats`: radiance times the samples of a pixel.
 
     Args:
-        scene: the scene.
         films: the cameras that each path is joined to.
         parts: what is kept apart; all light that lands is indirect.
         light_paths: Float, light paths for each sample of a pixel, the same as of `trace`.

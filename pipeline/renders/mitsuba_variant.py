@@ -15,19 +15,20 @@ import contextlib
 import dataclasses
 import json
 import os
+import platform
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Mapping
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.renders import probe_picture
-from pipeline.renders.visible_gpus import gpu_identity, visible_gpus
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.denoiser import DenoiserDevice, set_denoiser_device
@@ -65,7 +66,6 @@ class Variant:
     note: str
     """Note for the user about this choice; empty if there is none."""
     denoiser: DenoiserDevice = "CPU"
-    """Device of Open Image Denoise."""
 
     @property
     def device(self) -> Device:
@@ -78,7 +78,7 @@ class Variant:
 
 
 def device_of(environment: Mapping[str, Any]) -> Device:
-    """Return the device in a dataset's environment (pipeline.generation.software_environment)."""
+    """Return the device in a dataset's `environment`."""
     return _DEVICES.get(str(environment.get("mitsuba_variant")), "cpu")
 
 
@@ -110,7 +110,9 @@ def choose_variant(default: Device = "cpu", *, device: Device | None = None) -> 
         return _on_processor()
     if not visible_gpus():
         raise _refused_gpu(device, "no NVIDIA GPU is visible here")
-    probed = _remembered_probe(_GPU, _gpu_identity(), retry_failed=chosen == "gpu")
+    versions = map(_version, ("mitsuba", "drjit", "pyoidn"))
+    identity = sha256_hex(canonical_json([gpu_identity(), *versions, probe_picture.TABLE]))
+    probed = _remembered_probe(_GPU, identity, retry_failed=chosen == "gpu")
     if not probed.problem:
         note = (
             probed.denoiser_problem and f"{probed.denoiser_problem}, so the CPU denoises pictures"
@@ -180,7 +182,6 @@ def _remembered_probe(variant: Variant, identity: str, *, retry_failed: bool) ->
     """Return the result of a probe of what has this identity, remembered or new.
 
     Args:
-        variant: the variant to probe.
         identity: a name that changes whenever its answer may.
         retry_failed: whether a remembered problem is probed again: its cause may be fixed.
     """
@@ -204,14 +205,8 @@ def _remembered_probe(variant: Variant, identity: str, *, retry_failed: bool) ->
 def _identity(library: Path) -> str:
     """Return a name that changes whenever the library or Mitsuba does."""
     status = library.stat()
-    versions = [metadata.version(name) for name in ("mitsuba", "drjit")]
+    versions = map(_version, ("mitsuba", "drjit"))
     return sha256_hex(canonical_json([str(library), status.st_mtime_ns, status.st_size, *versions]))
-
-
-def _gpu_identity() -> str:
-    """Return a name that changes whenever the GPUs, their driver, or what renders does."""
-    versions = [metadata.version(name) for name in ("mitsuba", "drjit", "pyoidn")]
-    return sha256_hex(canonical_json([gpu_identity(), *versions, probe_picture.TABLE]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,17 +224,12 @@ class _ProbeResult:
 _GPU = Variant(name="cuda_ad_rgb", libllvm="", note="", denoiser="CUDA")
 
 
-def _probe(variant: Variant) -> _ProbeResult:
-    """Render a small picture in a child, and once more where it gave no answer."""
-    result = _probe_within(variant, _PROBE_S[0])
-    for wall_s in _PROBE_S[1:]:
-        if result.is_silent:
-            result = _probe_within(variant, wall_s)
-    return result
+def _probe(variant: Variant, walls_s: Sequence[float] = _PROBE_S) -> _ProbeResult:
+    """Render a small picture in a child, and once more where it gave no answer.
 
-
-def _probe_within(variant: Variant, wall_s: float) -> _ProbeResult:
-    """Render a small picture in a child; an abort, a hang or a wrong picture is a problem."""
+    An abort, a hang or a wrong picture is a problem.
+    """
+    wall_s, *more_s = walls_s
     with tempfile.TemporaryDirectory() as kernels:
         environment = {**child_environment(), "DRJIT_CACHE_DIR": kernels}
         if variant.libllvm:
@@ -247,7 +237,8 @@ def _probe_within(variant: Variant, wall_s: float) -> _ProbeResult:
         try:
             result = run_module("variant_probe", variant.name, wall_s, environment)
         except subprocess.TimeoutExpired:
-            return _ProbeResult(problem=f"no answer within {wall_s:g} s", is_silent=True)
+            silent = _ProbeResult(problem=f"no answer within {wall_s:g} s", is_silent=True)
+            return _probe(variant, more_s) if more_s else silent
     if _RAYS_LEFT_OUT in result.stderr:
         return _ProbeResult(problem="Dr.Jit left out some of the rays")
     if result.returncode == 0:
@@ -293,7 +284,13 @@ def llvm_libraries() -> list[Path]:
     """
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
     candidates = {path.resolve() for path in (*_known_to_loader(), *_in_usual_folders())}
-    ordered = sorted(candidates, key=lambda path: (-_major_version(path), str(path)))
+
+    def by_version(path: Path) -> tuple[int, str]:
+        match = _NAME.match(path.name)
+        numbers = [int(group) for group in match.groups() if group] if match else []
+        return -numbers[0] if numbers else 0, str(path)
+
+    ordered = sorted(candidates, key=by_version)
     first = [Path(named).resolve()] if named else []
     return [path for path in dict.fromkeys([*first, *_of_wheel(), *ordered]) if path.is_file()]
 
@@ -305,12 +302,6 @@ def _of_wheel() -> list[Path]:
     except metadata.PackageNotFoundError:
         return []
     return [Path(str(file.locate())).resolve() for file in members if _NAME.match(file.name)]
-
-
-def _major_version(path: Path) -> int:
-    match = _NAME.match(path.name)
-    numbers = [int(group) for group in match.groups() if group] if match else []
-    return numbers[0] if numbers else 0
 
 
 def _known_to_loader() -> Iterable[Path]:
@@ -328,3 +319,95 @@ def _in_usual_folders() -> Iterable[Path]:
         for folder in Path("/").glob(pattern.lstrip("/")):
             for name in ("libLLVM*.so*", "libLLVM*.dylib"):
                 yield from (path for path in folder.glob(name) if _NAME.match(path.name))
+
+
+_LIBRARIES = (
+    "trilight",
+    "mitsuba",
+    "drjit",
+    "pyoidn",
+    "numpy",
+    "scipy",
+    "trimesh",
+    "pymeshlab",
+    "OpenEXR",
+    "safetensors",
+)
+_VECTOR_EXTENSIONS = ("avx512f", "avx2", "sse4_2", "asimd")
+
+
+def environment(variant: Variant) -> dict[str, Any]:
+    """Return the processor, variant and library versions that decide a digest, as JSON values."""
+    # Stated only for a GPU, so that manifests from before this field stay equal.
+    gpu_denoiser = {} if variant.denoiser == "CPU" else {"denoiser_device": variant.denoiser}
+    return {
+        **gpu_denoiser,
+        "mitsuba_variant": variant.name,
+        "llvm": Path(variant.libllvm).name,
+        "processor": f"{platform.machine()} {vector_extension()}".strip(),
+        "libraries": {
+            **{name: _version(name) for name in _LIBRARIES},
+            "zlib": zlib.ZLIB_RUNTIME_VERSION,  # Python's own: compresses the arrays of scenes
+        },
+    }
+
+
+def vector_extension() -> str:
+    """Return the widest vector extension of this processor that compilers use, or an empty text."""
+    try:
+        flags = Path("/proc/cpuinfo").read_text().split()
+    except OSError:
+        return ""
+    return next((name for name in _VECTOR_EXTENSIONS if name in flags), "")
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+_DRIVER = Path("/proc/driver/nvidia")
+_ASK_S = 20
+
+
+def visible_gpus() -> tuple[str, ...]:
+    """Return the GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them."""
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if named is not None:
+        return tuple(name.strip() for name in named.split(",") if name.strip() not in ("", "-1"))
+    try:
+        return tuple(str(number) for number in range(len(list((_DRIVER / "gpus").iterdir()))))
+    except OSError:  # a container without that folder
+        return tuple(query_gpus("index"))
+
+
+def gpu_identity() -> tuple[str, ...]:
+    """Return texts that change with the driver, the GPUs, or those that are visible."""
+    paths = (_DRIVER / "version", *sorted((_DRIVER / "gpus").glob("*/information")))
+    try:
+        texts = [path.read_text(errors="replace") for path in paths]
+    except OSError:
+        texts = query_gpus("name,driver_version")
+    return (*visible_gpus(), *texts)
+
+
+def gpu_memory_bytes() -> int:
+    """Return the memory of the smallest GPU of this machine; 0 where it is unknown."""
+    try:
+        return min(int(line) for line in query_gpus("memory.total")) << 20
+    except ValueError:
+        return 0
+
+
+def query_gpus(fields: str) -> list[str]:
+    """Return a line for each GPU with fields of nvidia-smi; none where it does not answer."""
+    command = ["nvidia-smi", f"--query-gpu={fields}", "--format=csv,noheader,nounits"]
+    try:
+        answer = subprocess.run(
+            command, capture_output=True, text=True, timeout=_ASK_S, check=True
+        ).stdout
+    except (OSError, subprocess.SubprocessError):
+        return []
+    return [line.strip() for line in answer.splitlines() if line.strip()]

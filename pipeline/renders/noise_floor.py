@@ -32,7 +32,7 @@ Two allowances are added to the mean over the pixels:
 
 Light that no sample has found is not seen: a view whose only caustic was never hit looks converged.
 
-The terms of each pixel are in numpy_arithmetic.noise_floor and in pixel_arithmetic.estimates
+The terms of each pixel are in host_pictures and in pixel_arithmetic.estimates
 (kernels); both hand their sums over blocks to `estimate_noise_floor_db` here. The error that is
 stated by calibration on other scenes is in pipeline.renders.calibrated_error.
 """

@@ -44,7 +44,6 @@ def trace(
     """Return the radiance (Color3f) of each part along camera rays; emitters are not seen.
 
     Args:
-        scene: the scene.
         film: the camera.
         parts: the sums that are kept apart.
         light_paths: Float, light paths for each sample of a pixel. What they may find is left out

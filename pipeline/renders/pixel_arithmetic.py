@@ -1,6 +1,6 @@
 """The formulas of a look as kernels: arithmetic of pixels, and sums over tiles and over all.
 
-They are those of pipeline.renders.noise_floor and pipeline.renders.denoise_corrections. Sums are
+They are those of pipeline.renders.noise_floor and pipeline.renders.view_pictures. Sums are
 taken over tiles of 64 pixels, then over rows of tiles: in their own order, but always the same one.
 Pictures are Color3f, what is worked out of them is Float64, pixel by pixel.
 """
@@ -11,16 +11,16 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from pipeline.renders.adaptive_sampling import TILE_PX
-from pipeline.renders.denoise_corrections import (
+from pipeline.renders.noise_floor import BLOCK_PX, SMALLEST_STEP
+from pipeline.renders.samples import TILE_PX
+from pipeline.renders.view_pictures import (
     DARKER,
     GLINT,
     MOST_APART,
     STANDARD_ERRORS,
     STANDS_OUT,
+    add_up,
 )
-from pipeline.renders.noise_floor import BLOCK_PX, SMALLEST_STEP
-from pipeline.renders.view_pictures import add_up
 
 assert BLOCK_PX == TILE_PX  # one order of pixels serves both
 TILE = TILE_PX * TILE_PX
@@ -36,7 +36,7 @@ def clean(picture: Any, raw: Any, normal: Any) -> Any:
 
 
 def with_means_of(pairs: Sequence[tuple[Any, Any]], resolution: int) -> list[Any]:
-    """Return pictures (denoised, raw) with the mean of the raw ones (see denoise_corrections)."""
+    """Return pictures (denoised, raw) with the mean of the raw ones (see view_pictures)."""
     bright = [channel_mean(denoised) > GLINT for denoised, _ in pairs]
     values = [
         dr.select(part, channel_sum(mi.Color3d(picture)), 0)

@@ -15,12 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.calibrated_error import first_spp
-from pipeline.renders.camera import PixelCamera
-from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer, representable, require_surfaces
 from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.settings import PASS_SPP, Depth, Filtered, RenderSettings, Resolution
-from pipeline.renders.tracer import Tracer
+from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer
 from pipeline.renders.view_pictures import require_bounded
 from storage.denoiser import Features, Quality, denoise
 from storage.errors import Rejected, TrilightError
@@ -142,6 +140,8 @@ def guide_rays(spp: int) -> int:
     return PASS_SPP[1] if spp >= PASS_SPP[1] else PASS_SPP[2]
 
 
+_PASS = "pass of {}".format
+_GUIDES = "guides of {}".format
 SCENE = "scene"
 """Loading the scene, once for all pictures of it."""
 
@@ -154,9 +154,9 @@ _SEED = 20_261_124
 
 def preview_parts(spp: int, denoiser: Filtered) -> Counter[str]:
     """Return how often each part occurs in a preview, by name, without loading the scene."""
-    parts = Counter(_pass_name(size) for size in pass_sizes(spp))
+    parts = Counter(_PASS(size) for size in pass_sizes(spp))
     if denoiser != "off":
-        parts.update([_guides_name(guide_rays(spp)), denoiser])
+        parts.update([_GUIDES(guide_rays(spp)), denoiser])
     return parts
 
 
@@ -181,23 +181,19 @@ def timed_parts(
     camera = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=resolution)
     for size in PASSES:
         tracer.radiance(small, seed=_SEED, spp=size)  # kernels are compiled, or read from disk
-        seconds[_pass_name(size)] = _median_s(
+        seconds[_PASS(size)] = _median_s(
             clock, partial(tracer.radiance, camera, seed=_SEED, spp=size)
         )
     for rays in PASS_SPP[1:]:
         tracer.features(small, spp=rays)
-        seconds[_guides_name(rays)] = _median_s(clock, partial(tracer.features, camera, spp=rays))
+        seconds[_GUIDES(rays)] = _median_s(clock, partial(tracer.features, camera, spp=rays))
     picture = tracer.radiance(camera, seed=_SEED, spp=1)
     features = tracer.features(camera, spp=4)
+    grey = np.ones((resolution, resolution, 3), np.float32)
     for quality in get_args(Quality):
-        _warm_up(resolution, quality)
+        denoise(grey, Features(albedo=grey, normal=grey), quality)  # the filter is built
         seconds[quality] = _median_s(clock, partial(denoise, picture, features, quality))
     return seconds
-
-
-def _warm_up(resolution: int, quality: Quality) -> None:
-    grey = np.ones((resolution, resolution, 3), np.float32)
-    denoise(grey, Features(albedo=grey, normal=grey), quality)
 
 
 def _median_s(clock: Callable[[], float], part: Callable[[], Any]) -> float:
@@ -209,18 +205,10 @@ def _median_s(clock: Callable[[], float], part: Callable[[], Any]) -> float:
     return float(np.median(seconds))
 
 
-def _pass_name(size: int) -> str:
-    return f"pass of {size}"
-
-
-def _guides_name(rays: int) -> str:
-    return f"guides of {rays}"
-
-
 def all_parts() -> tuple[str, ...]:
     """Return the names of all parts, in the order in which they are timed."""
-    passes = map(_pass_name, PASSES)
-    guides = map(_guides_name, PASS_SPP[1:])
+    passes = map(_PASS, PASSES)
+    guides = map(_GUIDES, PASS_SPP[1:])
     return (SCENE, *passes, *guides, *get_args(Quality))
 
 

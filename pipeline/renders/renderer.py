@@ -5,8 +5,8 @@ comes next, is not known here (pipeline.generation.render_sample).
 
 A picture is sampled as two halves that share nothing. They are denoised apart to measure its floors
 (pipeline.renders.noise_floor), until these reach their targets or the samples reach the cap
-(pipeline.renders.stopping); from the second measurement on, the tiles that need more samples get
-more (pipeline.renders.adaptive_sampling). The picture itself is one denoise of the mean of all
+(pipeline.renders.samples); from the second measurement on, the tiles that need more samples get
+more (pipeline.renders.samples). The picture itself is one denoise of the mean of all
 samples, which is better than the mean of two. With `per_light` all of this is done for each emitter
 and the sky alone, and the picture is their sum; with `split` direct and indirect light are kept
 apart, and it is theirs.
@@ -21,17 +21,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.renders.adaptive_sampling import TileChoice
 from pipeline.renders.calibrated_error import first_spp
-from pipeline.renders.camera import PixelCamera
-from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.host_pictures import HostPictures
 from pipeline.renders.noise_floor import MeasuredFloor
-from pipeline.renders.numpy_arithmetic.host_pictures import HostPictures
 from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
-from pipeline.renders.samples import DualBuffer
-from pipeline.renders.settings import Filtered, RenderSettings
-from pipeline.renders.stopping import Floors, Goal, expected_spp, gaps_db, next_spp
-from pipeline.renders.tracer import Tracer
+from pipeline.renders.samples import (
+    DualBuffer,
+    Floors,
+    Goal,
+    TileChoice,
+    expected_spp,
+    gaps_db,
+    next_spp,
+)
+from pipeline.renders.settings import RenderSettings
+from pipeline.renders.tracer import PixelCamera, load_tracer
 from pipeline.renders.view_pictures import MeasuredLook, ViewPictures
 from storage.conventions import HALF_FLOAT_MAX
 from storage.denoiser import set_denoiser_threads
@@ -71,8 +75,6 @@ class SceneRenderer:
         """Load a scene that passes `Scene.check`; `activate` must have been called.
 
         Args:
-            scene: what is rendered.
-            settings: how well.
             shows_looks: whether `view_steps` yields a `GrowingPicture` after each measurement by
                 which a target is missed; pictures stay the same, each look costs one denoise.
             light_seed: of the light paths of all views, where the settings let them share these;
@@ -88,12 +90,12 @@ class SceneRenderer:
         self._settings = settings
         self._shows_looks = shows_looks
         self._began_s = 0.0
-        self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
+        self.tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
         if settings.part_names:
-            self._tracer = self._tracer.split_lights(
+            self.tracer = self.tracer.split_lights(
                 bounces=settings.split, lobes=settings.split_lobes
             )
-        self._tracers = [self._tracer]
+        self._tracers = [self.tracer]
         self._arithmetic: Any = HostPictures
         if settings.arithmetic == "device":
             from pipeline.renders.device_pictures import DevicePictures  # imports mitsuba
@@ -102,16 +104,15 @@ class SceneRenderer:
         self._sees_sky = scene.environment is not None and scene.environment.is_seen
         if settings.per_light:
             most = MAX_LIGHTS // max(1, len(settings.part_names))
-            self._tracers = _tracers_of_lights(self._tracer, scene, most)
+            if (count := num_light_pictures(scene)) > most:
+                raise Rejected("too_many_lights", f"{count} lights apart; at most {most}")
+            rows = light_rows(scene)
+            sky = [None] * (count - len(rows))
+            self._tracers = [self.tracer.only_light(row) for row in (*rows, *sky)]
         self._light_seed = light_seed if settings.light_paths == "scene" else None
         if self._light_seed is not None:
             cameras = [self._camera(*view) for view in zip(scene.c2w, scene.fov_deg, strict=True)]
             self._tracers = [tracer.for_views(cameras) for tracer in self._tracers]
-
-    @property
-    def tracer(self) -> Tracer:
-        """What traces all light of the scene."""
-        return self._tracer
 
     def render_view(self, c2w: ArrayLike, fov_deg: float, seed: int) -> RenderedView:
         """Return the picture of one camera; equal arguments give equal bits.
@@ -148,22 +149,33 @@ class SceneRenderer:
         first_pass_of_both = 2 * samples.pass_spp
         for _ in samples.passes_to(first_pass_of_both):
             yield Sampling(spp=samples.spp, expected_spp=settled, missing_db=None)
-        self._refuse_black(samples)
+        mean = self._arithmetic.mean_radiance(samples)
+        if mean < (bound := settings.min_mean_radiance):
+            raise Rejected("black_view", f"mean radiance {mean:.2g} is below {bound:.2g}")
         for _ in samples.passes_to(settled):
             yield Sampling(spp=samples.spp, expected_spp=settled, missing_db=None)
-        pictures: ViewPictures = self._arithmetic(samples, self._tracer, camera, settings)
+        pictures: ViewPictures = self._arithmetic(samples, self.tracer, camera, settings)
         if not self._sees_sky:
             samples.count_over(pictures.visible)
         look = yield from self._sample_until_targets(samples, pictures)
         floor = look.floor
-        self._refuse_noisy(floor)
+        missed = gaps_db(settings.targets_db, floor.by_metric)
+        if settings.reject_at_cap and missed:
+            raise Rejected(
+                "floor_not_reached",
+                ", ".join(
+                    f"{metric} is {floor.by_metric[metric]:.1f} dB; expected "
+                    f"{settings.targets_db[metric]:g}"
+                    for metric in missed
+                ),
+            )
         stored = self._to_stored(pictures.finish())
         yield RenderedView(
             spp=samples.spp,
             noise_floor_db=floor.log_db,
             noise_floor_linear_db=floor.linear_db,
             object_noise_floor_db=floor.object_log_db,
-            at_cap=bool(gaps_db(settings.targets_db, floor.by_metric)),
+            at_cap=bool(missed),
             core_s=time.process_time() - self._began_s,
             hits=pictures.hits,
             part_floors=look.part_floors or None,
@@ -192,22 +204,6 @@ class SceneRenderer:
             "parts_rgb": dict(named) or None,
         }
 
-    def _refuse_black(self, samples: DualBuffer) -> None:
-        mean = self._arithmetic.mean_radiance(samples)
-        bound = self._settings.min_mean_radiance
-        if mean < bound:
-            raise Rejected("black_view", f"mean radiance {mean:.2g} is below {bound:.2g}")
-
-    def _refuse_noisy(self, floor: MeasuredFloor) -> None:
-        targets_db = self._settings.targets_db
-        floors_db = floor.by_metric
-        missed = [
-            f"{metric} is {floors_db[metric]:.1f} dB; expected {targets_db[metric]:g}"
-            for metric in gaps_db(targets_db, floors_db)
-        ]
-        if self._settings.reject_at_cap and missed:
-            raise Rejected("floor_not_reached", ", ".join(missed))
-
     def _sample_until_targets(
         self, samples: DualBuffer, pictures: ViewPictures
     ) -> Generator[Sampling, None, MeasuredLook]:
@@ -217,7 +213,9 @@ class SceneRenderer:
         visible = np.ones_like(pictures.visible) if self._sees_sky else pictures.visible
         tiles = TileChoice(visible)
         while True:
-            quality = self._filter_of_halves(samples.spp)
+            quality = self._settings.denoiser
+            if quality == "high" and samples.spp <= _FAST_HALVES_SPP:
+                quality = "fast"
             look = pictures.look(quality)
             tiles.learn(look.changes, samples, quality)
             measured.append((samples.spp, look.floor.by_metric))
@@ -257,19 +255,6 @@ class SceneRenderer:
             floor=floor,
             core_s=core_s,
         )
-
-    def _filter_of_halves(self, spp: int) -> Filtered:
-        quality = self._settings.denoiser
-        return "fast" if quality == "high" and spp <= _FAST_HALVES_SPP else quality
-
-
-def _tracers_of_lights(tracer: Tracer, scene: Scene, most: int) -> list[Tracer]:
-    count = num_light_pictures(scene)
-    if count > most:
-        raise Rejected("too_many_lights", f"{count} lights apart; at most {most}")
-    rows = light_rows(scene)
-    sky = [None] * (count - len(rows))
-    return [tracer.only_light(row) for row in (*rows, *sky)]
 
 
 def require_surfaces(scene: Scene) -> None:

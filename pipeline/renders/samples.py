@@ -1,13 +1,34 @@
-"""The samples of one view: two growing halves that share nothing, of each light apart or of all."""
+"""The samples of one view: two growing halves that share nothing, of each light apart or of all.
 
-from collections.abc import Iterator, Sequence
+Adaptive sampling chooses the tiles that get more samples, those that still change most. Where a
+half of the samples grew from m to n of them per pixel, its denoised picture changed by d in
+log10(1 + radiance). If the variance there is v / n, then d^2 is v (1 / m - 1 / n) on average: each
+tile's v is read off two measurements. The error of a denoised picture falls much slower than 1 / n,
+so the samples of a tile are made proportional to v^(1/3): on other scenes than those that judged
+it, 1/3 spent them better than 1/2 and 1 did.
+
+A half never chooses for itself. What one half is given goes by what the *other* half saw: the
+samples of a half are then independent of how many it is given, and its mean stays unbiased. Had it
+a say itself, tiles in which it found rare light by luck would be diluted, and the rest never
+looked at again. Later choices go by pictures whose own samples the first one chose; what that
+leaves is below what the tests can see.
+
+Sampling stops at all targets of a view, or at the cap. Targets and measured floors go by the name
+of their metric (storage.metrics). One view may need many more samples by one metric than by
+another: the linear PSNR weighs bright pixels more, up to radiance 1, and empty background raises
+every mean but the one over objects. So each target that is missed is extrapolated by what a
+doubling of the samples bought in its own metric, and the one that needs most samples governs.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import PixelCamera
-from pipeline.renders.settings import PASS_SPP
-from pipeline.renders.tracer import Chosen, Tracer
+from pipeline.renders.settings import PASS_SPP, Filtered
+from pipeline.renders.tracer import Chosen, PixelCamera, Tracer
 from storage.seeds import seed_for
 
 
@@ -32,8 +53,6 @@ class DualBuffer:
         """Begin a view without any sample.
 
         Args:
-            tracers: what is traced.
-            camera: the view.
             seed: of this view alone.
             first_spp: samples per pixel of the first measurement, both halves together.
             max_spp: the most that will be asked for.
@@ -124,3 +143,210 @@ class DualBuffer:
         for tracers in self.sums:
             for tracer in tracers:
                 tracer.guide()
+
+
+TILE_PX = 8
+"""Pixels across a tile; the widths of pictures are multiples of it."""
+
+_PASS = PASS_SPP[0]
+"""Samples per pixel of a pass over tiles; there is no choice before a half has as many."""
+
+_LEAST_SHARE = 1e-3
+"""Of the mean variance, added to every tile's: none is taken for perfect."""
+
+_MOST = 2.0
+"""A tile gets at most this many times the mean that is wanted: what one measurement says of it may
+be wrong, and the next one says it again."""
+
+_SMOOTHING = np.array([0.25, 0.5, 0.25])
+
+
+class TileChoice:
+    """Chooses the next passes of each half by the changes of the other one."""
+
+    def __init__(self, visible: NDArray[np.bool_]) -> None:
+        """Begin with nothing seen.
+
+        Args:
+            visible: [R, R] pixels that may have light at all.
+        """
+        self._weight = tile_means(visible.astype(np.float64))
+        self._seen: list[NDArray[np.int64]] = []
+        self._variance: list[NDArray[np.float64]] = []
+        self._filter: Filtered | None = None
+
+    def learn(
+        self, changes: Sequence[NDArray[np.float64]], samples: DualBuffer, quality: Filtered
+    ) -> None:
+        """Look at both halves as they are now, denoised by a filter of this quality.
+
+        Args:
+            changes: of each half, [T, T] mean squared change of its log radiance since the look
+                before; anything at the first.
+            quality: of the filter. What changes with it says nothing of the samples: after that
+                nothing new is known.
+        """
+        tiles = slice(None, None, TILE_PX)
+        seen = [samples.spp_of(half)[tiles, tiles].copy() for half in range(len(changes))]
+        if self._seen and quality == self._filter:
+            known = self._variance or [np.zeros_like(self._weight)] * 2
+            self._variance = [
+                _variance(*each) for each in zip(changes, self._seen, seen, known, strict=True)
+            ]
+        self._seen = seen
+        self._filter = quality
+
+    def passes(self, samples: DualBuffer, mean_spp: int) -> list[NDArray[np.int64]] | None:
+        """Return how many more passes each pixel of each half gets, [R, R]; None: all alike.
+
+        Args:
+            samples: what is there, as it was when `learn` was called last.
+            mean_spp: samples per pixel that are wanted, both halves together.
+        """
+        more = mean_spp - samples.spp
+        started = self._variance and self._seen[0].min() >= _PASS
+        if not started or more < 2 * _PASS:
+            return None
+        of_tiles = [
+            passes_of_tiles(other_variance, spp, self._weight, more / 2)
+            for other_variance, spp in zip(self._variance[::-1], self._seen, strict=True)
+        ]
+        return [each.repeat(TILE_PX, axis=0).repeat(TILE_PX, axis=1) for each in of_tiles]
+
+
+def _variance(
+    change: NDArray[np.float64],
+    spp_before: NDArray[np.int64],
+    spp: NDArray[np.int64],
+    known: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the variance of one sample, [T, T], by two looks; `known` where nothing was added."""
+    grown = spp > spp_before
+    less = np.where(grown, 1 / spp_before - 1 / spp, 1)
+    return np.where(grown, _smooth(change) / less, known)
+
+
+def passes_of_tiles(
+    variance: NDArray[np.float64],
+    spp: NDArray[np.int64],
+    weight: NDArray[np.float64],
+    more: float,
+) -> NDArray[np.int64]:
+    """Return how many more passes each tile gets, [T, T]: the fewest that make the mean grow so.
+
+    Args:
+        variance: [T, T] of one sample, of the other half.
+        spp: [T, T] samples per pixel that are there.
+        weight: [T, T] of each tile in the mean. Tiles without weight get nothing.
+        more: by how many samples per pixel the mean shall grow, _PASS at least.
+    """
+    weight = weight / weight.sum()
+    target_spp = (weight * spp).sum() + more
+    mean = (variance * weight).sum()
+    share = np.where(weight > 0, np.cbrt(variance + _LEAST_SHARE * mean) if mean else 1.0, 0)
+    room = np.maximum((_MOST * target_spp - spp) // _PASS, 0)
+
+    def passes(factor: float) -> NDArray[np.float64]:
+        return np.clip(np.floor((factor * share - spp) / _PASS + 0.5), 0, room)
+
+    low = 0.0
+    high = 2 * _MOST * target_spp / share[weight > 0].min()
+    for _ in range(60):  # bisection, to the precision of float64
+        middle = (low + high) / 2
+        suffices = (weight * (spp + _PASS * passes(middle))).sum() >= target_spp
+        low, high = (low, middle) if suffices else (middle, high)
+    return passes(high).astype(np.int64)
+
+
+def tile_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the means over the tiles [T, T] of a picture [R, R]."""
+    across = len(values) // TILE_PX
+    means: NDArray[np.float64] = values.reshape(across, TILE_PX, across, TILE_PX).mean(axis=(1, 3))
+    return means
+
+
+def _smooth(tiles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the tiles, each mixed with its eight neighbours (the edge's own beyond the edge)."""
+    across = len(tiles)
+    for axis in range(2):
+        wide = np.pad(tiles, [(1, 1) if axis == n else (0, 0) for n in range(2)], mode="edge")
+        rows = [wide.take(range(k, k + across), axis) * part for k, part in enumerate(_SMOOTHING)]
+        tiles = np.sum(rows, axis=0)
+    return tiles
+
+
+Floors = Mapping[str, float]
+"""Decibels by metric."""
+
+Measured = Sequence[tuple[int, Floors]]
+"""Samples per pixel and the floors that were measured then, in order."""
+
+_DB_PER_DOUBLING = 1.2
+"""The true error falls by 0.9 to 2.0 dB per doubling of the samples, not by 3. This low guess is
+used until the view itself has been measured twice."""
+
+_SLOWEST_DB = 0.6
+"""Smallest gain per doubling that is believed: two floors of a view are noisy."""
+
+_FASTEST_DB = 3.0
+"""Largest gain per doubling that is believed."""
+
+_MAX_GROWTH = 2.0
+"""The samples grow at most by this between two measurements: each of them is a new choice of tiles.
+With 4 half of what these gain was lost."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Goal:
+    """Targets and cap of the samples of a view."""
+
+    targets_db: Floors
+    """Stated errors to reach, in dB by metric."""
+    step: int
+    """Samples per pixel that one pass adds, both halves together."""
+    max_spp: int
+    """Maximum samples per pixel, a multiple of `step`."""
+
+
+def gaps_db(targets_db: Floors, floors_db: Floors) -> dict[str, float]:
+    """Return by how many dB each target is missed, by metric; without those that are reached."""
+    gaps = {metric: target_db - floors_db[metric] for metric, target_db in targets_db.items()}
+    return {metric: gap_db for metric, gap_db in gaps.items() if gap_db > 0}
+
+
+def next_spp(measured: Measured, goal: Goal) -> int:
+    """Return the number of samples at which the floors are measured next.
+
+    Args:
+        measured: of this view so far; the last floors miss a target of the goal, and their samples
+            are a multiple of its step below its cap.
+        goal: when sampling ends.
+    """
+    spp = measured[-1][0]
+    step = goal.step
+    growth = max(step * math.ceil(spp * _MAX_GROWTH / step), spp + step)
+    return min(expected_spp(measured, goal), growth)
+
+
+def expected_spp(measured: Measured, goal: Goal) -> int:
+    """Return the number of samples that should reach all targets, or the cap; as `next_spp`."""
+    spp, floors_db = measured[-1]
+    gaps = gaps_db(goal.targets_db, floors_db)
+    needed_doublings = max(gap_db / slope_db(measured, metric) for metric, gap_db in gaps.items())
+    doublings = min(needed_doublings, math.log2(goal.max_spp / spp) + 1)
+    target_spp = goal.step * math.ceil(spp * 2**doublings / goal.step)
+    return min(goal.max_spp, max(target_spp, spp + goal.step))
+
+
+def slope_db(measured: Measured, metric: str) -> float:
+    """Return what a doubling of the samples buys in this view, in dB, from its last two floors.
+
+    Args:
+        measured: of this view so far; one measurement is enough.
+        metric: whose floors are compared.
+    """
+    if len(measured) < 2:
+        return _DB_PER_DOUBLING
+    (before, lower_db), (now, upper_db) = measured[-2:]
+    gain_db = upper_db[metric] - lower_db[metric]
+    return min(max(gain_db / math.log2(now / before), _SLOWEST_DB), _FASTEST_DB)

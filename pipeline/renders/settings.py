@@ -152,25 +152,21 @@ class RenderSettings:
     without a picture to calibrate the error by; None takes a picture each time."""
 
     def __post_init__(self) -> None:
-        _require(
-            self.resolution % 8 == 0,
-            f"resolution is {self.resolution}; expected a multiple of 8",
-        )
-        _require(
-            self.min_spp <= self.max_spp,
-            f"min_spp is {self.min_spp} and max_spp {self.max_spp}; expected min <= max",
-        )
         unit = 2 * PASS_SPP[-1]
-        _require(
-            self.min_spp % unit == 0 and self.max_spp % unit == 0,
-            f"min_spp is {self.min_spp} and max_spp {self.max_spp}; expected multiples of {unit}, "
-            f"and a cap of a multiple of {2 * PASS_SPP[0]} for the best sampling",
-        )
-        _require(self.aux_spp in PASS_SPP, f"aux_spp is {self.aux_spp}; expected one of {PASS_SPP}")
-        _require(
-            bool(self.targets_db),
-            f"noise_floor_db is None; expected one of {', '.join(_METRICS)} to be a number",
-        )
+        spp = f"min_spp is {self.min_spp} and max_spp {self.max_spp}; expected"
+        best = f"and a cap of a multiple of {2 * PASS_SPP[0]} for the best sampling"
+        laws = {
+            f"resolution is {self.resolution}; expected a multiple of 8": self.resolution % 8 == 0,
+            f"{spp} min <= max": self.min_spp <= self.max_spp,
+            f"{spp} multiples of {unit}, {best}": not (self.min_spp % unit or self.max_spp % unit),
+            f"aux_spp is {self.aux_spp}; expected one of {PASS_SPP}": self.aux_spp in PASS_SPP,
+            f"noise_floor_db is None; expected one of {', '.join(_METRICS)} to be a number": bool(
+                self.targets_db
+            ),
+        }
+        for complaint, holds in laws.items():
+            if not holds:
+                raise TrilightError(f"render settings: {complaint}.")
 
     @property
     def first_spp(self) -> int:
@@ -211,8 +207,3 @@ class NoiseTargets:
         """Values of the fields of RenderSettings; empty if no target is set."""
         values = (self.log_db, self.linear_db, self.objects_db)
         return {} if values == (None, None, None) else dict(zip(_METRICS, values, strict=True))
-
-
-def _require(law: bool, complaint: str) -> None:
-    if not law:
-        raise TrilightError(f"render settings: {complaint}.")

@@ -4,15 +4,37 @@ The tests have another one, Mitsuba's stock path integrator (tests/oracle): an i
 estimates the same integral.
 """
 
+import dataclasses
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import PixelCamera
 from storage.denoiser import Features
+from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PixelCamera:
+    """A square picture's camera, as storage.conventions means it."""
+
+    c2w: NDArray[np.float64]
+    """[4, 4] camera to world; looks along -Z with +Y up."""
+    fov_deg: float
+    """Full field of view, equal in width and height."""
+    resolution: int
+    """Width and height in pixels."""
+
+    def at_scale(self, factor: float) -> "PixelCamera":
+        """Return the camera that sees the same of a scene that is so many times as large."""
+        c2w = self.c2w.copy()
+        c2w[:3, 3] *= factor
+        return replace(self, c2w=c2w)
+
 
 Chosen = NDArray[np.bool_] | None
 """[R, R] the pixels of a pass, one at least; None means all of them."""
@@ -93,8 +115,7 @@ class Tracer(Protocol):
             chosen: the pixels that are wanted. A tracer may trace the others too.
         """
 
-    def pass_sum(self, camera: PixelCamera) -> PassSum:
-        """Return an empty sum of passes of a view."""
+    def pass_sum(self, camera: PixelCamera) -> PassSum: ...
 
     def features(self, camera: PixelCamera, *, spp: int) -> Features:
         """Return the albedo and normal pictures, of `spp` evenly spread rays in each pixel."""
@@ -107,3 +128,38 @@ def split_triangles(scene: Scene) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the triangle rows of surfaces and those of emitters."""
     emits = scene.triangle_emits
     return np.flatnonzero(~emits), np.flatnonzero(emits)
+
+
+SIZES_AS_THEY_ARE_M = (0.1, 10.0)
+"""Scenes between these sizes are traced as they are; all presets' scenes are."""
+
+
+def load_tracer(scene: Scene, *, max_depth: int, rr_depth: int) -> Tracer:
+    """Return the tracer of a scene; call after `activate`.
+
+    Textures of one value are the constants that they are: they cost nothing.
+    """
+    from pipeline.renders.vector_tracer import VectorTracer  # imports mitsuba
+
+    scale = choose_tracing_scale(scene)
+    scene = without_constant_textures(scene)
+    if scale != 1:
+        scene = dataclasses.replace(
+            scene, vertex_positions=scene.vertex_positions * np.float32(scale)
+        )
+    return VectorTracer(scene, max_depth=max_depth, rr_depth=rr_depth, scale=scale)
+
+
+def choose_tracing_scale(scene: Scene) -> float:
+    """Return what lengths are multiplied by for tracing: 1, or a power of two (exact in floats).
+
+    Mitsuba moves the origins of rays off surfaces by lengths that suit a scene of a metre. In a
+    scene of a millimetre they would pass through walls, and the stated error would not show it.
+    Radiance knows no length, so a tiny or huge scene is traced at the size of about a metre. Size
+    is the diagonal of what is seen: emitters and cameras may be far away.
+    """
+    surfaces, _ = split_triangles(scene)
+    corners = scene.vertex_positions[np.unique(scene.faces[surfaces])].astype(np.float64)
+    size = float(np.linalg.norm(np.ptp(corners, axis=0))) if len(corners) else 0.0
+    smallest, largest = SIZES_AS_THEY_ARE_M
+    return 1.0 if size == 0 or smallest <= size <= largest else 2.0 ** -round(math.log2(size))

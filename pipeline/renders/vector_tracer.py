@@ -10,7 +10,7 @@ so that raw samples are at hand before denoising.
 import copy
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -18,22 +18,74 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import PixelCamera
-from pipeline.renders.device_memory import own_integers, read_back
+from pipeline.renders.device_memory import KernelInputs, own_integers, read_back, record_launches
 from pipeline.renders.emitter_table import EmitterTable
 from pipeline.renders.film import Film, Splats, SplatUnit
 from pipeline.renders.guide_table import GuideCells, GuideTable, learn
 from pipeline.renders.kernel_scene import KernelParts, KernelScene
-from pipeline.renders.landed_light import LandedLight
 from pipeline.renders.light_kernel import PhotonRecords, trace_light, trace_photons
 from pipeline.renders.path_kernel import trace
-from pipeline.renders.recorded_calls import KernelInputs, record_launches
 from pipeline.renders.sky_table import SkyTable
-from pipeline.renders.tracer import Chosen, split_triangles
+from pipeline.renders.tracer import Chosen, PixelCamera, split_triangles
 from storage.denoiser import Features
 from storage.records.lights import shining_sky
 from storage.records.scene import Scene
 from storage.seeds import seed_for
+
+_MOST_PIXELS = 1 << 23
+"""Pixels of pictures that wait to be asked for: 100 MB. Beyond them each view traces its own."""
+
+
+class LandedLight:
+    """Pictures of light paths of a scene that wait for the view that they belong to.
+
+    A path takes more than twice as long to trace as to join to a camera. So views whose light paths
+    have the same seed are joined to them together: those that wait get pictures that they may not
+    need. What a view gets does not depend on that, to the last bit: each picture has its own sums
+    of whole numbers (pipeline.renders.film). Errors of the views of a scene are then correlated.
+    Those of each view are what they were: it has as many light paths, its halves share none, and
+    what it asks for does not depend on other views.
+    """
+
+    def __init__(self, cameras: Sequence[PixelCamera] = ()) -> None:
+        """Begin with the cameras of the views that will be asked for."""
+        self._waiting = {_view_name(camera): camera for camera in cameras}
+        self._kept = dict[tuple[Hashable, Hashable], Any]()
+
+    def begin(self, camera: PixelCamera) -> None:
+        """Begin a view; pictures of those that were begun before it are dropped."""
+        self._waiting.pop(_view_name(camera), None)
+        names = {_view_name(camera), *self._waiting}
+        self._kept = {key: picture for key, picture in self._kept.items() if key[0] in names}
+
+    def take(
+        self,
+        camera: PixelCamera,
+        paths: Hashable,
+        land: Callable[[Sequence[PixelCamera]], Sequence[Any]],
+    ) -> Any:
+        """Return the picture of a view, once.
+
+        Args:
+            paths: what tells these light paths from others.
+            land: returns the picture of each of some cameras.
+        """
+        picture = self._kept.pop((_view_name(camera), paths), None)
+        if picture is not None:
+            return picture
+        waiting = self._waiting
+        pixels = camera.resolution**2
+        if (len(self._kept) + len(waiting)) * pixels > _MOST_PIXELS:
+            waiting = {}
+        pictures = iter(land([camera, *waiting.values()]))
+        picture = next(pictures)
+        self._kept |= {(name, paths): each for name, each in zip(waiting, pictures, strict=True)}
+        return picture
+
+
+def _view_name(camera: PixelCamera) -> Hashable:
+    return camera.c2w.tobytes(), camera.fov_deg, camera.resolution
+
 
 LIGHT_PATHS = 0.25
 """Light paths for each camera path: a quarter has most of the gain, and the whole then takes 1.1 to

@@ -1,15 +1,21 @@
 """Composes scenes: meshes within the triangle budget, in a layout, with cameras that see them.
 
 A scene is a pure function of (settings, pool, scene key).
+
+FCL (Pan, Chitta, Manocha 2012) tests triangle against triangle in float64 over bounding volume
+trees; distant objects are separated by their bounding spheres alone. A mesh inside another one does
+not touch it, so a mesh also meets every mesh whose box contains its own. This rejects a ball in a
+bowl.
 """
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
+import fcl
 import numpy as np
+from numpy.typing import NDArray
 
-from pipeline.scenes.mesh_collision import MeshShape
 from pipeline.scenes.pieces import (
     ScenePiece,
     Skin,
@@ -19,25 +25,96 @@ from pipeline.scenes.pieces import (
     object_piece,
     shell_piece,
     with_drawn_columns,
+    with_drawn_textures,
 )
-from pipeline.scenes.pool import PooledAsset, fits_of
-from pipeline.scenes.posing import pose_points
-from pipeline.scenes.scene_checks import require_valid
 from pipeline.scenes.source_materials import source_skins, with_source_emission
 from pipeline.scenes.subdivision import fill_triangles
-from pipeline.scenes.textured_pieces import with_drawn_textures
-from pipeline.scenes.triangle_budget import draw_rows, levels_within
-from pipeline.scenes.views import with_first_cameras
-from scene_templates.layout import Layout
+from pipeline.scenes.triangle_budget import PooledAsset, draw_rows, fits_of, levels_within
+from pipeline.scenes.views import require_valid, with_first_cameras
+from scene_templates.layout import Layout, Pose
+from scene_templates.rotations import rotate_points
 from scene_templates.sample_layout import ScenePlan, sample_layout, scene_plan
 from scene_templates.settings import SceneSettings
 from scene_templates.skies.drawn_scene import scene_sky
 from scene_templates.user_maps import NO_OWN_MAPS, OwnMaps
-from storage.errors import TrilightError
+from storage.errors import Rejected, TrilightError
+from storage.records.asset import Level
 from storage.records.material import EMISSION
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene, SceneObject
 from storage.seeds import SceneKey
+
+
+class MeshShape:
+    """One level of an asset in the unit sphere; see scene_templates.placement.Shape."""
+
+    def __init__(self, uid: str, level: Level, centring: Literal["vertex_mean", "box"]) -> None:
+        """Scale a level of the object `uid` to the unit sphere.
+
+        Raises:
+            Rejected: "no_faces" if it is a single point or not finite.
+        """
+        self.points = normalize_to_unit_sphere(level.positions, centring)
+        if not np.isfinite(self.points).all():
+            raise Rejected("no_faces", f"{uid}: the level has no extent, or is not finite")
+        self.faces = level.faces
+        self._tree: tuple[float, Any] | None = None
+
+    def overlaps(self, pose: Pose, other: "MeshShape", its_pose: Pose) -> bool:
+        """Return True if two posed meshes share a point, or one's box contains the other's."""
+        offset = pose.centre - its_pose.centre
+        if np.sum(np.square(offset)) > (pose.radius + its_pose.radius) ** 2:
+            return False
+        low, high = self._box(pose)
+        its_low, its_high = other._box(its_pose)
+        if (low > its_high).any() or (its_low > high).any():
+            return False
+        inside = (low >= its_low).all() and (high <= its_high).all()
+        outside = (low <= its_low).all() and (high >= its_high).all()
+        if inside or outside:
+            return True
+        result = fcl.CollisionResult()
+        fcl.collide(self._body(pose), other._body(its_pose), fcl.CollisionRequest(), result)
+        return bool(result.is_collision)
+
+    def _body(self, pose: Pose) -> Any:
+        """Return FCL's object; its tree is cached, since poses change more often than sizes."""
+        if self._tree is None or self._tree[0] != pose.radius:
+            tree = fcl.BVHModel()
+            tree.beginModel(len(self.points), len(self.faces))
+            tree.addSubModel(pose.radius * self.points, self.faces.astype(np.int32))
+            tree.endModel()
+            self._tree = (pose.radius, tree)
+        return fcl.CollisionObject(self._tree[1], fcl.Transform(pose.rotation, pose.centre))
+
+    def _box(self, pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        points = pose.radius * rotate_points(self.points, pose.rotation) + pose.centre
+        return points.min(axis=0), points.max(axis=0)
+
+
+def normalize_to_unit_sphere(
+    positions: NDArray[np.float32], centring: Literal["vertex_mean", "box"]
+) -> NDArray[np.float64]:
+    """Return the vertices [V, 3] of a level scaled so that the farthest lies on the unit sphere.
+
+    Args:
+        positions: [V, 3] in the unit box of the asset, whose middle is that of its source.
+        centring: the new center: that middle, which is the same for all levels of an asset, or as
+            published the mean of the vertices, which moves with the tessellation.
+
+    Returns:
+        float64; not finite if a position is not, or if all positions are the same point.
+    """
+    points = positions.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if centring == "vertex_mean":
+            points -= points.mean(axis=0)
+        return points / np.sqrt(np.sum(np.square(points), axis=1).max())
+
+
+def pose_points(points: NDArray[np.float64], pose: Pose) -> NDArray[np.float32]:
+    """Return points [V, 3] of the unit sphere in world space."""
+    return (pose.radius * rotate_points(points, pose.rotation) + pose.centre).astype(np.float32)
 
 
 def compose_scene(
@@ -50,9 +127,7 @@ def compose_scene(
     """Compose one scene.
 
     Args:
-        settings: the ranges to draw from.
         pool: the objects of the scene's split, sorted by uid.
-        scene_key: seed, index and attempt of the scene.
         user_maps: the user's textures and maps of the scene's split.
 
     Returns:
@@ -85,27 +160,20 @@ def compose_scene(
     pieces = with_drawn_textures(
         pieces, layout, settings.textures, scene_key, user_textures=user_maps.textures
     )
-    scene = _scene_of(pieces, provenance, scene_key)
-    uids = {piece.skin.uid for piece in pieces if piece.skin and piece.skin.uid}
-    scene = _with_sky(scene, settings, scene_key, user_maps, uids)
-    scene = with_first_cameras(without_constant_textures(scene), settings)
-    require_valid(scene, settings)
-    return scene
-
-
-def _scene_of(
-    pieces: Sequence[ScenePiece], provenance: dict[str, Any], scene_key: SceneKey
-) -> Scene:
-    """Return the scene of some pieces, still without cameras."""
     arrays = concatenate_pieces(pieces)
     arrays["materials"] = with_drawn_columns(arrays["materials"], scene_key)
-    return Scene(
+    scene = Scene(
         **arrays,
         c2w=np.zeros((0, 4, 4), np.float32),
         fov_deg=np.zeros(0, np.float32),
         objects=tuple(piece.entry for piece in pieces),
         provenance=provenance,
     )
+    uids = {piece.skin.uid for piece in pieces if piece.skin and piece.skin.uid}
+    scene = _with_sky(scene, settings, scene_key, user_maps, uids)
+    scene = with_first_cameras(without_constant_textures(scene), settings)
+    require_valid(scene, settings)
+    return scene
 
 
 def _with_sky(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scenes.pieces import concatenate_pieces, emitter_piece, with_drawn_columns
-from pipeline.scenes.scene_checks import object_boxes
+from pipeline.scenes.views import object_boxes
 from scene_templates.sample_emitters import LightSettings, sample_emitters
 from scene_templates.sample_material import MaterialSettings, sample_material
 from scene_templates.templates import TEMPLATES
@@ -27,11 +27,6 @@ def with_new_materials(scene: Scene, settings: MaterialSettings, scene_key: Scen
 
     New materials have no textures. Faces that shared a row of materials within an object still
     share one, and the number of colors stays.
-
-    Args:
-        scene: a valid scene.
-        settings: the ranges to draw from.
-        scene_key: seed, index and attempt of the scene.
     """
     scene = without_maps(scene, environment=False)
     rng = scene_key.rng("new materials")
@@ -75,10 +70,8 @@ def with_new_lights(
     Emitting components of objects keep their radiance.
 
     Args:
-        scene: a valid scene.
         settings: the ranges to draw from; its count is not used.
         num_lights: number of new lamps; None for as many as there are.
-        scene_key: seed, index and attempt of the scene.
 
     Raises:
         Rejected: "no_layout" if the template of the scene is no known layout.

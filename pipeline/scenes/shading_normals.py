@@ -1,4 +1,4 @@
-"""Shading normals and shading groups.
+"""Shading normals and shading groups, and faces that have an area.
 
 Flat faces get three vertices each. Smooth shading joins faces across edges below an angle into
 shading groups; a vertex has one normal per group, so that a cube stays a cube and a sphere becomes
@@ -17,6 +17,10 @@ from scipy.sparse.csgraph import connected_components
 LEAST_FACING = 0.1
 """Least cosine between the normals of a corner and of its face. Below it the corner gets the normal
 of its face, because seen from in front it would be shaded as if seen from behind."""
+
+
+SMALLEST_DOUBLE_AREA = 1e-12
+"""A triangle of a square micrometre: no ray meets it, and its normal is rounding."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,6 +80,21 @@ def face_normals(positions: NDArray[np.float32], faces: NDArray[np.uint32]) -> N
     corners = positions.astype(np.float64)[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return cross / np.sqrt(np.sum(np.square(cross), axis=1, keepdims=True))
+
+
+def not_slivers(positions: NDArray[np.float32], faces: NDArray[np.uint32]) -> NDArray[np.bool_]:
+    """Return a mask [F] of the faces that have an area after rounding to float32."""
+    corners = positions.astype(np.float64)[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    has_area: NDArray[np.bool_] = np.sqrt(np.sum(np.square(cross), axis=1)) > SMALLEST_DOUBLE_AREA
+    return has_area
+
+
+def without_slivers(
+    positions: NDArray[np.float32], faces: NDArray[np.uint32]
+) -> NDArray[np.uint32]:
+    """Return the faces that have an area after rounding to float32."""
+    return faces[not_slivers(positions, faces)]
 
 
 def shading_groups(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scenes.pieces import ScenePiece, Skin
-from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.sample_material import MaterialSettings
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level, LevelSkin
@@ -36,10 +36,7 @@ def source_skins(
     another `own_share` changes none of the skins that stay.
 
     Args:
-        chosen: the objects of a scene.
-        levels: the level of detail of each.
         settings: source of the materials, and the fraction of objects that keep theirs.
-        scene_key: seed, index and attempt of the scene.
 
     Raises:
         Rejected: law_broken, which names the object.
@@ -93,11 +90,15 @@ def with_source_emission(
 
     Args:
         objects: pieces, some with skins that state the emission of their triangles.
-        lamps: the drawn lamps.
         share: fraction of the lamps' power for all emitting triangles; 0 without lamps.
     """
     scale = _scale(objects, lamps, share)
-    plain = [_without_emission(piece) for piece in objects]
+    plain = [
+        dataclasses.replace(piece, skin=dataclasses.replace(piece.skin, emission=None))
+        if piece.skin
+        else piece
+        for piece in objects
+    ]
     if scale == 0:
         return plain, []
     taken = {piece.entry.name for piece in [*objects, *lamps]}
@@ -120,7 +121,6 @@ def with_source_emission(
 
 
 def _scale(objects: Sequence[ScenePiece], lamps: Sequence[ScenePiece], share: float) -> float:
-    """Return the factor on the stated radiance."""
     emissions = [(_emission(piece).astype(np.float64), _areas(piece)) for piece in objects]
     power = sum(float(areas @ emission.mean(axis=1)) for emission, areas in emissions)
     brightest = max((float(emission.max(initial=0)) for emission, _ in emissions), default=0.0)
@@ -173,12 +173,6 @@ def _emission(piece: ScenePiece) -> NDArray[np.float32]:
     """Return the stated radiance of an object's triangles, [T, 3]."""
     stated = None if piece.skin is None else piece.skin.emission
     return np.zeros((len(piece.mesh.faces), 3), np.float32) if stated is None else stated
-
-
-def _without_emission(piece: ScenePiece) -> ScenePiece:
-    if piece.skin is None or piece.skin.emission is None:
-        return piece
-    return dataclasses.replace(piece, skin=dataclasses.replace(piece.skin, emission=None))
 
 
 def _areas(piece: ScenePiece) -> NDArray[np.float64]:

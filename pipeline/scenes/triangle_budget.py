@@ -10,34 +10,29 @@ licence: two columns that are read in chunks, and not at all if every object fit
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import Rejected
+from storage.licences import share_alike_camp
 from storage.records.asset import Asset, Level
 from storage.records.object_index import CampSizes
+from storage.records.objects import LockedObject
 
 _CHUNK = 1 << 16
 """Rows of a column that are read together: half a megabyte."""
-
-
-class Column(Protocol):
-    """Numbers of the rows of a split, in memory or in a file."""
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, rows: slice, /) -> NDArray[Any]: ...
 
 
 class FitTable:
     """Triangles and camp of every object of a split, in the order of their uids."""
 
     def __init__(
-        self, least: Column, camp: Column, camps: Sequence[str], sizes: Mapping[str, CampSizes]
+        self, least: Any, camp: Any, camps: Sequence[str], sizes: Mapping[str, CampSizes]
     ) -> None:
-        """Make a table of columns.
+        """Make a table of columns, arrays in memory or in a file that are read by slices.
 
         Args:
             least: triangles of the coarsest level of each row.
@@ -68,18 +63,15 @@ class FitTable:
         )
 
     def size(self, row: int) -> int:
-        """Return the triangles of a row."""
         return int(self._least[row : row + 1][0])
 
     def camp(self, row: int) -> str:
-        """Return the camp of a row."""
         return self._camps[int(self._camp[row : row + 1][0])]
 
     def draw_row(self, rng: np.random.Generator, rooms: Mapping[str, int]) -> int | None:
         """Draw a row uniformly among those that fit; None if none does.
 
         Args:
-            rng: source of the random number.
             rooms: most triangles by camp; rows of other camps do not fit.
         """
         if rooms.keys() == self.sizes.keys() and all(
@@ -105,6 +97,32 @@ class FitTable:
         return fits
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PooledAsset:
+    """An object as the lock file names it, and its meshes."""
+
+    locked: LockedObject
+    """The object's row of the lock: uid, split and rights."""
+    asset: Asset
+    """Meshes of the object at several levels of detail."""
+
+    @property
+    def camp(self) -> str:
+        """Objects of two camps never meet in a scene: their licences could not both be kept."""
+        return share_alike_camp(self.locked.licence)
+
+
+def fits_of(pool: Sequence[PooledAsset]) -> FitTable:
+    """Return the table from which objects of a pool are drawn.
+
+    A pool that opens an object on access has one, `fits`, so that it draws without opening any.
+    """
+    fits: FitTable | None = getattr(pool, "fits", None)
+    return fits or FitTable.of(
+        [least_triangles(entry.asset) for entry in pool], [e.camp for e in pool]
+    )
+
+
 def draw_rows(
     rng: np.random.Generator, table: FitTable, count: int, num_triangles: int
 ) -> list[int]:
@@ -115,9 +133,7 @@ def draw_rows(
     different camps never fit beside each other.
 
     Args:
-        rng: source of the random numbers.
         table: table to draw from, with at least one row.
-        count: number of rows to draw.
         num_triangles: most triangles of all rows together.
 
     Raises:
@@ -190,7 +206,6 @@ def levels_within(
 
 
 def least_triangles(asset: Asset) -> int:
-    """Return the triangles of the coarsest level."""
     return min(_size(level) for level in asset.levels)
 
 

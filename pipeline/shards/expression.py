@@ -118,10 +118,10 @@ class _Reader:
         raise TrilightError(f"--where: {part!r:.60} is {_article(got)}; expected {expected}.")
 
     def read(self, node: ast.expr) -> _Term:
-        """Return the term of a syntax tree."""
         match node:
             case ast.Constant(value=bool() | int() | float() | str() as value):
-                return _Term(kind=_kind(value), of=lambda _: value)
+                kinds: Mapping[type, Kind] = {bool: "truth", str: "text"}
+                return _Term(kind=kinds.get(type(value), "number"), of=lambda _: value)
             case ast.Name(id=name):
                 return self._read_name(node, name)
             case ast.Tuple(elts=parts) | ast.List(elts=parts):
@@ -197,12 +197,6 @@ _HINTS = {
     ("truths", "truth"): "any(...) or all(...) of it: a scene has several",
     ("texts", "text"): '"..." in it: a scene has several',
 }
-
-
-def _kind(value: object) -> Kind:
-    if isinstance(value, bool):
-        return "truth"
-    return "text" if isinstance(value, str) else "number"
 
 
 def _article(kind: str) -> str:

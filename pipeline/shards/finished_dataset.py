@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from pipeline.shards.scene_values import condition_values
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, index_shard, read_manifest
 from storage.dataset.planned import is_whole, num_planned
@@ -16,8 +15,10 @@ from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.records.objects import LockedObject, locked_uids, read_objects_lock
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
+from storage.records.quantities import QUANTITIES
 from storage.records.safe_read import open_plain
-from storage.records.sample import decode_scene
+from storage.records.sample import SceneRecord, decode_scene
+from storage.records.scene_facts import scene_values
 from storage.remote.safe_url import safe_url
 
 
@@ -164,3 +165,23 @@ def _facts(
         raise TrilightError(
             f"{shard.name}: sample {key} is not as expected ({error!r}); run `trilight verify`."
         ) from error
+
+
+def condition_values(record: SceneRecord, split: str, names: Collection[str]) -> Mapping[str, Any]:
+    """Return the values of a scene for some names (pipeline.shards.expression)."""
+    scene = record.scene
+    of_scene = dict[str, Any]()
+    if not QUANTITIES.keys().isdisjoint(names):
+        for name, values in scene_values(record).items():
+            plain = [float(value) for value in values]
+            of_scene[name] = plain[0] if QUANTITIES[name].per == "scene" else plain
+    of_scene |= {
+        "key": record.key,
+        "split": split,
+        "template": str(scene.provenance.get("template", "")),
+        "excursion": str((scene.provenance.get("excursion") or {}).get("axis", "")),
+        "uid": [entry.uid for entry in scene.objects if entry.kind == "object" or entry.uid],
+        "licence": [entry.licence for entry in scene.objects],
+        "at_cap": [view.at_cap for view in record.views],
+    }
+    return {name: of_scene[name] for name in names}

@@ -1,34 +1,83 @@
-"""Stage "shards": packs the staged scenes of a shard into its tar file."""
+"""Stage "shards": packs staged scenes into the tar file of a shard, publishes it, reads others'.
+
+A shard is packed in the dataset's folder on this machine. Of a folder that publishes it; to a
+bucket it is sent. The server refuses a second writer, which then reads the existing file. Below
+`.staging` is a note for each shard with its manifest entry and rejections. A shard is finished in a
+bucket when it and its note have come, or the manifest lists it. The notes decide that list, so any
+machine may write it.
+
+Before a bucket, the folder has the manifest without the list; its marks of sent shards cover the
+parts of the dataset that its workers have requested. Two machines with the same shards make their
+scenes twice, and the first writer wins, without a wrong result.
+
+A finished scene waits in the staging folder until all scenes of its shard are there. A claim
+(storage.file_locks) marks a scene that a worker is making, or a shard that it is packing; it ends
+with the process that holds it, so that nothing has to be cleaned up after a kill.
+"""
 
 import contextlib
 import dataclasses
+import io
+import logging
 import os
 import shutil
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 from typing import BinaryIO
 
-from storage.dataset.layout import DatasetFolder
+from storage.atomic import write_atomically
+from storage.dataset.dataset import DatasetFiles, RemoteDatasetFiles, read_beside
+from storage.dataset.layout import (
+    DatasetFolder,
+    numbered_path,
+    place_of_part,
+    shard_names_in,
+    shard_names_in_part,
+)
 from storage.dataset.manifest import (
+    SHARD_NAME,
     Manifest,
     ShardEntry,
+    decode_head,
+    decode_manifest,
     index_shard,
+    index_stream,
     read_head,
     read_manifest,
     write_manifest,
 )
+from storage.dataset.planned import planned_scenes_of
 from storage.dataset.progress import count_given_up
+from storage.dataset.scene_logs import log_name, log_scene
+from storage.dataset.settings import MOST_SCENES, SplitSettings
 from storage.dataset.shard import samples_of, write_shard
 from storage.dataset.shard_notes import (
     ShardNote,
+    encode_note,
+    fetch_notes,
     note_of,
     note_shard,
     noted_shard,
     rejections_of_shard,
 )
-from storage.dataset.staging import read_staged_scene, stage_members
+from storage.dataset.splits import cut_splits, scenes_of_shard, shard_name, split_of_shard
+from storage.dataset.staging import is_staged, read_staged_scene, stage_members, stage_scene
+from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError
-from storage.records.objects import Failure, write_failures
+from storage.file_locks import hold_lock, is_locked
+from storage.records.objects import Failure, decode_failures, read_failures, write_failures
 from storage.records.packed_maps import MAP_NAME
-from storage.records.sample import sample_key
+from storage.records.profiles import Profile
+from storage.records.sample import Sample, sample_key
+from storage.remote.shard_cache import shard_cache
+from storage.remote.store import Store
+
+PLANNED = ".staging/planned/"
+"""Folder of a bucket with one file for each requested number of scenes; the largest counts."""
+_HEAD_BYTES = 1 << 18
+"""Bytes of a manifest that are read to get its head, which takes about 6 kB."""
 
 
 def pack_shard(
@@ -43,8 +92,6 @@ def pack_shard(
     carries no locks, who comes second returns what the first has packed.
 
     Args:
-        folder: the dataset.
-        name: file name of the shard.
         scene_indices: indices of its scenes, all of which are staged.
         grows: True if the manifest lists the shard as growing; then call while holding its mutex.
 
@@ -112,10 +159,7 @@ def unpack_shard(folder: DatasetFolder, note: ShardNote, scenes: range, stream: 
     """Stage the scenes of a shard again, byte for byte, so that it can be packed with more.
 
     Args:
-        folder: the dataset.
-        note: note on the shard.
         scenes: indices of its scenes; one that the file lacks was given up.
-        stream: bytes of the shard.
     """
     name = note.shard.name
     samples = dict(samples_of(stream, name))
@@ -125,3 +169,380 @@ def unpack_shard(folder: DatasetFolder, note: ShardNote, scenes: range, stream: 
         if key not in samples:
             count_given_up(folder, index)
         stage_members(folder.staged_shard(name), index, samples.get(key, {}), failures)
+
+
+class PublishedShards:
+    """Publishes the shards of a folder, and tells which are published."""
+
+    def __init__(self, folder: DatasetFolder, store: Store, files: DatasetFiles) -> None:
+        self._folder = folder
+        self._store = store
+        self._files = files
+        self._names_listed: set[str] | None = None
+        self._unpacked = set[str]()
+
+    def names_in_part(self, part: int, ends: Mapping[str, range]) -> Iterator[str]:
+        """Yield the names of the published shards of a part of the dataset, growing ones too.
+
+        Args:
+            ends: shards of a bucket with fewer scenes than planned; their scenes are staged here.
+        """
+        if self._store.is_here:
+            return shard_names_in_part(self._folder.root, part)
+        self._look_at(part, ends)
+        return shard_names_in_part(self._folder.staged_sent, part)
+
+    def _look_at(self, part: int, ends: Mapping[str, range]) -> None:
+        """Mark the shards of a part of the dataset that are finished in the bucket."""
+        place = place_of_part(part)
+        notes = self._store.list(f"{self._folder.name_of(self._folder.staged_entries)}/{place}")
+        for name in filter(SHARD_NAME.fullmatch, self._store.list(place)):
+            noted = self._folder.name_of(note_of(self._folder, name)) in notes
+            if self._folder.is_sent(name) or not (noted or name in self._manifest_names()):
+                continue
+            if scenes := ends.get(name):
+                note = self._read_note(name) or self._note_of_list(name)
+                if (note.scenes or MOST_SCENES) < len(scenes):
+                    self._unpack(note, scenes[: note.scenes])
+                    continue
+                note_shard(self._folder, note)  # another machine may have grown it
+                if name in read_head(self._folder.manifest).growing:
+                    self._folder.shard(name).unlink(missing_ok=True)
+            self._mark_sent(name)
+
+    def _unpack(self, note: ShardNote, scenes: range) -> None:
+        """Stage the scenes of a shard of the bucket here, if its digest is the one of the note."""
+        with contextlib.suppress(TrilightError):  # else its scenes are made again
+            if note.shard.name not in self._unpacked:
+                with self._files.open(note.shard, checked=True) as tar:
+                    unpack_shard(self._folder, note, scenes, tar)
+        self._unpacked.add(note.shard.name)
+
+    def _manifest_names(self) -> set[str]:
+        """Return the shards that the bucket's manifest lists: of a grown or copied dataset."""
+        if self._names_listed is None:
+            self._names_listed = {shard.name for shard in self.manifest().shards}
+        return self._names_listed
+
+    def manifest(self) -> Manifest:
+        """Return the published manifest, with the shards that it lists."""
+        return read_beside(self._files, decode_manifest)
+
+    def notes(self, names: Sequence[str]) -> list[ShardNote]:
+        """Return the notes on finished shards: from the folder, or else from the bucket."""
+        folder = self._folder
+        local_names = {
+            name for name in names if note_of(folder, name).exists() or folder.shard(name).exists()
+        }
+        remote_names = (
+            self._folder.name_of(note_of(folder, name)) for name in names if name not in local_names
+        )
+        noted = [noted_shard(folder, name) for name in names if name in local_names]
+        return noted + fetch_notes(self._store.get, remote_names, folder.display_name)
+
+    def publish_all(self) -> None:
+        """Publish what a killed worker, or another one of this machine, has left to publish."""
+        if not self._store.is_here:
+            for name in shard_names_in(self._folder.root):
+                self._send(name)
+
+    def publish(self, note: ShardNote) -> ShardNote | None:
+        """Publish a packed shard with its log and note; the cache keeps the bytes of a sent one.
+
+        Returns:
+            The published note; None if another worker publishes or published it, or it grows.
+        """
+        name = note.shard.name
+        if self._folder.shard(name).exists():  # else another machine, or process, has sent it
+            note_shard(self._folder, note)
+        return note if self._store.is_here else self._send(name)
+
+    def _send(self, name: str) -> ShardNote | None:
+        folder = self._folder
+        path = folder.shard(name)
+        with hold_lock(folder.staging / "sending" / f"{name}.claim") as ours:
+            head = read_head(folder.manifest)
+            if not ours or not path.exists() or name in head.growing:
+                return None
+            made = noted_shard(folder, name)
+            made = dataclasses.replace(made, scenes=planned_scenes_of(head, made.shard))
+            note = made if folder.is_sent(name) else self._upload(made)
+            if note is None:
+                return None
+            self._mark_sent(name)
+            if note.shard == made.shard and isinstance(self._files, RemoteDatasetFiles):
+                shard_cache().keep(path, self._files.url.child(name), made.shard.sha256)
+            path.unlink(missing_ok=True)
+        return note
+
+    def _upload(self, made: ShardNote) -> ShardNote | None:
+        """Upload a shard with its log and note; return the note that is in the bucket then.
+
+        A worker that was not first adopts the first writer's note; if that writer was killed before
+        it wrote one, this worker's rejections are stored. A shard with more scenes replaces a
+        smaller one; None if another machine is replacing it.
+        """
+        name = made.shard.name
+        folder = self._folder
+        log = folder.root / log_name(name)
+        note = self._folder.name_of(note_of(folder, name))
+        first = self._store.create_if_absent(name, folder.shard(name))
+        theirs = None if first else self._read_note(name)
+        if not first and theirs is None:
+            theirs = dataclasses.replace(made, shard=self._index_remote(name))
+            if theirs.shard.num_samples < made.shard.num_samples:
+                theirs = dataclasses.replace(theirs, scenes=0)
+            elif not self._store.create_if_absent(note, encode_note(theirs)):
+                theirs = self._read_note(name)
+        if theirs and (theirs.scenes is None or theirs.scenes >= (made.scenes or MOST_SCENES)):
+            note_shard(folder, theirs)
+            return theirs
+        with self._store.hold_lock(note) if theirs else contextlib.nullcontext(True) as ours:
+            if theirs and not (ours and self._read_note(name) in (theirs, None)):
+                return None
+            if theirs:
+                self._store.put(name, folder.shard(name))
+                self._list_again(made.shard)
+            if log.exists():
+                self._store.put(self._folder.name_of(log), log)
+            self._store.put(note, encode_note(made))
+        return made
+
+    def _list_again(self, shard: ShardEntry) -> None:
+        """Update the entry of a shard in the bucket's manifest, if it is listed there."""
+        theirs = self.manifest()
+        if theirs.with_grown(shard) != theirs:
+            path = self._folder.staging / "relisted.json"
+            write_manifest(path, theirs.with_grown(shard))
+            self._store.put("manifest.json", path)
+
+    def _read_note(self, name: str) -> ShardNote | None:
+        data = self._store.get(note := self._folder.name_of(note_of(self._folder, name)))
+        if data is None:
+            return None
+        return fetch_notes(lambda _: data, [note], self._folder.display_name)[0]
+
+    def _note_of_list(self, name: str) -> ShardNote:
+        """Return a note made of the manifest's entry of a shard, as in a copied dataset."""
+        theirs = self.manifest()
+        shard = {entry.name: entry for entry in theirs.shards}[name]
+        return ShardNote(shard=shard, failures=(), scenes=planned_scenes_of(theirs, shard))
+
+    def _index_remote(self, name: str) -> ShardEntry:
+        assert isinstance(self._files, RemoteDatasetFiles)
+        url = self._files.url.child(name)
+        with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
+            return index_stream(stream, Path(name).name)
+
+    def _mark_sent(self, name: str) -> None:
+        path = self._folder.staged_sent / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        self._unpacked.discard(name)
+
+
+def published_head(folder: DatasetFolder, store: Store) -> Manifest | None:
+    """Return the published manifest without its shards, with the digest of the published lock."""
+    place = f"{folder.display_name}/manifest.json"
+    start = store.get("manifest.json", _HEAD_BYTES)
+    if start is None:
+        return None
+    try:
+        head = decode_head(io.BytesIO(start), place)
+    except TrilightError:  # the head is longer, or malformed: read it all
+        head = decode_head(io.BytesIO(store.get("manifest.json") or b""), place)
+    if head.objects_lock_sha256:
+        return head
+    lock = store.get(folder.objects_lock.name)
+    return dataclasses.replace(head, objects_lock_sha256=sha256_hex(lock) if lock else "")
+
+
+def fetch(folder: DatasetFolder, store: Store, path: Path) -> None:
+    """Take over a published file that is not in the folder."""
+    if not path.exists() and (data := store.get(folder.name_of(path))) is not None:
+        write_atomically(path, data)
+
+
+def fetch_lock(folder: DatasetFolder, store: Store, sha256: str) -> None:
+    """Take over the published lock, of a digest, and its index, unless it is here."""
+    lock = folder.objects_lock
+    if not sha256 or (lock.exists() and sha256_of_file(lock) == sha256):
+        return
+    for path in (lock, folder.staged_index):
+        if (data := store.get(folder.name_of(path))) is not None:
+            write_atomically(path, data)
+
+
+def merge_failures(folder: DatasetFolder, store: Store) -> None:
+    """Add the published rejections to the folder's; call while holding the manifest's mutex."""
+    theirs = decode_failures(store.get(folder.failures.name) or b"")
+    write_failures(folder.failures, [*read_failures(folder.failures), *theirs])
+
+
+def hold_dataset_lock(folder: DatasetFolder) -> contextlib.AbstractContextManager[None]:
+    """Hold the lock that a dataset's workers share; one that is alone updates the folder.
+
+    Before a bucket it gets the bucket's state. Elsewhere, the manifest of a dataset without any
+    object, scene or shard is deleted: it begins again.
+
+    Raises:
+        TrilightError: the folder cannot be written, or the bucket not be read.
+    """
+    store = folder.store()
+    return folder.hold_shared_lock(
+        partial(_forget_unused, folder) if store.is_here else partial(adopt, folder, store)
+    )
+
+
+def _forget_unused(folder: DatasetFolder) -> None:
+    """Delete the manifest of a dataset without any frozen object, scene or shard.
+
+    A run that ended that early, over its objects, must not bind the next one to its settings. Call
+    while alone in the folder; a worker that missed this notices it (`DatasetWriter.refresh`).
+    """
+    with contextlib.suppress(TrilightError):  # a later reader reports an unreadable manifest
+        if read_head(folder.manifest).objects_lock_sha256:
+            return
+        folder.objects_lock.unlink(missing_ok=True)  # a kill came before the manifest named it
+        if not folder.shard_files() and not any(folder.staged_samples.rglob("*.tar")):
+            folder.manifest.unlink()
+
+
+def adopt(folder: DatasetFolder, store: Store) -> None:
+    """Give the folder before a bucket the bucket's state; call while no other process uses it.
+
+    Staged scenes stay only if the bucket holds the same dataset.
+    """
+    theirs = published_head(folder, store)
+    own_head = None
+    with contextlib.suppress(TrilightError):
+        own_head = read_head(folder.manifest)
+    if not (theirs and own_head and own_head.identity == theirs.identity):
+        own_head = None
+        folder.clear()
+    shutil.rmtree(folder.staged_sent, ignore_errors=True)  # it is looked at again
+    if theirs is None:
+        return
+    publish_plan(store, theirs.num_scenes)
+    if own_head:  # as the shards here were packed
+        theirs = dataclasses.replace(
+            theirs, num_scenes=own_head.num_scenes, growing=own_head.growing
+        )
+    fetch_lock(folder, store, theirs.objects_lock_sha256)
+    if not theirs.objects_lock_sha256:
+        merge_failures(folder, store)
+    write_manifest(folder.manifest, theirs)
+
+
+def publish_plan(store: Store, num_scenes: int) -> None:
+    """Publish a requested number of scenes; in a folder the manifest does so."""
+    if not store.is_here:
+        store.put(f"{PLANNED}{num_scenes:012d}", b"\n")
+
+
+log = logging.getLogger("trilight.scenes")
+
+
+class UnfinishedShard:
+    """One shard of a dataset, finished or not."""
+
+    def __init__(self, folder: DatasetFolder, splits: SplitSettings, shard_index: int) -> None:
+        self.name = shard_name(shard_index, splits)
+        self.split = split_of_shard(shard_index, splits)
+        self._folder = folder
+        self._index = shard_index
+        self._splits = splits
+        self._staged = folder.staged_shard(self.name)
+        self._packing = self._staged / "pack.claim"
+
+    @contextlib.contextmanager
+    def claim(self, scene_index: int) -> Iterator[bool]:
+        """Claim a scene; yield True if it is missing and no other worker has claimed it.
+
+        Raises:
+            TrilightError: the folder cannot be written.
+        """
+        if self._is_done(scene_index):
+            yield False
+            return
+        with hold_lock(self._claim(scene_index)) as ours:
+            yield ours and not self._is_done(scene_index)  # finished meanwhile
+
+    def stage(
+        self,
+        scene_index: int,
+        sample: Sample | None,
+        failures: list[Failure],
+        profile: Profile,
+        *,
+        began: float,
+        cores: int,
+    ) -> None:
+        """Stage a finished or given-up scene as `stage_scene`, and log its cost.
+
+        Args:
+            sample: the finished scene; None if it was given up.
+            began: start of the work on it, by `time.monotonic`.
+            cores: number of cores that the work kept busy.
+        """
+        stage_scene(self._staged, scene_index, sample, failures, profile)
+        seconds = time.monotonic() - began
+        outcome = "made" if sample else "given up"
+        log.info("%s: scene %09d %s in %.1f s", self.name, scene_index, outcome, seconds)
+        folder = self._folder
+        count = len(failures)
+        if sample is None:
+            count_given_up(folder, scene_index)
+        log_scene(folder, self.name, scene_index, seconds=seconds, cores=cores, num_rejected=count)
+
+    def pack(self) -> ShardEntry | None:
+        """Pack the shard if all its scenes are staged, unless another worker does.
+
+        Returns:
+            The shard if this call packed it, else None.
+        """
+        scenes, grows = self._plan()
+        if self._is_packed() or not all(is_staged(self._staged, index) for index in scenes):
+            return None
+        with contextlib.ExitStack() as stack:
+            if not stack.enter_context(hold_lock(self._packing)):
+                return None
+            if grows or scenes != scenes_of_shard(self._index, self._splits):
+                stack.enter_context(self._folder.mutex("manifest"))  # no plan changes meanwhile
+            if self._is_packed() or self._plan() != (scenes, grows):
+                return None
+            shard = pack_shard(self._folder, self.name, scenes, grows=grows)
+        log.info("%s: packed, %d scenes, %d bytes", self.name, shard.num_samples, shard.num_bytes)
+        return shard
+
+    def is_free(self) -> bool:
+        """Return True if a missing scene, or the packing, is claimed by no worker.
+
+        The check claims each missing scene for a moment. A worker that wants the scene just then
+        skips it, so a caller that gets True must make it.
+        """
+        claims = self.missing_claims()
+        if self._is_packed():  # checked last: packing empties the staging folder
+            return False
+        return not all(map(is_locked, claims))
+
+    def missing_claims(self) -> list[Path]:
+        """Return the claim files of the missing scenes; without any, the one of the packing."""
+        missing = [index for index in self._plan()[0] if not is_staged(self._staged, index)]
+        return [*map(self._claim, missing)] or [self._packing]
+
+    def _claim(self, scene_index: int) -> Path:
+        return self._staged / numbered_path(scene_index, f"{sample_key(scene_index)}.claim")
+
+    def _is_done(self, scene_index: int) -> bool:
+        return is_staged(self._staged, scene_index) or self._is_packed()
+
+    def _is_packed(self) -> bool:
+        is_sent = self._folder.is_sent(self.name)
+        return is_sent or (self._folder.shard(self.name).exists() and not self._plan()[1])
+
+    def _plan(self) -> tuple[range, bool]:
+        """Return the planned scenes, and whether a shard with fewer scenes is to grow."""
+        head = read_head(self._folder.manifest)
+        scenes = scenes_of_shard(self._index, cut_splits(head.num_scenes, self._splits))
+        return scenes, self.name in head.growing

@@ -21,13 +21,13 @@ from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.exchange.usd.write_usd import write_usd
 from pipeline.generation.prepare_isolated import asset_store, prepare_isolated
 from pipeline.generation.scene_worker import MAX_ATTEMPTS
-from pipeline.generation.software_environment import vector_extension
 from pipeline.objects.generated import generate_objects
 from pipeline.objects.local.folder import list_folder
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.presets.settings import DatasetSettings
+from pipeline.renders.mitsuba_variant import vector_extension
 from pipeline.scenes.compose import compose_scene
-from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.triangle_budget import PooledAsset
 from storage.dataset.dataset import open_dataset
 from storage.dataset.statistics import digest_of_scenes
 from storage.digests import canonical_json, sha256_hex

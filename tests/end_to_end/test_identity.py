@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.generation.software_environment import vector_extension
+from pipeline.renders.mitsuba_variant import vector_extension
 from tests.end_to_end.identity import KEPT, PARTS, SETS, digests_of
 
 

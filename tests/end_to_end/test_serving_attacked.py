@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from infra.serving.deployments import read_deployments
-from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
+from pipeline.flows.prefect_server import DISK_LIMIT, GPU_LIMIT
 from storage.dataset.verify import verify_dataset
 from tests.end_to_end.browser_kit import Browser, browser
 from tests.end_to_end.production_kit import (

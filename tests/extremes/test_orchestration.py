@@ -20,9 +20,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.generation.generation_run import ShardJob, TaskResult
+from pipeline.generation.generation_run import Piece, ShardJob, TaskResult
 from pipeline.generation.pipeline import make_dataset
-from pipeline.generation.tasks import Piece
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.scene_logs import decode_scene_log

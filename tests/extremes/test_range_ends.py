@@ -28,7 +28,7 @@ from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import MAX_SPP, RenderSettings
 from pipeline.scenes.compose import compose_scene
-from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.families import Family
 from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom

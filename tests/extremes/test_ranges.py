@@ -25,8 +25,7 @@ from pipeline.flows.forms import DatasetInRuns
 from pipeline.generation.price import CorePrice
 from pipeline.generation.revisit_options import RevisitOptions
 from pipeline.presets.registry import preset_settings
-from pipeline.presets.revisit import GivenCamera, RevisitSettings
-from pipeline.presets.settings import DatasetSettings
+from pipeline.presets.settings import DatasetSettings, GivenCamera, RevisitSettings
 from pipeline.renders.settings import MAX_SPP, RenderSettings
 from scene_templates.families import Family
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH

@@ -17,10 +17,10 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.guide_table import BINS
-from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
+from pipeline.renders.tracer import load_tracer
 from pipeline.renders.vector_tracer import VectorTracer
 from storage.conventions import camera_rays
 from storage.errors import Rejected

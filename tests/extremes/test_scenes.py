@@ -14,7 +14,7 @@ import pytest
 from pipeline.assets.settings import AssetSettings
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
-from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.records.asset import Asset

@@ -12,8 +12,8 @@ from infra.planning import MeasuredScenes, describe_run, measure_scenes, predict
 from pipeline.executors.threads import ThreadRunner
 from pipeline.flows import prefect_server
 from pipeline.generation.generate_options import GenerateOptions
+from pipeline.generation.generation_run import MAX_TASKS
 from pipeline.generation.pipeline import make_dataset
-from pipeline.generation.tasks import MAX_TASKS
 from pipeline.isolation import confinement
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder

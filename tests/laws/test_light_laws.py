@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.tracer import load_tracer
 from scene_templates.rotations import uniform_rotation
 from storage.conventions import camera_rays
 from storage.records.lookup import environment_values

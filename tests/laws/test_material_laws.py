@@ -8,8 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders import surface_table
-from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.tracer import Tracer
+from pipeline.renders.tracer import Tracer, load_tracer
 from storage.conventions import alpha_ggx
 from storage.optics.bsdf import MIN_ALPHA, bsdf_lobes
 from storage.optics.multiscatter import scattered_again

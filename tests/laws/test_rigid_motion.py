@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pipeline.scenes.visibility import Visibility
+from pipeline.scenes.views import Visibility
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.rotations import uniform_rotation
 from scene_templates.settings import SceneSettings

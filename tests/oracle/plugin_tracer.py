@@ -14,8 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.camera import PixelCamera
-from pipeline.renders.tracer import Chosen, Tracer
+from pipeline.renders.tracer import Chosen, PixelCamera, Tracer
 from storage.denoiser import Features
 from storage.records.scene import Scene
 from tests.oracle.plugin_scene import plugin_background, plugin_feature_scene, plugin_scene

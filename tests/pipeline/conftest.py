@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.records.scene import Scene

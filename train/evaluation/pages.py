@@ -26,7 +26,7 @@ from train.evaluation.judged_view import (
 from train.evaluation.metrics import METRICS
 
 BENCHMARK = "benchmark-v1"
-"""Name of our public test set (pipeline.presets.judging)."""
+"""Name of our public test set (pipeline.presets.frozen_v1)."""
 
 _METRICS = ("psnr_linear_db", "ssim", "lpips", "hdr_flip")
 

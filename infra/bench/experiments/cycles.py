@@ -16,10 +16,10 @@ from infra.bench.workloads.traced_pictures import render_shot, render_shots
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera, raw_reference, true_error_db
 from pipeline.presets.training import object_views
-from pipeline.renders.camera import PixelCamera
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import USUAL_FLOOR_DB
+from pipeline.renders.tracer import PixelCamera
 from storage.conventions import log10_radiance
 from storage.metrics import psnr_linear_db
 from storage.records.scene import Scene

@@ -23,7 +23,7 @@ from model.config import ModelConfig, hits_smoke, smoke, tiny
 from model.costs import Workload, training_flops
 from model.precision import fast_float32_products
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
-from pipeline.renders.visible_gpus import query_gpus
+from pipeline.renders.mitsuba_variant import query_gpus
 from storage.conventions import look_at_c2w
 from train.data.buckets import TrainingBatch
 from train.loop.distributed import DistributedContext

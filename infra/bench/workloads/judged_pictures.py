@@ -10,9 +10,9 @@ from safetensors.numpy import load, save
 
 from infra.render.raw_references import LEAST_ERROR, RawReference, raw_reference, true_error_db
 from pipeline.isolation import IsolatedChild
-from pipeline.renders.camera import PixelCamera
 from pipeline.renders.noise_floor import Curve, clamped_radiance, secant_slope
 from pipeline.renders.results import RenderedView
+from pipeline.renders.tracer import PixelCamera
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.conventions import log10_radiance

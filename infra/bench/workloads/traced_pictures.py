@@ -22,11 +22,10 @@ from numpy.typing import NDArray
 
 from infra.render.methods import SAMPLE_SEED, warm_up_denoiser
 from infra.render.raw_references import first_camera
-from pipeline.renders.camera import PixelCamera
-from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
+from pipeline.renders.tracer import PixelCamera, load_tracer
 from storage.denoiser import Features, denoise
 from storage.errors import TrilightError
 from storage.installation import IMPORT_ROOT

@@ -26,8 +26,12 @@ from infra.serving.deployments import limits
 from infra.serving.local import running, start, stop
 from infra.serving.train_model import RunChanges, TrainOptions, train_model, train_options
 from pipeline.flows import prefect_server
-from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
-from pipeline.flows.prefect_server import STOPPED_BY_PARENT, wait_until_healthy
+from pipeline.flows.prefect_server import (
+    DISK_LIMIT,
+    GPU_LIMIT,
+    STOPPED_BY_PARENT,
+    wait_until_healthy,
+)
 from storage.errors import TrilightError
 from storage.settings.fields import describe_fields
 from tests.command_line import run_program, trilight

@@ -19,9 +19,8 @@ from infra.viewer.folder_handlers import THUMBNAIL_PX, FolderHandlers
 from infra.viewer.scene_list import scene_list
 from pipeline.exchange.convert import write_scene
 from pipeline.renders.mitsuba_variant import Variant, choose_variant
+from pipeline.shards.derive import Selection, list_scenes
 from pipeline.shards.finished_dataset import FinishedDataset
-from pipeline.shards.listing import list_scenes
-from pipeline.shards.plans import Selection
 from storage.conventions import preview_srgb8
 from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
@@ -90,8 +89,8 @@ def test_what_is_shown_is_what_the_printed_command_selects(asker: Asker, dataset
             )
             whole = FinishedDataset(folder=dataset.folder, manifest=dataset.manifest, objects={})
             chosen = list_scenes(whole, selection)
-            assert [row["key"] for row in found["rows"]] == [row["key"] for row in chosen.rows]
-            for mine, theirs in zip(found["rows"], chosen.rows, strict=True):
+            assert [row["key"] for row in found["rows"]] == [row["key"] for row in chosen]
+            for mine, theirs in zip(found["rows"], chosen, strict=True):
                 for name in ("split", "template", "triangles", "lights", "spp"):
                     assert mine[name] == theirs[name]
                 assert mine["floor"] == pytest.approx(theirs["floor"], abs=0.06)

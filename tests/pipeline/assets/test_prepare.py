@@ -23,10 +23,10 @@ from pipeline.assets.recipe import RECIPE, methods_of
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.generation.prepare_isolated import prepare_isolated
-from pipeline.generation.software_environment import vector_extension
 from pipeline.objects.generated import generate_objects
 from pipeline.objects.sources import find_objects
 from pipeline.presets.registry import preset_settings
+from pipeline.renders.mitsuba_variant import vector_extension
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.asset import Asset, encode_asset

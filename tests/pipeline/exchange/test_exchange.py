@@ -18,7 +18,7 @@ from pipeline.exchange.formats import list_lost_members
 from pipeline.exchange.open_scene import SceneSource, load_source, scene_source
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.registry import preset_settings
-from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.sample_layout import scene_plan
 from scene_templates.settings import SceneSettings
 from storage.errors import TrilightError

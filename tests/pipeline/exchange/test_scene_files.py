@@ -18,7 +18,7 @@ from pipeline.generation.accept_scene_files import (
     build_once,
     settings_for_files,
 )
-from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
+from pipeline.generation.dataset_writer import begin_or_resume_dataset
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
@@ -72,7 +72,7 @@ def _build(folder: Path, name: str = "a.json") -> Scene:
 
 def _digests(folder: Path, name: str) -> dict[str, str]:
     assets = preset_settings("smoke").assets
-    return dict(build_once(folder.resolve(), name, assets, 1, "scale").sha256)
+    return dict(build_once(folder.resolve(), name, assets, 1, "scale")[0])
 
 
 def _settings(folder: Path, views: int | None = None) -> DatasetSettings:

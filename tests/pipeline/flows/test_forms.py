@@ -7,9 +7,13 @@ import pytest
 from prefect.exceptions import ParameterTypeError
 
 from infra.serving.train_model import train_model
-from pipeline.flows.array_flow import make_by_array
 from pipeline.flows.forms import DatasetOverrides, changed_values, options_of_form
-from pipeline.flows.prefect_flows import build_dataset, generate_scenes, prepare_assets
+from pipeline.flows.prefect_flows import (
+    build_dataset,
+    generate_scenes,
+    make_by_array,
+    prepare_assets,
+)
 from pipeline.flows.prefect_runner import is_retryable
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.presets.settings import DatasetSettings

@@ -13,13 +13,22 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from pipeline.executors.array_job import ArrayJob, DatasetByArray
-from pipeline.executors.kubernetes_array import KubernetesOptions, options_from_environment
+from pipeline.executors.array_job import (
+    ArrayJob,
+    DatasetByArray,
+    KubernetesOptions,
+    options_from_environment,
+)
 from pipeline.executors.registry import find_executor
-from pipeline.flows import array_flow, run_artifacts
-from pipeline.flows.array_flow import make_by_array
-from pipeline.flows.prefect_runner import PrefectRunner
-from pipeline.flows.run_artifacts import RunArtifacts, report_url, small_picture, usd_per_core_hour
+from pipeline.flows import prefect_flows, prefect_runner
+from pipeline.flows.prefect_flows import make_by_array
+from pipeline.flows.prefect_runner import (
+    PrefectRunner,
+    RunArtifacts,
+    report_url,
+    small_picture,
+    usd_per_core_hour,
+)
 from pipeline.generation.dataset_writer import DatasetProgress
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import TaskResult
@@ -52,12 +61,12 @@ def _shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
     def table(rows: list[dict[str, str]], key: str, description: str) -> None:
         shown.append((key, {row["what"]: row["value"] for row in rows}))
 
-    module = run_artifacts
+    module = prefect_runner
     monkeypatch.setattr(module, "create_table_artifact", table)
     monkeypatch.setattr(module, "create_progress_artifact", lambda *args, **named: "id")
     monkeypatch.setattr(module, "update_progress_artifact", lambda *args: None)
     monkeypatch.setattr(module, "create_image_artifact", lambda *args, **named: None)
-    for each in (module, array_flow):
+    for each in (module, prefect_flows):
         monkeypatch.setattr(each, "get_run_logger", lambda: logging.getLogger("trilight.test"))
     return shown
 
@@ -66,8 +75,8 @@ def _cannot_show(monkeypatch: pytest.MonkeyPatch) -> None:
     def gone(*args: object, **named: object) -> None:
         raise ConnectionError("gone")
 
-    monkeypatch.setattr(run_artifacts, "create_progress_artifact", gone)
-    monkeypatch.setattr(run_artifacts, "create_table_artifact", gone)
+    monkeypatch.setattr(prefect_runner, "create_progress_artifact", gone)
+    monkeypatch.setattr(prefect_runner, "create_table_artifact", gone)
 
 
 @pytest.fixture
@@ -78,7 +87,7 @@ def tables(monkeypatch: pytest.MonkeyPatch) -> Shown:
 @pytest.fixture
 def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
     """The dataset is looked at all the time."""
-    monkeypatch.setattr(array_flow, "LOOK_S", 0.01)
+    monkeypatch.setattr(prefect_flows, "LOOK_S", 0.01)
     return _shown(monkeypatch)
 
 
@@ -101,7 +110,7 @@ def test_the_rate_begins_with_the_first_scene(
 ) -> None:
     """An hour of preparing objects, then 4 scenes in 20 s."""
     now = 0.0
-    monkeypatch.setattr(run_artifacts.time, "monotonic", lambda: now)
+    monkeypatch.setattr(prefect_runner.time, "monotonic", lambda: now)
     watched = RunArtifacts(GenerateOptions(out=str(tmp_path)))
     assert watched.scenes_per_s() == 0
     now = 3620.0
@@ -114,7 +123,7 @@ def test_a_page_shows_the_scenes_and_where_their_report_is(
 ) -> None:
     pictures: list[str] = []
     monkeypatch.setattr(
-        run_artifacts, "create_image_artifact", lambda url, **named: pictures.append(url)
+        prefect_runner, "create_image_artifact", lambda url, **named: pictures.append(url)
     )
     monkeypatch.delenv("TRILIGHT_PUBLIC_URL", raising=False)
     out = tmp_path / "set"
@@ -139,7 +148,7 @@ def test_a_page_shows_the_scenes_and_where_their_report_is(
 def test_the_page_ends_with_how_far_everything_is(
     tables: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run_artifacts.time, "monotonic", lambda: 0.0)
+    monkeypatch.setattr(prefect_runner.time, "monotonic", lambda: 0.0)
     watched = RunArtifacts(GenerateOptions(out=str(tmp_path)))
     done = DatasetProgress(shards=1, scenes=4, shards_requested=2, scenes_requested=8)
     publication = SimpleNamespace(progress=done, manifest=SimpleNamespace(num_views=2))
@@ -162,9 +171,9 @@ def test_a_run_that_fails_says_so_in_its_summary(
     def full(*arguments: object) -> None:
         raise TrilightError("the disk is full of https://me:secret@host/x")
 
-    monkeypatch.setattr(run_artifacts, "make_dataset", full)
+    monkeypatch.setattr(prefect_runner, "make_dataset", full)
     with pytest.raises(TrilightError):
-        run_artifacts.make_with_artifacts(GenerateOptions(out=str(tmp_path)), PrefectRunner())
+        prefect_runner.make_with_artifacts(GenerateOptions(out=str(tmp_path)), PrefectRunner())
     ((key, rows),) = tables
     assert key == "summary"
     assert rows["failed"].startswith("TrilightError: the disk is full")
@@ -202,7 +211,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
         threading.Thread(target=work).start()
         return "4711"
 
-    monkeypatch.setattr(array_flow, "submit_slurm_array", submit)
+    monkeypatch.setattr(prefect_flows, "submit_slurm_array", submit)
     return arrays
 
 

@@ -10,14 +10,13 @@ from typing import Any, cast
 
 import pytest
 
-from pipeline.flows import on_dask
+from pipeline.flows import flow_executors
 from pipeline.flows import prefect_flows as building
 from pipeline.flows import prefect_runner as runner
 from pipeline.flows.forms import DatasetInRuns, options_of_form
-from pipeline.flows.limits import GPU_LIMIT
-from pipeline.flows.process import run_to_end
+from pipeline.flows.prefect_server import GPU_LIMIT, run_to_end
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.tasks import shard_ranges
+from pipeline.generation.generation_run import shard_ranges
 from storage.errors import TrilightError
 from tests.for_each import for_each
 
@@ -84,9 +83,8 @@ def test_rendering_on_a_gpu_takes_its_limit(
         yield
 
     monkeypatch.setattr(runner, "concurrency", limit)
-    monkeypatch.setattr(runner, "make_task", lambda job, pieces: (job, pieces, list(taken)))
-    work = SimpleNamespace(job=SimpleNamespace(device=device), pieces=())
-    assert cast(Any, runner.make_scenes).fn("0", work) == (work.job, (), held)
+    work = runner.Opaque(lambda: list(taken), on_gpu=device == "gpu")
+    assert cast(Any, runner.make_scenes).fn("0", work) == held
 
 
 def test_documents_are_tried_again_where_that_can_help() -> None:
@@ -104,7 +102,7 @@ def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_pat
 
     order = GenerateOptions(out=str(tmp_path / "set"))
     with pytest.raises(TrilightError, match="1 of 2 Dask workers do not see.*such as tcp://b:1"):
-        on_dask._require_shared(cast(Any, Client()), order)
+        flow_executors._require_shared(cast(Any, Client()), order)
     assert list((tmp_path / "set" / ".staging").iterdir()) == []
 
 
@@ -112,7 +110,7 @@ def test_a_dask_scheduler_that_does_not_answer_is_named() -> None:
     pytest.importorskip("distributed", reason="needs the package distributed (setup-all)")
     with (
         pytest.raises(TrilightError, match="--address http://127.0.0.1:1: no Dask scheduler"),
-        on_dask._client("http://127.0.0.1:1"),
+        flow_executors._client("http://127.0.0.1:1"),
     ):
         pass
 

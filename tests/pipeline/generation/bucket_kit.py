@@ -10,10 +10,9 @@ from typing import Any
 import pytest
 
 from pipeline.generation import dataset_writer
-from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
-from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
 from pipeline.presets.registry import preset_settings
-from pipeline.shards.pack import pack_shard
+from pipeline.shards.pack import hold_dataset_lock, pack_shard
 from storage.dataset.layout import dataset_folder
 from storage.dataset.staging import stage_scene
 from storage.records.objects import Failure

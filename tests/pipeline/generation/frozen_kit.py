@@ -11,10 +11,10 @@ import pytest
 
 from pipeline.assets.stage import PreparedObject
 from pipeline.generation import object_batches
-from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
-from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.freeze_objects import AcceptedObjects, ObjectLock
+from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
+from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.prepare_isolated import asset_store
+from pipeline.generation.revisited_scenes import AcceptedObjects
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from storage.dataset.layout import DatasetFolder

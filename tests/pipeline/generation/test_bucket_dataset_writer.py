@@ -14,11 +14,11 @@ import pytest
 from pipeline.executors.array_job import array_job
 from pipeline.generation import dataset_writer
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes
+from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, SplitPool
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import prepare_dataset
 from pipeline.generation.prepare_isolated import asset_store
-from pipeline.shards import published
+from pipeline.shards import pack
 from pipeline.shards.pack import pack_shard
 from storage.dataset.dataset import open_dataset
 from storage.dataset.progress import read_status
@@ -316,9 +316,9 @@ def test_of_those_who_end_together_one_reads_the_notes(
 ) -> None:
     """The others wait for its list; one that died over its list is waited for in vain."""
     read: list[str] = []
-    fetched = published.fetch_notes
+    fetched = pack.fetch_notes
     monkeypatch.setattr(
-        published, "fetch_notes", lambda how, names, at: fetched(how, _told(names, read), at)
+        pack, "fetch_notes", lambda how, names, at: fetched(how, _told(names, read), at)
     )
     monkeypatch.setattr(dataset_writer, "_PATIENCE_S", 10.0)
     with _ending_together(machines) as (first, second):
@@ -413,4 +413,4 @@ def test_who_comes_later_trusts_the_index_of_the_first(bucket: Any, machines: Ma
         assert trusted is not None and isinstance(trusted.origin, ComposedScenes)
         assert trusted.num_objects == 30
         with pytest.raises(AssetMissing):
-            trusted.origin.pool.open_split("train", asset_store())[0]
+            SplitPool(trusted.origin, "train", asset_store())[0]

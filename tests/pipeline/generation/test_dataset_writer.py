@@ -6,15 +6,13 @@ from pathlib import Path
 import pytest
 
 from pipeline.generation import dataset_writer
-from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
-from pipeline.generation.dataset_writer import DatasetWriter
+from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import choose_dataset_variant
-from pipeline.generation.software_environment import environment
 from pipeline.objects.generated import generate_objects
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
-from pipeline.renders.mitsuba_variant import Device, Variant, _ProbeResult, device_of
+from pipeline.renders.mitsuba_variant import Device, Variant, _ProbeResult, device_of, environment
 from pipeline.shards.pack import pack_shard
 from storage.dataset import layout
 from storage.dataset.dataset import open_dataset

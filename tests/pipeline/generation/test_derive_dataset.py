@@ -15,12 +15,11 @@ from typing import Any
 
 import pytest
 
-from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset
+from pipeline.generation.dataset_writer import begin_or_resume_dataset
 from pipeline.generation.derive_dataset import derive_dataset
-from pipeline.shards.derive import DeriveOptions, derive_shards
+from pipeline.shards.derive import DeriveOptions, Selection, derive_shards
 from pipeline.shards.finished_dataset import open_finished
 from pipeline.shards.pack import pack_shard
-from pipeline.shards.plans import Selection
 from storage.dataset import layout
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.derived import derivation_of

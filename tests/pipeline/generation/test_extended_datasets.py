@@ -11,13 +11,14 @@ from prefect.exceptions import ParameterTypeError
 from infra.repair import repair
 from pipeline.exchange.reader import file_child
 from pipeline.executors.threads import ThreadRunner
-from pipeline.generation.begin_or_resume_dataset import begin_or_resume_dataset, hold_dataset_lock
+from pipeline.generation.dataset_writer import begin_or_resume_dataset
 from pipeline.generation.freeze_objects import ObjectLock
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, make_task, prepare_dataset
 from pipeline.isolation import call_with_retries
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings, resolve_dataset_preset
 from pipeline.shards.derive import _extensions
+from pipeline.shards.pack import hold_dataset_lock
 from scene_templates.families import FAMILIES
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder

@@ -6,26 +6,27 @@ import io
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from pipeline.documents.attribution import encode_attribution
 from pipeline.generation import accept_maps as accepting
-from pipeline.generation import freeze_objects, frozen_pool, pipeline, restore_object
+from pipeline.generation import freeze_objects, frozen_pool, pipeline, render_workers
 from pipeline.generation.accept_maps import AcceptedMaps, MapFolders, accept_maps, map_folders
 from pipeline.generation.dataset_writer import DatasetWriter
-from pipeline.generation.freeze_objects import AcceptedObjects, require_same
+from pipeline.generation.freeze_objects import require_same
 from pipeline.generation.frozen_pool import AssetMissing, ComposedScenes, SplitPool, user_maps
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.prepare_isolated import asset_store
+from pipeline.generation.revisited_scenes import AcceptedObjects
 from pipeline.generation.scene_worker import SceneAttempt
 from pipeline.objects.maps.prepared import MapFiles, prepare_map
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.scenes.compose import compose_scene
-from pipeline.scenes.pool import PooledAsset, fits_of
-from pipeline.scenes.triangle_budget import draw_rows
+from pipeline.scenes.triangle_budget import PooledAsset, draw_rows, fits_of
 from scene_templates.user_maps import UserMap, draw_user_map
 from storage.conventions import SPLITS
 from storage.dataset.manifest import Manifest
@@ -65,7 +66,7 @@ def made(
 
 def _opened(accepted: AcceptedObjects, split: str = "train") -> SplitPool:
     assert isinstance(accepted.origin, ComposedScenes)
-    return accepted.origin.pool.open_split(split, asset_store())
+    return SplitPool(accepted.origin, split, asset_store())
 
 
 def _stored(name: str) -> Asset:
@@ -196,13 +197,11 @@ def test_an_index_that_contradicts_the_objects_is_refused(
         path.write_bytes(was)
 
 
-def test_an_object_that_is_away_is_brought_back_for_the_same_attempt(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_object_that_is_away_is_brought_back_for_the_same_attempt() -> None:
     calls: list[tuple[object, ...]] = []
     away = [("a", "1"), ("b", "2")]
 
-    def attempt(child: object, args: tuple[object, ...]) -> SceneAttempt:
+    def attempt(method: object, *args: object) -> SceneAttempt:
         calls.append(args)
         return SceneAttempt(sample=None, failures=[], missing_asset=away[0] if away else None)
 
@@ -210,8 +209,7 @@ def test_an_object_that_is_away_is_brought_back_for_the_same_attempt(
         calls.append((uid, name))
         away.pop(0)
 
-    monkeypatch.setattr(pipeline, "_attempt_with_retries", attempt)
-    child: object = None
+    child: object = SimpleNamespace(call_method=attempt)
     pipeline.make_scene("train", 7, 1, child, restore)  # type: ignore[arg-type]
     assert calls == [("train", 7, 0), ("a", "1"), ("train", 7, 0), ("b", "2"), ("train", 7, 0)]
 
@@ -219,9 +217,9 @@ def test_an_object_that_is_away_is_brought_back_for_the_same_attempt(
 def test_an_object_that_is_there_again_is_found(tmp_path: Path) -> None:
     """A worker that lives long has listed the source before."""
     source = ("builtin:4", None, tmp_path / "objects", ("MIT", "CC0-1.0"))
-    uid = restore_object._list_source(*source).allowed[0].uid
+    uid = render_workers._list_source(*source).allowed[0].uid
     shutil.rmtree(tmp_path / "objects")
-    record = restore_object.find_object(*source, uid)
+    record = render_workers.find_object(*source, uid)
     assert record is not None and Path(record.path).exists()
 
 

@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.executors.array_job import array_job
-from pipeline.executors.kubernetes import PLACE
-from pipeline.executors.kubernetes_array import KubernetesOptions, job_manifest
+from pipeline.executors.array_job import KubernetesOptions, array_job, job_manifest
 from pipeline.executors.registry import find_executor
+from pipeline.executors.threads import PLACE
 from pipeline.generation.object_batches import (
     ObjectWork,
     PrepareResult,

@@ -13,10 +13,16 @@ from hypothesis import strategies as st
 
 from infra.cli.overrides import parse_overrides
 from pipeline.generation.generate_options import GenerateOptions, generate_words
-from pipeline.generation.generation_run import TaskResult, children_of_gpu
-from pipeline.generation.runner import Runner
-from pipeline.generation.tasks import MAX_TASKS, TASK_S, Piece, TaskCutter
-from pipeline.renders.visible_gpus import visible_gpus
+from pipeline.generation.generation_run import (
+    MAX_TASKS,
+    TASK_S,
+    Piece,
+    Runner,
+    TaskCutter,
+    TaskResult,
+    children_of_gpu,
+)
+from pipeline.renders.mitsuba_variant import visible_gpus
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure, TrilightError

@@ -14,16 +14,14 @@ from typing import Any, cast
 import pytest
 from PIL import Image
 
-from pipeline.generation import pipeline, render_workers, tasks, unfinished_shard
+from pipeline.generation import generation_run, pipeline, render_workers
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.generation.generation_run import Run, ShardJob, TaskResult
+from pipeline.generation.generation_run import Piece, Run, Runner, ShardJob, TaskResult
 from pipeline.generation.pipeline import make_dataset, make_piece
-from pipeline.generation.runner import Runner
 from pipeline.generation.scene_worker import SceneAttempt
-from pipeline.generation.tasks import Piece
-from pipeline.generation.unfinished_shard import UnfinishedShard
 from pipeline.isolation import ChildFailed, ChildPool, IsolatedChild
-from pipeline.shards.pack import pack_shard
+from pipeline.shards import pack
+from pipeline.shards.pack import UnfinishedShard, pack_shard
 from storage import file_locks
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry, index_shard
@@ -131,7 +129,7 @@ def test_who_waits_for_others_says_for_whom(
     )
     _make(tmp_path, 1, 4, Counter())
     with hold_lock(folder.staged_shard(NAME) / f"{sample_key(0)}.claim"):
-        tasks.wait_for_others(run, 0.0)
+        generation_run.wait_for_others(run, 0.0)
     assert f"{sample_key(0)}.claim: waiting for 0 s for process {os.getpid()} of" in caplog.text
 
 
@@ -144,11 +142,11 @@ def test_a_shard_that_is_packed_while_one_looks_is_not_free(
 
     def packed_meanwhile(staged: Path, scene_index: int) -> bool:
         seen = is_staged(staged, scene_index)
-        monkeypatch.setattr(unfinished_shard, "is_staged", is_staged)
+        monkeypatch.setattr(pack, "is_staged", is_staged)
         assert _make(tmp_path, 0, 4, Counter()) is not None
         return seen
 
-    monkeypatch.setattr(unfinished_shard, "is_staged", packed_meanwhile)
+    monkeypatch.setattr(pack, "is_staged", packed_meanwhile)
     assert not looked_at.is_free()
 
 
@@ -160,12 +158,12 @@ def _somebody_quicker(
     @contextlib.contextmanager
     def claimed_late(claim: Path) -> Iterator[bool]:
         if claim.name == claim_name:
-            monkeypatch.setattr(unfinished_shard, "hold_lock", hold_lock)
+            monkeypatch.setattr(pack, "hold_lock", hold_lock)
             work()
         with hold_lock(claim) as ours:
             yield ours
 
-    monkeypatch.setattr(unfinished_shard, "hold_lock", claimed_late)
+    monkeypatch.setattr(pack, "hold_lock", claimed_late)
 
 
 def test_a_scene_that_somebody_made_before_the_claim_is_not_made_again(
@@ -260,7 +258,7 @@ def test_waiting_for_others_takes_few_looks_and_no_tasks(
         if len(pauses) == 10:  # and somebody else was quicker
             make_tiny_shard(begin_tiny(tmp_path, 4), 0)
 
-    monkeypatch.setattr(tasks.time, "sleep", sleep)
+    monkeypatch.setattr(generation_run.time, "sleep", sleep)
     for scene in range(4):
         held.enter_context(_claim(run.publication.folder, scene))
     pipeline.make_shards(run, runner, lambda run, outcome: None)
@@ -274,7 +272,7 @@ def test_a_range_leaves_to_others_what_they_are_at(
     def sleep(seconds: float) -> None:
         raise AssertionError("nobody waits")
 
-    monkeypatch.setattr(tasks.time, "sleep", sleep)
+    monkeypatch.setattr(generation_run.time, "sleep", sleep)
     run, runner = _run(tmp_path, 8), Idle()
     ranged = dataclasses.replace(run, options=dataclasses.replace(run.options, shards="0:1"))
     pipeline.make_shards(ranged, runner, lambda run, outcome: None)

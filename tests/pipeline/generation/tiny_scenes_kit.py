@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 
 from pipeline.executors.threads import ThreadRunner
-from pipeline.generation.freeze_objects import AcceptedObjects, ObjectLock
-from pipeline.generation.frozen_pool import ComposedScenes, FrozenPool
+from pipeline.generation.freeze_objects import ObjectLock
+from pipeline.generation.frozen_pool import ComposedScenes
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import ShardJob
+from pipeline.generation.revisited_scenes import AcceptedObjects
 from pipeline.renders.mitsuba_variant import Variant
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.statistics import Statistics
@@ -23,9 +24,7 @@ from tests.scenes_by_hand import tiny_sample
 NO_OBJECTS = AcceptedObjects(
     num_objects=0,
     num_found=0,
-    origin=ComposedScenes(
-        pool=FrozenPool(lock=Path("none"), index=Path("none"), source="none", licence=None)
-    ),
+    origin=ComposedScenes(lock=Path("none"), index=Path("none"), source="none", licence=None),
 )
 
 

@@ -13,12 +13,12 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from pipeline.isolation import confinement, landlock, seccomp
+from pipeline.isolation import confinement, system_calls
 from tests.conftest import ROOT
 
 LIBC = ctypes.CDLL(None, use_errno=True)
-_COLUMN = seccomp._MACHINES.get(platform.machine(), (0,))[0]
-_CALLS: Mapping[str, tuple[object, ...]] = {**seccomp._NUMBERS, **seccomp._BY_ARGUMENT}
+_COLUMN = system_calls._MACHINES.get(platform.machine(), (0,))[0]
+_CALLS: Mapping[str, tuple[object, ...]] = {**system_calls._NUMBERS, **system_calls._BY_ARGUMENT}
 
 
 def kernel(call: str | int, *args: object) -> int:
@@ -131,14 +131,14 @@ def build(wall: str, inside: Path) -> None:
     if name == "all":
         confinement.confine(confinement.reach(files=[inside]), frozenset([ROOT]))
     elif name == "rights":
-        landlock.give_up_privileges()
+        system_calls.give_up_privileges()
     elif name:
         LIBC.prctl(38, 1, 0, 0, 0)
     if name == "landlock":
-        landlock.landlock_version = lambda: int(version)  # type: ignore[assignment]
-        landlock.restrict_files(reads=[*confinement._libraries(), ROOT, inside], writes=[])
+        system_calls.landlock_version = lambda: int(version)  # type: ignore[assignment]
+        system_calls.restrict_files(reads=[*confinement._libraries(), ROOT, inside], writes=[])
     if name == "seccomp":
-        seccomp.refuse_calls()
+        system_calls.refuse_calls()
 
 
 def try_all(wall: str, folder: Path, victim: int) -> dict[str, bool | None]:

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, frames
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, answers
 from pipeline.isolation.answers import (
     CLASS,
     MOST_HEAD_BYTES,
@@ -303,7 +303,7 @@ def test_an_owner_without_memory_for_an_answer_has_a_failed_call(
             raise MemoryError
         return real(count, *more)
 
-    monkeypatch.setattr(frames.np, "zeros", zeros)
+    monkeypatch.setattr(answers.np, "zeros", zeros)
     with pytest.raises(ChildFailed, match="out_of_memory: this process has no memory"):
         child.call(called.large)
     assert child.call(called.double, 4) == 8

@@ -24,11 +24,10 @@ from pipeline.isolation import (
     confinement,
     is_transient,
     reach,
-    seccomp,
+    system_calls,
 )
 from pipeline.isolation.call_failures import ENDS, with_retries
-from pipeline.isolation.landlock import landlock_version
-from pipeline.isolation.seccomp import seccomp_works
+from pipeline.isolation.system_calls import landlock_version, seccomp_works
 from storage.errors import EnvironmentFailure, TrilightError
 from tests.conftest import ROOT
 from tests.for_each import for_each
@@ -245,8 +244,8 @@ def test_very_many_folders_become_those_above_and_never_the_whole_disk() -> None
 
 def _decide(machine: str, call: int, argument: int = 0) -> int:
     """Return what the filter answers to a call whose arguments are all the same."""
-    data = {0: call, 4: seccomp._MACHINES[machine][1], 16: argument, 24: argument}
-    steps, at, loaded = seccomp._program(machine, 77), 0, 0
+    data = {0: call, 4: system_calls._MACHINES[machine][1], 16: argument, 24: argument}
+    steps, at, loaded = system_calls._program(machine, 77), 0, 0
     passes = {0x15: int.__eq__, 0x35: int.__ge__, 0x45: int.__and__}
     while steps[at][0] != 0x06:
         code, then, otherwise, value = steps[at]
@@ -258,14 +257,14 @@ def _decide(machine: str, call: int, argument: int = 0) -> int:
 @for_each(("machine", "column"), [("x86_64", 0), ("aarch64", 1)])
 def test_the_filter_refuses_calls_by_number_and_by_argument(machine: str, column: int) -> None:
     allow, refuse = 0x7FFF0000, 0x50001
-    numbers = [row[column] for row in seccomp._NUMBERS.values() if row[column] is not None]
+    numbers = [row[column] for row in system_calls._NUMBERS.values() if row[column] is not None]
     assert {_decide(machine, each) for each in (*numbers, 63 | 0x40000000)} == {refuse}  # type: ignore[arg-type]
     assert (_decide(machine, 63), _decide(machine, 435)) == (allow, 0x50026)
     for name, kept, given_up in (
         ("ioctl", 0x5401, 0x5412), ("fcntl", 4, 8), ("kill", 77, 78), ("tgkill", 77, 0),
         ("prlimit64", 0, 1), ("clone", 0x3D0F00, 0x1200011), ("prctl", 15, 1),
     ):  # fmt: skip
-        number = seccomp._BY_ARGUMENT[name][:2][column]
+        number = system_calls._BY_ARGUMENT[name][:2][column]
         assert _decide(machine, number, kept) == allow, name
         assert _decide(machine, number, given_up) == refuse, name
 

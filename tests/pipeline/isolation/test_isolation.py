@@ -19,9 +19,9 @@ from pipeline.isolation import (
     ChildFailed,
     ChildLimits,
     IsolatedChild,
+    answers,
     call_failures,
     call_with_retries,
-    waiting,
 )
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from tests.conftest import ROOT
@@ -154,8 +154,8 @@ PATIENT = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
 @pytest.fixture
 def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[IsolatedChild]:
     """Looked at twenty times a second, and given up after three quarters of one."""
-    monkeypatch.setattr(waiting, "LOOK_S", 0.05)
-    monkeypatch.setattr(waiting, "LOOKS_BEFORE_KILL", 15)
+    monkeypatch.setattr(answers, "LOOK_S", 0.05)
+    monkeypatch.setattr(answers, "LOOKS_BEFORE_KILL", 15)
     monkeypatch.setattr(call_failures, "_PAUSE_S", 0.0)
     watched = IsolatedChild(limits=PATIENT)
     yield watched
@@ -238,7 +238,7 @@ def test_a_command_that_is_stopped_as_a_whole_goes_on_where_it_was(tmp_path: Pat
         first = process.stdout.readline()
         os.killpg(process.pid, signal.SIGTSTP)
         time.sleep(2.5)
-        assert waiting._is_stopped(process.pid) and waiting._is_stopped(int(first))
+        assert answers._is_stopped(process.pid) and answers._is_stopped(int(first))
         (tmp_path / "program.py.go").touch()
         os.killpg(process.pid, signal.SIGCONT)
         second, errors = process.communicate(timeout=120)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.presets.judging import PRESETS_FOR_JUDGING
+from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.presets.renderformer import RENDERFORMER_PRESETS
 from scene_templates import placement
@@ -166,7 +166,7 @@ def test_a_default_that_is_changed_later_changes_no_frozen_set() -> None:
             pass
         else:
             raise AssertionError("a default is still there")
-        from pipeline.presets.judging import PRESETS_FOR_JUDGING
+        from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING
         from pipeline.presets.renderformer import RENDERFORMER_PRESETS
         DATASET_PRESETS = PRESETS_FOR_JUDGING | RENDERFORMER_PRESETS
         """)

@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.renders.camera import PixelCamera
-from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import Tracer
+from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer
 from storage.records.scene import Scene
 from tests.conftest import ROOT
 

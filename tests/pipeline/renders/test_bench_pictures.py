@@ -10,7 +10,7 @@ from infra.bench.workloads.recorded_looks import FIGURES, record_looks, unreacha
 from infra.bench.workloads.traced_pictures import fixed_samples, render_levels, render_shot
 from infra.render.raw_references import raw_reference
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.tracer import load_tracer
 from storage.metrics import psnr_log_db
 from tests.pipeline.renders.sampling import camera_of
 from tests.pipeline.renders.scene_kit import sampled_like_scene

@@ -18,8 +18,8 @@ from pipeline.renders.calibrated_error import (
     load_statement,
     versions_of_pictures,
 )
+from pipeline.renders.host_pictures import Half, measure_errors
 from pipeline.renders.noise_floor import ErrorMeasures, clamped_radiance
-from pipeline.renders.numpy_arithmetic.noise_floor import Half, measure_errors
 from pipeline.renders.settings import Arithmetic, RenderSettings
 from storage.errors import TrilightError
 from tests.for_each import for_each

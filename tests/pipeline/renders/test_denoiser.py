@@ -10,19 +10,19 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders import variant_probe
-from pipeline.renders.adaptive_sampling import TileChoice
-from pipeline.renders.denoise_corrections import LEAST_PASSES
-from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.numpy_arithmetic.host_pictures import (
+from pipeline.renders.host_pictures import (
+    Half,
     HostMeans,
     Pictures,
+    estimate_error,
     keep_converged,
     keep_in_halves,
     with_mean_of,
 )
-from pipeline.renders.numpy_arithmetic.noise_floor import Half, estimate_error
-from pipeline.renders.samples import DualBuffer
+from pipeline.renders.samples import DualBuffer, TileChoice
 from pipeline.renders.settings import RenderSettings
+from pipeline.renders.tracer import load_tracer
+from pipeline.renders.view_pictures import LEAST_PASSES
 from storage import denoiser
 from storage.denoiser import Features, denoise, load_oidn, set_denoiser_device
 from tests.pipeline.renders.sampling import camera_of, render_view

@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
 from pipeline.presets.registry import preset_settings
 from pipeline.renders import kernel_scene
-from pipeline.renders.device_memory import read_back
+from pipeline.renders.device_memory import KernelInputs, read_back, record_launches
 from pipeline.renders.device_pictures import DevicePictures
-from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.recorded_calls import KernelInputs, record_launches
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import Filtered, RenderSettings
-from pipeline.renders.tracer import Tracer
+from pipeline.renders.tracer import Tracer, load_tracer
 from pipeline.renders.vector_tracer import VectorTracer
 from pipeline.renders.view_pictures import MeasuredLook
 from storage.records.scene import Scene

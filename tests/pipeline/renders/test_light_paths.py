@@ -9,13 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders import vector_tracer
-from pipeline.renders.camera import PixelCamera
 from pipeline.renders.device_memory import read_back
 from pipeline.renders.film import Film, Splats, SplatUnit
-from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
+from pipeline.renders.tracer import PixelCamera, load_tracer
 from pipeline.renders.vector_tracer import (
     VectorTracer,
     even_numbers,

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from pipeline.renders import kernel_scene
 from pipeline.renders.emitter_table import alias_table
-from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.sky_table import SkyTable, alias_rows, peaked_radiance, sky_share
 from pipeline.renders.surface_table import KernelTextures
-from pipeline.renders.tracer import Tracer
+from pipeline.renders.tracer import Tracer, load_tracer
 from pipeline.scenes.pieces import apply_skin, concatenate_pieces, emitter_piece, object_piece
-from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.source_materials import source_skins
+from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.layout import Emitter
 from scene_templates.rotations import uniform_rotation
 from scene_templates.sample_material import MaterialSettings

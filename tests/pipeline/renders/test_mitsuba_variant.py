@@ -12,7 +12,6 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from pipeline.generation.software_environment import environment
 from pipeline.renders import mitsuba_variant as variant_module
 from pipeline.renders import variant_probe, vector_tracer
 from pipeline.renders.facts import render_facts
@@ -22,6 +21,7 @@ from pipeline.renders.mitsuba_variant import (
     _ProbeResult,
     activate,
     choose_variant,
+    environment,
     llvm_libraries,
 )
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from pipeline.generation.render_sample import RenderInput, ViewProgress, render_sample
 from pipeline.presets.registry import preset_settings
-from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import Tracer
+from pipeline.renders.tracer import Tracer, load_tracer
 from storage.dataset.manifest import Manifest
 from storage.dataset.verify import check_sample
 from storage.errors import Rejected

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.tracer import load_tracer
 from storage.raycast.first_hits import first_hits
 from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from infra.bench.workloads.cycles import installed_python, render_with_cycles, run_blender
 from pipeline.exchange.usd.write_usd import write_usd
-from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.settings import RenderSettings
+from pipeline.renders.tracer import load_tracer
 from storage.metrics import psnr_linear_db, psnr_log_db
 from storage.records.exr import decode_exr
 from storage.records.passes.pictures import passes_exr, view_passes

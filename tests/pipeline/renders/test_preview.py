@@ -8,7 +8,6 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders import preview
-from pipeline.renders.camera import PixelCamera
 from pipeline.renders.preview import (
     FIRST_LOOKS_SPP,
     Preview,
@@ -24,6 +23,7 @@ from pipeline.renders.preview import (
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.settings import Filtered, RenderSettings
+from pipeline.renders.tracer import PixelCamera
 from storage.denoiser import Features
 from storage.errors import Rejected, TrilightError
 from storage.metrics import psnr_log_db

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.renders.load_tracer import choose_tracing_scale, load_tracer
-from pipeline.renders.numpy_arithmetic import host_pictures
-from pipeline.renders.numpy_arithmetic.host_pictures import HostMeans, with_mean_of
+from pipeline.renders import host_pictures
+from pipeline.renders.host_pictures import HostMeans, with_mean_of
 from pipeline.renders.renderer import SceneRenderer, set_threads
 from pipeline.renders.results import RenderedView
 from pipeline.renders.samples import DualBuffer
 from pipeline.renders.settings import RenderSettings
+from pipeline.renders.tracer import choose_tracing_scale, load_tracer
 from storage.conventions import look_at_c2w
 from storage.denoiser import Features, Quality, denoise
 from storage.errors import Rejected

@@ -11,21 +11,28 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from infra.render.quality import ToStatedError
-from pipeline.renders.adaptive_sampling import TILE_PX, TileChoice, passes_of_tiles
-from pipeline.renders.camera import PixelCamera
-from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.numpy_arithmetic.host_pictures import HostMeans, LogChanges
-from pipeline.renders.numpy_arithmetic.noise_floor import (
+from pipeline.renders.host_pictures import (
     Half,
+    HostMeans,
+    LogChanges,
     estimate_error,
     squared_error,
     surprises,
 )
 from pipeline.renders.renderer import SceneRenderer
-from pipeline.renders.samples import DualBuffer
+from pipeline.renders.samples import (
+    TILE_PX,
+    DualBuffer,
+    Goal,
+    TileChoice,
+    expected_spp,
+    gaps_db,
+    next_spp,
+    passes_of_tiles,
+    slope_db,
+)
 from pipeline.renders.settings import NoiseTargets, RenderSettings
-from pipeline.renders.stopping import Goal, expected_spp, gaps_db, next_spp, slope_db
-from pipeline.renders.tracer import Chosen
+from pipeline.renders.tracer import Chosen, PixelCamera, load_tracer
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
 from storage.metrics import MAX_DB, psnr_linear_db, psnr_log_db

@@ -17,8 +17,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.tracer import Tracer
+from pipeline.renders.tracer import Tracer, load_tracer
 from storage.records.scene import Scene
 from storage.seeds import seed_for
 from tests.pipeline.renders.sampling import block_means, camera_of

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.tracer import load_tracer
 from scene_templates.rotations import uniform_rotation
 from storage.conventions import camera_rays
 from storage.records.scene import Scene

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from pipeline.scenes.compose import compose_scene
-from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.layout import SurfaceLook
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
-from pipeline.renders.load_tracer import choose_tracing_scale
+from pipeline.renders.tracer import choose_tracing_scale
 from pipeline.scenes.compose import compose_scene
-from pipeline.scenes.pool import PooledAsset
-from pipeline.scenes.scene_checks import require_valid
+from pipeline.scenes.triangle_budget import PooledAsset
+from pipeline.scenes.views import require_valid
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.sample_layout import scene_plan
 from scene_templates.settings import SceneSettings

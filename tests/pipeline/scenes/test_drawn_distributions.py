@@ -17,9 +17,9 @@ from scipy.spatial.distance import pdist
 
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import differences
-from pipeline.scenes.mesh_collision import MeshShape
+from pipeline.scenes.compose import MeshShape
 from pipeline.scenes.pieces import object_piece, shell_piece
-from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.layout import ShellPart, SurfaceLook
 from scene_templates.out_of_range import median_settings
 from scene_templates.rooms import PATCH_FACES, SIDES, patch

@@ -8,16 +8,16 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from pipeline.scenes.mesh_collision import MeshShape
-from pipeline.scenes.pool import PooledAsset
-from pipeline.scenes.posing import normalize_to_unit_sphere, pose_points, without_slivers
+from pipeline.scenes.compose import MeshShape, normalize_to_unit_sphere, pose_points
 from pipeline.scenes.shading_normals import (
     ShadedMesh,
     face_normals,
     flat_shaded,
     shading_groups,
     smooth_shaded,
+    without_slivers,
 )
+from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Pose
 from scene_templates.rotations import rotation_xyz, uniform_rotation

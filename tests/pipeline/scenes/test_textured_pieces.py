@@ -15,16 +15,17 @@ from pipeline.scenes.pieces import (
     Skin,
     apply_skin,
     concatenate_pieces,
+    cube_coordinates,
     emitter_piece,
     object_piece,
     shell_piece,
+    with_drawn_textures,
 )
-from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.redrawn import with_new_lights
 from pipeline.scenes.shading_normals import flat_shaded
 from pipeline.scenes.source_materials import source_skins, with_source_emission
 from pipeline.scenes.subdivision import fill_triangles, subdivide
-from pipeline.scenes.textured_pieces import cube_coordinates, with_drawn_textures
+from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Emitter, Layout, ObjectPlacement, Pose, ShellPart
 from scene_templates.rooms import PATCH_FACES, SIDES, patch

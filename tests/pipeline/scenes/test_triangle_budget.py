@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 
 from pipeline.scenes import triangle_budget
-from pipeline.scenes.pool import PooledAsset
-from pipeline.scenes.triangle_budget import FitTable, draw_rows, least_triangles, levels_within
+from pipeline.scenes.triangle_budget import (
+    FitTable,
+    PooledAsset,
+    draw_rows,
+    least_triangles,
+    levels_within,
+)
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected

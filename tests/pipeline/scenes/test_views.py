@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 from pipeline.presets.registry import preset_settings
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
-from pipeline.scenes.scene_checks import require_valid
 from pipeline.scenes.views import (
     CAMERA_ATTEMPTS,
     ViewCamera,
+    Visibility,
     cameras_of_view,
+    require_valid,
     visibility_problem,
     with_cameras,
 )
-from pipeline.scenes.visibility import Visibility
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings, ViewLaws
 from storage.conventions import camera_rays, look_at_c2w

@@ -14,7 +14,7 @@ from PIL import Image
 from infra import judging
 from model.inference import light_groups
 from model.weights import encode_weights
-from pipeline.presets.judging import PRESETS_FOR_JUDGING
+from pipeline.presets.frozen_v1 import PRESETS_FOR_JUDGING
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError

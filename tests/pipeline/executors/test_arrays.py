@@ -1,4 +1,4 @@
-"""Executors are peers; arrays of Slurm by its variables, and `submit slurm` of what is missing."""
+"""Executors are peers; arrays by the variables and the schema of their schedulers; `submit`."""
 
 import contextlib
 import dataclasses
@@ -10,13 +10,22 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from pipeline.executors.array_job import MAX_TASKS, ArrayJob, array_job
+from pipeline.executors import array_job as arrays
+from pipeline.executors.array_job import (
+    MAX_TASKS,
+    ArrayJob,
+    KubernetesOptions,
+    array_job,
+    job_manifest,
+    sbatch_command,
+    sbatch_environment,
+)
 from pipeline.executors.registry import EXECUTORS, find_executor
-from pipeline.executors.slurm import shards_of_task
-from pipeline.executors.slurm_array import sbatch_command, sbatch_environment
+from pipeline.executors.threads import PLACE, shards_of_place, shards_of_task
 from pipeline.generation.generate_options import GenerateOptions
 from storage.dataset.dataset import open_dataset
 from storage.dataset.progress import missing_shards
@@ -55,19 +64,31 @@ def test_the_tasks_of_an_array_have_equal_shares() -> None:
     assert shards_of_task(alone, unknown) == "8:12"
 
 
+GIVEN = {"TASKS": "0-1,7", "SHARDS_PER_TASK": "4"}
+
+
 @for_each(
-    ("environment", "message"),
+    ("on", "environment", "message"),
     [
-        ({}, "SLURM_ARRAY_TASK_ID is not set; expected a task of an array, .* Submit"),
-        (_array(3, 3, 7, 2, SHARDS_PER_TASK="0"), "SHARDS_PER_TASK is '0'; expected .* from 1"),
-        (_array(0, 0, 0, 1) | {"SLURM_ARRAY_TASK_ID": "x"}, "ID is 'x'; expected a number from 0"),
-        (_array(3, 0, 7, 3), r"3 tasks between 0 and 7, with gaps; .* Or set SHARDS_PER_TASK"),
-        (_array(2, 0, 9, 4), r"4 tasks between 0 and 9, with gaps"),  # 0, 2, 5, 9
+        ("slurm", {}, "SLURM_ARRAY_TASK_ID is not set; expected a task of an array, .* Submit"),
+        ("slurm", _array(3, 3, 7, 2, SHARDS_PER_TASK="0"), "SHARDS_PER_TASK is '0'; .* from 1"),
+        ("slurm", _array(0, 0, 0, 1) | {"SLURM_ARRAY_TASK_ID": "x"}, "ID is 'x'; .* from 0"),
+        ("slurm", _array(3, 0, 7, 3), r"3 tasks between 0 and 7, .* Or set SHARDS_PER_TASK"),
+        ("slurm", _array(2, 0, 9, 4), r"4 tasks between 0 and 9, with gaps"),  # 0, 2, 5, 9
+        ("kubernetes", {}, "TASKS is not set; expected .* as trilight submit kubernetes makes it"),
+        ("kubernetes", GIVEN, f"{PLACE} is not set"),
+        ("kubernetes", {**GIVEN, PLACE: "3"}, f"{PLACE} is 3; expected a place below 3"),
+        ("kubernetes", {**GIVEN, PLACE: "\N{SUPERSCRIPT TWO}"}, "expected a number from 0"),
+        ("kubernetes", {**GIVEN, PLACE: "0", "SHARDS_PER_TASK": "0"}, "_TASK is '0'; .* from 1"),
+        ("kubernetes", {**GIVEN, PLACE: "0", "TASKS": "0,,2"}, "TASKS is '0,,2'; expected numbers"),
+        ("kubernetes", {**GIVEN, PLACE: "0", "TASKS": "0-999999999"}, "at most 100000"),
     ],
 )
-def test_what_is_no_array_is_named(environment: dict[str, str], message: str) -> None:
-    with pytest.raises(TrilightError, match=message):
-        shards_of_task(environment, _shards(8))
+def test_what_is_no_array_is_named(on: str, environment: dict[str, str], message: str) -> None:
+    with pytest.raises(TrilightError, match=f"--runner {on}: .*{message}"):
+        if on == "slurm":
+            shards_of_task(environment, _shards(8))
+        shards_of_place(environment)
 
 
 def test_an_array_makes_the_dataset_that_one_process_makes(
@@ -91,8 +112,9 @@ def test_an_array_makes_the_dataset_that_one_process_makes(
     assert verify_dataset(tmp_path / "set").problems == []
     one, array = (open_dataset(str(tmp_path / name)) for name in ("one", "set"))
     assert array.digest == one.digest
-    with pytest.raises(TrilightError, match="--shards is 0:2; expected none with --runner slurm"):
-        slurm.make(dataclasses.replace(shared, shards="0:2"), None)
+    for on in ("slurm", "kubernetes"):
+        with pytest.raises(TrilightError, match=f"--shards is 0:2; expected none .* {on}"):
+            find_executor(on, None, None).make(dataclasses.replace(shared, shards="0:2"), None)
 
 
 FAKE = """#!/bin/bash
@@ -245,13 +267,12 @@ def test_what_an_executor_is_and_has_no_use_for() -> None:
         find_executor("slurm", "tcp://a:1", None)
     with pytest.raises(TrilightError, match="--runner is 'thread'; .*threads"):
         find_executor("thread", None, None)
-    homes = (
-        *("executors.threads", "executors.slurm", "executors.kubernetes"),
-        *("flows.on_prefect", "flows.on_dask"),
-    )
     assert set(EXECUTORS) == {"threads", "slurm", "kubernetes", "prefect", "dask"}
-    for home in homes:
-        make = import_module(f"pipeline.{home}").make
+    for name in ("executors.threads:make", "executors.threads:make_slurm",
+                 "executors.threads:make_kubernetes", "flows.flow_executors:make_on_prefect",
+                 "flows.flow_executors:make"):  # fmt: skip
+        home, _, function = name.partition(":")
+        make = getattr(import_module(f"pipeline.{home}"), function)
         assert make.__code__.co_varnames[: make.__code__.co_argcount] == ("options", "address")
 
 
@@ -266,3 +287,100 @@ def test_names_of_executors_load_neither_prefect_nor_the_stages() -> None:
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     )
     assert done.stdout == "[]\n"
+
+
+IMAGE = "registry.example/trilight@sha256:1"
+MISSING = [0, 1, 5, 8]
+"""Shards, two to a task: tasks 0, 2 and 4."""
+Made = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> Made:
+    """Make the manifest of an array of MISSING in a bucket, or of other shards."""
+
+    def make(missing: list[int] = MISSING, **options: Any) -> dict[str, Any]:
+        monkeypatch.setattr(arrays, "_is_begun", lambda place: True)
+        monkeypatch.setattr(arrays, "missing_shards", lambda place, scenes: missing)
+        order = GenerateOptions(
+            build="smoke", scenes=64, out="s3://sets/mine", objects="builtin:", seed=7
+        )
+        job = arrays.array_job(order, per_task=2, at_once=None, on="kubernetes")
+        return job_manifest(job, KubernetesOptions(**{"image": IMAGE, **options}))
+
+    return make
+
+
+def test_every_place_makes_what_is_missing_and_nothing_else(made: Made) -> None:
+    manifest = made()
+    spec = manifest["spec"]
+    assert shards_of_place({**GIVEN, PLACE: "2"}) == "28:32"
+    (container,) = spec["template"]["spec"]["containers"]
+    environment = {row["name"]: row["value"] for row in container["env"]}
+    places = range(spec["completions"])
+    shares = [shards_of_place({**environment, PLACE: str(place)}) for place in places]
+    assert shares == ["0:2", "4:6", "8:10"]
+    assert container["command"] == [
+        *("trilight", "generate", "smoke", "--objects", "builtin:", "--scenes", "64"),
+        *("--seed", "7", "--out", "s3://sets/mine", "--runner", "kubernetes"),
+    ]
+    assert environment["TRILIGHT_CORES"] == "8" and environment["HOME"] == "/tmp"
+    assert made() == manifest
+    assert made([0])["metadata"]["name"] != manifest["metadata"]["name"]
+
+
+def test_kubernetes_takes_the_job(made: Made) -> None:
+    schemas = pytest.importorskip("kubernetes_validate", reason="make setup-all")
+    manifest = made(account="trilight-flow", machine_type="c7i.2xlarge", tries=4)
+    schemas.validate(manifest, "1.37", strict=True)
+    spec = manifest["spec"]
+    # what Kubernetes demands beside its schema of indices that are tried again one by one
+    assert spec["completionMode"] == "Indexed" and spec["backoffLimitPerIndex"] == 3
+    assert spec["parallelism"] == spec["completions"] == 3
+    pod = spec["template"]["spec"]
+    assert pod["restartPolicy"] == "Never"
+    (container,) = pod["containers"]
+    rules = spec["podFailurePolicy"]["rules"]
+    assert [rule["action"] for rule in rules] == ["Ignore", "FailIndex"]
+    assert rules[1]["onExitCodes"]["containerName"] == container["name"]
+    assert manifest["metadata"]["namespace"] == "trilight"
+
+
+def test_the_pod_has_the_rights_of_the_other_manifests(made: Made) -> None:
+    from tests.infra.setup.manifests_kit import job_template
+
+    manifest = job_template()["job_configuration"]["job_manifest"]
+    theirs = manifest["spec"]["template"]["spec"]
+    pod = made()["spec"]["template"]["spec"]
+    (ours,), (other,) = pod["containers"], theirs["containers"]
+    assert pod["securityContext"] == theirs["securityContext"]
+    for name in ("securityContext", "resources", "envFrom", "imagePullPolicy"):
+        assert ours[name] == other[name], name
+    assert {mount["mountPath"] for mount in ours["volumeMounts"]} == {
+        mount["mountPath"] for mount in other["volumeMounts"]
+    }
+    assert not pod["automountServiceAccountToken"]
+
+
+def test_an_image_is_needed(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("TRILIGHT_IMAGE", raising=False)
+    with pytest.raises(TrilightError, match="submit kubernetes: --image is not given"):
+        made(image=None)
+
+
+@for_each(
+    ("asked", "message"),
+    [
+        ({"out": "data/mine"}, "--out is data/mine; expected a bucket"),
+        ({"objects": "chairs"}, "--objects is chairs, a folder of this machine"),
+        ({"objects": "builtin:", "skies": "file:///skies"}, "--skies is file:///skies, a folder"),
+        ({"build": "mine.py:sunsets"}, "mine.py:sunsets, a file of this machine"),
+    ],
+)
+def test_files_of_this_machine_are_refused(asked: dict[str, str], message: str) -> None:
+    given: dict[str, Any] = {"scenes": 8, "out": "gs://sets/mine", **asked}
+    order = GenerateOptions(**given | {"build": "smoke"})
+    object.__setattr__(order, "build", asked.get("build", "smoke"))  # --extend has loaded it
+    job = ArrayJob(options=order, tasks=[0], per_task=1, at_once=1)
+    with pytest.raises(TrilightError, match=f"submit kubernetes: .*{message}"):
+        job_manifest(job, KubernetesOptions(image=IMAGE))

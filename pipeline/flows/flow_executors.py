@@ -1,8 +1,12 @@
-"""`--runner dask`: runs tasks on a Dask cluster, whose workers see the same folder and cache.
+"""`--runner prefect` and `--runner dask`: make a dataset as a flow run of this process.
 
-Each worker process runs its tasks with a render child of its own, so it must be allowed to have
-children: `dask worker ADDRESS --nthreads 1 --no-nanny`, one for each GPU or for each group of cores
-(TRILIGHT_CORES sets how many cores a worker uses).
+Prefect's page shows the run. The server is the one of PREFECT_API_URL; where that is not set, a
+private one for this run. A Dask cluster, whose workers see the same folder and cache, runs the
+tasks of `--runner dask`.
+
+Each worker process of Dask runs its tasks with a render child of its own, so it must be allowed to
+have children: `dask worker ADDRESS --nthreads 1 --no-nanny`, one for each GPU or for each group of
+cores (TRILIGHT_CORES sets how many cores a worker uses).
 """
 
 import contextlib
@@ -11,7 +15,6 @@ import uuid
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from pipeline.flows.on_prefect import as_flow
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.generation_run import Outcome
@@ -22,6 +25,8 @@ from storage.errors import TrilightError
 
 if TYPE_CHECKING:
     from distributed import Client
+
+    from pipeline.flows.prefect_runner import PrefectRunner
 
 _AHEAD = 2
 """Tasks submitted for each thread of the cluster, so that none waits for the next one."""
@@ -40,6 +45,27 @@ def make(options: GenerateOptions, address: str | None) -> Outcome:
         return _make(options, address)
 
 
+def make_on_prefect(options: GenerateOptions, address: str | None) -> Outcome:
+    """Make a dataset here; raises as `make_dataset`, or if the private server does not start."""
+    quiet_prefect()
+    with prefect_server():
+        from pipeline.flows.prefect_runner import PrefectRunner  # Prefect reads settings on import
+
+        return _as_flow(options, PrefectRunner())
+
+
+def _as_flow(options: GenerateOptions, runner: "PrefectRunner", **flow_options: Any) -> Outcome:
+    """Make a dataset as a flow run, with its artifacts; `flow_options` are Prefect's."""
+    from prefect import flow
+
+    from pipeline.flows.prefect_runner import make_with_artifacts
+
+    def generate() -> Outcome:
+        return make_with_artifacts(options, runner)
+
+    return flow(name="generate-scenes", persist_result=False, **flow_options)(generate)()
+
+
 def _make(options: GenerateOptions, address: str) -> Outcome:
     try:
         from prefect_dask import DaskTaskRunner
@@ -55,7 +81,7 @@ def _make(options: GenerateOptions, address: str) -> Outcome:
         _require_shared(client, options)
     runner = PrefectRunner(window=_AHEAD * sum(threads), num_at_once=max(threads))
     try:
-        return as_flow(options, runner, task_runner=DaskTaskRunner(address=address))
+        return _as_flow(options, runner, task_runner=DaskTaskRunner(address=address))
     finally:
         # the workers outlive the run; where the cluster is gone, so are its children
         with contextlib.suppress(TrilightError, OSError), _client(address) as client:
@@ -100,7 +126,6 @@ def _require_shared(client: "Client", options: GenerateOptions) -> None:
     if blind := sorted(worker for worker, sees in seen.items() if not sees):
         raise TrilightError(
             f"{folder.display_name}: {len(blind)} of {len(seen)} Dask workers do not see this "
-            "folder, "
-            f"such as {blind[0]}; expected all to see the same --out at the same place (for a "
-            "bucket, the same TRILIGHT_CACHE). Share it."
+            f"folder, such as {blind[0]}; expected all to see the same --out at the same place "
+            "(for a bucket, the same TRILIGHT_CACHE). Share it."
         )
