@@ -13,8 +13,8 @@ from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadric
-from pipeline.objects.builtin.torus_knot import TorusKnotParams, torus_knot
+from pipeline.objects.builtin.superquadric import superquadric
+from pipeline.objects.builtin.torus_knot import torus_knot
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level
 from storage.records.objects import ObjectRecord
@@ -146,15 +146,11 @@ def cube(cells: int = 1) -> TriangleMesh:
 def sphere(rings: int = 15, columns: int = 24) -> TriangleMesh:
     """A closed ellipsoid of 2 rings columns faces, without symmetry of its axes."""
     positions, faces = superquadric(
-        SuperquadricParams(
-            exponent_profile=1.0,
-            exponent_plan=1.0,
-            half_sizes=(1.0, 0.8, 0.6),
-            taper=0.0,
-            twist_rad=0.0,
-            rings=rings,
-            columns=columns,
-        )
+        exponent_profile=1.0,
+        exponent_plan=1.0,
+        half_sizes=(1.0, 0.8, 0.6),
+        rings=rings,
+        columns=columns,
     )
     return TriangleMesh(positions=positions, faces=faces)
 
@@ -162,17 +158,15 @@ def sphere(rings: int = 15, columns: int = 24) -> TriangleMesh:
 def knot(segments: int = 160, sides: int = 12) -> TriangleMesh:
     """A trefoil of 2 segments sides faces: no symmetric axes, and it hides parts of itself."""
     positions, faces = torus_knot(
-        TorusKnotParams(
-            windings=(2, 3),
-            minor_radius=0.45,
-            fill=0.6,
-            ribs=3,
-            rib_depth=0.4,
-            rib_turns=1,
-            flatten=0.8,
-            segments=segments,
-            sides=sides,
-        )
+        windings=(2, 3),
+        minor_radius=0.45,
+        fill=0.6,
+        ribs=3,
+        rib_depth=0.4,
+        rib_turns=1,
+        flatten=0.8,
+        segments=segments,
+        sides=sides,
     )
     return TriangleMesh(positions=positions, faces=faces)
 

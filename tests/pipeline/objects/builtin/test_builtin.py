@@ -1,7 +1,7 @@
 """Laws of all built-in families, the digests of their first objects, and volumes known on paper."""
 
 import itertools
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -9,8 +9,8 @@ import pytest
 from pipeline.objects.builtin.grids import Mesh
 from pipeline.objects.builtin.lattice import LatticeParams, lattice
 from pipeline.objects.builtin.shell import ShellParams, shell
-from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadric
-from pipeline.objects.builtin.torus_knot import TorusKnotParams, torus_knot
+from pipeline.objects.builtin.superquadric import superquadric
+from pipeline.objects.builtin.torus_knot import torus_knot
 from pipeline.objects.generated import FAMILIES
 from storage.digests import sha256_hex
 from storage.seeds import rng_for
@@ -136,28 +136,22 @@ def _require_no_floating_part(parts: list[Mesh]) -> None:
     ],
 )
 def test_superquadrics_have_known_volumes(exponent: float, share: float, tolerance: float) -> None:
-    params = SuperquadricParams(
+    mesh = superquadric(
         exponent_profile=exponent,
         exponent_plan=exponent,
         half_sizes=(1.0, 0.8, 0.5),
-        taper=0.0,
-        twist_rad=0.0,
         rings=63,
         columns=64,
     )
     expected = share * 2.0 * 1.6 * 1.0
-    assert volume(superquadric(params)) == pytest.approx(expected, rel=tolerance)
+    assert volume(mesh) == pytest.approx(expected, rel=tolerance)
 
 
-def _ring(windings: tuple[int, int], segments: int, sides: int) -> TorusKnotParams:
-    return TorusKnotParams(
-        windings=windings, minor_radius=0.4, fill=0.95, ribs=0, rib_depth=0.3, rib_turns=0,
-        flatten=1.0, segments=segments, sides=sides,
-    )  # fmt: skip
+_ring = partial(torus_knot, minor_radius=0.4, fill=0.95)
 
 
 def test_the_unknot_is_a_torus_of_known_volume() -> None:
-    positions, faces = torus_knot(_ring((1, 0), 256, 48))
+    positions, faces = _ring(windings=(1, 0), segments=256, sides=48)
     tube = (np.ptp(positions[:, 2])) / 2
     centre = 1.4
     # Pappus: area of the section times the way of its centre; 48-gons miss 0.3 %.
@@ -167,7 +161,7 @@ def test_the_unknot_is_a_torus_of_known_volume() -> None:
 
 @for_each("windings", [(2, 3), (3, 2), (2, 5), (3, 4), (1, 5), (4, 3), (5, 2)])
 def test_strands_of_a_knot_do_not_meet(windings: tuple[int, int]) -> None:
-    positions, _ = torus_knot(_ring(windings, 240, 8))
+    positions, _ = _ring(windings=windings, segments=240, sides=8)
     rings = positions.reshape(240, 8, 3)
     centre = rings.mean(axis=1)
     tube = np.linalg.norm(rings - centre[:, None], axis=2).max()
