@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.attempt import AssetAttempt
 from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalize
 from pipeline.assets.cleaning.guards import check_clean, check_raw
 from pipeline.assets.cleaning.orient import orient_outward
@@ -18,6 +17,7 @@ from pipeline.assets.quality.triangles import count_edges
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.source_materials.skin import add_source_materials
+from pipeline.assets.stage import AssetAttempt
 from pipeline.assets.watertight import LevelBase, make_watertight
 from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
