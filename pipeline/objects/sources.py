@@ -153,7 +153,7 @@ class ListedObjects:
     ) -> FoundObjects:
         """Download the selected objects and return them with the failures.
 
-        Downloads stay in the user's cache (`storage.cache`; Objaverse in the folder of its own
+        Downloads stay in the user's cache (`storage.cache`; Objaverse in the folder of its
         package) and are not repeated.
 
         Args:
