@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalize
 from pipeline.assets.cleaning.guards import check_clean, check_raw
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.decimation.decimate import decimate, safe_method
-from pipeline.assets.decimation.smallest import smallest_passing
+from pipeline.assets.decimation.decimate import decimate, safe_method, smallest_passing
 from pipeline.assets.quality.level_checks import check_level, require_watertight
 from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.assets.quality.triangles import count_edges

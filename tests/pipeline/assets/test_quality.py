@@ -7,11 +7,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pipeline.assets.quality.components import Components, label_components
 from pipeline.assets.quality.distance import Surface, sample_surface
 from pipeline.assets.quality.level_checks import check_level
-from pipeline.assets.quality.measure import MeasuredSource
-from pipeline.assets.quality.silhouette import intersection_over_union, silhouette
+from pipeline.assets.quality.measure import (
+    Components,
+    MeasuredSource,
+    intersection_over_union,
+    label_components,
+    silhouette,
+)
 from pipeline.assets.quality.triangles import area_variation, count_edges, smallest_angles_deg
 from pipeline.assets.settings import GateSettings
 from pipeline.foreign.mesh import TriangleMesh

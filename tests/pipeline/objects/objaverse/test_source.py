@@ -194,9 +194,7 @@ def test_mistakes_in_a_file_of_uids(
 
 
 @for_each("status, message", [(404, "no such file"), (500, "status 500")])
-def test_a_dead_link_costs_one_object(
-    site: Site, place: Path, status: int, message: str
-) -> None:
+def test_a_dead_link_costs_one_object(site: Site, place: Path, status: int, message: str) -> None:
     site.always = {glb("d"): Fault(status=status)}
     found = find("category/chair,vase")
     assert found_names(found) == [name for name in FREE if name in "ac"]
