@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import cell_keys, normalize
-from pipeline.foreign.material import MaterialSamples, Slot, SourceMaterial, source_columns
+from pipeline.foreign.material import Slot, SourceMaterial, source_columns
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.textured_mesh import TexturedMesh
 from storage.errors import Rejected
@@ -158,28 +158,19 @@ class SourceSurface:
     ) -> NDArray[np.float64]:
         known: dict[tuple[object, ...], NDArray[np.float32]] = {}
 
-        def sample(slot: Slot | None) -> NDArray[np.float32] | None:
-            if slot is None:
-                return None
+        def sample(slot: Slot) -> NDArray[np.float32]:
             place = slot.uv_matrix.tobytes(), slot.uv_offset.tobytes()
             key = id(slot.picture), slot.uv_set, place
             if key not in known:  # one picture often holds several numbers
                 known[key] = self._sample_picture(slot, source_face, source_weights, cell)
             return known[key]
 
-        base = sample(material.base)
+        seen = {name: sample(slot) for name, slot in material.column_slots.items()}
         if self.parts.color is not None:
             tint = np.einsum("nc,ncd->nd", source_weights, self.parts.color[source_face])
-            base = np.ones((len(source_face), 4), np.float32) if base is None else base
-            base = np.concatenate([base[:, :3] * tint, base[:, 3:]], axis=1).astype(np.float32)
-        seen = MaterialSamples(
-            base=base,
-            metallic=sample(material.metallic_map),
-            roughness=sample(material.roughness_map),
-            specular_colour=sample(material.specular_colour),
-            specular_strength=sample(material.specular_strength_map),
-            glossiness=sample(material.glossiness),
-        )
+            base = seen.get("base", np.ones((len(source_face), 4), np.float32))
+            tinted = np.concatenate([base[:, :3] * tint, base[:, 3:]], axis=1)
+            seen["base"] = tinted.astype(np.float32)
         return source_columns(material, seen, len(source_face))
 
     def _sample_picture(
