@@ -3,12 +3,13 @@
 The Fresnel term becomes albedos that are the same at every angle (storage.optics.fresnel).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.picture import Picture
 from storage.optics.fresnel import constant_albedos
 
@@ -150,3 +151,20 @@ def source_columns(
     if material.has_fresnel:
         diffuse, specular = constant_albedos(base, metal, dielectric, grazing)
     return np.concatenate([diffuse, specular, np.clip(rough, least_roughness, 1)], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TexturedMesh:
+    """The triangles of a source, those of `load_mesh`, with their materials."""
+
+    mesh: TriangleMesh
+    material: NDArray[np.int64]
+    """[F] index into `materials` of each face."""
+    materials: Sequence[SourceMaterial]
+    uv: NDArray[np.float64]
+    """[F, S, 3, 2] texture coordinates of corners by set S, v up; NaN where there are none."""
+    tangent: NDArray[np.float64] | None = None
+    """[F, 3, 4] tangent of each corner, and the sign of its bitangent, where the file states them;
+    NaN where it does not."""
+    color: NDArray[np.float64] | None = None
+    """[F, 3, 3] linear tint of each corner, multiplied with the base color; None for white."""

@@ -13,12 +13,12 @@ from pipeline.assets.source_materials.source_surface import SourceSurface, match
 from pipeline.assets.source_materials.texture_quality import skin_quality
 from pipeline.foreign.gltf.materials import GltfMaterials
 from pipeline.foreign.gltf.objects import gltf_textured_mesh
+from pipeline.foreign.material import TexturedMesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.mesh_materials import read_textured_mesh
 from pipeline.foreign.numbers import FINITE
 from pipeline.foreign.picture import Decode, Decoder
 from pipeline.foreign.source_file import SourceFile
-from pipeline.foreign.textured_mesh import TexturedMesh
 from pipeline.foreign.usd.materials import usd_textured_mesh
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import cell_keys, normalize
-from pipeline.foreign.material import Slot, SourceMaterial, source_columns
+from pipeline.foreign.material import Slot, SourceMaterial, TexturedMesh, source_columns
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.textured_mesh import TexturedMesh
 from storage.errors import Rejected
 from storage.records.normal_map import LEAST_Z, u_directions, unit_or_zero
 

@@ -8,9 +8,8 @@ from pipeline.foreign.gltf.document import GltfDocument, refuse_malformed
 from pipeline.foreign.gltf.materials import DEFAULT, GltfMaterials
 from pipeline.foreign.gltf.nodes import placed_meshes
 from pipeline.foreign.gltf.primitives import PlacedPrimitive, placed_primitives
-from pipeline.foreign.material import MOST_UV_SETS
+from pipeline.foreign.material import MOST_UV_SETS, TexturedMesh
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.textured_mesh import TexturedMesh
 from storage.errors import Rejected
 
 

@@ -16,11 +16,11 @@ from pipeline.foreign.material import (
     WHITE,
     Slot,
     SourceMaterial,
+    TexturedMesh,
     with_normal_map,
 )
 from pipeline.foreign.picture import Decode, Picture, has_colors
-from pipeline.foreign.textured_mesh import TexturedMesh
-from pipeline.foreign.usd.object_source import UsdSource
+from pipeline.foreign.usd.object_source import StageMaterials, UsdSource, name_unsupported
 from pipeline.foreign.usd.polygons import CutMesh
 from pipeline.foreign.usd.shaders import (
     IOR_OF_CONSTANT_ALBEDOS,
@@ -29,7 +29,6 @@ from pipeline.foreign.usd.shaders import (
     read_colors,
     reflect_head_on,
 )
-from pipeline.foreign.usd.stage_materials import StageMaterials, name_unsupported
 from pipeline.foreign.usd.texture_nodes import TextureNode
 from storage.errors import Rejected
 
