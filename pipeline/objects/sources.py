@@ -123,15 +123,6 @@ class FoundObjects:
     """Failures of the stage `objects`, sorted by uid: licence_refused, download_failed,
     too_large_bytes, too_many_buffers, unsafe_name, unknown_uid, link_outside, name_clash."""
 
-    @property
-    def num_found(self) -> int:
-        """Number of objects in the source."""
-        return len(self.records) + len(self.failures)
-
-
-def _ignore_progress(done: int, total: int) -> None:
-    """Show no progress."""
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ListedObjects:
@@ -149,7 +140,7 @@ class ListedObjects:
     def fetch_selected(
         self,
         is_selected: Callable[[str], bool] = lambda uid: True,
-        downloaded: CountDone = _ignore_progress,
+        downloaded: CountDone = lambda done, total: None,
     ) -> FoundObjects:
         """Download the selected objects and return them with the failures.
 
@@ -237,7 +228,7 @@ def find_objects(
     work_dir: Path,
     allowed_licences: Sequence[str],
     licence: str | None = None,
-    downloaded: CountDone = _ignore_progress,
+    downloaded: CountDone = lambda done, total: None,
 ) -> FoundObjects:
     """List a source and download all its usable objects; raises as `list_objects`."""
     listed = list_objects(
