@@ -79,7 +79,7 @@ def _facts(
         num_faces_read=len(raw.faces),
         num_faces=len(source.mesh.faces),
         num_faces_turned=_count_flipped(cleaned, source.mesh),
-        num_parts=source.components.count,
+        num_parts=source.num_components,
         open_edges=edges.open,
         nonmanifold_edges=edges.nonmanifold,
         front_share=round(front_share, 6),

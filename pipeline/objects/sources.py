@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 
+from pipeline.foreign.limits import SUFFIXES
 from pipeline.objects.generated import generate_objects, num_builtin
 from pipeline.objects.licences import (
     check_allowed,
@@ -19,7 +20,7 @@ from pipeline.objects.licences import (
     require_unstated,
     stated_licence,
 )
-from pipeline.objects.listing import SUFFIXES, CountDone, Fetched, Listing
+from pipeline.objects.listing import CountDone, Fetched, Listing
 from pipeline.objects.local.folder import list_folder
 from pipeline.objects.objaverse.source import list_objaverse
 from pipeline.objects.remote.source import list_remote

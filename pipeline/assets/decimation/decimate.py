@@ -1,7 +1,6 @@
 """Decimation of meshes by named methods, and the search for the smallest budget that passes."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import TypeVar
 
 import igl
@@ -32,32 +31,16 @@ _FEWEST = 4
 """Faces of the smallest closed surface."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Decimation:
-    """A decimation method."""
-
-    run: Callable[[TriangleMesh, int], TriangleMesh]
-    """Returns a mesh of about the given number of faces; raises Rejected."""
-    always_ends: bool
-    """True where the method ends on every mesh."""
-
-
-def _simplify_first(mesh: TriangleMesh, budget: int) -> TriangleMesh:
-    if len(mesh.faces) > 1.25 * _DETOUR * budget:
-        return clean(meshopt.simplify(mesh, _DETOUR * budget))
-    return mesh
-
-
 def _remesh_evenly(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     from pipeline.assets.decimation import pymeshlab_filters  # may not be installed
 
-    return pymeshlab_filters.remesh_evenly(_simplify_first(mesh, budget), budget)
+    return pymeshlab_filters.remesh_evenly(mesh, budget)
 
 
 def _collapse(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     from pipeline.assets.decimation import pymeshlab_filters  # may not be installed
 
-    return pymeshlab_filters.collapse(_simplify_first(mesh, budget), budget)
+    return pymeshlab_filters.collapse(mesh, budget)
 
 
 def collapse_by_qslim(mesh: TriangleMesh, budget: int) -> TriangleMesh:
@@ -75,28 +58,29 @@ def collapse_by_qslim(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     )
 
 
-DECIMATIONS: Mapping[str, Decimation] = {
-    "pymeshlab_uniform": Decimation(run=_remesh_evenly, always_ends=False),
-    "pymeshlab_collapse": Decimation(run=_collapse, always_ends=False),
-    "libigl_qslim": Decimation(
-        run=lambda mesh, budget: collapse_by_qslim(_simplify_first(mesh, budget), budget),
-        always_ends=True,
-    ),
-    "libigl_qslim_alone": Decimation(run=collapse_by_qslim, always_ends=True),
-    "meshoptimizer": Decimation(run=meshopt.simplify, always_ends=True),
-    "meshoptimizer_sloppy": Decimation(run=meshopt.simplify_sloppily, always_ends=True),
+_METHODS: Mapping[str, Callable[[TriangleMesh, int], TriangleMesh]] = {
+    "pymeshlab_uniform": _remesh_evenly,
+    "pymeshlab_collapse": _collapse,
+    "libigl_qslim": collapse_by_qslim,
+    "libigl_qslim_alone": collapse_by_qslim,
+    "meshoptimizer": meshopt.simplify,
+    "meshoptimizer_sloppy": meshopt.simplify_sloppily,
 }
 """Methods by the names that `recipe.methods_of` lists in order of trial."""
+_MAY_HANG = ("pymeshlab_uniform", "pymeshlab_collapse")
+_AFTER_MESHOPTIMIZER = (*_MAY_HANG, "libigl_qslim")
 
 
 def decimate(mesh: TriangleMesh, budget: int, method: str) -> TriangleMesh:
     """Return a mesh of about `budget` faces by a method of `recipe.methods_of`; raises Rejected."""
-    return DECIMATIONS[method].run(mesh, budget)
+    if method in _AFTER_MESHOPTIMIZER and len(mesh.faces) > 1.25 * _DETOUR * budget:
+        mesh = clean(meshopt.simplify(mesh, _DETOUR * budget))
+    return _METHODS[method](mesh, budget)
 
 
 def safe_method(mesh: TriangleMesh, method: str) -> str:
     """Return `method`, or `meshoptimizer` where that method might not end on the mesh."""
-    if DECIMATIONS[method].always_ends:
+    if method not in _MAY_HANG:
         return method
     valence = np.bincount(mesh.faces.ravel()).max()
     wild = valence > _MAX_VALENCE or count_edges(mesh).most_faces > _MAX_FACES_PER_EDGE

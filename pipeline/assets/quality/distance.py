@@ -1,8 +1,8 @@
 """Two-way (Hausdorff) distance of two surfaces, by evenly spread points and exact distances.
 
 The quality check uses the 99th percentile: one vertex decides the largest value, and a mean accepts
-almost anything. A component with less than one percent of the area escapes it; `Components`
-checks those.
+almost anything. A component with less than one percent of the area escapes it;
+`MeasuredSource` checks those.
 """
 
 from dataclasses import dataclass

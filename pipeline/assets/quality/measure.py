@@ -41,7 +41,11 @@ class MeasuredSource:
         """Sample a clean mesh of the unit box."""
         self.mesh = mesh
         self.surface = Surface(mesh, rng_for(0, "asset-error").random((_NUM_POINTS, 3)))
-        self.components = Components(self.surface)
+        component = label_components(mesh)
+        self._component = component[self.surface.points.faces]
+        extents = _diagonals(mesh, component) / mesh.diagonal
+        self.num_components = len(extents)
+        self._lost_beyond = np.maximum(_OWN_SIZE * extents, _VISIBLE)[self._component]
         self._silhouette = silhouette(mesh)
         self._area = _area(mesh)
 
@@ -52,6 +56,20 @@ class MeasuredSource:
     def silhouette_iou(self, result: TriangleMesh) -> float:
         """Return the intersection over union of the outlines, 0 to 1."""
         return intersection_over_union(self._silhouette, silhouette(result))
+
+    def _lost_area(self, distances: NDArray[np.float64]) -> float:
+        """Return the fraction of the source's area in lost components.
+
+        Args:
+            distances: [N] from each sample point to the result, as a fraction of the diagonal.
+
+        A component without a sample point (below about 1/8000 of the area) never counts as lost.
+        """
+        count = self.num_components
+        is_far = distances > self._lost_beyond
+        far = np.bincount(self._component, weights=is_far, minlength=count)
+        points = np.bincount(self._component, minlength=count)
+        return float(points[2 * far > points].sum() / points.sum())
 
     def source_quality(self) -> LevelQuality:
         """Return the measures of the unchanged source as a level: the error is exactly 0."""
@@ -68,7 +86,7 @@ class MeasuredSource:
             normal_error_deg=round_digits(measured.angle_deg.mean()),
             area_ratio=round_digits(self.area_ratio(result)),
             silhouette_iou=round_digits(self.silhouette_iou(result)),
-            lost_area=round_digits(self.components.lost_area(measured.to_other)),
+            lost_area=round_digits(self._lost_area(measured.to_other)),
             area_variation=round_digits(area_variation(result)),
             min_angle_p5_deg=round_digits(np.percentile(smallest_angles_deg(result), 5)),
             open_edges=count_edges(result).open,
@@ -84,31 +102,9 @@ def label_components(mesh: TriangleMesh) -> NDArray[np.int64]:
     return np.asarray(igl.facet_components(mesh.faces)[1], np.int64)
 
 
-class Components:
-    """The components of a source, and the sample points on each."""
-
-    def __init__(self, surface: Surface) -> None:
-        part = label_components(surface.mesh)
-        self.count = int(part.max()) + 1
-        self._part_of_point = part[surface.points.faces]
-        self._extent = _diagonals(surface.mesh, part, self.count) / surface.mesh.diagonal
-
-    def lost_area(self, distances: NDArray[np.float64]) -> float:
-        """Return the fraction of the source's area in lost components.
-
-        Args:
-            distances: [N] from each sample point to the result, as a fraction of the diagonal.
-
-        A component without a sample point (below about 1/8000 of the area) never counts as lost.
-        """
-        limit = np.maximum(_OWN_SIZE * self._extent, _VISIBLE)[self._part_of_point]
-        far = np.bincount(self._part_of_point, weights=distances > limit, minlength=self.count)
-        points = np.bincount(self._part_of_point, minlength=self.count)
-        return float(points[2 * far > points].sum() / points.sum())
-
-
-def _diagonals(mesh: TriangleMesh, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
+def _diagonals(mesh: TriangleMesh, part: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return [P] diagonals of the bounding box of each component."""
+    count = int(part.max()) + 1
     low = np.full((count, 3), np.inf)
     high = np.full((count, 3), -np.inf)
     for corner in mesh.corners.transpose(1, 0, 2):

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.cleaning.clean import cell_keys, normalize
+from pipeline.assets.cleaning.clean import cell_keys, normalize, start_at_lowest
 from pipeline.foreign.material import Slot, SourceMaterial, TexturedMesh, source_columns
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
@@ -251,17 +251,12 @@ def match_source_surface(mesh: TriangleMesh, parts: TexturedMesh) -> SourceSurfa
 
 def _first_matches(faces: NDArray[np.int64], candidates: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the first candidate equal to each face up to rotation of its corners, or -1."""
-    rows = np.concatenate([_start_at_lowest(candidates), _start_at_lowest(faces)])
+    rows = np.concatenate([start_at_lowest(candidates), start_at_lowest(faces)])
     _, number = np.unique(rows, axis=0, return_inverse=True)
     first = np.full(int(number.max()) + 1, len(candidates))
     np.minimum.at(first, number.ravel()[: len(candidates)], np.arange(len(candidates)))
     first_match = first[number.ravel()[len(candidates) :]]
     return np.where(first_match < len(candidates), first_match, -1)
-
-
-def _start_at_lowest(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    corner_order = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
-    return np.take_along_axis(faces, corner_order, axis=1)
 
 
 def _nearest_matched(

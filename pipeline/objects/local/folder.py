@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from pipeline.foreign.limits import SUFFIXES
 from pipeline.objects.file_filters import (
     drop_duplicates,
     drop_outputs,
@@ -12,7 +13,7 @@ from pipeline.objects.file_filters import (
     warn_unread_formats,
 )
 from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
-from pipeline.objects.listing import SUFFIXES, Listing, assign_uids, failure, is_object_file
+from pipeline.objects.listing import Listing, assign_uids, failure, is_object_file
 from pipeline.objects.local.catalogue import only_catalogue, read_catalogue
 from storage.errors import Rejected, TrilightError
 from storage.records.objects import ObjectRecord

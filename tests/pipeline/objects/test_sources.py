@@ -11,11 +11,9 @@ from typing import Any
 
 import pytest
 
-from pipeline.foreign.source_file import SUFFIXES as READABLE
 from pipeline.objects.file_filters import drop_duplicates, drop_outputs, drop_scenes, warn_once
 from pipeline.objects.generated import FAMILIES
 from pipeline.objects.licences import DEFAULT_ALLOWED, USER_PROVIDED, refuse_licences
-from pipeline.objects.listing import SUFFIXES
 from pipeline.objects.local.folder import list_folder
 from pipeline.objects.maps.listing import find_maps
 from storage.errors import TrilightError
@@ -37,11 +35,6 @@ def listed(folder: Path, **options: Any) -> list[ObjectRecord]:
 
 def uids_of(folder: Path) -> list[str]:
     return [record.uid for record in listed(folder)]
-
-
-def test_what_is_listed_is_what_is_read() -> None:
-    """Stages do not import each other, so the list of formats stands in both."""
-    assert SUFFIXES == READABLE
 
 
 def test_a_folder_is_listed_at_any_depth_in_order(tmp_path: Path) -> None:
