@@ -207,15 +207,6 @@ def test_a_dead_link_costs_one_object(site: Site, place: Path, status: int, mess
     (place / glb("d")[1:]).unlink()
 
 
-def test_what_may_pass_is_tried_again(site: Site, place: Path) -> None:
-    site.faults = {
-        glb("a"): [Fault(status=500), Fault(status=503)],
-        "/object-paths.json.gz": [Fault(status=503)],
-        "/metadata/000-000.json.gz": [Fault(status=500)],
-    }
-    assert found_names(find(UID["a"])) == ["a"]
-
-
 def test_damaged_metadata_is_fetched_again(site: Site, place: Path) -> None:
     whole = find("category/vase,chair")
     damages: list[Callable[[bytes], bytes]] = [
@@ -230,15 +221,6 @@ def test_damaged_metadata_is_fetched_again(site: Site, place: Path) -> None:
         site.requests.clear()
         assert find("category/vase,chair") == whole
         assert dict(site.gets()) == {f"/{name}": 1}
-
-
-def test_a_transfer_that_breaks_leaves_nothing_broken(site: Site, place: Path) -> None:
-    site.always = {"/metadata/000-000.json.gz": Fault(cut_after=30), glb("b"): Fault(cut_after=3)}
-    found = find(f"{UID['a']},{UID['b']},{UID['c']}")
-    assert found_names(found) == ["c"]
-    assert reasons(found) == {"a": "download_failed", "b": "download_failed"}
-    site.always.clear()
-    assert set(found_names(find(f"{UID['a']},{UID['b']},{UID['c']}"))) == {"a", "b", "c"}
 
 
 def test_no_server_at_all(site: Site, place: Path) -> None:
