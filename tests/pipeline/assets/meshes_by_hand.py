@@ -18,6 +18,7 @@ from pipeline.objects.builtin.torus_knot import torus_knot
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level
 from storage.records.objects import ObjectRecord
+from tests.pipeline.foreign.gltf.gltf_writer import GltfWriter
 
 
 def record_of(path: Path, uid: str = "object") -> ObjectRecord:
@@ -216,26 +217,15 @@ def write_ply(path: Path, mesh: TriangleMesh) -> Path:
 
 def gltf_tree(mesh: TriangleMesh) -> tuple[dict[str, Any], bytes]:
     """A glTF of one node, and its buffer; tests then break the tree in one place."""
+    file = GltfWriter()
     upright = mesh.positions[:, [0, 2, 1]] * [1, 1, -1]  # glTF has +Y up, we have +Z
-    points = upright.astype("<f4").tobytes()
-    indices = mesh.faces.astype("<u4").tobytes()
-    tree = {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": len(mesh.positions), "type": "VEC3"},
-            {"bufferView": 1, "componentType": 5125, "count": mesh.faces.size, "type": "SCALAR"},
-        ],
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": 0, "byteLength": len(points)},
-            {"buffer": 0, "byteOffset": len(points), "byteLength": len(indices)},
-        ],
-        "buffers": [{"byteLength": len(points) + len(indices)}],
-    }
-    return tree, points + indices
+    attributes = {"POSITION": file.accessor(upright, "f4")}
+    indices = file.accessor(mesh.faces.ravel(), "u4")
+    file.add("meshes", {"primitives": [{"attributes": attributes, "indices": indices}]})
+    file.add("nodes", {"mesh": 0})
+    file.add("scenes", {"nodes": [0]})
+    file.tree["buffers"] = [{"byteLength": len(file.data)}]
+    return file.tree, bytes(file.data)
 
 
 def write_glb(path: Path, tree: dict[str, Any], buffer: bytes) -> Path:
