@@ -4,7 +4,7 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.quality.distance import sample_surface
+from pipeline.assets.quality.measure import sample_surface
 from pipeline.assets.quality.triangles import round_digits, unit_normals
 from pipeline.assets.source_materials.bake import DIFFUSE, BakedTextures
 from pipeline.assets.source_materials.nearest import SurfaceLookup, barycentric

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.assets.decimation.decimate import decimate, safe_method, smallest_passing
 from pipeline.assets.decimation.pymeshlab_filters import REQUIRED_FILTERS, pymeshlab
-from pipeline.assets.quality.distance import Surface
+from pipeline.assets.quality.measure import Surface
 from pipeline.assets.recipe import methods_of, missing_filters
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import GRID
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.quality.distance import Surface
+from pipeline.assets.quality.measure import Surface
 from pipeline.assets.recipe import RECIPE, methods_of
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh

@@ -7,12 +7,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pipeline.assets.quality.distance import Surface, sample_surface
 from pipeline.assets.quality.level_checks import check_level
 from pipeline.assets.quality.measure import (
     MeasuredSource,
+    Surface,
     intersection_over_union,
     label_components,
+    sample_surface,
     silhouette,
 )
 from pipeline.assets.quality.triangles import area_variation, count_edges, smallest_angles_deg

@@ -14,8 +14,8 @@ from pipeline.objects.maps.prepared import (
     decode_prepared,
     prepare_map,
     texture_set,
+    usable_map,
 )
-from pipeline.objects.maps.radiance import usable_map
 from pipeline.objects.maps.resample import area_means, flux, solid_angle_means
 from pipeline.objects.maps.texture_names import _parse_name, group_textures
 from storage.conventions import linear_from_srgb8
