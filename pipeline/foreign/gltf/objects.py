@@ -9,7 +9,7 @@ from pipeline.foreign.gltf.materials import DEFAULT, GltfMaterials
 from pipeline.foreign.gltf.nodes import placed_meshes
 from pipeline.foreign.gltf.primitives import PlacedPrimitive, placed_primitives
 from pipeline.foreign.material import MOST_UV_SETS, TexturedMesh
-from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.mesh import TriangleMesh, join_meshes
 from storage.errors import Rejected
 
 
@@ -72,9 +72,6 @@ def _list_primitives(document: GltfDocument) -> list[PlacedPrimitive]:
 def _join_primitives(primitives: Sequence[PlacedPrimitive]) -> TriangleMesh:
     if not any(len(instance.faces) for instance in primitives):
         raise Rejected("no_faces", "the file holds no triangles, or no node shows them")
-    starts = np.cumsum([0, *(len(instance.positions) for instance in primitives)])
-    faces = [instance.faces + start for instance, start in zip(primitives, starts, strict=False)]
-    return TriangleMesh(
-        positions=np.concatenate([instance.positions for instance in primitives]),
-        faces=np.concatenate(faces),
+    return join_meshes(
+        [TriangleMesh(positions=each.positions, faces=each.faces) for each in primitives]
     )

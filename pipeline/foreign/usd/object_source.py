@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material_files import MaterialFiles
-from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.mesh import TriangleMesh, join_meshes
 from pipeline.foreign.usd.placed import PlacedPrim, placed_prims
 from pipeline.foreign.usd.polygons import CutMesh, cut_mesh, mesh_polygons, place_points
 from pipeline.foreign.usd.shaders import StatedMaterial, read_bindings, read_material
@@ -282,13 +282,12 @@ class UsdSource:
     @cached_property
     def mesh(self) -> TriangleMesh:
         """Return all meshes as one, unwelded, in meters, +Z up; raises Rejected as `meshes`."""
-        starts = np.cumsum([0, *(len(part.points) for part in self.meshes)])
-        faces = [
-            part.cut.indices[part.cut.corners] + start
-            for part, start in zip(self.meshes, starts[:-1], strict=True)
-        ]
-        positions = np.concatenate([part.points for part in self.meshes])
-        return TriangleMesh(positions=positions, faces=np.concatenate(faces))
+        return join_meshes(
+            [
+                TriangleMesh(positions=part.points, faces=part.cut.indices[part.cut.corners])
+                for part in self.meshes
+            ]
+        )
 
     def materials(self) -> StageMaterials:
         """Return the materials; raises Rejected as `read_stage_materials`, or no_materials."""

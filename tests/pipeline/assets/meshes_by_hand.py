@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings
-from pipeline.foreign.mesh import TriangleMesh
+from pipeline.foreign.mesh import TriangleMesh, join_meshes
 from pipeline.objects.builtin.superquadric import superquadric
 from pipeline.objects.builtin.torus_knot import torus_knot
 from storage.errors import Rejected
@@ -92,11 +92,7 @@ def geometry(asset: Asset) -> bytes:
 
 def joined(*meshes: TriangleMesh) -> TriangleMesh:
     """All of them as one mesh."""
-    starts = np.cumsum([0, *(len(mesh.positions) for mesh in meshes)])
-    return TriangleMesh(
-        positions=np.concatenate([mesh.positions for mesh in meshes]),
-        faces=np.concatenate([m.faces + k for m, k in zip(meshes, starts[:-1], strict=True)]),
-    )
+    return join_meshes(meshes)
 
 
 def moved(mesh: TriangleMesh, scale: ArrayLike = 1.0, offset: ArrayLike = 0.0) -> TriangleMesh:
