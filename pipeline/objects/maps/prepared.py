@@ -57,18 +57,6 @@ _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "TGA", "WEBP")
 _MOST = {"I;16": 65535, "I;16L": 65535, "I;16B": 65535, "I": 65535}
 
 
-@dataclass(frozen=True, kw_only=True)
-class MapFiles:
-    """The files of a texture or map, and its largest size."""
-
-    kind: str
-    """Kind of the map: TEXTURE or SKY."""
-    files: Mapping[str, Path]
-    """Picture files by component; a map has one, "map"."""
-    size: int
-    """Most texels along a side of a texture; most rows of a map."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PreparedMap:
     """A prepared texture or map."""
@@ -90,28 +78,32 @@ def decode_prepared(data: bytes, name: str) -> PreparedMap:
     return PreparedMap(content_sha256=metadata["content"], arrays=arrays)
 
 
-def map_cache_key(map_files: MapFiles) -> str:
-    """Return the cache key of the outcome: a digest of the files, the size and the recipe.
+def map_cache_key(kind: str, files: Mapping[str, Path], size: int) -> str:
+    """Return the cache key of the outcome of `prepare_map`: a digest of the files and the rest.
 
     Raises:
         Rejected: missing_file, too_large_bytes.
     """
-    digests = {part: sha256_hex(_read(path)) for part, path in map_files.files.items()}
-    parts = [map_files.kind, digests, map_files.size, _RECIPE]
-    return sha256_hex(canonical_json(parts))[:32]
+    digests = {part: sha256_hex(_read(path)) for part, path in files.items()}
+    return sha256_hex(canonical_json([kind, digests, size, _RECIPE]))[:32]
 
 
-def prepare_map(map_files: MapFiles) -> tuple[bytes, tuple[str, ...]]:
+def prepare_map(kind: str, files: Mapping[str, Path], size: int) -> tuple[bytes, tuple[str, ...]]:
     """Return the file of a texture or map, and notes on unread parts; for child processes.
+
+    Args:
+        kind: TEXTURE or SKY.
+        files: picture files by component; a map has one, "map".
+        size: most texels along a side of a texture; most rows of a map.
 
     Raises:
         Rejected: the reason and a remedy; see `usable_map`, `texture_set` and the readers.
     """
-    if map_files.kind == SKY:
-        return _prepare_sky(_read(map_files.files["map"]), map_files.size)
+    if kind == SKY:
+        return _prepare_sky(_read(files["map"]), size)
     pictures: dict[str, NDArray[np.float32]] = {}
     unread: list[str] = []
-    for part, path in sorted(map_files.files.items()):
+    for part, path in sorted(files.items()):
         values, notes = _picture_of(part, path)
         unread += [f"{note} of its {part}" for note in notes]
         if packed_channels(part) and values.shape[2] < 3:
@@ -121,7 +113,7 @@ def prepare_map(map_files: MapFiles) -> tuple[bytes, tuple[str, ...]]:
         raise Rejected(
             "unknown_map", "its values are unit vectors, as of a normal map; end it in _normal"
         )
-    return texture_set(unpack_parts(pictures), map_files.size).encode(), tuple(unread)
+    return texture_set(unpack_parts(pictures), size).encode(), tuple(unread)
 
 
 def _prepare_sky(data: bytes, rows: int) -> tuple[bytes, tuple[str, ...]]:
