@@ -174,19 +174,21 @@ def flip_some(mesh: TriangleMesh, share: float, rng: np.random.Generator) -> Tri
     return with_faces(mesh, np.where(flipped[:, None], mesh.faces[:, ::-1], mesh.faces))
 
 
+def _lines(mesh: TriangleMesh, vertex: str, face: str, first: int) -> str:
+    """Return a line for each vertex and face, of doubles as text that reads back exactly."""
+    lines = [f"{vertex}{x!r} {y!r} {z!r}\n" for x, y, z in mesh.positions.tolist()]
+    lines += [f"{face}{a} {b} {c}\n" for a, b, c in (mesh.faces + first).tolist()]
+    return "".join(lines)
+
+
 def write_obj(path: Path, mesh: TriangleMesh) -> Path:
-    """Doubles as text that reads back exactly."""
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.positions.tolist()]
-    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces.tolist()]
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text(_lines(mesh, "v ", "f ", 1))
     return path
 
 
 def write_off(path: Path, mesh: TriangleMesh) -> Path:
-    lines = ["OFF", f"{len(mesh.positions)} {len(mesh.faces)} 0"]
-    lines += [f"{x!r} {y!r} {z!r}" for x, y, z in mesh.positions.tolist()]
-    lines += [f"3 {a} {b} {c}" for a, b, c in mesh.faces.tolist()]
-    path.write_text("\n".join(lines) + "\n")
+    header = f"OFF\n{len(mesh.positions)} {len(mesh.faces)} 0\n"
+    path.write_text(header + _lines(mesh, "", "3 ", 0))
     return path
 
 
@@ -205,9 +207,7 @@ def write_ply(path: Path, mesh: TriangleMesh) -> Path:
         "property double x\nproperty double y\nproperty double z\n"
         f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
-    rows = [f"{x!r} {y!r} {z!r}" for x, y, z in mesh.positions.tolist()]
-    rows += [f"3 {a} {b} {c}" for a, b, c in mesh.faces.tolist()]
-    path.write_text(header + "\n".join(rows) + "\n")
+    path.write_text(header + _lines(mesh, "", "3 ", 0))
     return path
 
 
