@@ -7,7 +7,7 @@ Native code parses some of the bytes, so only processes with limits import this
 - `load_mesh`: the triangles of an object; `part`: those of a scene with one material; `polygons`
   cuts them.
 - `material`, `picture`: a material as its file states it, triangles with theirs, and pictures.
-- `light_pictures`, `openexr`, `radiance_hdr`, `linear_picture`: pictures of floats.
+- `openexr`, `radiance_hdr`, `linear_picture`: pictures of floats.
 - `obj`, `off`, `ply`, `stl`: one reader a format, of one `FileMesh`; `text` splits text into
   words.
 - `mtl`, `mesh_materials`: materials of those.

@@ -206,13 +206,13 @@ class _Body:
         return kind.itemsize if self._order else 8
 
     def count(self, at: int, kind: np.dtype) -> int:
-        return int(self._stored(self._codes[at : at + self.width(kind)], kind)[0])
+        return int(self._view_as(self._codes[at : at + self.width(kind)], kind)[0])
 
     def take(self, at: NDArray[np.int64], kind: np.dtype) -> NDArray:
         taken = self._codes[at[:, None] + np.arange(self.width(kind))]
-        return self._stored(np.ascontiguousarray(taken), kind)[:, 0].astype(kind)
+        return self._view_as(np.ascontiguousarray(taken), kind)[:, 0].astype(kind)
 
-    def _stored(self, codes: NDArray[np.uint8], kind: np.dtype) -> NDArray:
+    def _view_as(self, codes: NDArray[np.uint8], kind: np.dtype) -> NDArray:
         return codes.view(kind.newbyteorder(self._order) if self._order else np.float64)
 
 

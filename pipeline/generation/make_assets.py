@@ -24,7 +24,7 @@ from pipeline.foreign.mesh import TriangleMesh
 from pipeline.generation.prepare_isolated import asset_child, asset_store, prepare_isolated
 from pipeline.generation.unread_notes import UnreadNotes, write_unread
 from pipeline.isolation import ChildFailed, call_with_retries, reach
-from pipeline.objects.ply import encode_ply
+from pipeline.objects.generated import encode_ply
 from pipeline.objects.sources import find_objects
 from storage.atomic import write_atomically
 from storage.cache import cache_folder

@@ -6,8 +6,7 @@ Many separate closed components with flat faces, as in most hand-made models.
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.grids import Mesh
-from pipeline.objects.builtin.solids import beam, box, join, lathe, scale_and_move
+from pipeline.objects.builtin.solids import Mesh, beam, box, join, lathe, scale_and_move
 
 
 class _Furniture:

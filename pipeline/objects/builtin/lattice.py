@@ -6,8 +6,7 @@ Thin parts, right angles and many holes; the surface is one piece, whatever its 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.grids import Mesh
-from pipeline.objects.builtin.solids import taper_and_twist
+from pipeline.objects.builtin.solids import Mesh, taper_and_twist
 
 
 class _Lattice:

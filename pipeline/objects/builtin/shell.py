@@ -6,7 +6,7 @@ Smooth, with a visible inside, and detail that shrinks towards the tip.
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.grids import Mesh, sphere_faces
+from pipeline.objects.builtin.solids import Mesh, sphere_faces
 
 
 class _Shell:

@@ -7,8 +7,7 @@ of boxes.
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.grids import Mesh, sphere_faces
-from pipeline.objects.builtin.solids import taper_and_twist
+from pipeline.objects.builtin.solids import Mesh, sphere_faces, taper_and_twist
 
 
 def superquadric(

@@ -6,7 +6,7 @@ The thickness has a limit at which strands would meet or bends would fold.
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.grids import Mesh, torus_faces
+from pipeline.objects.builtin.solids import Mesh, torus_faces
 
 _KNOTS = ((1, 0), (2, 3), (3, 2), (1, 3), (2, 5), (3, 4), (1, 5), (4, 3), (5, 2), (1, 4))
 """Coprime windings around the axis and through the hole; (1, 0) is a plain ring."""

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.grids import Mesh, sphere_faces
-from pipeline.objects.builtin.solids import icosphere, join, tube
+from pipeline.objects.builtin.solids import Mesh, icosphere, join, sphere_faces, tube
 from storage.seeds import rng_for
 
 _GOLDEN = np.pi * (3 - np.sqrt(5))

@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from safetensors.numpy import save
 
-from pipeline.foreign.light_pictures import read_linear_picture
 from pipeline.foreign.linear_picture import clip_to_unit
-from pipeline.foreign.picture import UNREADABLE_PICTURE
+from pipeline.foreign.picture import UNREADABLE_PICTURE, read_linear_picture
 from pipeline.objects.maps.resample import area_means, flux, solid_angle_means
 from pipeline.objects.maps.texture_names import TEXTURE_PARTS, packed_channels
 from storage.conventions import linear_from_srgb

@@ -13,10 +13,9 @@ from pipeline.assets.source_materials.skin import _parts
 from pipeline.assets.source_materials.source_surface import SourceSurface
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_json import read_description
-from pipeline.foreign.light_pictures import read_linear_picture
 from pipeline.foreign.material import LEAST_ROUGHNESS
 from pipeline.foreign.numbers import FINITE
-from pipeline.foreign.picture import Decoder
+from pipeline.foreign.picture import Decoder, read_linear_picture
 from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected, TrilightError
 from storage.records.lookup import textured_rows

@@ -5,7 +5,7 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from pipeline.objects.builtin.grids import Mesh
+from pipeline.objects.builtin.solids import Mesh
 from pipeline.objects.builtin.superquadric import superquadric
 from pipeline.objects.builtin.torus_knot import torus_knot
 from pipeline.objects.generated import FAMILIES
