@@ -11,8 +11,7 @@ from pipeline.assets.cleaning.guards import check_clean, check_raw
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.decimation.decimate import decimate, safe_method, smallest_passing
 from pipeline.assets.quality.level_checks import check_level, require_watertight
-from pipeline.assets.quality.measure import MeasuredSource
-from pipeline.assets.quality.triangles import count_edges
+from pipeline.assets.quality.measure import MeasuredSource, count_edges
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.source_materials.skin import add_source_materials

@@ -11,8 +11,7 @@ from pipeline.assets.cleaning.clean import clean
 from pipeline.assets.cleaning.surface_around import surface_around
 from pipeline.assets.decimation.decimate import collapse_by_qslim
 from pipeline.assets.quality.level_checks import check_level, require_watertight
-from pipeline.assets.quality.measure import MeasuredSource
-from pipeline.assets.quality.triangles import open_half_edges
+from pipeline.assets.quality.measure import MeasuredSource, open_half_edges
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected

@@ -10,6 +10,6 @@ Native code parses some of the bytes, so only processes with limits import this
 - `openexr`, `radiance_hdr`, `linear_picture`: pictures of floats.
 - `obj`, `off`, `ply`, `stl`: one reader a format, of one `FileMesh`; `text` splits text into
   words.
-- `mtl`, `mesh_materials`: materials of those.
+- `material_files`, `mesh_materials`: materials of those.
 - `gltf`, `usd`: the other formats.
 """

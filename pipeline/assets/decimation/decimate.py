@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.assets.cleaning.clean import clean
 from pipeline.assets.decimation import meshopt
-from pipeline.assets.quality.triangles import count_edges
+from pipeline.assets.quality.measure import count_edges
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 

@@ -7,8 +7,12 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.quality.measure import sample_surface
-from pipeline.assets.quality.triangles import round_digits, unit_normals
+from pipeline.assets.quality.measure import (
+    level_mesh,
+    round_digits,
+    sample_surface,
+    unit_normals,
+)
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.assets.source_materials.bake import DIFFUSE, BakedTextures, bake, level_emission
 from pipeline.assets.source_materials.nearest import SurfaceLookup, barycentric
@@ -106,9 +110,7 @@ class SkinBaker:
             Rejected: colours_changed or colours_missed where an error is over its limit, or
                 materials_unreadable where no scene could hold the skin.
         """
-        mesh = TriangleMesh(
-            positions=level.positions.astype(np.float64), faces=level.faces.astype(np.int64)
-        )
+        mesh = level_mesh(level)
         off = level.record.quality.error_max * self._surface.mesh.diagonal
         reach = max(_LEAST_REACH, 1.5 * off)
         baked = bake(mesh, self._surface, self._nearest, self._settings, reach)

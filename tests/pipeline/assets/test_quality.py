@@ -11,12 +11,14 @@ from pipeline.assets.quality.level_checks import check_level
 from pipeline.assets.quality.measure import (
     MeasuredSource,
     Surface,
+    area_variation,
+    count_edges,
     intersection_over_union,
     label_components,
     sample_surface,
     silhouette,
+    smallest_angles_deg,
 )
-from pipeline.assets.quality.triangles import area_variation, count_edges, smallest_angles_deg
 from pipeline.assets.settings import GateSettings
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
