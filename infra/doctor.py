@@ -156,7 +156,7 @@ def _mesh_filters() -> Finding:
         problem = "libigl decimates: other meshes, other digests, and no profile uniform"
         return Finding("slower", "no pymeshlab (GPL)", problem, "make setup")
     code = (
-        f"from {module_name('pipeline.assets.check_pymeshlab')} import missing_filters; "
+        f"from {module_name('pipeline.assets.recipe')} import missing_filters; "
         "m = missing_filters(); "
         "raise SystemExit(', '.join(m) if m else 0)"
     )

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from pipeline.generation.generation_run import Runner as Runner
     from pipeline.generation.pipeline import make_dataset as make_dataset
     from pipeline.generation.pipeline import prepare_dataset as prepare_dataset
+    from pipeline.objects.generated import encode_ply as encode_ply
     from pipeline.objects.listing import Listing as Listing
-    from pipeline.objects.ply import encode_ply as encode_ply
     from pipeline.objects.sources import SOURCES as SOURCES
     from pipeline.objects.sources import ObjectSource as ObjectSource
     from pipeline.objects.sources import SourceQuery as SourceQuery

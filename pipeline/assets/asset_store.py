@@ -6,15 +6,13 @@ process, so that others wait for the outcome instead of computing it too. The fo
 while no process uses it; its files are then computed again.
 """
 
-import contextlib
-import time
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pipeline.assets.recipe import READERS, RECIPE
 from pipeline.assets.settings import AssetSettings
-from storage.atomic import TEMPORARY_SUFFIX, write_atomically
+from storage.atomic import remove_leftovers, write_atomically
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
 from storage.file_locks import hold_lock
@@ -25,7 +23,7 @@ _FAN_OUT = 2
 """Letters of the key that choose a sub-folder, so that no folder holds every outcome."""
 
 _OLD_S = 24 * 3600
-"""Age in seconds from which a temporary file counts as a leftover."""
+"""Age in seconds from which a temporary file counts as a leftover: no writer takes a day."""
 
 _LOCKS = 3
 """Letters of the key that choose a lock: 4096 files that need no cleaning up, at the price of a
@@ -82,22 +80,20 @@ class AssetStore:
         if unread:
             write_atomically(self._unread_path(key), canonical_json(unread))
         write_atomically(path, encode_asset(asset))
-        _remove_old_leftovers(path.parent)
+        remove_leftovers(path.parent, older_than_s=_OLD_S)
 
     def save_refusal(self, key: str, reason: str, message: str) -> None:
         """Store a refusal; raises TrilightError where the store cannot be written."""
         outcome = canonical_json({"reason": reason, "message": message})
         write_atomically(self._refusal_path(key), outcome)
 
-    @contextlib.contextmanager
-    def lock(self, key: str) -> Iterator[None]:
+    def lock(self, key: str) -> AbstractContextManager[bool]:
         """Hold the lock of a key; wait until no other process computes its outcome.
 
         Raises:
             TrilightError: the store cannot be written.
         """
-        with hold_lock(self.root / "locks" / key[:_LOCKS], wait=True):
-            yield
+        return hold_lock(self.root / "locks" / key[:_LOCKS], wait=True)
 
     def _unread_path(self, key: str) -> Path:
         return self.asset_path(key).with_suffix(".unread.json")
@@ -108,11 +104,3 @@ class AssetStore:
 
 def _label(path: Path) -> str:
     return f"{path} of the asset store (delete it, and it is made again)"
-
-
-def _remove_old_leftovers(folder: Path) -> None:
-    """Delete temporary files of killed writers: no writer takes a day for one file."""
-    for leftover in folder.glob(f"*{TEMPORARY_SUFFIX}"):
-        with contextlib.suppress(OSError):  # another process may have been quicker
-            if time.time() - leftover.stat().st_mtime > _OLD_S:
-                leftover.unlink()

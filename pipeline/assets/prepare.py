@@ -6,18 +6,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.attempt import AssetAttempt
 from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalize
 from pipeline.assets.cleaning.guards import check_clean, check_raw
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.decimation.decimate import decimate, safe_method
-from pipeline.assets.decimation.smallest import smallest_passing
+from pipeline.assets.decimation.decimate import decimate, safe_method, smallest_passing
 from pipeline.assets.quality.level_checks import check_level, require_watertight
-from pipeline.assets.quality.measure import MeasuredSource
-from pipeline.assets.quality.triangles import count_edges
+from pipeline.assets.quality.measure import MeasuredSource, count_edges
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.source_materials.skin import add_source_materials
+from pipeline.assets.stage import AssetAttempt
 from pipeline.assets.watertight import LevelBase, make_watertight
 from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
@@ -80,7 +78,7 @@ def _facts(
         num_faces_read=len(raw.faces),
         num_faces=len(source.mesh.faces),
         num_faces_turned=_count_flipped(cleaned, source.mesh),
-        num_parts=source.components.count,
+        num_parts=source.num_components,
         open_edges=edges.open,
         nonmanifold_edges=edges.nonmanifold,
         front_share=round(front_share, 6),

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.outside_rays import first_faces
+from pipeline.assets.quality.measure import level_mesh
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.source_materials.nearest import barycentric
 from pipeline.foreign.load_mesh import load_mesh
@@ -40,9 +41,7 @@ def preview_source_and_level(
 
 def preview_level(level: Level, width_px: int) -> NDArray[np.uint8]:
     """Return a picture of a level: gray [W, W], or [W, W, 3] where the level has colors."""
-    mesh = TriangleMesh(
-        positions=level.positions.astype(np.float64), faces=level.faces.astype(np.int64)
-    )
+    mesh = level_mesh(level)
     grey = preview(mesh, width_px)
     return grey if level.skin is None else _preview_colors(mesh, level.skin, width_px)
 

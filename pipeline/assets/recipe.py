@@ -62,3 +62,20 @@ def methods_of(
     use_pymeshlab = decimator == "pymeshlab" and with_pymeshlab
     collapse = "pymeshlab_collapse" if use_pymeshlab else "libigl_qslim"
     return (*evenly, collapse, "meshoptimizer", "meshoptimizer_sloppy")
+
+
+def missing_filters() -> list[str]:
+    """Return the filters that the mesh stage calls and the installed pymeshlab lacks.
+
+    Without the system library libOpenGL.so.0, pymeshlab imports with a warning and lacks 46 of its
+    filters. That is a fault of the environment, which stops a run; it must not reject every object.
+    The list is empty without pymeshlab too: `methods_of` then leaves its methods out.
+
+    The call loads the native libraries (about one second), so run it in a child process.
+    """
+    if _installed_version("pymeshlab") == "absent":
+        return []
+    from pipeline.assets.decimation.pymeshlab_filters import REQUIRED_FILTERS, pymeshlab
+
+    present = set(pymeshlab.filter_list())
+    return [name for name in REQUIRED_FILTERS if name not in present]

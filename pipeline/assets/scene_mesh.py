@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.guards import check_raw
-from pipeline.assets.remesh import remesh
-from pipeline.assets.settings import AssetSettings
+from pipeline.assets.decimation.decimate import decimate, safe_method
+from pipeline.assets.recipe import methods_of
+from pipeline.assets.settings import AssetSettings, Profile
 from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
@@ -64,3 +66,26 @@ def load_scene_mesh(path: Path, settings: AssetSettings, remesh_faces: int | Non
         sha256=source.sha256,
         unread=source.unread,
     )
+
+
+def remesh(raw: TriangleMesh, num_faces: int, profile: Profile = "uniform") -> TriangleMesh:
+    """Return the surface with at most `num_faces` triangles, in the units of the file.
+
+    Raises:
+        Rejected: "remesh_failed" where no method gives that many.
+        TrilightError: `uniform` without pymeshlab.
+    """
+    used = raw.positions[np.unique(raw.faces)]
+    low = used.min(axis=0)
+    high = used.max(axis=0)
+    unit = clean(normalize(raw))
+    if len(unit.faces):
+        for method in methods_of(profile):
+            try:
+                result = decimate(unit, num_faces, safe_method(unit, method))
+            except Rejected:
+                continue
+            if 0 < len(result.faces) <= num_faces:
+                positions = result.positions * (high - low).max() + (low + high) / 2
+                return TriangleMesh(positions=positions, faces=result.faces)
+    raise Rejected("remesh_failed", f"no method gives at most {num_faces} triangles")

@@ -1,15 +1,15 @@
 """Stage "assets": every object becomes a prepared asset or a rejection, each computed once."""
 
+import contextlib
 import dataclasses
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.assets.asset_store import AssetStore
-from pipeline.assets.attempt import AssetAttempt
 from pipeline.assets.recipe import library_versions, methods_of
 from pipeline.assets.settings import AssetSettings
 from pipeline.foreign.source_file import needs_child, read_source
@@ -22,6 +22,20 @@ from storage.records.objects import Failure, ObjectRecord
 _LOG = logging.getLogger(__name__)
 
 BorrowChild = Callable[[], AbstractContextManager[IsolatedChild]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AssetAttempt:
+    """The result of one decimation method for one object."""
+
+    method: str
+    """Method that ran: `meshoptimizer` where the requested one is unsafe for this mesh."""
+    asset: Asset
+    """The asset, with the levels that passed the quality checks; possibly none."""
+    missed: Mapping[int, tuple[str, str]]
+    """Reason code and message by budget, for the levels that failed."""
+    unread: tuple[str, ...] = ()
+    """Short sentences, one for each part of the file that no reader handled."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +83,7 @@ def prepare_assets(
 
     def prepare(record: ObjectRecord) -> PreparedObject | Failure:
         try:
-            return _prepare_once(record, settings, store, methods, borrow_child)
+            return _Preparation(record, settings, store, methods, borrow_child).run()
         except Rejected as rejection:
             return Failure(
                 stage="assets",
@@ -86,40 +100,138 @@ def prepare_assets(
     return prepared, [outcome for outcome in outcomes if isinstance(outcome, Failure)]
 
 
-def _prepare_once(
-    record: ObjectRecord,
-    settings: AssetSettings,
-    store: AssetStore,
-    methods: tuple[str, ...],
-    borrow_child: BorrowChild,
-) -> PreparedObject:
-    """Load or compute the outcome of an object; raises Rejected where there is no asset."""
-    source = Path(record.path)
-    root = Path(record.root) if record.root else None
-    key = _key(source, root, settings, store, borrow_child)
-    path = store.asset_path(key)
-    with store.lock(key):
-        if refusal := store.refusal(key):
-            raise refusal
-        if not path.exists():
-            outcome = _prepare_in_child(source, root, settings, methods, borrow_child)
-            if _key(source, root, settings, store, borrow_child) != key:
-                raise Rejected("unreadable_file", "it changed while it was being prepared")
-            if isinstance(outcome, Rejected):
-                store.save_refusal(key, outcome.reason, outcome.message)
-                raise outcome
-            store.save_asset(key, *outcome)
-    data = path.read_bytes()
-    asset = decode_asset(data)
-    return PreparedObject(
-        record=record,
-        asset_name=key,
-        asset_sha256=sha256_hex(data),
-        geometry_sha256=asset.geometry_sha256,
-        least_triangles=min(len(level.faces) for level in asset.levels),
-        without_own="" if asset.materials is None else asset.materials.reason,
-        unread=(*store.unread(key), *_list_lost_properties(asset)),
-    )
+class _Preparation:
+    """The preparation of one object."""
+
+    def __init__(
+        self,
+        record: ObjectRecord,
+        settings: AssetSettings,
+        store: AssetStore,
+        methods: tuple[str, ...],
+        borrow_child: BorrowChild,
+    ) -> None:
+        self._record = record
+        self._settings = settings
+        self._store = store
+        self._methods = methods
+        self._borrow_child = borrow_child
+        self._source = Path(record.path)
+        self._root = Path(record.root) if record.root else None
+
+    def run(self) -> PreparedObject:
+        """Load or compute the outcome; raises Rejected where there is no asset."""
+        store = self._store
+        key = self._key()
+        path = store.asset_path(key)
+        with store.lock(key):
+            if refusal := store.refusal(key):
+                raise refusal
+            if not path.exists():
+                outcome = self._prepare_in_child()
+                if self._key() != key:
+                    raise Rejected("unreadable_file", "it changed while it was being prepared")
+                if isinstance(outcome, Rejected):
+                    store.save_refusal(key, outcome.reason, outcome.message)
+                    raise outcome
+                store.save_asset(key, *outcome)
+        data = path.read_bytes()
+        asset = decode_asset(data)
+        return PreparedObject(
+            record=self._record,
+            asset_name=key,
+            asset_sha256=sha256_hex(data),
+            geometry_sha256=asset.geometry_sha256,
+            least_triangles=min(len(level.faces) for level in asset.levels),
+            without_own="" if asset.materials is None else asset.materials.reason,
+            unread=(*store.unread(key), *_list_lost_properties(asset)),
+        )
+
+    @contextlib.contextmanager
+    def _child(self) -> Iterator[IsolatedChild]:
+        with self._borrow_child() as child:
+            child.allow_files(reach(files=[self._source, self._root or self._source]))
+            yield child
+
+    def _key(self) -> str:
+        """Return the store's key; raises Rejected where the pre-flight refuses the source."""
+        arguments = self._source, self._settings, self._root
+        try:
+            if not needs_child(self._source):
+                kind, digest = source_digest(*arguments)
+            else:
+                with self._child() as child:
+                    kind, digest = call_with_retries(child, source_digest, *arguments)
+        except ChildFailed as failure:
+            raise Rejected(failure.reason, failure.sentence) from failure
+        except OSError as error:
+            raise Rejected("unreadable_file", f"cannot be read ({error.strerror})") from error
+        return self._store.key(kind, digest, self._settings)
+
+    def _prepare_in_child(self) -> tuple[Asset, tuple[str, ...]] | Rejected:
+        """Return what the store keeps: an asset with its unread parts, or a rejection.
+
+        Raises:
+            Rejected: the environment failed; the store keeps nothing, and the next run tries again.
+        """
+        try:
+            with self._child() as child:
+                return self._try_methods(child)
+        except Rejected as rejection:
+            return rejection
+        except ChildFailed as failure:
+            refusal = Rejected(failure.reason, failure.sentence)
+            if failure.is_verdict:
+                return refusal
+            raise refusal from failure
+
+    def _try_methods(self, child: IsolatedChild) -> tuple[Asset, tuple[str, ...]]:
+        """Try the methods in turn, each in a fresh child, for the levels that are still missing.
+
+        Raises:
+            Rejected: the object is unusable; or no level passed the quality checks, then with the
+                first method's reason at the largest budget.
+            ChildFailed: every method crashed its child or used up its processor time; or a child
+                was ended by something else, which says nothing about the method and leads to no
+                other.
+        """
+        asset: Asset | None = None
+        unread: tuple[str, ...] = ()
+        levels: list[Level] = []
+        first_miss: tuple[str, str] | None = None
+        death: ChildFailed | None = None
+        missing = self._settings.budgets
+        waiting = list(self._methods)
+        while waiting:
+            method = waiting.pop(0)
+            settings = dataclasses.replace(self._settings, budgets=missing)
+            if missing[0] != self._settings.budgets[0]:  # epsilon is about the finest level
+                settings = dataclasses.replace(settings, epsilon=None)
+            arguments = self._source, settings, method, self._root
+            try:
+                attempt = call_with_retries(child, attempt_in_child, *arguments)
+            except ChildFailed as failure:
+                if not failure.is_verdict:
+                    raise
+                death = failure
+                continue
+            asset = _carry_materials_reason(asset, attempt.asset)
+            unread = attempt.unread
+            if attempt.method in waiting:  # it replaced a method that is not safe for this mesh
+                waiting = waiting[waiting.index(attempt.method) + 1 :]
+            levels += asset.levels
+            missing = tuple(budget for budget in missing if budget in attempt.missed)
+            if not missing:
+                break
+            first_miss = first_miss or attempt.missed[missing[0]]
+            child.retire()
+        if asset is None:
+            assert death is not None
+            raise death
+        if not levels:
+            assert first_miss is not None
+            raise Rejected(*first_miss)
+        return dataclasses.replace(asset, levels=_drop_wasteful_levels(levels)), unread
 
 
 def _list_lost_properties(asset: Asset) -> list[str]:
@@ -128,33 +240,9 @@ def _list_lost_properties(asset: Asset) -> list[str]:
         return []
     see_through = asset.materials.see_through
     return [
-        f"{word} of materials: surfaces are opaque"
-        if word in see_through
-        else f"{word} of materials: not shown"
+        f"{word} of materials: {'surfaces are opaque' if word in see_through else 'not shown'}"
         for word in asset.materials.lost
     ]
-
-
-def _key(
-    source: Path,
-    root: Path | None,
-    settings: AssetSettings,
-    store: AssetStore,
-    borrow_child: BorrowChild,
-) -> str:
-    """Return the store's key of a source; raises Rejected where the pre-flight refuses it."""
-    try:
-        if not needs_child(source):
-            kind, digest = source_digest(source, settings, root)
-        else:
-            with borrow_child() as child:
-                child.allow_files(reach(files=[source, root or source]))
-                kind, digest = call_with_retries(child, source_digest, source, settings, root)
-    except ChildFailed as failure:
-        raise Rejected(failure.reason, failure.sentence) from failure
-    except OSError as error:
-        raise Rejected("unreadable_file", f"cannot be read ({error.strerror})") from error
-    return store.key(kind, digest, settings)
 
 
 def source_digest(
@@ -168,87 +256,6 @@ def source_digest(
     """
     source_file = read_source(source, settings.read_limits, root)
     return source_file.kind, source_file.sha256
-
-
-def _prepare_in_child(
-    source: Path,
-    root: Path | None,
-    settings: AssetSettings,
-    methods: tuple[str, ...],
-    borrow_child: BorrowChild,
-) -> tuple[Asset, tuple[str, ...]] | Rejected:
-    """Return what the store keeps: an asset with its unread parts, or a rejection.
-
-    Raises:
-        Rejected: the environment failed; the store keeps nothing, and the next run tries again.
-    """
-    try:
-        with borrow_child() as child:
-            child.allow_files(reach(files=[source, root or source]))
-            return _try_methods(child, source, root, settings, methods)
-    except Rejected as rejection:
-        return rejection
-    except ChildFailed as failure:
-        refusal = Rejected(failure.reason, failure.sentence)
-        if failure.is_verdict:
-            return refusal
-        raise refusal from failure
-
-
-def _try_methods(
-    child: IsolatedChild,
-    source: Path,
-    root: Path | None,
-    settings: AssetSettings,
-    methods: tuple[str, ...],
-) -> tuple[Asset, tuple[str, ...]]:
-    """Try the methods in turn, each in a fresh child, for the levels that are still missing.
-
-    Raises:
-        Rejected: the object is unusable; or no level passed the quality checks, then with the
-            first method's reason at the largest budget.
-        ChildFailed: every method crashed its child or used up its processor time; or a child was
-            ended by something else, which says nothing about the method and leads to no other.
-    """
-    asset: Asset | None = None
-    unread: tuple[str, ...] = ()
-    levels: list[Level] = []
-    first_miss: tuple[str, str] | None = None
-    death: ChildFailed | None = None
-    missing = settings.budgets
-    waiting = list(methods)
-    while waiting:
-        method = waiting.pop(0)
-        finest = missing[0] == settings.budgets[0]  # epsilon is about this level
-        attempt_settings = dataclasses.replace(
-            settings, budgets=missing, epsilon=settings.epsilon if finest else None
-        )
-        try:
-            attempt = call_with_retries(
-                child, attempt_in_child, source, attempt_settings, method, root
-            )
-        except ChildFailed as failure:
-            if not failure.is_verdict:
-                raise
-            death = failure
-            continue
-        asset = _carry_materials_reason(asset, attempt.asset)
-        unread = attempt.unread
-        if attempt.method in waiting:  # it replaced a method that is not safe for this mesh
-            waiting = waiting[waiting.index(attempt.method) + 1 :]
-        levels += asset.levels
-        missing = tuple(budget for budget in missing if budget in attempt.missed)
-        if not missing:
-            break
-        first_miss = first_miss or attempt.missed[missing[0]]
-        child.retire()
-    if asset is None:
-        assert death is not None
-        raise death
-    if not levels:
-        assert first_miss is not None
-        raise Rejected(*first_miss)
-    return dataclasses.replace(asset, levels=_drop_wasteful_levels(levels)), unread
 
 
 def _carry_materials_reason(before: Asset | None, now: Asset) -> Asset:

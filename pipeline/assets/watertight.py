@@ -9,10 +9,9 @@ from scipy.sparse.csgraph import connected_components
 
 from pipeline.assets.cleaning.clean import clean
 from pipeline.assets.cleaning.surface_around import surface_around
-from pipeline.assets.decimation import qslim
+from pipeline.assets.decimation.decimate import collapse_by_qslim
 from pipeline.assets.quality.level_checks import check_level, require_watertight
-from pipeline.assets.quality.measure import MeasuredSource
-from pipeline.assets.quality.triangles import open_half_edges
+from pipeline.assets.quality.measure import MeasuredSource, open_half_edges
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
@@ -62,7 +61,7 @@ def make_watertight(source: MeasuredSource, settings: AssetSettings) -> LevelBas
             refusals[form] = refusal
             continue
         fewer = max(_FEWEST, _DETOUR * settings.budgets[0])
-        start = mesh if len(mesh.faces) <= fewer else qslim.collapse(mesh, fewer)
+        start = mesh if len(mesh.faces) <= fewer else collapse_by_qslim(mesh, fewer)
         return LevelBase(mesh=mesh, start=start, gate=gate, form=form)
     reason = refusals["solid"]
     raise Rejected(reason.reason, f"made watertight: {reason.message}")

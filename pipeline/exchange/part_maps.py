@@ -20,17 +20,6 @@ from pipeline.foreign.picture import Picture, Wrap
 from storage.records.exr import MAX_RESOLUTION
 from storage.records.scene_maps import MAX_UV
 
-_SLOTS: Mapping[str, str] = {
-    "base": "base",
-    "metallic": "metallic_map",
-    "roughness": "roughness_map",
-    "specular_colour": "specular_colour",
-    "specular_strength": "specular_strength_map",
-    "glossiness": "glossiness",
-}
-"""Slot of `SourceMaterial` for each field of `MaterialSamples`."""
-
-
 _MAX_TILES = 8
 """Maximum number of tiles along a side."""
 
@@ -53,7 +42,7 @@ class PlacedSlots:
     """Pictures of a material, and the coordinates of a mesh in their maps."""
 
     slots: Mapping[str, Slot]
-    """Slots by the field of `MaterialSamples`."""
+    """Slots of the material that have a picture, by name."""
     same_chart: Sequence[str]
     """Names of the slots whose maps vary over the mesh; others are their means."""
     tiles: tuple[_Tiles, _Tiles] | None
@@ -86,8 +75,7 @@ def place_slots(part: Part, lost: list[str]) -> PlacedSlots:
 
     `lost` receives a sentence for each loss.
     """
-    stated = {name: getattr(part.material, field) for name, field in _SLOTS.items()}
-    slots: dict[str, Slot] = {name: slot for name, slot in stated.items() if slot is not None}
+    slots = part.material.column_slots
     first = next(iter(slots.values()), None)
     plain = None if first is None else part.coordinates(first.uv_set)
     if first is None or plain is None:

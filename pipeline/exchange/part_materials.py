@@ -18,7 +18,7 @@ from pipeline.exchange.linear_maps import (
 )
 from pipeline.exchange.part_maps import PlacedSlots, place_slots
 from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles, TextureSet
-from pipeline.foreign.material import MaterialSamples, SourceMaterial, source_columns
+from pipeline.foreign.material import SourceMaterial, source_columns
 from pipeline.foreign.part import Part
 from pipeline.foreign.picture import spread_points
 from storage.conventions import srgb8
@@ -142,9 +142,7 @@ def _columns(
         texel_values["base"] = (
             texel_values["base"][:, :3] * colors if "base" in texel_values else colors
         )
-        rows = source_columns(
-            material, MaterialSamples(**texel_values), size * width, least_roughness=0
-        )
+        rows = source_columns(material, texel_values, size * width, least_roughness=0)
         values[first : first + size] = rows.reshape(size, width, 7)
     return values
 

@@ -3,8 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.light_pictures import read_linear_picture
-from pipeline.foreign.picture import Picture, decode_image
+from pipeline.foreign.picture import Picture, decode_image, read_linear_picture
 from storage.errors import Rejected, TrilightError
 
 MAX_BYTES = 256 << 20

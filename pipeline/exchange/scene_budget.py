@@ -7,7 +7,7 @@ material of the nearest old one, and smooth normals are computed again.
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.remesh import remesh
+from pipeline.assets.scene_mesh import remesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.shading_normals import (

@@ -4,12 +4,12 @@ Native code parses some of the bytes, so only processes with limits import this
 (pipeline.isolation).
 
 - `source_file`, `limits`: one bounded read of a file and of those that it names.
-- `load_mesh`, `textured_mesh`: the triangles of an object with their materials; `part`: those of a
-  scene with one material; `polygons` cuts them.
-- `material`, `picture`: a material as its file states it, and its pictures.
-- `light_pictures`, `openexr`, `radiance_hdr`, `linear_picture`: pictures of floats.
+- `load_mesh`: the triangles of an object; `part`: those of a scene with one material; `polygons`
+  cuts them.
+- `material`, `picture`: a material as its file states it, triangles with theirs, and pictures.
+- `openexr`, `radiance_hdr`, `linear_picture`: pictures of floats.
 - `obj`, `off`, `ply`, `stl`: one reader a format, of one `FileMesh`; `text` splits text into
   words.
-- `mtl`, `mesh_materials`: materials of those.
+- `material_files`, `mesh_materials`: materials of those.
 - `gltf`, `usd`: the other formats.
 """

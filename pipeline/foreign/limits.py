@@ -1,6 +1,11 @@
-"""`ReadLimits`: bounds of what is read of an untrusted file."""
+"""What is read of an untrusted file: the suffixes of its formats, and `ReadLimits`."""
 
 from dataclasses import dataclass
+
+USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", *USD_SUFFIXES)
+"""Suffixes of object files, compared in lower case. The suffix decides: a file of another format is
+refused or fails to load, and never reaches the reader of that format."""
 
 
 @dataclass(frozen=True, kw_only=True)

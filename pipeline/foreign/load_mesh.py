@@ -1,6 +1,6 @@
 """`load_mesh`: the triangles of a file, by the reader of its format."""
 
-from pipeline.foreign.gltf.objects import gltf_mesh
+from pipeline.foreign.gltf.primitives import gltf_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import SourceFile
 from storage.errors import Rejected

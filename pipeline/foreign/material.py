@@ -3,11 +3,13 @@
 The Fresnel term becomes albedos that are the same at every angle (storage.optics.fresnel).
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.picture import Picture
 from storage.optics.fresnel import constant_albedos
 
@@ -79,19 +81,23 @@ class SourceMaterial:
         return any(self.emission_rgb)
 
     @property
-    def slots(self) -> tuple[Slot, ...]:
-        """The slots that have a picture."""
-        slots = (
-            self.base,
-            self.metallic_map,
-            self.roughness_map,
-            self.specular_colour,
-            self.specular_strength_map,
-            self.glossiness,
-            self.emission,
-            self.normal,
-        )
-        return tuple(slot for slot in slots if slot is not None)
+    def column_slots(self) -> dict[str, Slot]:
+        """The slots that have a picture, by their names in `source_columns`."""
+        slots = {
+            "base": self.base,
+            "metallic": self.metallic_map,
+            "roughness": self.roughness_map,
+            "specular_colour": self.specular_colour,
+            "specular_strength": self.specular_strength_map,
+            "glossiness": self.glossiness,
+        }
+        return {name: slot for name, slot in slots.items() if slot is not None}
+
+    @property
+    def slots(self) -> list[Slot]:
+        """All slots that have a picture."""
+        more = (self.emission, self.normal)
+        return [*self.column_slots.values(), *(slot for slot in more if slot is not None)]
 
 
 def with_normal_map(
@@ -108,46 +114,35 @@ def with_normal_map(
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MaterialSamples:
-    """Values [N, 4] of the pictures of a material at N places; None without such a picture."""
-
-    base: NDArray[np.float32] | None = None
-    metallic: NDArray[np.float32] | None = None
-    roughness: NDArray[np.float32] | None = None
-    specular_colour: NDArray[np.float32] | None = None
-    specular_strength: NDArray[np.float32] | None = None
-    glossiness: NDArray[np.float32] | None = None
-
-
 def source_columns(
     material: SourceMaterial,
-    samples: MaterialSamples,
+    samples: Mapping[str, NDArray[np.float32]],
     count: int,
     *,
     least_roughness: float = LEAST_ROUGHNESS,
 ) -> NDArray[np.float64]:
-    """Return diffuse rgb, specular rgb and roughness [N, 7] at `count` places."""
+    """Return diffuse rgb, specular rgb and roughness [N, 7] at `count` places.
 
-    def scale(factor: object, values: NDArray[np.float32] | None, channels: slice) -> NDArray:
+    `samples` holds values [N, 4] of pictures at those places, by `SourceMaterial.column_slots`.
+    """
+
+    def scale(factor: object, name: str, channels: slice) -> NDArray:
         factors = np.broadcast_to(
             np.asarray(factor, np.float64), (count, channels.stop - channels.start)
         )
-        return factors if values is None else factors * values[:, channels]
+        return factors * samples[name][:, channels] if name in samples else factors
 
-    def scale_channel(
-        factor: float, values: NDArray[np.float32] | None, slot: Slot | None
-    ) -> NDArray:
+    def scale_channel(factor: float, name: str, slot: Slot | None) -> NDArray:
         channel = 0 if slot is None else slot.channel
-        return scale(factor, values, slice(channel, channel + 1))
+        return scale(factor, name, slice(channel, channel + 1))
 
-    base = np.clip(scale(material.base_rgb, samples.base, slice(0, 3)), 0, 1)
-    rough = scale_channel(material.roughness, samples.roughness, material.roughness_map)
-    metal = np.clip(scale_channel(material.metallic, samples.metallic, material.metallic_map), 0, 1)
-    if samples.glossiness is not None:
-        rough = 1 - (1 - material.roughness) * samples.glossiness[:, 3:4]
-    tint = scale(material.specular_rgb, samples.specular_colour, slice(0, 3))
-    strength = scale(material.specular_strength, samples.specular_strength, slice(3, 4))
+    base = np.clip(scale(material.base_rgb, "base", slice(0, 3)), 0, 1)
+    rough = scale_channel(material.roughness, "roughness", material.roughness_map)
+    metal = np.clip(scale_channel(material.metallic, "metallic", material.metallic_map), 0, 1)
+    if "glossiness" in samples:
+        rough = 1 - (1 - material.roughness) * samples["glossiness"][:, 3:4]
+    tint = scale(material.specular_rgb, "specular_colour", slice(0, 3))
+    strength = scale(material.specular_strength, "specular_strength", slice(3, 4))
     dielectric = np.minimum(material.f0 * tint, 1) * strength
     # a surface without reflectance at normal incidence is meant to have no specular lobe at all
     grazing = np.where(dielectric.max(axis=1, keepdims=True) > 0, np.clip(strength, 0, 1), 0)
@@ -156,3 +151,20 @@ def source_columns(
     if material.has_fresnel:
         diffuse, specular = constant_albedos(base, metal, dielectric, grazing)
     return np.concatenate([diffuse, specular, np.clip(rough, least_roughness, 1)], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TexturedMesh:
+    """The triangles of a source, those of `load_mesh`, with their materials."""
+
+    mesh: TriangleMesh
+    material: NDArray[np.int64]
+    """[F] index into `materials` of each face."""
+    materials: Sequence[SourceMaterial]
+    uv: NDArray[np.float64]
+    """[F, S, 3, 2] texture coordinates of corners by set S, v up; NaN where there are none."""
+    tangent: NDArray[np.float64] | None = None
+    """[F, 3, 4] tangent of each corner, and the sign of its bitangent, where the file states them;
+    NaN where it does not."""
+    color: NDArray[np.float64] | None = None
+    """[F, 3, 3] linear tint of each corner, multiplied with the base color; None for white."""

@@ -1,4 +1,4 @@
-"""The files that the materials of an object name: pictures, and the MTL of an OBJ.
+"""The files that the materials of an object name: pictures, and the MTL of an OBJ with its parser.
 
 Only regular files below the folder that the user gave are read, within its bound of bytes, and
 never from a server. A missing picture does not refuse the object; a missing buffer does.
@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from pipeline.foreign.mtl import list_pictures
 from pipeline.foreign.obj import list_libraries
 from pipeline.foreign.ply import list_ply_pictures
+from pipeline.foreign.text import decode_name, join_continued, plain_text, unquote_name
 from storage.errors import Rejected
 
 READ_MAPS = {"map_kd", "map_ks", "map_pr", "map_pm", "map_ke"}
@@ -29,6 +29,15 @@ _ENCODINGS = ("cp1252", "cp932", "gbk", "cp1251", "cp437")
 _LAYOUTS = ("textures", "images", "../textures", "../images", "../materials/textures")
 """Folders where large collections keep pictures that their MTL files name without a folder."""
 _WINDOWS_ROOT = re.compile(r"[A-Za-z]:/|/")
+
+Fields = dict[str, str]
+"""Statements of a material, by key words in lower case."""
+
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?=\s)"
+_OPTION = re.compile(
+    rf"(-o|-s|-t)((?:\s+{_NUMBER}){{1,3}})\s+|(-mm)((?:\s+{_NUMBER}){{1,2}})\s+|(-[a-z]+)\s+(\S+)\s+",
+    re.IGNORECASE,
+)
 
 ReadFile = Callable[[Path, int], bytes]
 """Reads a regular file of at most so many bytes; raises Rejected."""
@@ -188,3 +197,36 @@ def obj_files(
 def ply_files(data: bytes, folder: SourceFolder, bytes_left: int) -> MaterialFiles:
     """Return the pictures that a PLY names."""
     return folder.read_all(list_ply_pictures(data), bytes_left)
+
+
+def read_mtl(data: bytes) -> dict[str, Fields]:
+    """Return the materials of a library by name; statements before the first one are ignored."""
+    materials: dict[str, Fields] = {}
+    fields: Fields = {}
+    for line in join_continued(plain_text(data)).split(b"\n"):
+        words = line.split(maxsplit=1)
+        if not words or words[0].startswith(b"#"):
+            continue
+        key = decode_name(words[0]).lower()
+        value = decode_name(b"".join(words[1:]))
+        if key == "newmtl":
+            fields = materials[unquote_name(value)] = {}
+        elif value or not key.startswith("map_"):  # exporters write maps without a file
+            fields[key] = value
+    return materials
+
+
+def split_map(text: str) -> tuple[Mapping[str, list[str]], str]:
+    """Return the options of a map, in lower case, and the file that it names."""
+    options: dict[str, list[str]] = {}
+    while option := _OPTION.match(text):
+        name, value = [group for group in option.groups() if group is not None]
+        options[name.lower()] = value.split()
+        text = text[option.end() :]
+    return options, unquote_name(text.strip())
+
+
+def list_pictures(data: bytes, keys: set[str]) -> Iterator[str]:
+    """Yield the files that the maps of a library name."""
+    for fields in read_mtl(data).values():
+        yield from (split_map(fields[key])[1] for key in fields if key in keys)

@@ -1,5 +1,6 @@
 """`TriangleMesh` and `FileMesh`: the arrays of a mesh, and the attributes that its file states."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,3 +65,12 @@ def decode_colors(codes: NDArray) -> NDArray[np.float64]:
     elif coded.size and coded.max() > 1:
         coded /= 255
     return np.asarray(linear_from_srgb(np.clip(coded, 0, 1)), np.float64)
+
+
+def join_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    """Return all meshes, at least one, as one; no vertices are welded."""
+    starts = np.cumsum([0, *(len(mesh.positions) for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
+    return TriangleMesh(
+        positions=np.concatenate([mesh.positions for mesh in meshes]), faces=np.concatenate(faces)
+    )

@@ -13,14 +13,26 @@ from collections.abc import Iterator, Mapping, Sequence, Set
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.material import RGB, WHITE, Slot, SourceMaterial, with_normal_map
-from pipeline.foreign.material_files import NORMAL_MAPS, READ_MAPS, MaterialFiles
+from pipeline.foreign.material import (
+    RGB,
+    WHITE,
+    Slot,
+    SourceMaterial,
+    TexturedMesh,
+    with_normal_map,
+)
+from pipeline.foreign.material_files import (
+    NORMAL_MAPS,
+    READ_MAPS,
+    Fields,
+    MaterialFiles,
+    read_mtl,
+    split_map,
+)
 from pipeline.foreign.mesh import FileMesh
-from pipeline.foreign.mtl import Fields, read_mtl, split_map
 from pipeline.foreign.numbers import Malformed, parse_number
 from pipeline.foreign.picture import Decode, Picture
 from pipeline.foreign.source_file import SourceFile
-from pipeline.foreign.textured_mesh import TexturedMesh
 from storage.errors import Rejected
 
 

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from pipeline.foreign.light_pictures import read_linear_picture
+from pipeline.foreign import openexr, radiance_hdr
 from pipeline.foreign.linear_picture import LinearPicture, clip_to_unit
 from storage.conventions import linear_from_srgb, linear_from_srgb8
 from storage.errors import Rejected
+from storage.records.exr import MAGIC
 
 Wrap = Literal["repeat", "clamp", "mirror", "black"]
 """Wrap modes; `black` is 0 beyond the picture, alpha included."""
@@ -38,6 +39,31 @@ UNREADABLE_PICTURE = (
 _STRIP = 256  # rows; an even number, since pairs of rows are averaged
 _MOST = 65504.0
 """Largest number of a half float."""
+
+
+def read_linear_picture(
+    data: bytes, max_pixels: int, *, is_color: bool = True
+) -> LinearPicture | None:
+    """Return the floats of an OpenEXR or Radiance picture in linear Rec.709, or None for others.
+
+    The first bytes decide on the format.
+
+    Args:
+        data: the file.
+        max_pixels: maximum number of pixels, checked before memory is allocated.
+        is_color: whether its numbers are colors, which its primaries apply to.
+
+    Raises:
+        Rejected: not_hdr, load_error or too_many_pixels.
+    """
+    try:
+        if data.startswith(MAGIC):
+            return openexr.read_openexr(data, max_pixels, is_color=is_color)
+        if data.startswith(radiance_hdr.MAGIC):
+            return radiance_hdr.read_radiance_hdr(data, max_pixels, is_color=is_color)
+    except (ValueError, LookupError, ArithmeticError) as error:  # such as names that are not UTF-8
+        raise Rejected("load_error", "it is damaged; write it again") from error
+    return None
 
 
 class Decoder:

@@ -177,59 +177,46 @@ Columns = Mapping[str, NDArray | _Lists]
 
 
 def _read_elements(data: bytes, header: _Header) -> tuple[dict[str, Columns], int]:
-    """Return the columns of each element, and the number of bytes or words after the last one."""
+    """Return the columns of each element, and the number of bytes after the last one."""
     data = data.removeprefix(b"\xef\xbb\xbf")
-    body = _Binary(data, header.order) if header.order else _Text(data[header.size :])
+    body = _Body(memoryview(data)[header.size :], header.order)
     columns: dict[str, Columns] = {}
-    at = header.size if header.order else 0
+    at = 0
     for element in header.elements:
         if element.properties:
             columns[element.name], at = _read_rows(body, element, at)
     if at < body.size and not header.order:
-        raise Rejected("header_size_mismatch", f"the PLY holds {body.size - at} numbers too many")
+        more = (body.size - at) // 8
+        raise Rejected("header_size_mismatch", f"the PLY holds {more} numbers too many")
     return columns, body.size - at
 
 
-class _Text:
-    """The data of a text PLY, addressed by word."""
+class _Body:
+    """The data of a PLY, addressed by byte; each number of a text takes eight."""
 
-    def __init__(self, data: bytes) -> None:
-        self.size = len(split_lines(data).words)
-        self._values = parse_numbers(data, self.size, np.float64)
-
-    def width(self, kind: np.dtype) -> int:
-        return 1
-
-    def count(self, at: int, kind: np.dtype) -> int:
-        return int(self._values[at])
-
-    def take(self, at: NDArray[np.int64], kind: np.dtype) -> NDArray:
-        return self._values[at].astype(kind)
-
-
-class _Binary:
-    """The data of a binary PLY, addressed by byte."""
-
-    def __init__(self, data: bytes, order: Order) -> None:
-        self.size = len(data)
-        self._data = data
-        self._order: Order = order
+    def __init__(self, data: memoryview, order: Order | None) -> None:
         self._codes = np.frombuffer(data, np.uint8)
+        if order is None:
+            count = len(split_lines(bytes(data)).words)
+            self._codes = parse_numbers(bytes(data), count, np.float64).view(np.uint8)
+        self.size = len(self._codes)
+        self._order = order
 
     def width(self, kind: np.dtype) -> int:
-        return kind.itemsize
+        return kind.itemsize if self._order else 8
 
     def count(self, at: int, kind: np.dtype) -> int:
-        piece = self._data[at : at + kind.itemsize]
-        return int(np.frombuffer(piece, kind.newbyteorder(self._order))[0])
+        return int(self._view_as(self._codes[at : at + self.width(kind)], kind)[0])
 
     def take(self, at: NDArray[np.int64], kind: np.dtype) -> NDArray:
-        taken = self._codes[at[:, None] + np.arange(kind.itemsize)]
-        ordered = kind.newbyteorder(self._order)
-        return np.ascontiguousarray(taken).view(ordered)[:, 0].astype(kind)
+        taken = self._codes[at[:, None] + np.arange(self.width(kind))]
+        return self._view_as(np.ascontiguousarray(taken), kind)[:, 0].astype(kind)
+
+    def _view_as(self, codes: NDArray[np.uint8], kind: np.dtype) -> NDArray:
+        return codes.view(kind.newbyteorder(self._order) if self._order else np.float64)
 
 
-def _read_rows(body: _Text | _Binary, element: _Element, at: int) -> tuple[Columns, int]:
+def _read_rows(body: _Body, element: _Element, at: int) -> tuple[Columns, int]:
     """Return the columns of an element whose rows begin at position `at`, and their end."""
     widths = [body.width(one.count or one.kind) for one in element.properties]
     if element.rows * sum(widths) > body.size - at:
@@ -256,7 +243,7 @@ def _read_rows(body: _Text | _Binary, element: _Element, at: int) -> tuple[Colum
 
 
 def _place_rows(
-    body: _Text | _Binary, element: _Element, at: int, lengths: NDArray[np.int64]
+    body: _Body, element: _Element, at: int, lengths: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
     """Return the start of each property [rows, P], and the end of the last one."""
     steps = np.zeros((element.rows, len(element.properties)), np.int64)
@@ -268,7 +255,7 @@ def _place_rows(
     return ends - steps, int(ends[-1, -1]) if element.rows else at
 
 
-def _list_lengths(body: _Text | _Binary, element: _Element, at: int) -> NDArray[np.int64]:
+def _list_lengths(body: _Body, element: _Element, at: int) -> NDArray[np.int64]:
     """Return the lengths [rows, L] of lists, without walking the rows where all are equal."""
     lists = [k for k, one in enumerate(element.properties) if one.count is not None]
     if not lists or not element.rows:
@@ -284,7 +271,7 @@ def _list_lengths(body: _Text | _Binary, element: _Element, at: int) -> NDArray[
     return _walk_lists(body, element, at, element.rows)
 
 
-def _walk_lists(body: _Text | _Binary, element: _Element, at: int, rows: int) -> NDArray[np.int64]:
+def _walk_lists(body: _Body, element: _Element, at: int, rows: int) -> NDArray[np.int64]:
     """Return the lengths [rows, L] of lists, read row by row."""
     steps: list[tuple[int, np.dtype, int]] = []
     skipped = 0

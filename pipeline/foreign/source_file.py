@@ -15,22 +15,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.foreign.gltf.document import GltfDocument, open_gltf
-from pipeline.foreign.limits import ReadLimits
+from pipeline.foreign.limits import SUFFIXES, USD_SUFFIXES, ReadLimits
 from pipeline.foreign.material_files import MaterialFiles, SourceFolder, obj_files, ply_files
 from pipeline.foreign.mesh import FileMesh
 from pipeline.foreign.obj import read_obj
 from pipeline.foreign.off import read_off
 from pipeline.foreign.ply import check_face_count, read_ply
 from pipeline.foreign.stl import count_facets, read_stl
-from pipeline.foreign.usd.stage import SUFFIXES as USD_SUFFIXES
 from storage.errors import Rejected
 
 if TYPE_CHECKING:
     from pipeline.foreign.usd.object_source import UsdSource
-
-SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", *USD_SUFFIXES)
-"""Suffixes of the formats that are read. The suffix decides: a file of another format is refused or
-fails to load, and never reaches the reader of that format."""
 
 _READERS: Mapping[str, Callable[[bytes], FileMesh]] = {
     "obj": read_obj,

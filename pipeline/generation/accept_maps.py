@@ -5,7 +5,7 @@ its content decides the split of a texture or map, by the rule of objects.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,7 @@ from pipeline.isolation import (
     reach,
 )
 from pipeline.objects.maps.listing import PLURALS, FoundMap, find_maps
-from pipeline.objects.maps.prepared import MapFiles, decode_prepared, map_cache_key, prepare_map
+from pipeline.objects.maps.prepared import decode_prepared, map_cache_key, prepare_map
 from pipeline.presets.settings import DatasetSettings
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
@@ -149,7 +149,7 @@ def _prepare_maps(
     def prepare(user_map: FoundMap) -> tuple[LockedObject, Path] | Failure:
         try:
             with pool.borrow() as child:
-                path = _prepare_file(MapFiles(kind=kind, files=user_map.files, size=size), child)
+                path = _prepare_file(kind, user_map.files, size, child)
             return _lock_entry(kind, user_map, path, settings), path
         except Rejected as rejection:
             return failure_of("objects", user_map.record.uid, rejection)
@@ -166,16 +166,16 @@ def _notes(prepared: Path) -> Path:
     return prepared.with_suffix(".txt")
 
 
-def _prepare_file(map_files: MapFiles, child: IsolatedChild) -> Path:
+def _prepare_file(kind: str, files: Mapping[str, Path], size: int, child: IsolatedChild) -> Path:
     """Prepare a file in a child unless the cache has it; return its path. Raises Rejected."""
-    name = map_cache_key(map_files)
+    name = map_cache_key(kind, files, size)
     path = cache_folder("maps") / name[:2] / f"{name}.safetensors"
     if not path.exists():
         try:
-            data, unread = call_with_retries(child, prepare_map, map_files)
+            data, unread = call_with_retries(child, prepare_map, kind, files, size)
         except ChildFailed as failure:
             raise Rejected(failure.reason, failure.sentence) from failure
-        if map_cache_key(map_files) != name:
+        if map_cache_key(kind, files, size) != name:
             raise Rejected("unreadable_file", "it changed while it was being prepared")
         if unread:
             message = printable(f"it is used without {'; '.join(unread)}")

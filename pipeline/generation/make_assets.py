@@ -29,7 +29,7 @@ from pipeline.generation.prepare_isolated import (
     write_unread,
 )
 from pipeline.isolation import ChildFailed, call_with_retries, reach
-from pipeline.objects.ply import encode_ply
+from pipeline.objects.generated import encode_ply
 from pipeline.objects.sources import find_objects
 from storage.atomic import write_atomically
 from storage.cache import cache_folder

@@ -19,10 +19,11 @@ from typing import Any
 from pipeline.assets.recipe import READERS, RECIPE
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedObject
+from pipeline.foreign.limits import SUFFIXES
 from pipeline.generation.dataset_writer import DatasetWriter
 from pipeline.generation.prepare_isolated import MeshWork
 from pipeline.isolation import is_transient
-from pipeline.objects.listing import SUFFIXES, Fetched
+from pipeline.objects.listing import Fetched
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.digests import canonical_json, sha256_hex

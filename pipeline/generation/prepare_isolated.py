@@ -105,7 +105,7 @@ def require_filters() -> None:
     Raises:
         TrilightError: pymeshlab is installed and lacks a filter that we use.
     """
-    from pipeline.assets.check_pymeshlab import missing_filters
+    from pipeline.assets.recipe import missing_filters
 
     if missing := missing_filters():
         raise TrilightError(

@@ -12,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
+from pipeline.foreign.limits import USD_SUFFIXES
 from storage.conventions import SPLITS
 from storage.remote.safe_url import printable
 
@@ -47,7 +48,6 @@ _MESH = re.compile(r".*-[0-9a-f]{8}\.(?:ply|glb)")
 _UNREAD = frozenset(
     "fbx dae blend 3ds 3mf ma mb max abc x3d wrl ifc step stp iges skp vrm zip 7z rar".split()
 )
-_USD = ("usd", "usda", "usdc", "usdz")
 
 _TWINS = (
     (re.compile(r"(?<![^/])normalized_model\.obj$"), "raw_model.obj"),  # 3D-FUTURE
@@ -121,7 +121,11 @@ def warn_unread_formats(names: Sequence[str], objects: Sequence[str]) -> None:
 
 def drop_scenes(root: Path, names: Sequence[str]) -> list[str]:
     """Return object files without USD and GLB files of whole Trilight scenes."""
-    scenes = [name for name in names if _suffix(name) in (*_USD, "glb") and _is_scene(root / name)]
+    scenes = [
+        name
+        for name in names
+        if name.lower().endswith((*USD_SUFFIXES, ".glb")) and _is_scene(root / name)
+    ]
     if scenes:
         example = f"{printable(scenes[0])}{_and_more(len(scenes) - 1)}"
         warn_once(f"left out as scenes that Trilight wrote: {example}")

@@ -11,19 +11,19 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.objects.builtin.furniture import sample_furniture
 from pipeline.objects.builtin.gear import sample_gear
-from pipeline.objects.builtin.grids import Mesh
 from pipeline.objects.builtin.lattice import sample_lattice
 from pipeline.objects.builtin.plant import sample_plant
 from pipeline.objects.builtin.rock import sample_rock
 from pipeline.objects.builtin.shell import sample_shell
+from pipeline.objects.builtin.solids import Mesh
 from pipeline.objects.builtin.superquadric import sample_superquadric
 from pipeline.objects.builtin.torus_knot import sample_torus_knot
 from pipeline.objects.builtin.tree import sample_tree
 from pipeline.objects.builtin.vase import sample_vase
-from pipeline.objects.ply import encode_ply
 from storage.atomic import write_atomically
 from storage.dataset.layout import numbered_path
 from storage.errors import TrilightError, expected_one_of
@@ -114,3 +114,21 @@ def num_builtin(source: str) -> int:
             f"{PREFIX}{DEFAULT_COUNT}, or {BENCHMARK}."
         )
     return count
+
+
+def encode_ply(positions: NDArray[np.floating], faces: NDArray[np.integer]) -> bytes:
+    """Return a mesh as binary PLY: float32 positions [V, 3], triangles [F, 3].
+
+    It is a plain format that every modeling program opens.
+    """
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(positions)}\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        f"element face {len(faces)}\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    rows = np.zeros(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
+    rows["count"] = 3
+    rows["corners"] = faces
+    return header.encode() + positions.astype("<f4").tobytes() + rows.tobytes()

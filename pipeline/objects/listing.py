@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 
+from pipeline.foreign.limits import SUFFIXES
 from storage.records.objects import Failure, ObjectRecord
 from storage.remote.retries import TransferFailed
 from storage.remote.safe_url import printable
@@ -38,13 +39,6 @@ class Listing:
 def failure(uid: str, reason: str, message: str) -> Failure:
     """Return the failure of an object that the stage `objects` refuses."""
     return Failure(stage="objects", item=uid, reason=reason, message=message)
-
-
-SUFFIXES = (
-    *(".glb", ".gltf", ".obj", ".ply", ".stl", ".off"),
-    *(".usd", ".usda", ".usdc", ".usdz"),
-)
-"""Suffixes of object files, compared in lower case."""
 
 
 def is_object_file(name: str) -> bool:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 
+from pipeline.foreign.limits import SUFFIXES
 from pipeline.objects.generated import generate_objects, num_builtin
 from pipeline.objects.licences import (
     check_allowed,
@@ -19,7 +20,7 @@ from pipeline.objects.licences import (
     require_unstated,
     stated_licence,
 )
-from pipeline.objects.listing import SUFFIXES, CountDone, Fetched, Listing
+from pipeline.objects.listing import CountDone, Fetched, Listing
 from pipeline.objects.local.folder import list_folder
 from pipeline.objects.objaverse.source import list_objaverse
 from pipeline.objects.remote.source import list_remote
@@ -123,15 +124,6 @@ class FoundObjects:
     """Failures of the stage `objects`, sorted by uid: licence_refused, download_failed,
     too_large_bytes, too_many_buffers, unsafe_name, unknown_uid, link_outside, name_clash."""
 
-    @property
-    def num_found(self) -> int:
-        """Number of objects in the source."""
-        return len(self.records) + len(self.failures)
-
-
-def _ignore_progress(done: int, total: int) -> None:
-    """Show no progress."""
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ListedObjects:
@@ -149,11 +141,11 @@ class ListedObjects:
     def fetch_selected(
         self,
         is_selected: Callable[[str], bool] = lambda uid: True,
-        downloaded: CountDone = _ignore_progress,
+        downloaded: CountDone = lambda done, total: None,
     ) -> FoundObjects:
         """Download the selected objects and return them with the failures.
 
-        Downloads stay in the user's cache (`storage.cache`; Objaverse in the folder of its own
+        Downloads stay in the user's cache (`storage.cache`; Objaverse in the folder of its
         package) and are not repeated.
 
         Args:
@@ -223,8 +215,7 @@ def list_objects(
     """
     source = stored_name(source, OBJECTS)
     with _resolve_source(source) as value:
-        listing = _query_source(value, work_dir, licence, allowed_licences)
-    assert listing is not None
+        listing = _list_some(*_choose_source(value, work_dir, licence, allowed_licences))
     allowed, refused = refuse_licences(listing.records, allowed_licences)
     return ListedObjects(
         source=source, listing=listing, allowed=allowed, refused=[*listing.failures, *refused]
@@ -237,7 +228,7 @@ def find_objects(
     work_dir: Path,
     allowed_licences: Sequence[str],
     licence: str | None = None,
-    downloaded: CountDone = _ignore_progress,
+    downloaded: CountDone = lambda done, total: None,
 ) -> FoundObjects:
     """List a source and download all its usable objects; raises as `list_objects`."""
     listed = list_objects(
@@ -255,7 +246,12 @@ def check_source(source: str, *, allowed_licences: Sequence[str], licence: str |
         TrilightError: as `list_objects`.
     """
     with _resolve_source(source) as value:
-        _query_source(value, cache_folder("objects"), licence, allowed_licences, check_only=True)
+        folder = cache_folder("objects")
+        kind, query = _choose_source(value, folder, licence, allowed_licences)
+        if kind.look is not None:
+            kind.look(query)
+        else:
+            _list_some(kind, query)
 
 
 @contextlib.contextmanager
@@ -302,34 +298,26 @@ def _redact_value(message: str, source: str, value: str) -> str:
     )
 
 
-def _query_source(
-    source: str,
-    work_dir: Path,
-    licence: str | None,
-    allowed_licences: Sequence[str],
-    *,
-    check_only: bool = False,
-) -> Listing | None:
-    """Return the listing of a source, or None where a check suffices.
-
-    Raises:
-        TrilightError: the source is invalid or empty.
-    """
+def _choose_source(
+    source: str, work_dir: Path, licence: str | None, allowed_licences: Sequence[str]
+) -> tuple[ObjectSource, SourceQuery]:
+    """Return a source with its query; raises TrilightError for licences that cannot be."""
     check_allowed(allowed_licences)
     stated_licence(licence)
-    query = SourceQuery(
-        source=source, work_dir=work_dir, licence=licence, allowed_licences=allowed_licences
-    )
     kind = source_of(source)
     if kind.states_licences:
         require_unstated(licence, f"{source.partition(':')[0]}:")
-    if check_only and kind.look:
-        kind.look(query)
-        return None
+    return kind, SourceQuery(
+        source=source, work_dir=work_dir, licence=licence, allowed_licences=allowed_licences
+    )
+
+
+def _list_some(kind: ObjectSource, query: SourceQuery) -> Listing:
+    """Return the listing of a source; raises TrilightError where it is invalid or empty."""
     listing = kind.list(query)
     if not listing.records and not listing.failures:
         raise TrilightError(
-            f"objects {printable(safe_url(source))!r} holds no object; expected "
+            f"objects {printable(safe_url(query.source))!r} holds no object; expected "
             f"{' '.join(SUFFIXES)} files, or a catalogue (objects.jsonl or objects.csv) that lists "
             "some. Name procedural: for built-in objects."
         )

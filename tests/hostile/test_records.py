@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.exchange.renderformer_json import read_description
 from pipeline.isolation.call_failures import ChildFailed
-from pipeline.objects.maps.prepared import MapFiles, prepare_map
+from pipeline.objects.maps.prepared import prepare_map
 from storage.errors import Rejected, TrilightError
 from storage.records.objects import SKY, TEXTURE
 from tests.conftest import ROOT
@@ -87,7 +87,7 @@ def _refusals(folder: Path) -> Iterator[tuple[str, Exception]]:
         (folder / "map").write_bytes(picture)
         for kind, part in ((TEXTURE, "base"), (SKY, "map")):
             with pytest.raises(Rejected) as caught:
-                prepare_map(MapFiles(kind=kind, files={part: folder / "map"}, size=8))
+                prepare_map(kind, {part: folder / "map"}, 8)
             yield f"{kind} {number}", caught.value
     text = changed()
     for at in range(0, len(text), 31):

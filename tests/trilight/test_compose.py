@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.objects.ply import encode_ply
+from pipeline.objects.generated import encode_ply
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from tests.for_each import for_each
 from trilight import Material, SceneBuilder, TrilightError, read_scene

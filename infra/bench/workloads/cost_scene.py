@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadric
+from pipeline.objects.builtin.superquadric import superquadric
 from pipeline.scenes.pieces import (
     ScenePiece,
     concatenate_pieces,
@@ -115,16 +115,13 @@ def _object(
     """Return a superquadric of 2 rings columns triangles, near `num_triangles`."""
     rings = max(2, round(math.sqrt(num_triangles / 4)))
     columns = max(3, round(num_triangles / (2 * rings)))
-    params = SuperquadricParams(
+    positions, faces = superquadric(
         exponent_profile=exponent,
         exponent_plan=exponent,
         half_sizes=(0.3, 0.3, 0.35),
-        taper=0.0,
-        twist_rad=0.0,
         rings=rings,
         columns=columns,
     )
-    positions, faces = superquadric(params)
     placed: NDArray[np.float32] = (positions + np.array(centre)).astype(np.float32)
     entry = SceneObject(name=name, kind="object")
     return object_piece(entry, placed, faces.astype(np.uint32), surface, rng, _SMOOTH_ANGLE_DEG)

@@ -61,9 +61,14 @@ def clean(mesh: TriangleMesh) -> TriangleMesh:
 
 def canonical(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     """Rotate every face to start at its lowest vertex, and sort the faces."""
-    corner_order = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
-    rotated = np.take_along_axis(faces, corner_order, axis=1)
+    rotated = start_at_lowest(faces)
     return rotated[np.lexsort(rotated.T[::-1])]
+
+
+def start_at_lowest(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rotate every face to start at its lowest vertex."""
+    corner_order = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    return np.take_along_axis(faces, corner_order, axis=1)
 
 
 def geometry_sha256(mesh: TriangleMesh) -> str:

@@ -4,8 +4,7 @@ import igl
 import numpy as np
 
 from pipeline.assets.cleaning.clean import clean
-from pipeline.assets.quality.measure import MeasuredSource
-from pipeline.assets.quality.triangles import half_edges, open_half_edges
+from pipeline.assets.quality.measure import MeasuredSource, half_edges, open_half_edges
 from pipeline.assets.settings import GateSettings
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected

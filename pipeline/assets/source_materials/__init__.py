@@ -3,5 +3,6 @@
 - `source_surface`: the cleaned source with its materials at every point.
 - `nearest`: the point of the source for each point of a level.
 - `texture_atlas`: an atlas with a tile for every triangle.
-- `bake`, `texture_quality`: the textures of a level, and their error.
+- `bake`: the textures of a level.
+- `skin`: the skins of all levels, with the errors of their textures.
 """

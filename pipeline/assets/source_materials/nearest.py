@@ -12,7 +12,7 @@ from embreex.mesh_construction import TriangleMesh as EmbreeMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from pipeline.assets.quality.triangles import unit_normals
+from pipeline.assets.quality.measure import unit_normals
 from pipeline.foreign.mesh import TriangleMesh
 
 _BEHIND = 1e-4

@@ -3,31 +3,46 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 
+import igl
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.assets.quality.measure import (
+    level_mesh,
+    round_digits,
+    sample_surface,
+    unit_normals,
+)
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
-from pipeline.assets.source_materials.bake import bake, level_emission
-from pipeline.assets.source_materials.nearest import SurfaceLookup
+from pipeline.assets.source_materials.bake import DIFFUSE, BakedTextures, bake, level_emission
+from pipeline.assets.source_materials.nearest import SurfaceLookup, barycentric
 from pipeline.assets.source_materials.source_surface import SourceSurface, match_source_surface
-from pipeline.assets.source_materials.texture_quality import skin_quality
 from pipeline.foreign.gltf.materials import GltfMaterials
-from pipeline.foreign.gltf.objects import gltf_textured_mesh
+from pipeline.foreign.gltf.primitives import gltf_textured_mesh
+from pipeline.foreign.material import TexturedMesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.mesh_materials import read_textured_mesh
 from pipeline.foreign.numbers import FINITE
 from pipeline.foreign.picture import Decode, Decoder
 from pipeline.foreign.source_file import SourceFile
-from pipeline.foreign.textured_mesh import TexturedMesh
 from pipeline.foreign.usd.materials import usd_textured_mesh
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level, LevelSkin, OwnMaterials, SkinQuality
+from storage.records.lookup import texture_values
 from storage.records.packed_maps import pack_map
 from storage.records.texture import TEXTURED, Texture
+from storage.seeds import rng_for
 
 _LEAST_REACH = 1e-3
 """Least distance within which rays search the source, in the unit box; beyond it, 1.5 times the
 level's largest error."""
+
+_NUM_POINTS = 4096
+"""Points on the source at which the color error is measured."""
+_ALONG = (0.2, 0.5, 0.8)
+"""Positions along an edge, as fractions, at which its two sides are compared."""
+_TORN_TEXELS = 2.0
+"""Gap in texels from which a seam counts as torn."""
 
 
 def add_source_materials(
@@ -94,9 +109,7 @@ class SkinBaker:
             Rejected: colours_changed or colours_missed where an error is over its limit, or
                 materials_unreadable where no scene could hold the skin.
         """
-        mesh = TriangleMesh(
-            positions=level.positions.astype(np.float64), faces=level.faces.astype(np.int64)
-        )
+        mesh = level_mesh(level)
         off = level.record.quality.error_max * self._surface.mesh.diagonal
         reach = max(_LEAST_REACH, 1.5 * off)
         baked = bake(mesh, self._surface, self._nearest, self._settings, reach)
@@ -167,3 +180,69 @@ def _parts(
         materials = GltfMaterials(source.gltf, decode, emission=emission, normals=normals)
         return gltf_textured_mesh(source.gltf, materials)
     return read_textured_mesh(source, decode, emission=emission, normals=normals)
+
+
+def skin_quality(
+    level: TriangleMesh,
+    baked: BakedTextures,
+    source: SourceSurface,
+    nearest: SurfaceLookup,
+    reach: float,
+) -> SkinQuality:
+    """Return the measures of a baked level; arguments as those of `bake`."""
+    error = _color_errors(level, baked, source)
+    return SkinQuality(
+        colour_error=round_digits(error.mean()),
+        colour_error_p95=round_digits(np.percentile(error, 95)),
+        missed_cells=round_digits(baked.missed),
+        torn_seams=round_digits(_torn_seams(level, nearest, source, reach, 1 / baked.density)),
+        texels_per_length=round_digits(baked.density),
+    )
+
+
+def _color_errors(
+    level: TriangleMesh, baked: BakedTextures, source: SourceSurface
+) -> NDArray[np.float64]:
+    """Return the mean color difference [N] at points spread evenly over the source."""
+    uniform = rng_for(0, "own-materials").random((_NUM_POINTS, 3))
+    points = sample_surface(source.mesh, uniform)
+    weights = barycentric(source.mesh.corners[points.faces], points.positions)
+    source_rgb = source.columns(points.faces, weights, 1 / baked.density)[:, DIFFUSE]
+    _, faces, nearest = igl.point_mesh_squared_distance(
+        points.positions, level.positions, level.faces
+    )
+    faces = np.asarray(faces, np.int64).ravel()
+    uv = np.einsum("nc,ncd->nd", barycentric(level.corners[faces], nearest), baked.uv[faces])
+    level_rgb = texture_values(baked.textures[0], uv)
+    return np.abs(level_rgb - source_rgb).mean(axis=1)
+
+
+def _torn_seams(
+    level: TriangleMesh,
+    nearest: SurfaceLookup,
+    source: SourceSurface,
+    reach: float,
+    texel: float,
+) -> float:
+    """Return the fraction of inner edge length whose two sides show distant source points."""
+    directed = np.stack([level.faces, np.roll(level.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+    ends = np.sort(directed, axis=1)
+    edges, edge, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    edge = edge.ravel()
+    order = np.argsort(edge, kind="stable")
+    sides = order[count[edge[order]] == 2].reshape(-1, 2) // 3
+    if not len(sides):
+        return 0.0
+    inner = level.positions[edges[count == 2]]
+    normal = unit_normals(level)
+    along = np.array(_ALONG)[:, None, None]
+    points = ((1 - along) * inner[:, 0] + along * inner[:, 1]).reshape(-1, 3)
+    side_positions = []
+    for side in sides.T:
+        locations = nearest.find(points, np.tile(normal[side], (len(_ALONG), 1)), reach)
+        corners = source.mesh.corners[locations.faces]
+        side_positions.append(np.einsum("nc,ncd->nd", locations.weights, corners))
+    gap = np.linalg.norm(side_positions[0] - side_positions[1], axis=1).reshape(len(_ALONG), -1)
+    length = np.linalg.norm(inner[:, 1] - inner[:, 0], axis=1)
+    torn = (gap > _TORN_TEXELS * texel).mean(axis=0)
+    return float((torn * length).sum() / length.sum())

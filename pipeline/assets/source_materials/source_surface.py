@@ -3,14 +3,14 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.cleaning.clean import cell_keys, normalize
-from pipeline.foreign.material import MaterialSamples, Slot, SourceMaterial, source_columns
+from pipeline.assets.cleaning.clean import cell_keys, normalize, start_at_lowest
+from pipeline.foreign.material import Slot, SourceMaterial, TexturedMesh, source_columns
 from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.textured_mesh import TexturedMesh
 from storage.errors import Rejected
 from storage.records.lookup import LEAST_Z, u_directions, unit_or_zero
 
@@ -20,6 +20,13 @@ _LEAST_FOUND = 0.999
 
 _LEAST_LENGTH = 0.1
 """Least length of a normal of a picture: a shorter one has no direction, and counts as flat."""
+
+
+class _Points(NamedTuple):
+    """Points on faces of the file: their faces [N], and their weights of its corners [N, 3]."""
+
+    faces: NDArray[np.int64]
+    weights: NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,8 +53,8 @@ class SourceSurface:
             cell: width in the unit box over which pictures are averaged.
         """
         result = np.zeros((len(faces), 7))
-        for material, chosen, in_file in self._by_material(faces, weights):
-            result[chosen] = self._material_columns(material, *in_file, cell)
+        for material, chosen, points in self._by_material(faces, weights):
+            result[chosen] = self._material_columns(material, points, cell)
         return result
 
     @property
@@ -60,11 +67,11 @@ class SourceSurface:
     ) -> NDArray[np.float64]:
         """Return the radiance [N, 3] at points on faces; arguments as in `columns`."""
         result = np.zeros((len(faces), 3))
-        for material, chosen, in_file in self._by_material(faces, weights):
+        for material, chosen, points in self._by_material(faces, weights):
             if material.emits:
                 result[chosen] = material.emission_rgb
             if material.emits and material.emission is not None:
-                result[chosen] *= self._sample_picture(material.emission, *in_file, cell)[:, :3]
+                result[chosen] *= self._sample_picture(material.emission, points, cell)[:, :3]
         return result
 
     @property
@@ -91,15 +98,15 @@ class SourceSurface:
             frame: unit normal and x axis of the level at each point, [N, 3] each.
         """
         result = np.tile([0.0, 0.0, 1.0], (len(faces), 1))
-        for material, chosen, in_file in self._by_material(faces, weights):
+        for material, chosen, points in self._by_material(faces, weights):
             if material.normal is None:
                 continue
-            texels = self._sample_picture(material.normal, *in_file, cell)[:, :3]
+            texels = self._sample_picture(material.normal, points, cell)[:, :3]
             stated = texels * np.array(material.normal_scale) + np.array(material.normal_bias)
             stated[np.square(stated).sum(axis=1) < _LEAST_LENGTH**2] = 0, 0, 1
             stated[:, 2] = np.maximum(stated[:, 2], LEAST_Z)
             x, y, z = unit_or_zero(stated).T
-            tangent, bitangent, normal = self._frames(material.normal, *in_file)
+            tangent, bitangent, normal = self._frames(material.normal, points)
             outward = _unit_normals(self.mesh.positions[self.mesh.faces[faces[chosen]]])
             # A face that was turned over shows the other side of the same bumps.
             side = np.where((outward * normal).sum(axis=1) < 0, -1.0, 1.0)
@@ -112,22 +119,22 @@ class SourceSurface:
         return result
 
     def _frames(
-        self, slot: Slot, source_face: NDArray[np.int64], source_weights: NDArray[np.float64]
+        self, slot: Slot, points: _Points
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return unit tangent, bitangent and normal [N, 3] at points of the file.
 
         Tangents are those that the file states, or else those of its texture coordinates. Without
         either they are 0, and leave the normal as it is.
         """
-        corners = self.parts.mesh.positions[self.parts.mesh.faces[source_face]]
+        corners = self.parts.mesh.positions[self.parts.mesh.faces[points.faces]]
         normal = _unit_normals(corners)
-        uv = self.parts.uv[source_face, slot.uv_set] @ slot.uv_matrix.T + slot.uv_offset
+        uv = self.parts.uv[points.faces, slot.uv_set] @ slot.uv_matrix.T + slot.uv_offset
         steps = uv[:, 1:] - uv[:, :1]
         area = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0]
         tangent = u_directions(corners, uv)
         hand = np.sign(area)
         if self.parts.tangent is not None:
-            stated = np.einsum("nc,ncd->nd", source_weights, self.parts.tangent[source_face])
+            stated = np.einsum("nc,ncd->nd", points.weights, self.parts.tangent[points.faces])
             flat = stated[:, :3] - (stated[:, :3] * normal).sum(axis=1, keepdims=True) * normal
             flat = unit_or_zero(flat)
             is_stated = np.square(flat).sum(axis=1) > 0
@@ -137,9 +144,7 @@ class SourceSurface:
 
     def _by_material(
         self, faces: NDArray[np.int64], weights: NDArray[np.float64]
-    ) -> Iterator[
-        tuple[SourceMaterial, NDArray[np.int64], tuple[NDArray[np.int64], NDArray[np.float64]]]
-    ]:
+    ) -> Iterator[tuple[SourceMaterial, NDArray[np.int64], _Points]]:
         """Yield each material, the rows of its points, and their faces and weights in the file."""
         source_face = self.source_face[faces]
         source_weights = np.zeros((len(faces), 3))  # weights of the corners in the file's order
@@ -147,51 +152,33 @@ class SourceSurface:
         material = self.parts.material[source_face]
         for row in np.unique(material):
             chosen = np.flatnonzero(material == row)
-            yield self.parts.materials[row], chosen, (source_face[chosen], source_weights[chosen])
+            points = _Points(source_face[chosen], source_weights[chosen])
+            yield self.parts.materials[row], chosen, points
 
     def _material_columns(
-        self,
-        material: SourceMaterial,
-        source_face: NDArray[np.int64],
-        source_weights: NDArray[np.float64],
-        cell: float,
+        self, material: SourceMaterial, points: _Points, cell: float
     ) -> NDArray[np.float64]:
         known: dict[tuple[object, ...], NDArray[np.float32]] = {}
 
-        def sample(slot: Slot | None) -> NDArray[np.float32] | None:
-            if slot is None:
-                return None
+        def sample(slot: Slot) -> NDArray[np.float32]:
             place = slot.uv_matrix.tobytes(), slot.uv_offset.tobytes()
             key = id(slot.picture), slot.uv_set, place
             if key not in known:  # one picture often holds several numbers
-                known[key] = self._sample_picture(slot, source_face, source_weights, cell)
+                known[key] = self._sample_picture(slot, points, cell)
             return known[key]
 
-        base = sample(material.base)
+        seen = {name: sample(slot) for name, slot in material.column_slots.items()}
         if self.parts.color is not None:
-            tint = np.einsum("nc,ncd->nd", source_weights, self.parts.color[source_face])
-            base = np.ones((len(source_face), 4), np.float32) if base is None else base
-            base = np.concatenate([base[:, :3] * tint, base[:, 3:]], axis=1).astype(np.float32)
-        seen = MaterialSamples(
-            base=base,
-            metallic=sample(material.metallic_map),
-            roughness=sample(material.roughness_map),
-            specular_colour=sample(material.specular_colour),
-            specular_strength=sample(material.specular_strength_map),
-            glossiness=sample(material.glossiness),
-        )
-        return source_columns(material, seen, len(source_face))
+            tint = np.einsum("nc,ncd->nd", points.weights, self.parts.color[points.faces])
+            base = seen.get("base", np.ones((len(points.faces), 4), np.float32))
+            tinted = np.concatenate([base[:, :3] * tint, base[:, 3:]], axis=1)
+            seen["base"] = tinted.astype(np.float32)
+        return source_columns(material, seen, len(points.faces))
 
-    def _sample_picture(
-        self,
-        slot: Slot,
-        source_face: NDArray[np.int64],
-        source_weights: NDArray[np.float64],
-        cell: float,
-    ) -> NDArray[np.float32]:
-        corners = self.parts.uv[source_face, slot.uv_set] @ slot.uv_matrix.T + slot.uv_offset
-        uv = np.einsum("nc,ncd->nd", source_weights, corners)
-        return slot.picture.sample(uv, _halvings(slot, corners, self._areas[source_face], cell))
+    def _sample_picture(self, slot: Slot, points: _Points, cell: float) -> NDArray[np.float32]:
+        corners = self.parts.uv[points.faces, slot.uv_set] @ slot.uv_matrix.T + slot.uv_offset
+        uv = np.einsum("nc,ncd->nd", points.weights, corners)
+        return slot.picture.sample(uv, _halvings(slot, corners, self._areas[points.faces], cell))
 
     @cached_property
     def _areas(self) -> NDArray[np.float64]:
@@ -261,17 +248,12 @@ def match_source_surface(mesh: TriangleMesh, parts: TexturedMesh) -> SourceSurfa
 
 def _first_matches(faces: NDArray[np.int64], candidates: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the first candidate equal to each face up to rotation of its corners, or -1."""
-    rows = np.concatenate([_start_at_lowest(candidates), _start_at_lowest(faces)])
+    rows = np.concatenate([start_at_lowest(candidates), start_at_lowest(faces)])
     _, number = np.unique(rows, axis=0, return_inverse=True)
     first = np.full(int(number.max()) + 1, len(candidates))
     np.minimum.at(first, number.ravel()[: len(candidates)], np.arange(len(candidates)))
     first_match = first[number.ravel()[len(candidates) :]]
     return np.where(first_match < len(candidates), first_match, -1)
-
-
-def _start_at_lowest(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    corner_order = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
-    return np.take_along_axis(faces, corner_order, axis=1)
 
 
 def _nearest_matched(

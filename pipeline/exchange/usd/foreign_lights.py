@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.numbers import FINITE, read_number, read_numbers
-from pipeline.foreign.usd.colors import convert_to_rec709
 from pipeline.foreign.usd.placed import PlacedPrim
+from pipeline.foreign.usd.texture_nodes import convert_to_rec709
 from storage.settings.ranges import Within
 
 _DISK_CORNERS = 24

@@ -28,7 +28,7 @@ from pipeline.exchange.usd.prim_names import added_column
 from pipeline.exchange.usd.read_exact_scene import read_written_rows
 from pipeline.foreign.part import Part, drop_empty, unit_normals
 from pipeline.foreign.usd.materials import MeshMaterials
-from pipeline.foreign.usd.object_stage import UsdStage
+from pipeline.foreign.usd.object_source import UsdStage, read_stage_materials
 from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.polygons import (
     CutMesh,
@@ -39,7 +39,6 @@ from pipeline.foreign.usd.polygons import (
     place_points,
 )
 from pipeline.foreign.usd.shaders import StatedMaterial, read_material
-from pipeline.foreign.usd.stage_materials import read_stage_materials
 from pipeline.scenes.shading_normals import smooth_shaded
 from storage.records.material import laid_out
 from storage.records.texture import MapSource, Texture

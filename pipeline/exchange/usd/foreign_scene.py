@@ -15,7 +15,7 @@ from pipeline.exchange.usd.foreign_lights import compute_radiance, light_triangl
 from pipeline.exchange.usd.foreign_materials import StageSurfaces, read_mesh
 from pipeline.exchange.usd.prim_names import FOV_DEG, INDEX, OBJECT_TEXTS, parse_camera_row
 from pipeline.foreign.numbers import read_number
-from pipeline.foreign.usd.object_stage import UsdStage
+from pipeline.foreign.usd.object_source import UsdStage
 from pipeline.foreign.usd.placed import DOMES, PlacedPrim, placed_prims
 from pipeline.foreign.usd.solids import SOLIDS
 from pipeline.foreign.usd.stage import OpenedStage

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.usd.authoring import Attributes
-from pipeline.foreign.usd.colors import convert_to_rec709
 from pipeline.foreign.usd.shaders import (
     note_unsupported,
     parse_color,
@@ -21,7 +20,7 @@ from pipeline.foreign.usd.shaders import (
     surface_shader,
 )
 from pipeline.foreign.usd.stage import OpenedStage
-from pipeline.foreign.usd.texture_nodes import find_sources, is_output
+from pipeline.foreign.usd.texture_nodes import convert_to_rec709, find_sources, is_output
 
 Color = tuple[float, float, float]
 

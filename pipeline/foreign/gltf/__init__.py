@@ -2,6 +2,6 @@
 
 - `container`, `document`: chunks, JSON and version; buffers, accessors and pictures.
 - `check`: refusals, counts within limits, and names of unread contents, before any buffer is read.
-- `nodes`, `primitives`: the placed meshes, and their triangles.
-- `materials`, `objects`: materials, and an object of triangles and materials.
+- `nodes`, `primitives`: the placed meshes, and their triangles, alone or with materials.
+- `materials`: those materials.
 """

@@ -6,7 +6,7 @@ Native code parses the bytes, so only processes with limits import this (pipelin
 - `stage`, `composition`: a file and the files that it names, bounded before it is composed.
 - `placed`: the visible prims with their transforms; names of unread contents.
 - `polygons`, `solids`, `skins`: a mesh as triangles, posed by its skeleton.
-- `shaders`, `texture_nodes`, `colors`: the inputs of a material.
-- `stage_materials`, `materials`: all materials of a stage, and those of a mesh's triangles.
-- `object_stage`, `object_source`: a stage as an object.
+- `shaders`, `texture_nodes`: the inputs of a material.
+- `object_source`: a stage as an object, and all of its materials; `materials`: those of a mesh's
+  triangles.
 """

@@ -16,11 +16,11 @@ from pipeline.foreign.material import (
     WHITE,
     Slot,
     SourceMaterial,
+    TexturedMesh,
     with_normal_map,
 )
 from pipeline.foreign.picture import Decode, Picture, has_colors
-from pipeline.foreign.textured_mesh import TexturedMesh
-from pipeline.foreign.usd.object_source import UsdSource
+from pipeline.foreign.usd.object_source import StageMaterials, UsdSource, name_unsupported
 from pipeline.foreign.usd.polygons import CutMesh
 from pipeline.foreign.usd.shaders import (
     IOR_OF_CONSTANT_ALBEDOS,
@@ -29,7 +29,6 @@ from pipeline.foreign.usd.shaders import (
     read_colors,
     reflect_head_on,
 )
-from pipeline.foreign.usd.stage_materials import StageMaterials, name_unsupported
 from pipeline.foreign.usd.texture_nodes import TextureNode
 from storage.errors import Rejected
 
@@ -181,7 +180,8 @@ class MeshMaterials:
         is_tint = base is not None or "diffuseColor" in stated.primvars
         roughness = self._slot(stated, "roughness")
         lost = name_unsupported(stated)
-        glows = any(_glow(stated)) or "emissiveColor" in stated.primvars
+        is_lit = any(_glow(stated, "emissiveColor" in stated.textures))
+        glows = is_lit or "emissiveColor" in stated.primvars
         material = SourceMaterial(
             base_rgb=WHITE if is_tint else _rgb(stated, "diffuseColor"),
             base=base,
@@ -189,9 +189,9 @@ class MeshMaterials:
             roughness_map=roughness,
             lost=("emission", *lost) if glows else lost,
         )
-        if self._emission and any(_glow(stated)):
+        if self._emission and is_lit:
             picture = self._color_slot(stated, "emissiveColor")
-            glow = _glow(stated) if picture is not None else _scale_glow(stated)
+            glow = _glow(stated, picture is not None)
             material = dataclasses.replace(material, emission_rgb=glow, emission=picture)
         if "normal" in stated.textures:
             material = self._with_normal_map(material, stated.textures["normal"])
@@ -333,17 +333,11 @@ def _drop_negative(values: NDArray) -> RGB:
     return red, green, blue
 
 
-def _glow(stated: StatedMaterial) -> RGB:
-    """Return the emission factor, which a picture, if there is one, is multiplied with."""
+def _glow(stated: StatedMaterial, has_picture: bool) -> RGB:
+    """Return the emission, or the factor of its picture."""
     strength = _read_strength(stated)
-    if "emissiveColor" in stated.textures:
-        return (strength, strength, strength)
-    return _scale_glow(stated)
-
-
-def _scale_glow(stated: StatedMaterial) -> RGB:
-    strength = _read_strength(stated)
-    red, green, blue = (strength * value for value in _rgb(stated, "emissiveColor"))
+    colors = WHITE if has_picture else _rgb(stated, "emissiveColor")
+    red, green, blue = (strength * value for value in colors)
     return red, green, blue
 
 

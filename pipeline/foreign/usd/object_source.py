@@ -1,24 +1,178 @@
-"""`UsdSource`: the triangles and materials of a USD object; only child processes make one."""
+"""`UsdSource`: the triangles and materials of a USD object; only child processes make one.
 
+USD itself resolves the names of other files, so it receives a path; every file that it may open is
+checked first (pipeline.foreign.usd.stage). Contents that would give a plausible but wrong mesh are
+refused: a missing reference, surfaces other than polygons, bones without a pose.
+`read_stage_materials` returns the materials of a stage by mesh and polygon, of scenes too.
+"""
+
+import dataclasses
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.limits import ReadLimits
-from pipeline.foreign.mesh import TriangleMesh
-from pipeline.foreign.usd.object_stage import UsdStage, open_stage, read_or_reject
+from pipeline.foreign.material_files import MaterialFiles
+from pipeline.foreign.mesh import TriangleMesh, join_meshes
+from pipeline.foreign.usd.placed import PlacedPrim, placed_prims
 from pipeline.foreign.usd.polygons import CutMesh, cut_mesh, mesh_polygons, place_points
-from pipeline.foreign.usd.stage_materials import StageMaterials, read_stage_materials
-from storage.errors import Rejected
+from pipeline.foreign.usd.shaders import StatedMaterial, read_bindings, read_material
+from pipeline.foreign.usd.skins import UnposedMesh
+from pipeline.foreign.usd.solids import SOLIDS
+from pipeline.foreign.usd.stage import OpenedStage, OutsideFile, read_quietly
+from pipeline.foreign.usd.texture_nodes import TextureNode, asset_bytes
+from storage.errors import Rejected, TrilightError
+
+Read = TypeVar("Read")
+ReadMaterial = Callable[[Any], StatedMaterial | None]
+
+_LOST = {
+    "opacity": "transparency",
+    "transmission": "transmission",
+    "clearcoat": "clearcoat",
+    "coat": "clearcoat",
+    "subsurface": "subsurface",
+    "displacement": "displacement",
+    "normal": "normal map",
+}
+"""Words for unsupported inputs, by the beginnings of their names."""
+
+
+Binding = tuple[int, NDArray[np.int64] | None]
+"""Index of a material, or -1 for none, and the polygons of a mesh that have it; None for all."""
 
 _MAX_OFFSET = 1e5
 """Maximum distance of points from their mesh's origin, in sizes of the object: points are float32,
 and off by 1 % of the size beyond it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class UsdStage:
+    """A composed stage with its visible meshes."""
+
+    opened: OpenedStage
+    """Opened layers of the stage, with notes on unread contents."""
+    composed: Any
+    """The Usd.Stage, kept because its prims expire with it."""
+    meshes: tuple[PlacedPrim, ...]
+    """Visible meshes with transforms to meters, +Z up."""
+    time: Any
+    """The Usd.TimeCode at which values are read: the first of an animated stage."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StageMaterials:
+    """The materials of a stage."""
+
+    materials: tuple[StatedMaterial, ...]
+    """Distinct materials in the order of their first use."""
+    bindings: tuple[tuple[Binding, ...], ...]
+    """Bindings of each mesh; later ones override earlier ones."""
+    pictures: MaterialFiles
+    """Contents of pictures by resolved path."""
+
+
+def read_stage_materials(
+    stage: UsdStage,
+    max_bytes: int,
+    read: ReadMaterial | None = None,
+    *,
+    normals: bool = False,
+) -> StageMaterials:
+    """Return the materials of the visible meshes of a stage.
+
+    Args:
+        stage: the open stage.
+        max_bytes: maximum bytes of all pictures together.
+        read: function that reads a UsdShade.Material, None leaving it out; by default one that
+            refuses a material without a shader that is understood.
+        normals: whether that function reads normal maps, too.
+
+    Raises:
+        Rejected: texture_outside, materials_unreadable.
+    """
+    rows: dict[str, int] = {}
+    materials: list[StatedMaterial] = []
+
+    def find_row(material: Any) -> int:
+        if not material:
+            return -1
+        name = str(material.GetPath())
+        if name not in rows:
+            stated = read(material) if read else _read_strictly(stage, material, normals=normals)
+            rows[name] = -1 if stated is None else len(materials)
+            materials.extend([] if stated is None else [_drop_ior_texture(stage, stated)])
+        return rows[name]
+
+    try:
+        bindings = tuple(
+            tuple(
+                (find_row(material), polygons)
+                for material, polygons in read_bindings(placed.prim, stage.time)
+            )
+            for placed in stage.meshes
+        )
+    except OutsideFile as error:
+        raise Rejected("texture_outside", f"{error!s:.200}") from error
+    except TrilightError as error:
+        raise Rejected("materials_unreadable", f"{error!s:.200}") from error
+    nodes = [node for material in materials for node in material.textures.values()]
+    return StageMaterials(
+        materials=tuple(materials), bindings=bindings, pictures=_read_pictures(nodes, max_bytes)
+    )
+
+
+def _read_strictly(stage: UsdStage, material: Any, *, normals: bool) -> StatedMaterial:
+    stated = read_material(material, stage.time, stage.opened, normals=normals)
+    if stated is None:
+        name = str(material.GetPath())
+        raise TrilightError(f"{name!r:.100} has no shader that is understood")
+    return stated
+
+
+def _drop_ior_texture(stage: UsdStage, stated: StatedMaterial) -> StatedMaterial:
+    textures = dict(stated.textures)
+    if textures.pop("ior", None):
+        stage.opened.lost.append(f"{stated.where}.ior: its texture is not read; 1.5 taken")
+    return dataclasses.replace(stated, textures=textures)
+
+
+def name_unsupported(stated: StatedMaterial) -> tuple[str, ...]:
+    """Return words for the unsupported inputs that a material states."""
+    words = {
+        word for name in stated.lost for start, word in _LOST.items() if name.startswith(start)
+    }
+    return tuple(sorted(words | {"networks of shaders"} if stated.has_networks else words))
+
+
+def _read_pictures(nodes: Sequence[TextureNode], bytes_left: int) -> MaterialFiles:
+    data: dict[str, bytes] = {}
+    refused: dict[str, Rejected] = {}
+    for node in nodes:
+        path = node.resolved or node.named
+        if path in data or path in refused:
+            continue
+        try:
+            picture = None if node.resolved is None else asset_bytes(node.resolved, bytes_left)
+        except TrilightError as error:
+            refused[path] = Rejected("texture_too_large", f"{error!s:.200}")
+            continue
+        if picture is None:
+            why = f"{node.named!r:.80} is not beside the object"
+            refused[path] = Rejected("texture_missing", why)
+            if "<UDIM>" in node.named:
+                why = f"{node.named!r:.80} has UDIM tiles, which are not read"
+                refused[path] = Rejected("texture_unreadable", why)
+        else:
+            data[path] = picture
+            bytes_left -= len(picture)
+    return MaterialFiles(data=data, refused=refused)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -86,11 +240,12 @@ class UsdSource:
         """Open the file and those that it names.
 
         Raises:
-            Rejected: as `open_stage`, or too_large_bytes for all layers together.
+            Rejected: external_uri, load_error, missing_file, too_many_instances,
+                unsupported_primitive, skinned_mesh, or too_large_bytes for all layers together.
         """
         self._path = path
         self._limits = limits
-        self.stage: UsdStage = open_stage(path, limits)
+        self.stage = read_or_reject(path, lambda: _read_stage(path, limits))
         self._digest, bytes_left = _digest_files(self.stage.opened.files, limits.max_bytes)
         self._materials: StageMaterials | Rejected | None = None
         if limits.with_materials:
@@ -127,13 +282,12 @@ class UsdSource:
     @cached_property
     def mesh(self) -> TriangleMesh:
         """Return all meshes as one, unwelded, in meters, +Z up; raises Rejected as `meshes`."""
-        starts = np.cumsum([0, *(len(part.points) for part in self.meshes)])
-        faces = [
-            part.cut.indices[part.cut.corners] + start
-            for part, start in zip(self.meshes, starts[:-1], strict=True)
-        ]
-        positions = np.concatenate([part.points for part in self.meshes])
-        return TriangleMesh(positions=positions, faces=np.concatenate(faces))
+        return join_meshes(
+            [
+                TriangleMesh(positions=part.points, faces=part.cut.indices[part.cut.corners])
+                for part in self.meshes
+            ]
+        )
 
     def materials(self) -> StageMaterials:
         """Return the materials; raises Rejected as `read_stage_materials`, or no_materials."""
@@ -154,3 +308,38 @@ def _digest_files(files: Sequence[Path], bytes_left: int) -> "tuple[hashlib._Has
         digest.update(data)
         bytes_left -= len(data)
     return digest, bytes_left
+
+
+def read_or_reject(path: Path, read: Callable[[], Read]) -> Read:
+    """Return the result of `read` for a USD file; its errors become reasons of Rejected.
+
+    Raises:
+        Rejected: external_uri, skinned_mesh, load_error, or as `read`.
+    """
+    try:
+        return read_quietly(path, read)
+    except TrilightError as error:
+        reasons = {OutsideFile: "external_uri", UnposedMesh: "skinned_mesh"}
+        raise Rejected(reasons.get(type(error), "load_error"), f"{error!s:.300}") from error
+
+
+def _read_stage(path: Path, limits: ReadLimits) -> UsdStage:
+    from pxr import Usd
+
+    opened = OpenedStage(path, max_file_bytes=limits.max_bytes)
+    stage = opened.compose()
+    time = Usd.TimeCode.EarliestTime()
+    if opened.unresolved:
+        raise Rejected("missing_file", f"{opened.unresolved[0]}; an object needs all of its parts")
+    placed = placed_prims(stage, time, opened.lost, ("Mesh", *SOLIDS, "NurbsPatch"))
+    if len(placed) > limits.max_instances:
+        raise Rejected("too_many_instances", f"{len(placed)} meshes; <= {limits.max_instances}")
+    for each in placed:
+        kind = each.prim.GetTypeName()
+        where = str(each.prim.GetPath())
+        if kind == "NurbsPatch":
+            raise Rejected("unsupported_primitive", f"{where!r:.100} is a {kind}; make it a mesh")
+        scheme = each.prim.GetAttribute("subdivisionScheme")
+        if scheme and scheme.Get() != "none":
+            opened.lost.append(f"{where}: subdivision; its cage was read")
+    return UsdStage(opened=opened, composed=stage, meshes=tuple(placed), time=time)

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.foreign.polygons import triangulate
-from pipeline.foreign.usd.colors import convert_to_rec709
 from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.solids import SOLIDS, build_solid
+from pipeline.foreign.usd.texture_nodes import convert_to_rec709
 from storage.errors import TrilightError
 
 

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.foreign.usd.colors import convert_to_rec709
 from pipeline.foreign.usd.polygons import CutMesh, as_array
 from pipeline.foreign.usd.stage import OpenedStage
 from pipeline.foreign.usd.texture_nodes import (
     TextureNode,
+    convert_to_rec709,
     find_sources,
     is_output,
     read_input,
@@ -23,22 +23,23 @@ from pipeline.foreign.usd.texture_nodes import (
 )
 
 PREVIEW = "UsdPreviewSurface"
+_OPEN_PBR = "ND_open_pbr_surface_surfaceshader"
+_STANDARD = "ND_standard_surface_surfaceshader"
+_MATERIALX = {"diffuseColor": "base_color", "emissiveColor": "emission_color"}
 NAMES: Mapping[str, Mapping[str, str]] = {
     PREVIEW: {},
-    "ND_open_pbr_surface_surfaceshader": {
-        "diffuseColor": "base_color",
+    _OPEN_PBR: {
+        **_MATERIALX,
         "metallic": "base_metalness",
         "roughness": "specular_roughness",
         "ior": "specular_ior",
-        "emissiveColor": "emission_color",
         "strength": "emission_luminance",
     },
-    "ND_standard_surface_surfaceshader": {
-        "diffuseColor": "base_color",
+    _STANDARD: {
+        **_MATERIALX,
         "metallic": "metalness",
         "roughness": "specular_roughness",
         "ior": "specular_IOR",
-        "emissiveColor": "emission_color",
         "strength": "emission",
     },
 }
@@ -54,20 +55,11 @@ DEFAULTS: Mapping[str, Any] = {
     "strength": 0.0,
     "useSpecularWorkflow": 0.0,
 }
+_OF_MATERIALX = {**DEFAULTS, "diffuseColor": 0.8, "emissiveColor": 1.0}
 _DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     PREVIEW: DEFAULTS,
-    "ND_open_pbr_surface_surfaceshader": {
-        **DEFAULTS,
-        "diffuseColor": 0.8,
-        "roughness": 0.3,
-        "emissiveColor": 1.0,
-    },
-    "ND_standard_surface_surfaceshader": {
-        **DEFAULTS,
-        "diffuseColor": 0.8,
-        "roughness": 0.2,
-        "emissiveColor": 1.0,
-    },
+    _OPEN_PBR: {**_OF_MATERIALX, "roughness": 0.3},
+    _STANDARD: {**_OF_MATERIALX, "roughness": 0.2},
 }
 """Defaults of each shader for inputs that are not stated."""
 

@@ -21,7 +21,6 @@ from pipeline.foreign.numbers import Malformed
 from pipeline.foreign.usd.composition import composition_errors
 from storage.errors import TrilightError
 
-SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 MAX_FILE_BYTES = 1 << 30
 """Maximum size of a file; a million triangles take about 70 MB."""
 MAX_LAYERS = 1000

@@ -3,78 +3,55 @@
 Many separate closed components with flat faces, as in most hand-made models.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.grids import Mesh
-from pipeline.objects.builtin.solids import beam, box, join, lathe, scale_and_move
+from pipeline.objects.builtin.solids import Mesh, beam, box, join, lathe, scale_and_move
 
 
-@dataclass(frozen=True, kw_only=True)
-class FurnitureParams:
-    """Shape of one piece of furniture; lengths are roughly in meters."""
+class _Furniture:
+    """Shape of a random piece of furniture; lengths are roughly in meters."""
 
-    kind: str  # `table`, `round` (a round top), `chair` (a seat with a back) or `shelf`
-    width: float  # along x
-    depth: float  # along y; unused for round tops
-    height: float  # of the top, the seat or the shelf
-    board: float  # thickness of boards
-    leg: float  # half thickness of legs at the top
-    leg_style: str  # `square`, `tapered` or `turned`
-    splay: float  # how far feet stand outside the tops of their legs
-    stretchers: bool  # whether bars join the legs near the floor
-    back: float  # height of a chair's back over its seat
-    slats: int  # boards of a chair's back or of a bench-like top; 1 is a plain one
-    level_slats: bool  # whether the back's boards lie level rather than upright
-    boards: int  # boards of a shelf between its top and bottom
-    books: tuple[tuple[float, float], ...]
-    """Thickness and height of the books on a shelf, from its lowest board upwards."""
-
-
-def furniture(params: FurnitureParams) -> Mesh:
-    """Return closed components that reach into each other."""
-    if params.kind == "shelf":
-        return join(_shelf(params))
-    parts = [*_top(params), *_legs(params)]
-    if params.kind == "chair":
-        parts += _back(params)
-    return join(parts)
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.kind = str(rng.choice(["table", "round", "chair", "chair", "shelf"]))
+        width, depth, height = {
+            "table": ((0.7, 1.8), (0.5, 0.9), (0.4, 0.8)),
+            "round": ((0.35, 1.1), (0.3, 0.4), (0.42, 0.8)),
+            "chair": ((0.4, 0.55), (0.4, 0.5), (0.4, 0.5)),
+            "shelf": ((0.6, 1.2), (0.22, 0.36), (0.8, 1.8)),
+        }[self.kind]
+        self.boards = rng.integers(2, 6)  # boards of a shelf between its top and bottom
+        books = np.column_stack([rng.uniform(0.02, 0.06, 60), rng.uniform(0.5, 0.92, 60)])
+        self.width = rng.uniform(*width)  # along x
+        self.depth = rng.uniform(*depth)  # along y; unused for round tops
+        self.height = rng.uniform(*height)  # of the top, the seat or the shelf
+        self.board = rng.uniform(0.025, 0.06)  # thickness of boards
+        self.leg = rng.uniform(0.018, 0.035)  # half thickness of legs at the top
+        self.leg_style = str(rng.choice(["square", "tapered", "turned"]))
+        # how far feet stand outside the tops of their legs
+        self.splay = float(rng.choice([0.0, rng.uniform(0.02, 0.09)]))
+        self.stretchers = rng.random() < 0.5  # whether bars join the legs near the floor
+        self.back = rng.uniform(0.35, 0.65)  # height of a chair's back over its seat
+        # boards of a chair's back or of a bench-like top; 1 is a plain one
+        self.slats = int(rng.integers(3, 8))
+        self.level_slats = rng.random() < 0.4  # whether the back's boards lie level
+        # thickness and height of the books on a shelf, from its lowest board upwards
+        self.books = books[: int(rng.integers(15, 60))]
 
 
 def sample_furniture(rng: np.random.Generator) -> Mesh:
-    """Return a random piece of furniture."""
-    kind = str(rng.choice(["table", "round", "chair", "chair", "shelf"]))
-    width, depth, height = {
-        "table": ((0.7, 1.8), (0.5, 0.9), (0.4, 0.8)),
-        "round": ((0.35, 1.1), (0.3, 0.4), (0.42, 0.8)),
-        "chair": ((0.4, 0.55), (0.4, 0.5), (0.4, 0.5)),
-        "shelf": ((0.6, 1.2), (0.22, 0.36), (0.8, 1.8)),
-    }[kind]
-    boards = int(rng.integers(2, 6))
-    books = np.column_stack([rng.uniform(0.02, 0.06, 60), rng.uniform(0.5, 0.92, 60)])
-    return furniture(
-        FurnitureParams(
-            kind=kind,
-            width=float(rng.uniform(*width)),
-            depth=float(rng.uniform(*depth)),
-            height=float(rng.uniform(*height)),
-            board=float(rng.uniform(0.025, 0.06)),
-            leg=float(rng.uniform(0.018, 0.035)),
-            leg_style=str(rng.choice(["square", "tapered", "turned"])),
-            splay=float(rng.choice([0.0, rng.uniform(0.02, 0.09)])),
-            stretchers=bool(rng.random() < 0.5),
-            back=float(rng.uniform(0.35, 0.65)),
-            slats=int(rng.integers(3, 8)),
-            level_slats=bool(rng.random() < 0.4),
-            boards=boards,
-            books=tuple((float(a), float(b)) for a, b in books[: int(rng.integers(15, 60))]),
-        )
-    )
+    """Return a random piece of furniture: closed components that reach into each other.
+
+    The kinds are a table, `round` (a round top), a chair (a seat with a back) and a shelf.
+    """
+    params = _Furniture(rng)
+    if params.kind == "shelf":
+        return join(_shelf(params))
+    back = _back(params) if params.kind == "chair" else []
+    return join([*_top(params), *_legs(params), *back])
 
 
-def _top(params: FurnitureParams) -> list[Mesh]:
+def _top(params: _Furniture) -> list[Mesh]:
     """Return the top or seat: a disk, a board, or slats on two battens."""
     high = params.height
     half = params.board / 2
@@ -102,7 +79,7 @@ def _top(params: FurnitureParams) -> list[Mesh]:
     return parts
 
 
-def _legs(params: FurnitureParams) -> list[Mesh]:
+def _legs(params: _Furniture) -> list[Mesh]:
     """Return four legs, the aprons under the top, and stretchers if any."""
     inset = 1.3 * params.leg + 0.6 * params.splay
     x = params.width / 2 - inset
@@ -136,7 +113,7 @@ _TURNED = (
 """Height and radius of a turned leg from foot to top, in its height and thickness."""
 
 
-def _leg(top: NDArray[np.float64], foot: NDArray[np.float64], params: FurnitureParams) -> Mesh:
+def _leg(top: NDArray[np.float64], foot: NDArray[np.float64], params: _Furniture) -> Mesh:
     """Return one leg between two points."""
     if params.leg_style == "turned":
         height = top[2] - foot[2]
@@ -148,7 +125,7 @@ def _leg(top: NDArray[np.float64], foot: NDArray[np.float64], params: FurnitureP
     return beam(top, foot, (params.leg, params.leg), 0.15 * params.leg, taper)
 
 
-def _back(params: FurnitureParams) -> list[Mesh]:
+def _back(params: _Furniture) -> list[Mesh]:
     """Return two posts that lean back, and boards between them."""
     x = params.width / 2 - 1.4 * params.leg
     y = params.depth / 2 - 1.4 * params.leg
@@ -175,7 +152,7 @@ def _back(params: FurnitureParams) -> list[Mesh]:
     return parts
 
 
-def _shelf(params: FurnitureParams) -> list[Mesh]:
+def _shelf(params: _Furniture) -> list[Mesh]:
     """Return two sides, boards between them, and books."""
     width = params.width / 2
     depth = params.depth / 2

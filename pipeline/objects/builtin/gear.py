@@ -7,7 +7,7 @@ this family adds to the others.
 
 import numpy as np
 
-from pipeline.objects.builtin.grids import Mesh, torus_faces
+from pipeline.objects.builtin.solids import Mesh, torus_faces
 
 _TOOTH = np.array([0.0, 0.0, 0.6, 1.0, 1.0, 0.6])
 """Relative height of the outline at six equal steps of one tooth: gap, flank, tip, flank."""

@@ -3,33 +3,49 @@
 Thin parts, right angles and many holes; the surface is one piece, whatever its genus.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.grids import Mesh
-from pipeline.objects.builtin.solids import taper_and_twist
+from pipeline.objects.builtin.solids import Mesh, taper_and_twist
 
 
-@dataclass(frozen=True, kw_only=True)
-class LatticeParams:
-    """Shape of one lattice."""
+class _Lattice:
+    """Shape of a random lattice."""
 
-    cells: tuple[int, int, int]  # holes along x, y and z; 0 is a grille, one bar thick that way
-    half_sizes: tuple[float, float, float]  # half extents along x, y and z, before it is warped
-    bar: float  # thickness of a bar, in steps of the lattice, in (0, 1)
-    hollow: bool  # True for bars on the outside only, as in a crate
-    crate: bool  # True where the lowest layer is a plate and the highest a mere rim
-    splits: int  # pieces of a bar between two crossings; more bend better
-    roundness: float  # from 0, a box, to 1, a ball
-    taper: float  # relative growth of width from the middle to the top, in (-1, 1)
-    twist_rad: float  # turn about z from the middle to the top
-    bend_rad: float  # angle of the arc about z that x is laid along; 0 is straight
+    def __init__(self, rng: np.random.Generator) -> None:
+        kind = str(rng.choice(["frame", "crate", "tower", "cage", "grille"]))
+        low, high = {
+            "frame": ((2, 1, 1), (3, 2, 2)),
+            "crate": ((3, 3, 2), (5, 4, 3)),
+            "tower": ((1, 1, 5), (2, 2, 7)),
+            "cage": ((2, 2, 3), (4, 3, 3)),
+            "grille": ((5, 0, 3), (8, 0, 5)),
+        }[kind]
+        # holes along x, y and z; 0 is a grille, one bar thick that way
+        self.cells = [int(rng.integers(a, b + 1)) for a, b in zip(low, high, strict=True)]
+        self.half_sizes = rng.uniform(0.6, 1.0, 3)  # half extents, before it is warped
+        if kind == "tower":
+            self.half_sizes *= [0.4, 0.4, 1.3]
+        if kind == "grille":
+            self.half_sizes *= [1.0, 0.06, 1.0]
+        taper = rng.uniform(-0.75, 0.0) if kind == "tower" or rng.random() < 0.5 else 0.0
+        bend = float(rng.choice([0.0, rng.uniform(1.0, 3.5)])) if kind == "grille" else 0.0
+        # Holes cannot be decimated away: a lattice of many bars has no triangles to spare.
+        fine = np.prod(np.add(self.cells, 1)) <= 40 and (kind in ("frame", "tower") or bend > 0)
+        self.splits = 2 if fine else 1  # pieces of a bar between two crossings; more bend better
+        self.bar = rng.uniform(0.14, 0.36)  # thickness of a bar, in steps of the lattice
+        self.hollow = kind in ("crate", "tower", "cage")  # True for bars on the outside only
+        self.crate = kind == "crate"  # the lowest layer is a plate and the highest a mere rim
+        # from 0, a box, to 1, a ball
+        self.roundness = rng.uniform(0.6, 1.0) if kind == "cage" else 0.0
+        self.taper = taper if kind in ("tower", "frame") else 0.0
+        self.twist_rad = rng.uniform(-0.7, 0.7) if kind == "tower" else 0.0
+        self.bend_rad = bend  # angle of the arc about z that x is laid along; 0 is straight
 
 
-def lattice(params: LatticeParams) -> Mesh:
-    """Return the closed surface; about 10 splits triangles per bar."""
+def sample_lattice(rng: np.random.Generator) -> Mesh:
+    """Return a random lattice: a closed surface of about 10 splits triangles per bar."""
+    params = _Lattice(rng)
     planes, bars = zip(*(_steps(cells, params) for cells in params.cells), strict=True)
     x, y, z = np.meshgrid(*bars, indexing="ij")
     solid = x.astype(np.int64) + y + z >= 2
@@ -47,43 +63,7 @@ def lattice(params: LatticeParams) -> Mesh:
     return _warp(unit, params), faces
 
 
-def sample_lattice(rng: np.random.Generator) -> Mesh:
-    """Return a random lattice."""
-    kind = str(rng.choice(["frame", "crate", "tower", "cage", "grille"]))
-    low, high = {
-        "frame": ((2, 1, 1), (3, 2, 2)),
-        "crate": ((3, 3, 2), (5, 4, 3)),
-        "tower": ((1, 1, 5), (2, 2, 7)),
-        "cage": ((2, 2, 3), (4, 3, 3)),
-        "grille": ((5, 0, 3), (8, 0, 5)),
-    }[kind]
-    cells = [int(rng.integers(a, b + 1)) for a, b in zip(low, high, strict=True)]
-    sizes = rng.uniform(0.6, 1.0, 3)
-    if kind == "tower":
-        sizes *= [0.4, 0.4, 1.3]
-    if kind == "grille":
-        sizes *= [1.0, 0.06, 1.0]
-    taper = float(rng.uniform(-0.75, 0.0)) if kind == "tower" or rng.random() < 0.5 else 0.0
-    bend = float(rng.choice([0.0, rng.uniform(1.0, 3.5)])) if kind == "grille" else 0.0
-    # Holes cannot be decimated away: a lattice of many bars has no triangles to spare.
-    fine = np.prod(np.add(cells, 1)) <= 40 and (kind in ("frame", "tower") or bend > 0)
-    return lattice(
-        LatticeParams(
-            cells=(cells[0], cells[1], cells[2]),
-            half_sizes=(float(sizes[0]), float(sizes[1]), float(sizes[2])),
-            bar=float(rng.uniform(0.14, 0.36)),
-            hollow=kind in ("crate", "tower", "cage"),
-            crate=kind == "crate",
-            splits=2 if fine else 1,
-            roundness=float(rng.uniform(0.6, 1.0)) if kind == "cage" else 0.0,
-            taper=taper if kind in ("tower", "frame") else 0.0,
-            twist_rad=float(rng.uniform(-0.7, 0.7)) if kind == "tower" else 0.0,
-            bend_rad=bend,
-        )
-    )
-
-
-def _steps(cells: int, params: LatticeParams) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _steps(cells: int, params: _Lattice) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the positions of grid planes [N + 1] from -1 to 1, and which steps [N] are bars."""
     gap = [(1 - params.bar) / params.splits] * params.splits
     widths = np.array([params.bar] + [*gap, params.bar] * cells)
@@ -121,12 +101,12 @@ def _surface(solid: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.in
     return points, flat.reshape(-1, 4)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
-def _warp(unit: NDArray[np.float64], params: LatticeParams) -> NDArray[np.float64]:
+def _warp(unit: NDArray[np.float64], params: _Lattice) -> NDArray[np.float64]:
     """Round, scale, taper, twist and bend points [V, 3] of the cube from -1 to 1."""
     largest = np.abs(unit).max(axis=1, keepdims=True)
     length = np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
     ball = unit * largest / length
-    points = (unit + params.roundness * (ball - unit)) * np.array(params.half_sizes)
+    points = (unit + params.roundness * (ball - unit)) * params.half_sizes
     taper_and_twist(points, unit[:, 2], params.taper, params.twist_rad)
     if params.bend_rad:
         radius = 2 * params.half_sizes[0] / params.bend_rad

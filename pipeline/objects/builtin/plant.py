@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.grids import Mesh, sheet_faces
-from pipeline.objects.builtin.solids import join, lathe, tube
+from pipeline.objects.builtin.solids import Mesh, join, lathe, sheet_faces, tube
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,8 +6,7 @@ Large flat facets that meet at any angle, unlike on a grid of rings.
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.grids import Mesh
-from pipeline.objects.builtin.solids import icosphere
+from pipeline.objects.builtin.solids import Mesh, icosphere
 
 
 def sample_rock(rng: np.random.Generator) -> Mesh:

@@ -3,39 +3,51 @@
 Smooth, with a visible inside, and detail that shrinks towards the tip.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.grids import Mesh, sphere_faces
+from pipeline.objects.builtin.solids import Mesh, sphere_faces
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShellParams:
-    """Shape of one shell; lengths are in distances of the mouth's center from the axis."""
+class _Shell:
+    """Shape of a random shell; lengths are in distances of the mouth's center from the axis."""
 
-    turns: float  # turns about the axis
-    growth: float  # size over that one turn before; above 1
-    drop: float  # how far the mouth lies below the tip: 0 is a flat spiral, 4 a turret
-    tube: float  # radius of the mouth across; about 1 fills the middle
-    stretch: float  # height of the mouth over its width
-    ribs: int  # ribs across the tube per turn; 0 is none
-    rib_height: float  # in radii of the tube
-    cords: int  # ridges along the tube, around its section; 0 is none
-    cord_height: float  # in radii of the tube
-    spines: float  # how much higher the ribs are at the shoulder than elsewhere
-    wall: float  # thickness at the mouth, in radii of the tube; below 1
-    lean_rad: float  # turn of the axis from upright: pi / 2 is a shell that lies on the ground
-    rings_per_turn: int  # rings of vertices in a turn
-    columns: int  # vertices of a ring
+    def __init__(self, rng: np.random.Generator) -> None:
+        kind = str(rng.choice(["nautilus", "snail", "turret", "whelk"]))
+        growth, drop, tube, stretch, turns = {
+            "nautilus": ((2.2, 3.2), (0.0, 0.15), (0.6, 0.8), (0.8, 1.1), (2.2, 3.0)),
+            "snail": ((1.6, 2.1), (0.8, 1.5), (0.75, 0.95), (0.9, 1.2), (3.0, 4.2)),
+            "turret": ((1.22, 1.45), (3.0, 7.0), (0.8, 1.1), (0.9, 1.4), (5.0, 8.0)),
+            "whelk": ((1.5, 1.9), (1.8, 2.8), (0.9, 1.1), (1.4, 2.0), (3.5, 4.8)),
+        }[kind]
+        self.turns = rng.uniform(*turns)  # about the axis
+        self.cords = int(rng.choice([0, 0, 5, 7]))  # ridges along the tube, around its section
+        # vertices of a ring
+        self.columns = int(rng.integers(14, 19)) if not self.cords else 3 * self.cords
+        # At most about 5500 triangles, whatever the random parameters.
+        most = int(2700 / (self.columns * (self.turns + 0.5)))
+        self.growth = rng.uniform(*growth)  # size over that one turn before; above 1
+        # how far the mouth lies below the tip: 0 is a flat spiral, 4 a turret
+        self.drop = rng.uniform(*drop)
+        self.tube = rng.uniform(*tube)  # radius of the mouth across; about 1 fills the middle
+        self.stretch = rng.uniform(*stretch)  # height of the mouth over its width
+        self.ribs = int(rng.choice([0, 6, 9, 12]))  # ribs across the tube per turn
+        self.rib_height = rng.uniform(0.1, 0.28)  # in radii of the tube
+        self.cord_height = rng.uniform(0.06, 0.14)  # in radii of the tube
+        # how much higher the ribs are at the shoulder than elsewhere
+        self.spines = float(rng.choice([0.0, 0.0, rng.uniform(1.0, 2.5)]))
+        self.wall = rng.uniform(0.06, 0.14)  # thickness at the mouth, in radii of the tube
+        # rotation of the axis from upright: pi / 2 is a shell that lies on the ground
+        self.lean_rad = float(rng.choice([0.0, rng.uniform(0.8, 1.7), rng.uniform(1.7, 2.4)]))
+        self.rings_per_turn = min(int(rng.integers(22, 37)), most)
 
 
-def shell(params: ShellParams) -> Mesh:
-    """Return the closed surface: outside, lip, and the inside of the last half turn.
+def sample_shell(rng: np.random.Generator) -> Mesh:
+    """Return a random shell: outside, lip, and the inside of the last half turn, closed.
 
     Turns lie on each other as in nature, so the surface meets itself where they touch.
     """
+    params = _Shell(rng)
     rings = int(params.turns * params.rings_per_turn)
     inside = params.rings_per_turn // 2
     winding = np.linspace(-params.turns, 0, rings)
@@ -53,41 +65,7 @@ def shell(params: ShellParams) -> Mesh:
     return np.concatenate([grid, poles]) @ lean.T, faces
 
 
-def sample_shell(rng: np.random.Generator) -> Mesh:
-    """Return a random shell."""
-    kind = str(rng.choice(["nautilus", "snail", "turret", "whelk"]))
-    growth, drop, tube, stretch, turns = {
-        "nautilus": ((2.2, 3.2), (0.0, 0.15), (0.6, 0.8), (0.8, 1.1), (2.2, 3.0)),
-        "snail": ((1.6, 2.1), (0.8, 1.5), (0.75, 0.95), (0.9, 1.2), (3.0, 4.2)),
-        "turret": ((1.22, 1.45), (3.0, 7.0), (0.8, 1.1), (0.9, 1.4), (5.0, 8.0)),
-        "whelk": ((1.5, 1.9), (1.8, 2.8), (0.9, 1.1), (1.4, 2.0), (3.5, 4.8)),
-    }[kind]
-    turn_count = float(rng.uniform(*turns))
-    cords = int(rng.choice([0, 0, 5, 7]))
-    columns = int(rng.integers(14, 19)) if not cords else 3 * cords
-    # At most about 5500 triangles, whatever the random parameters.
-    most = int(2700 / (columns * (turn_count + 0.5)))
-    return shell(
-        ShellParams(
-            turns=turn_count,
-            growth=float(rng.uniform(*growth)),
-            drop=float(rng.uniform(*drop)),
-            tube=float(rng.uniform(*tube)),
-            stretch=float(rng.uniform(*stretch)),
-            ribs=int(rng.choice([0, 6, 9, 12])),
-            rib_height=float(rng.uniform(0.1, 0.28)),
-            cords=cords,
-            cord_height=float(rng.uniform(0.06, 0.14)),
-            spines=float(rng.choice([0.0, 0.0, rng.uniform(1.0, 2.5)])),
-            wall=float(rng.uniform(0.06, 0.14)),
-            lean_rad=float(rng.choice([0.0, rng.uniform(0.8, 1.7), rng.uniform(1.7, 2.4)])),
-            rings_per_turn=min(int(rng.integers(22, 37)), most),
-            columns=columns,
-        )
-    )
-
-
-def _relief(winding: NDArray[np.float64], params: ShellParams) -> NDArray[np.float64]:
+def _relief(winding: NDArray[np.float64], params: _Shell) -> NDArray[np.float64]:
     """Return the height [rings, columns] of ribs, spines and cords, at least 0."""
     around = 2 * np.pi * np.arange(params.columns) / params.columns
     relief = np.zeros((len(winding), params.columns))
@@ -101,7 +79,7 @@ def _relief(winding: NDArray[np.float64], params: ShellParams) -> NDArray[np.flo
 
 
 def _rings(
-    winding: NDArray[np.float64], radius: NDArray[np.float64], params: ShellParams
+    winding: NDArray[np.float64], radius: NDArray[np.float64], params: _Shell
 ) -> NDArray[np.float64]:
     """Return points [rings, columns, 3] of the tube at `winding` [rings]; 0 is the mouth."""
     angle = 2 * np.pi * winding

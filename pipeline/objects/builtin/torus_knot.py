@@ -3,51 +3,55 @@
 The thickness has a limit at which strands would meet or bends would fold.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.grids import Mesh, torus_faces
+from pipeline.objects.builtin.solids import Mesh, torus_faces
 
 _KNOTS = ((1, 0), (2, 3), (3, 2), (1, 3), (2, 5), (3, 4), (1, 5), (4, 3), (5, 2), (1, 4))
 """Coprime windings around the axis and through the hole; (1, 0) is a plain ring."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class TorusKnotParams:
-    """Shape of one knot."""
+def torus_knot(
+    *,
+    windings: tuple[int, int],
+    minor_radius: float,
+    fill: float,
+    segments: int,
+    sides: int,
+    ribs: int = 0,
+    rib_depth: float = 0.0,
+    rib_turns: int = 0,
+    flatten: float = 1.0,
+) -> Mesh:
+    """Return the closed surface of 2 segments sides triangles.
 
-    windings: tuple[int, int]
-    """Windings of the strand around the axis and through the hole; coprime."""
-    minor_radius: float  # of the torus that the strand lies on, whose major radius is 1; in (0, 1)
-    fill: float  # thickness as a share of the thickest tube that neither meets itself nor folds
-    ribs: int  # ridges of the cross section; 0 is round
-    rib_depth: float  # depth of the ridges as a share of the tube's radius, in [0, 1)
-    rib_turns: int  # how often the ridges wind around the strand
-    flatten: float  # width of the cross section across the torus, over its height; at most 1
-    segments: int  # vertices along the strand
-    sides: int  # vertices around it; a multiple of the ribs makes them all alike
-
-
-def torus_knot(params: TorusKnotParams) -> Mesh:
-    """Return the closed surface of 2 segments sides triangles."""
-    along = 2 * np.pi * np.arange(params.segments) / params.segments
-    centre, outward = _strand(along, params)
+    Args:
+        windings: windings of the strand around the axis and through the hole; coprime.
+        minor_radius: of the torus that the strand lies on, whose major radius is 1; in (0, 1).
+        fill: thickness as a share of the thickest tube that neither meets itself nor folds.
+        segments: vertices along the strand.
+        sides: vertices around it; a multiple of the ribs makes them all alike.
+        ribs: ridges of the cross section; 0 is round.
+        rib_depth: depth of the ridges as a share of the tube's radius, in [0, 1).
+        rib_turns: how often the ridges wind around the strand.
+        flatten: width of the cross section across the torus, over its height; at most 1.
+    """
+    along = 2 * np.pi * np.arange(segments) / segments
+    centre, outward = _strand(along, windings, minor_radius)
     tangent = np.roll(centre, -1, axis=0) - np.roll(centre, 1, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     across = np.cross(outward, tangent)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     up = np.cross(tangent, across)
-    around = 2 * np.pi * np.arange(params.sides) / params.sides
-    phase = params.ribs * (around[None, :] + params.rib_turns * along[:, None])
-    radius = 1 + (params.rib_depth * (0.5 * np.cos(phase) - 0.5) if params.ribs else 0 * phase)
-    radius *= params.fill * _largest_radius(params)
+    around = 2 * np.pi * np.arange(sides) / sides
+    phase = ribs * (around[None, :] + rib_turns * along[:, None])
+    radius = 1 + (rib_depth * (0.5 * np.cos(phase) - 0.5) if ribs else 0 * phase)
+    radius *= fill * _largest_radius(windings, minor_radius)
     offset = (radius * np.cos(around))[..., None] * up[:, None] + (
-        params.flatten * radius * np.sin(around)
+        flatten * radius * np.sin(around)
     )[..., None] * across[:, None]
-    positions = (centre[:, None] + offset).reshape(-1, 3)
-    return positions, torus_faces(params.segments, params.sides)
+    return (centre[:, None] + offset).reshape(-1, 3), torus_faces(segments, sides)
 
 
 def sample_torus_knot(rng: np.random.Generator) -> Mesh:
@@ -55,36 +59,34 @@ def sample_torus_knot(rng: np.random.Generator) -> Mesh:
     windings = _KNOTS[rng.integers(len(_KNOTS))]
     ribs = int(rng.choice([0, 3, 4, 5]))
     return torus_knot(
-        TorusKnotParams(
-            windings=windings,
-            minor_radius=float(rng.uniform(0.3, 0.55)),
-            fill=float(rng.uniform(0.45, 0.9)),
-            ribs=ribs,
-            rib_depth=float(rng.uniform(0.2, 0.6)),
-            rib_turns=int(rng.integers(-3, 4)),
-            flatten=float(rng.uniform(0.5, 1.0)),
-            segments=int(rng.integers(64, 97)) + 8 * sum(windings),
-            sides=12 - 12 % max(ribs, 1),
-        )
+        windings=windings,
+        minor_radius=float(rng.uniform(0.3, 0.55)),
+        fill=float(rng.uniform(0.45, 0.9)),
+        ribs=ribs,
+        rib_depth=float(rng.uniform(0.2, 0.6)),
+        rib_turns=int(rng.integers(-3, 4)),
+        flatten=float(rng.uniform(0.5, 1.0)),
+        segments=int(rng.integers(64, 97)) + 8 * sum(windings),
+        sides=12 - 12 % max(ribs, 1),
     )
 
 
 def _strand(
-    along: NDArray[np.float64], params: TorusKnotParams
+    along: NDArray[np.float64], windings: tuple[int, int], minor_radius: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the points of the strand and the normals of its torus there, [N, 3] each."""
-    around_axis, through_hole = params.windings
+    around_axis, through_hole = windings
     azimuth = around_axis * along
     tube = through_hole * along
     radial = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)], axis=1)
     upright = np.array([0.0, 0.0, 1.0])
     normal = np.cos(tube)[:, None] * radial + np.sin(tube)[:, None] * upright
-    return radial + params.minor_radius * normal, normal
+    return radial + minor_radius * normal, normal
 
 
-def _largest_radius(params: TorusKnotParams, points: int = 512) -> float:
+def _largest_radius(windings: tuple[int, int], minor_radius: float, points: int = 512) -> float:
     """Return the radius at which strands meet or a bend folds, from `points` of the strand."""
-    centre, _ = _strand(2 * np.pi * np.arange(points) / points, params)
+    centre, _ = _strand(2 * np.pi * np.arange(points) / points, windings, minor_radius)
     step = np.roll(centre, -1, axis=0) - centre
     length = np.linalg.norm(step, axis=1)
     change = np.linalg.norm(np.roll(step, -1, axis=0) - step, axis=1)

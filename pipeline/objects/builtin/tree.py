@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.grids import Mesh, sphere_faces
-from pipeline.objects.builtin.solids import icosphere, join, tube
+from pipeline.objects.builtin.solids import Mesh, icosphere, join, sphere_faces, tube
 from storage.seeds import rng_for
 
 _GOLDEN = np.pi * (3 - np.sqrt(5))
@@ -22,26 +21,30 @@ _TIER = np.array([[0.2, 0.12], [0.7, 0.02], [1.0, -0.1], [0.62, 0.2], [0.3, 0.55
 """Radius and height of a tier's rings: inside, rim, and the cone above."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class TreeParams:
-    """Shape of one tree; the trunk is about 1 high."""
+class _Tree:
+    """Shape of a random tree; the trunk is about 1 high."""
 
-    crown: str  # `masses`, `tiers` or `bare`
-    children: tuple[int, ...]
-    """Number of branches on the trunk, on each of its branches, and so on; at most three numbers.
-    """
-    spread_rad: float  # angle between a branch and the one it grows from
-    shrink: float  # length of a branch over that of the one it grows from
-    thickness: float  # radius of the trunk's foot
-    rise: float  # how strongly branches bend upwards: 0 is straight, negative ones droop
-    mass: float  # radius of a mass of leaves at the end of a branch; unused without
-    tiers: int  # number of tiers; unused without
-    folds: int  # folds around a tier; unused without
-    variant: int  # picks the irregularities; trees that differ in it alone are of one kind
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.crown = str(rng.choice(["masses", "masses", "tiers", "bare"]))
+        # branches on the trunk, on each of its branches, and so on; at most three numbers
+        self.children = [int(rng.integers(3, 5)), int(rng.integers(2, 4))]
+        if self.crown == "bare":
+            self.children = [self.children[0], 2, int(rng.integers(2, 4))]
+        self.spread_rad = rng.uniform(0.5, 1.0)  # between a branch and the one it grows from
+        self.shrink = rng.uniform(0.45, 0.65)  # length of a branch over that of the one below
+        thickness = (0.08, 0.13) if self.crown == "bare" else (0.06, 0.1)
+        self.thickness = rng.uniform(*thickness)  # radius of the trunk's foot
+        # how strongly branches bend upwards: 0 is straight, negative ones droop
+        self.rise = rng.uniform(-0.2, 0.6)
+        self.mass = rng.uniform(0.25, 0.38)  # radius of a mass of leaves at the end of a branch
+        self.tiers = int(rng.integers(3, 7))
+        self.folds = int(rng.integers(6, 11))  # folds around a tier
+        self.variant = int(rng.integers(1 << 31))  # picks the irregularities
 
 
-def tree(params: TreeParams) -> Mesh:
-    """Return closed components: branches, and masses or tiers."""
+def sample_tree(rng: np.random.Generator) -> Mesh:
+    """Return a random tree: closed components, which are branches, and masses or tiers."""
+    params = _Tree(rng)
     rng = rng_for(params.variant, "tree")
     if params.crown == "tiers":
         path = np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, 0.9], 6)
@@ -51,28 +54,6 @@ def tree(params: TreeParams) -> Mesh:
     if params.crown == "masses":
         parts += [_mass(end, params, rng) for end in ends]
     return join(parts)
-
-
-def sample_tree(rng: np.random.Generator) -> Mesh:
-    """Return a random tree."""
-    crown = str(rng.choice(["masses", "masses", "tiers", "bare"]))
-    children: tuple[int, ...] = (int(rng.integers(3, 5)), int(rng.integers(2, 4)))
-    if crown == "bare":
-        children = (*children[:1], 2, int(rng.integers(2, 4)))
-    return tree(
-        TreeParams(
-            crown=crown,
-            children=children,
-            spread_rad=float(rng.uniform(0.5, 1.0)),
-            shrink=float(rng.uniform(0.45, 0.65)),
-            thickness=float(rng.uniform(0.08, 0.13) if crown == "bare" else rng.uniform(0.06, 0.1)),
-            rise=float(rng.uniform(-0.2, 0.6)),
-            mass=float(rng.uniform(0.25, 0.38)),
-            tiers=int(rng.integers(3, 7)),
-            folds=int(rng.integers(6, 11)),
-            variant=int(rng.integers(1 << 31)),
-        )
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +68,7 @@ class _Branch:
 
 
 def _branches(
-    params: TreeParams, rng: np.random.Generator
+    params: _Tree, rng: np.random.Generator
 ) -> tuple[list[Mesh], list[NDArray[np.float64]]]:
     """Return all branches as tubes, and the ends [3] of branches without children."""
     up = np.array([0.0, 0.0, 1.0])
@@ -113,7 +94,7 @@ def _branches(
 
 
 def _children(
-    parent: _Branch, path: NDArray[np.float64], params: TreeParams, rng: np.random.Generator
+    parent: _Branch, path: NDArray[np.float64], params: _Tree, rng: np.random.Generator
 ) -> list[_Branch]:
     """Return the children of a branch: along the trunk, but near the ends of other branches."""
     count = params.children[parent.order]
@@ -153,7 +134,7 @@ def _branch_direction(
     return np.cos(spread) * axis + np.sin(spread) * across
 
 
-def _mass(centre: NDArray[np.float64], params: TreeParams, rng: np.random.Generator) -> Mesh:
+def _mass(centre: NDArray[np.float64], params: _Tree, rng: np.random.Generator) -> Mesh:
     """Return one mass of leaves: a flat ball with dents, of 180 triangles or 320."""
     direction, faces = icosphere(3 if np.prod(params.children) > 10 else 4)
     waves = rng.normal(size=(6, 3)) * 4
@@ -162,7 +143,7 @@ def _mass(centre: NDArray[np.float64], params: TreeParams, rng: np.random.Genera
     return centre + direction * radius[:, None] * np.array([1.1, 1.1, 0.8]), faces
 
 
-def _tiers(params: TreeParams, rng: np.random.Generator) -> list[Mesh]:
+def _tiers(params: _Tree, rng: np.random.Generator) -> list[Mesh]:
     """Return folded cones with hanging rims, each of which reaches into the next."""
     columns = 4 * params.folds
     azimuth = 2 * np.pi * np.arange(columns) / columns

@@ -6,7 +6,7 @@ Unlike closed bodies, open vessels let light in, and their inside shades itself.
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.grids import Mesh, sphere_faces
+from pipeline.objects.builtin.solids import Mesh, sphere_faces
 
 
 def sample_vase(rng: np.random.Generator) -> Mesh:

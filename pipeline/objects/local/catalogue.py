@@ -74,21 +74,14 @@ def _record(root: Path, row: dict[str, Any], location: str, name: str) -> Object
         raise TrilightError(
             f"{location}: uid is {printable(uid)!r}; expected printable text that is not blank."
         )
-    return ObjectRecord(
-        uid=uid,
-        path=str(_path_below(root, path, location)),
-        root=str(root),
-        title=_public_field(row, "title", location, uid),
-        licence=_public_field(row, "licence", location, UNKNOWN),
-        licence_source=_public_field(row, "licence_source", location, name),
-        attribution=_public_field(row, "attribution", location, ""),
-        source_url=_public_field(row, "source_url", location, ""),
-    )
-
-
-def _public_field(row: dict[str, Any], field: str, location: str, default: str) -> str:
-    """Return a field's text for the dataset's documents: printable, without passwords."""
-    return printable(public_text(_text(row, field, location, default)))
+    defaults = {"title": uid, "licence": UNKNOWN, "licence_source": name}
+    defaults |= {"attribution": "", "source_url": ""}
+    texts = {  # for the dataset's documents: printable, without passwords
+        field: printable(public_text(_text(row, field, location, default)))
+        for field, default in defaults.items()
+    }
+    path = str(_path_below(root, path, location))
+    return ObjectRecord(uid=uid, path=path, root=str(root), **texts)
 
 
 def _text(row: dict[str, Any], field: str, location: str, default: str | None = None) -> str:

@@ -1,9 +1,11 @@
 """Objects of a local folder: the rows of its catalogue, or else its object files."""
 
 import os
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from pipeline.foreign.limits import SUFFIXES
 from pipeline.objects.file_filters import (
     drop_duplicates,
     drop_outputs,
@@ -11,10 +13,11 @@ from pipeline.objects.file_filters import (
     warn_unread_formats,
 )
 from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
-from pipeline.objects.listing import SUFFIXES, Listing, assign_uids, failure, is_object_file
+from pipeline.objects.listing import Listing, assign_uids, failure, is_object_file
 from pipeline.objects.local.catalogue import only_catalogue, read_catalogue
-from storage.errors import TrilightError
+from storage.errors import Rejected, TrilightError
 from storage.records.objects import ObjectRecord
+from storage.remote.retries import TransferFailed
 from storage.remote.safe_url import printable
 
 
@@ -53,20 +56,44 @@ def scan_folder(folder: Path, licence: StatedLicence) -> Listing:
         TrilightError: a folder cannot be read.
     """
     root = Path(os.path.realpath(folder))
-    names = drop_outputs(walk_files(root))
+
+    def locate(name: str) -> dict[str, str]:
+        if not is_below(root, root / name):
+            raise Rejected(
+                "link_outside",
+                f"{printable(name)} is a link out of the folder; copy the file into it, or name "
+                "the folder that holds it",
+            )
+        return {"path": str(root / name), "root": str(root)}
+
+    return list_files(walk_files(root), licence, locate, lambda names: drop_scenes(root, names))
+
+
+def list_files(
+    names: Sequence[str],
+    licence: StatedLicence,
+    locate: Callable[[str], dict[str, str]],
+    drop_more: Callable[[list[str]], list[str]] = list,
+) -> Listing:
+    """Return a record for every object file of a folder; copies and outputs are left out.
+
+    Args:
+        names: all files of the folder, with / between the parts of their paths.
+        licence: licence of every file.
+        locate: returns the fields of a file's record that say where it is; raises Rejected or
+            TransferFailed, which becomes a failure of that object.
+        drop_more: returns the object files without others that are none.
+    """
+    names = drop_outputs(names)
     files = [name for name in names if is_object_file(name)]
     warn_unread_formats(names, files)
-    uids, failures = assign_uids(drop_duplicates(drop_scenes(root, files)))
+    uids, failures = assign_uids(drop_duplicates(drop_more(files)))
     records = []
     for name, uid in uids.items():
-        if not is_below(root, root / name):
-            message = (
-                f"{printable(name)} is a link out of the folder; copy the file into it, or name "
-                "the folder that holds it"
-            )
-            failures.append(failure(uid, "link_outside", message))
-            continue
-        records.append(replace(file_record(uid, str(root / name), licence), root=str(root)))
+        try:
+            records.append(replace(file_record(uid, "", licence), **locate(name)))
+        except (Rejected, TransferFailed) as error:
+            failures.append(failure(uid, error.reason, error.message))
     return Listing(records=records, failures=failures)
 
 
@@ -76,9 +103,7 @@ def is_below(root: Path, path: Path) -> bool:
     return Path(os.path.realpath(path)).is_relative_to(root)
 
 
-def file_record(
-    uid: str, path: str, licence: StatedLicence, *, source_url: str = ""
-) -> ObjectRecord:
+def file_record(uid: str, path: str, licence: StatedLicence) -> ObjectRecord:
     """Return the record of a file without a catalogue row."""
     return ObjectRecord(
         uid=uid,
@@ -87,7 +112,7 @@ def file_record(
         licence=licence.licence,
         licence_source=licence.licence_source,
         attribution="",
-        source_url=source_url,
+        source_url="",
     )
 
 

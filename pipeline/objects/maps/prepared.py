@@ -4,30 +4,36 @@ The base color of a texture is sRGB-encoded, all else is linear. Means are of li
 mean of roughness is that of the GGX width, its square. There is no Fresnel term here: a surface
 with a metallic map, or with a base color alone, gets its albedos from storage.optics.fresnel.
 
+A NaN or infinite value rejects a map: half floats end at 65,504, so that a brighter sun was written
+as infinite and is lost. Small negative values, which color conversions leave, become 0 where
+together they are at most a thousandth of the light.
+
 A child process reads a file once, and the user's cache keeps the outcome under a key of all that it
 depends on. The cache keeps no refusal: it costs little, and the user may fix the file.
 """
 
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
 from safetensors.numpy import save
 
-from pipeline.foreign.light_pictures import read_linear_picture
-from pipeline.objects.maps.picture import are_normals, picture_values
-from pipeline.objects.maps.radiance import usable_map
-from pipeline.objects.maps.resample import area_means
+from pipeline.foreign.linear_picture import clip_to_unit
+from pipeline.foreign.picture import UNREADABLE_PICTURE, read_linear_picture
+from pipeline.objects.maps.resample import area_means, flux, solid_angle_means
 from pipeline.objects.maps.texture_names import TEXTURE_PARTS, packed_channels
 from storage.conventions import linear_from_srgb
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
 from storage.optics.fresnel import constant_albedos
+from storage.records.environment import MAX_RADIANCE
 from storage.records.objects import SKY
 from storage.records.safe_read import read_safetensors
-from storage.records.texture import content_digest
+from storage.records.texture import MAX_SIDE, content_digest
 
 MOST_BYTES = 1 << 30
 """Largest accepted size of one file, in bytes."""
@@ -40,17 +46,14 @@ _RECIPE = 3
 
 _MOST_HEADER = 1 << 12
 
+MOST_NEGATIVE = 1e-3
+"""Largest fraction of a map's light that its negative values may take away."""
 
-@dataclass(frozen=True, kw_only=True)
-class MapFiles:
-    """The files of a texture or map, and its largest size."""
+MAX_PIXELS = 1 << 26
+"""Most pixels of a picture: 8192 x 8192."""
 
-    kind: str
-    """Kind of the map: TEXTURE or SKY."""
-    files: Mapping[str, Path]
-    """Picture files by component; a map has one, "map"."""
-    size: int
-    """Most texels along a side of a texture; most rows of a map."""
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "TGA", "WEBP")
+_MOST = {"I;16": 65535, "I;16L": 65535, "I;16B": 65535, "I": 65535}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,28 +77,32 @@ def decode_prepared(data: bytes, name: str) -> PreparedMap:
     return PreparedMap(content_sha256=metadata["content"], arrays=arrays)
 
 
-def map_cache_key(map_files: MapFiles) -> str:
-    """Return the cache key of the outcome: a digest of the files, the size and the recipe.
+def map_cache_key(kind: str, files: Mapping[str, Path], size: int) -> str:
+    """Return the cache key of the outcome of `prepare_map`: a digest of the files and the rest.
 
     Raises:
         Rejected: missing_file, too_large_bytes.
     """
-    digests = {part: sha256_hex(_read(path)) for part, path in map_files.files.items()}
-    parts = [map_files.kind, digests, map_files.size, _RECIPE]
-    return sha256_hex(canonical_json(parts))[:32]
+    digests = {part: sha256_hex(_read(path)) for part, path in files.items()}
+    return sha256_hex(canonical_json([kind, digests, size, _RECIPE]))[:32]
 
 
-def prepare_map(map_files: MapFiles) -> tuple[bytes, tuple[str, ...]]:
+def prepare_map(kind: str, files: Mapping[str, Path], size: int) -> tuple[bytes, tuple[str, ...]]:
     """Return the file of a texture or map, and notes on unread parts; for child processes.
+
+    Args:
+        kind: TEXTURE or SKY.
+        files: picture files by component; a map has one, "map".
+        size: most texels along a side of a texture; most rows of a map.
 
     Raises:
         Rejected: the reason and a remedy; see `usable_map`, `texture_set` and the readers.
     """
-    if map_files.kind == SKY:
-        return _prepare_sky(_read(map_files.files["map"]), map_files.size)
+    if kind == SKY:
+        return _prepare_sky(_read(files["map"]), size)
     pictures: dict[str, NDArray[np.float32]] = {}
     unread: list[str] = []
-    for part, path in sorted(map_files.files.items()):
+    for part, path in sorted(files.items()):
         values, notes = _picture_of(part, path)
         unread += [f"{note} of its {part}" for note in notes]
         if packed_channels(part) and values.shape[2] < 3:
@@ -105,7 +112,7 @@ def prepare_map(map_files: MapFiles) -> tuple[bytes, tuple[str, ...]]:
         raise Rejected(
             "unknown_map", "its values are unit vectors, as of a normal map; end it in _normal"
         )
-    return texture_set(unpack_parts(pictures), map_files.size).encode(), tuple(unread)
+    return texture_set(unpack_parts(pictures), size).encode(), tuple(unread)
 
 
 def _prepare_sky(data: bytes, rows: int) -> tuple[bytes, tuple[str, ...]]:
@@ -201,3 +208,117 @@ def _read(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise Rejected("missing_file", f"cannot be read ({error.strerror})") from error
+
+
+def picture_values(data: bytes, *, is_color: bool) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+    """Return a picture [H, W, 1 or 3], the top row first, and notes on unread parts.
+
+    Alpha is left out. Floats are linear; float colors are encoded to sRGB here.
+
+    Raises:
+        Rejected: load_error, not_hdr, not_a_number, too_many_pixels.
+    """
+    linear = read_linear_picture(data, MAX_PIXELS, is_color=is_color)
+    if linear is None:
+        values, is_linear = _plain_values(data)
+        unread: tuple[str, ...] = ()
+    else:
+        values = linear.values[..., : 3 if linear.values.shape[2] >= 3 else 1]
+        is_linear = True
+        unread = linear.unread
+        if max(values.shape) > MAX_SIDE:
+            raise _too_large(values.shape[1], values.shape[0])
+    values, cut = clip_to_unit(values)
+    return (_encode(values) if is_linear and is_color else values), (*unread, *cut)
+
+
+def are_normals(values: NDArray[np.float32]) -> bool:
+    """Return whether nearly all values [H, W, 3] code unit vectors, most of them along +Z."""
+    vectors = 2 * values - 1
+    is_unit = np.abs(np.linalg.norm(vectors, axis=2) - 1) < 0.05
+    return values.shape[2] == 3 and bool((is_unit & (vectors[..., 2] > 0)).mean() > 0.98)
+
+
+def _encode(linear: NDArray[np.float32]) -> NDArray[np.float32]:
+    encoded = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return encoded.astype(np.float32)
+
+
+def _too_large(width: int, height: int) -> Rejected:
+    return Rejected(
+        "too_many_pixels",
+        f"{width} x {height}; expected at most {MAX_PIXELS} in all and {MAX_SIDE} a side: scale it "
+        "down",
+    )
+
+
+def _plain_values(data: bytes) -> tuple[NDArray[np.float32], bool]:
+    """Return a picture of another format, and True where its values are linear floats."""
+    is_linear = False
+    try:
+        with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
+            if image.width * image.height > MAX_PIXELS or max(image.size) > MAX_SIDE:
+                raise _too_large(image.width, image.height)
+            if image.mode in _MOST:
+                values = np.asarray(image, np.float32) / np.float32(_MOST[image.mode])
+            elif image.mode == "F":
+                values = np.asarray(image, np.float32)
+                is_linear = True
+            else:
+                mode = "L" if image.mode in ("1", "L", "LA") else "RGB"
+                values = np.asarray(image.convert(mode), np.float32) / np.float32(255)
+    except UnidentifiedImageError as error:
+        raise Rejected(
+            "load_error",
+            "it is cut off, or no PNG, JPEG, TIFF, BMP, TGA or WebP picture that is read; of TIFF, "
+            "colors of 16 or 32 bits are not: write it as PNG or OpenEXR",
+        ) from error
+    except (OSError, SyntaxError, ValueError, LookupError, Image.DecompressionBombError) as error:
+        raise Rejected("load_error", UNREADABLE_PICTURE) from error
+    return (values if values.ndim == 3 else values[..., None]), is_linear
+
+
+def usable_map(radiance: NDArray[np.float32], height: int) -> NDArray[np.float32]:
+    """Return a map of at most `height` rows, by means over solid angle.
+
+    Args:
+        radiance: [H, W, 3] linear, the top row first.
+        height: most rows of the result; a smaller map stays unchanged.
+
+    Raises:
+        Rejected: not_two_to_one, not_a_number, infinite_radiance, negative_radiance,
+            too_bright, black_map.
+    """
+    rows, columns = radiance.shape[:2]
+    if columns != 2 * rows:
+        raise Rejected(
+            "not_two_to_one",
+            f"the picture is {columns} x {rows}; expected latitude-longitude, twice as wide as "
+            "high: convert cube maps and fisheyes, crop or scale others",
+        )
+    _refuse(np.isnan(radiance), "not_a_number", "is not a number; mend it in a picture editor")
+    _refuse(
+        np.isinf(radiance),
+        "infinite_radiance",
+        "is infinite; write the map in 32 bits, or as .hdr: half floats end at 65504",
+    )
+    lawful = np.maximum(radiance, 0)
+    total = flux(lawful)
+    negative = flux(lawful - radiance)
+    if (negative > MOST_NEGATIVE * total).any() and negative.any():
+        raise Rejected(
+            "negative_radiance",
+            f"negative values take more than {MOST_NEGATIVE:g} of the light of a channel; set them "
+            "to 0 in a picture editor",
+        )
+    _refuse(lawful > MAX_RADIANCE, "too_bright", f"is over {MAX_RADIANCE:g}; scale the map down")
+    if not total.sum() > 0:
+        raise Rejected("black_map", "the map is black; expected some light")
+    return lawful if rows <= height else solid_angle_means(lawful, height).astype(np.float32)
+
+
+def _refuse(wrong: NDArray[np.bool_], reason: str, message: str) -> None:
+    if wrong.any():
+        row, column, channel = (int(i) for i in np.argwhere(wrong)[0])
+        where = f"{'RGB'[channel]} of row {row}, column {column} (from the top left)"
+        raise Rejected(reason, f"{where} {message}")

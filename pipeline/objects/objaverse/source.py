@@ -1,10 +1,16 @@
-"""`objaverse:`: objects of Objaverse 1.0 by uid, by a file of uids, or by LVIS category."""
+"""`objaverse:`: objects of Objaverse 1.0 by uid, by a file of uids, or by LVIS category.
+
+Files stay where the package `objaverse` keeps them, which other programs use too.
+"""
 
 import dataclasses
 import difflib
+import gzip
+import json
 import os
 import re
 import threading
+import zlib
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -12,11 +18,13 @@ from typing import Any
 
 from pipeline.objects.licences import UNKNOWN, refuse_licences
 from pipeline.objects.listing import CountDone, Fetched, Listing, failure, fetch_all
-from pipeline.objects.objaverse.package import ObjaversePackage
+from storage.atomic import atomic_writer
 from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
+from storage.remote.fetch import download
 from storage.remote.retries import TransferFailed
 from storage.remote.safe_url import printable
+from storage.remote.url import RemoteUrl
 
 PREFIX = "objaverse:"
 _CATEGORY = "category/"
@@ -38,6 +46,60 @@ _FORMS = (
 )
 
 
+_URL = RemoteUrl(
+    what="objects",
+    scheme="https",
+    root="https://huggingface.co/datasets/allenai/objaverse/resolve/main",
+)
+_FOLDER = Path("~/.objaverse/hf-objaverse-v1")
+_MOST_BYTES = 1 << 34
+"""Largest file that is downloaded; the mesh stage has limits of its own."""
+_THREADS = 8
+_PLACE = re.compile(r"glbs/[\w-]+/[\w-]+\.glb")
+
+
+class _ObjaverseFiles:
+    """Files of Objaverse on this machine, downloaded once, whole or not at all."""
+
+    def __init__(self) -> None:
+        """Read the list of all objects; raises TrilightError where it cannot be downloaded."""
+        paths: dict[str, str] = self.read_list("object-paths.json.gz")
+        self.paths = {uid: path for uid, path in paths.items() if _PLACE.fullmatch(str(path))}
+        """Paths of all objects by uid."""
+
+    def fetch(self, name: str) -> Path:
+        """Return the local path of a file, downloaded if it is missing; raises TransferFailed."""
+        path = _FOLDER.expanduser().absolute() / name
+        if not path.is_file():
+            with atomic_writer(path) as stream:
+                download(_URL.child(name), stream, num_bytes=None, max_bytes=_MOST_BYTES)
+        return path
+
+    def read(self, name: str) -> Any:
+        """Return the content of a metadata file; an unreadable one is downloaded again once.
+
+        Raises:
+            TransferFailed: it cannot be downloaded, or is damaged there too.
+        """
+        for _ in range(2):
+            path = self.fetch(name)
+            try:
+                return json.loads(gzip.decompress(path.read_bytes()))
+            except (OSError, EOFError, ValueError, zlib.error):
+                path.unlink(missing_ok=True)
+        raise TransferFailed("download_failed", "is damaged")
+
+    def read_list(self, name: str) -> Any:
+        """Return the content of a metadata file that every run needs."""
+        try:
+            return self.read(name)
+        except TransferFailed as error:
+            raise TrilightError(
+                f"objects objaverse: {name} cannot be downloaded ({error.message}); expected "
+                "Objaverse to be reachable. Check the network and try again."
+            ) from error
+
+
 def list_objaverse(source: str, allowed: Sequence[str]) -> Listing:
     """Return the objects that a source names, with the rights from their annotations.
 
@@ -46,52 +108,50 @@ def list_objaverse(source: str, allowed: Sequence[str]) -> Listing:
     its annotations.
 
     Raises:
-        TrilightError: the source is malformed, a category is unknown, the package is missing, or
-            its lists cannot be downloaded.
+        TrilightError: the source is malformed, a category is unknown, or the lists cannot be
+            downloaded.
     """
     text = source.removeprefix(PREFIX).strip()
     if text.startswith(_CATEGORY):
         names, count = _category_names(text.removeprefix(_CATEGORY), source)
-        package = ObjaversePackage()
-        uids = _uids_of_categories(package.categories(), names)
+        files = _ObjaverseFiles()
+        uids = _uids_of_categories(files.read_list("lvis-annotations.json.gz"), names)
     else:
         uids = _uids(text, source)
         count = None
-        package = ObjaversePackage()
+        files = _ObjaverseFiles()
     uids = sorted(set(uids))
-    known = [uid for uid in uids if uid in package]
+    known = [uid for uid in uids if uid in files.paths]
     failures = [
         failure(_name(uid), "unknown_uid", "Objaverse 1.0 has no object of this uid")
         for uid in uids
-        if uid not in package
+        if uid not in files.paths
     ]
-    records, lost = _records(package, known, allowed, count)
-    return Listing(records=records, failures=[*failures, *lost], fetch=partial(_fetch, package))
+    records, lost = _records(files, known, allowed, count)
+    return Listing(records=records, failures=[*failures, *lost], fetch=partial(_fetch, files))
 
 
 def _records(
-    package: ObjaversePackage, uids: list[str], allowed: Sequence[str], count: int | None
+    files: _ObjaverseFiles, uids: list[str], allowed: Sequence[str], count: int | None
 ) -> tuple[list[ObjectRecord], list[Failure]]:
     """Read annotations, file by file as they are needed, until `count` licences are allowed."""
-    group_of = {uid: group for group in package.groups(uids) for uid in group}
-    known: dict[str, dict[str, Any]] = {}
-    broken: dict[str, TransferFailed] = {}
+    known: dict[str, dict[str, Any] | TransferFailed] = {}
     records: list[ObjectRecord] = []
     failures: list[Failure] = []
     usable = 0
     for uid in uids:
-        if uid not in known and uid not in broken:
-            group = group_of[uid]
+        group = files.paths[uid].split("/")[1]
+        if group not in known:
             try:
-                annotations = package.annotations(group)
-                known |= {member: annotations.get(member) or {} for member in group}
+                known[group] = files.read(f"metadata/{group}.json.gz")
             except TransferFailed as error:
-                broken |= dict.fromkeys(group, error)
-        if uid in broken:
-            message = f"annotations: {broken[uid].message}"
-            failures.append(failure(_name(uid), broken[uid].reason, message))
+                known[group] = error
+        annotations = known[group]
+        if isinstance(annotations, TransferFailed):
+            message = f"annotations: {annotations.message}"
+            failures.append(failure(_name(uid), annotations.reason, message))
             continue
-        record = _record(uid, known[uid])
+        record = _record(uid, annotations.get(uid) or {})
         records.append(record)
         usable += len(refuse_licences([record], allowed)[0])
         if usable == count:
@@ -119,14 +179,12 @@ def _record(uid: str, annotation: dict[str, Any]) -> ObjectRecord:
     )
 
 
-def _fetch(
-    package: ObjaversePackage, records: list[ObjectRecord], downloaded: CountDone
-) -> Fetched:
+def _fetch(files: _ObjaverseFiles, records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
     def fetch(record: ObjectRecord) -> ObjectRecord:
-        path = package.fetch(record.uid.removeprefix(_name("")))
+        path = files.fetch(files.paths[record.uid.removeprefix(_name(""))])
         return dataclasses.replace(record, path=str(path))
 
-    return fetch_all(records, fetch, downloaded, threads=1, stop=threading.Event())
+    return fetch_all(records, fetch, downloaded, threads=_THREADS, stop=threading.Event())
 
 
 def _name(uid: str) -> str:

@@ -4,25 +4,16 @@ import dataclasses
 from functools import partial
 from pathlib import Path
 
-from pipeline.objects.file_filters import drop_duplicates, drop_outputs, warn_unread_formats
 from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
-from pipeline.objects.listing import (
-    CountDone,
-    Fetched,
-    Listing,
-    assign_uids,
-    failure,
-    fetch_all,
-    is_object_file,
-)
+from pipeline.objects.listing import CountDone, Fetched, Listing, fetch_all
 from pipeline.objects.local.catalogue import CATALOGUE_NAMES, only_catalogue, read_catalogue
-from pipeline.objects.local.folder import file_record
+from pipeline.objects.local.folder import list_files
 from pipeline.objects.remote.files import RemoteFiles
 from pipeline.objects.remote.folder import RemoteFolder
 from storage.cache import cache_folder
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.objects import Failure, ObjectRecord
+from storage.records.objects import ObjectRecord
 from storage.remote.retries import TransferFailed
 from storage.remote.safe_url import printable, safe_url
 from storage.remote.url import RemoteUrl
@@ -49,12 +40,11 @@ def list_remote(url: RemoteUrl, licence: str | None) -> Listing:
     files = RemoteFiles(folder, root, MAX_BYTES)
     catalogue = only_catalogue(folder.has)
     if catalogue is None:
-        records, failures = _list_object_files(folder, files, stated_licence(licence))
+        listing = _list_object_files(folder, files, stated_licence(licence))
     else:
         require_unstated(licence, catalogue)
-        records = _list_catalogue(folder, files, catalogue)
-        failures = []
-    return Listing(records=records, failures=failures, fetch=partial(_fetch, folder, files))
+        listing = Listing(records=_list_catalogue(folder, files, catalogue), failures=[])
+    return dataclasses.replace(listing, fetch=partial(_fetch, folder, files))
 
 
 def _list_catalogue(folder: RemoteFolder, files: RemoteFiles, catalogue: str) -> list[ObjectRecord]:
@@ -73,9 +63,7 @@ def _list_catalogue(folder: RemoteFolder, files: RemoteFiles, catalogue: str) ->
     ]
 
 
-def _list_object_files(
-    folder: RemoteFolder, files: RemoteFiles, licence: StatedLicence
-) -> tuple[list[ObjectRecord], list[Failure]]:
+def _list_object_files(folder: RemoteFolder, files: RemoteFiles, licence: StatedLicence) -> Listing:
     names = folder.names()
     for catalogue in set(CATALOGUE_NAMES) & set(names):
         # without the catalogue, the run could use objects that it forbids
@@ -83,19 +71,11 @@ def _list_object_files(
             f"objects {folder.url.display_url!r}: {catalogue} is listed but cannot be fetched; "
             "expected a readable catalogue. Check your access to it."
         )
-    names = drop_outputs(names)
-    objects = [name for name in names if is_object_file(name)]
-    warn_unread_formats(names, objects)
-    uids, failures = assign_uids(drop_duplicates(objects))
-    records = []
-    for name, uid in uids.items():
-        try:
-            path = str(files.path(name))
-        except TransferFailed as error:
-            failures.append(failure(uid, error.reason, error.message))
-            continue
-        records.append(file_record(uid, path, licence, source_url=_display_url(folder, name)))
-    return records, failures
+    return list_files(
+        names,
+        licence,
+        lambda name: {"path": str(files.path(name)), "source_url": _display_url(folder, name)},
+    )
 
 
 def _fetch(

@@ -20,8 +20,8 @@ from typing import Any
 
 from pipeline.assets import stage
 from pipeline.assets.asset_store import AssetStore
-from pipeline.assets.attempt import AssetAttempt
 from pipeline.assets.settings import AssetSettings
+from pipeline.assets.stage import AssetAttempt
 from pipeline.isolation import ChildLimits, IsolatedChild, preload
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Asset, decode_asset

@@ -12,12 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings
-from pipeline.foreign.mesh import TriangleMesh
-from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadric
-from pipeline.objects.builtin.torus_knot import TorusKnotParams, torus_knot
+from pipeline.foreign.mesh import TriangleMesh, join_meshes
+from pipeline.objects.builtin.superquadric import superquadric
+from pipeline.objects.builtin.torus_knot import torus_knot
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level
 from storage.records.objects import ObjectRecord
+from tests.pipeline.foreign.gltf.gltf_writer import GltfWriter
 
 
 def record_of(path: Path, uid: str = "object") -> ObjectRecord:
@@ -91,11 +92,7 @@ def geometry(asset: Asset) -> bytes:
 
 def joined(*meshes: TriangleMesh) -> TriangleMesh:
     """All of them as one mesh."""
-    starts = np.cumsum([0, *(len(mesh.positions) for mesh in meshes)])
-    return TriangleMesh(
-        positions=np.concatenate([mesh.positions for mesh in meshes]),
-        faces=np.concatenate([m.faces + k for m, k in zip(meshes, starts[:-1], strict=True)]),
-    )
+    return join_meshes(meshes)
 
 
 def moved(mesh: TriangleMesh, scale: ArrayLike = 1.0, offset: ArrayLike = 0.0) -> TriangleMesh:
@@ -146,15 +143,11 @@ def cube(cells: int = 1) -> TriangleMesh:
 def sphere(rings: int = 15, columns: int = 24) -> TriangleMesh:
     """A closed ellipsoid of 2 rings columns faces, without symmetry of its axes."""
     positions, faces = superquadric(
-        SuperquadricParams(
-            exponent_profile=1.0,
-            exponent_plan=1.0,
-            half_sizes=(1.0, 0.8, 0.6),
-            taper=0.0,
-            twist_rad=0.0,
-            rings=rings,
-            columns=columns,
-        )
+        exponent_profile=1.0,
+        exponent_plan=1.0,
+        half_sizes=(1.0, 0.8, 0.6),
+        rings=rings,
+        columns=columns,
     )
     return TriangleMesh(positions=positions, faces=faces)
 
@@ -162,17 +155,15 @@ def sphere(rings: int = 15, columns: int = 24) -> TriangleMesh:
 def knot(segments: int = 160, sides: int = 12) -> TriangleMesh:
     """A trefoil of 2 segments sides faces: no symmetric axes, and it hides parts of itself."""
     positions, faces = torus_knot(
-        TorusKnotParams(
-            windings=(2, 3),
-            minor_radius=0.45,
-            fill=0.6,
-            ribs=3,
-            rib_depth=0.4,
-            rib_turns=1,
-            flatten=0.8,
-            segments=segments,
-            sides=sides,
-        )
+        windings=(2, 3),
+        minor_radius=0.45,
+        fill=0.6,
+        ribs=3,
+        rib_depth=0.4,
+        rib_turns=1,
+        flatten=0.8,
+        segments=segments,
+        sides=sides,
     )
     return TriangleMesh(positions=positions, faces=faces)
 
@@ -183,19 +174,21 @@ def flip_some(mesh: TriangleMesh, share: float, rng: np.random.Generator) -> Tri
     return with_faces(mesh, np.where(flipped[:, None], mesh.faces[:, ::-1], mesh.faces))
 
 
+def _lines(mesh: TriangleMesh, vertex: str, face: str, first: int) -> str:
+    """Return a line for each vertex and face, of doubles as text that reads back exactly."""
+    lines = [f"{vertex}{x!r} {y!r} {z!r}\n" for x, y, z in mesh.positions.tolist()]
+    lines += [f"{face}{a} {b} {c}\n" for a, b, c in (mesh.faces + first).tolist()]
+    return "".join(lines)
+
+
 def write_obj(path: Path, mesh: TriangleMesh) -> Path:
-    """Doubles as text that reads back exactly."""
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.positions.tolist()]
-    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces.tolist()]
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text(_lines(mesh, "v ", "f ", 1))
     return path
 
 
 def write_off(path: Path, mesh: TriangleMesh) -> Path:
-    lines = ["OFF", f"{len(mesh.positions)} {len(mesh.faces)} 0"]
-    lines += [f"{x!r} {y!r} {z!r}" for x, y, z in mesh.positions.tolist()]
-    lines += [f"3 {a} {b} {c}" for a, b, c in mesh.faces.tolist()]
-    path.write_text("\n".join(lines) + "\n")
+    header = f"OFF\n{len(mesh.positions)} {len(mesh.faces)} 0\n"
+    path.write_text(header + _lines(mesh, "", "3 ", 0))
     return path
 
 
@@ -214,34 +207,21 @@ def write_ply(path: Path, mesh: TriangleMesh) -> Path:
         "property double x\nproperty double y\nproperty double z\n"
         f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
-    rows = [f"{x!r} {y!r} {z!r}" for x, y, z in mesh.positions.tolist()]
-    rows += [f"3 {a} {b} {c}" for a, b, c in mesh.faces.tolist()]
-    path.write_text(header + "\n".join(rows) + "\n")
+    path.write_text(header + _lines(mesh, "", "3 ", 0))
     return path
 
 
 def gltf_tree(mesh: TriangleMesh) -> tuple[dict[str, Any], bytes]:
     """A glTF of one node, and its buffer; tests then break the tree in one place."""
+    file = GltfWriter()
     upright = mesh.positions[:, [0, 2, 1]] * [1, 1, -1]  # glTF has +Y up, we have +Z
-    points = upright.astype("<f4").tobytes()
-    indices = mesh.faces.astype("<u4").tobytes()
-    tree = {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": len(mesh.positions), "type": "VEC3"},
-            {"bufferView": 1, "componentType": 5125, "count": mesh.faces.size, "type": "SCALAR"},
-        ],
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": 0, "byteLength": len(points)},
-            {"buffer": 0, "byteOffset": len(points), "byteLength": len(indices)},
-        ],
-        "buffers": [{"byteLength": len(points) + len(indices)}],
-    }
-    return tree, points + indices
+    attributes = {"POSITION": file.accessor(upright, "f4")}
+    indices = file.accessor(mesh.faces.ravel(), "u4")
+    file.add("meshes", {"primitives": [{"attributes": attributes, "indices": indices}]})
+    file.add("nodes", {"mesh": 0})
+    file.add("scenes", {"nodes": [0]})
+    file.tree["buffers"] = [{"byteLength": len(file.data)}]
+    return file.tree, bytes(file.data)
 
 
 def write_glb(path: Path, tree: dict[str, Any], buffer: bytes) -> Path:

@@ -9,12 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.assets.check_pymeshlab import missing_filters
-from pipeline.assets.decimation.decimate import decimate, safe_method
+from pipeline.assets.decimation.decimate import decimate, safe_method, smallest_passing
 from pipeline.assets.decimation.pymeshlab_filters import REQUIRED_FILTERS, pymeshlab
-from pipeline.assets.decimation.smallest import smallest_passing
-from pipeline.assets.quality.distance import Surface
-from pipeline.assets.recipe import methods_of
+from pipeline.assets.quality.measure import Surface
+from pipeline.assets.recipe import methods_of, missing_filters
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected

@@ -7,12 +7,18 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pipeline.assets.quality.components import Components, label_components
-from pipeline.assets.quality.distance import Surface, sample_surface
 from pipeline.assets.quality.level_checks import check_level
-from pipeline.assets.quality.measure import MeasuredSource
-from pipeline.assets.quality.silhouette import intersection_over_union, silhouette
-from pipeline.assets.quality.triangles import area_variation, count_edges, smallest_angles_deg
+from pipeline.assets.quality.measure import (
+    MeasuredSource,
+    Surface,
+    area_variation,
+    count_edges,
+    intersection_over_union,
+    label_components,
+    sample_surface,
+    silhouette,
+    smallest_angles_deg,
+)
 from pipeline.assets.settings import GateSettings
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
@@ -264,7 +270,7 @@ def test_a_part_that_vanishes_is_named_lost_and_one_that_is_coarser_is_not() -> 
     assert quality.error_max > 0 == quality.lost_area
     three = cleaned(joined(knot(20, 6), moved(cube(), 1, 5), moved(cube(), 1, -5)))
     assert len(np.unique(label_components(three))) == 3
-    assert Components(Surface(three, np.random.default_rng(0).random((8192, 3)))).count == 3
+    assert MeasuredSource(three).num_components == 3
 
 
 @for_each("slope_deg", [10.0, 30.0, 45.0])

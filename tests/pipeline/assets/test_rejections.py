@@ -4,14 +4,11 @@ Every reason code has a file that earns it.
 """
 
 import gzip
-import io
 import json
 import os
 import struct
 import subprocess
 import sys
-import tarfile
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.assets.settings import AssetSettings, GateSettings
+from pipeline.assets.settings import AssetSettings
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 from storage.records.asset import Asset
@@ -92,20 +89,12 @@ def test_an_offset_is_judged_by_the_precision_of_the_format(tmp_path: Path) -> N
     assert prepare(dirty).geometry_sha256 == near.geometry_sha256
 
 
-def _tar(data: bytes) -> bytes:
-    stream = io.BytesIO()
-    with tarfile.open(fileobj=stream, mode="w", format=tarfile.USTAR_FORMAT) as archive:
-        entry = tarfile.TarInfo("a.obj")
-        entry.size = len(data)
-        archive.addfile(entry, io.BytesIO(data))
-    return stream.getvalue()
-
-
-def _zip(data: bytes) -> bytes:
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("a.obj", data)
-    return stream.getvalue()
+ARCHIVES = {
+    "gzip": gzip.compress(b"v 0 0 0\n" * 100),
+    "zip": b"PK\x03\x04" + b"v 0 0 0\n" * 100,
+    "tar": b"a.obj".ljust(257, b"\0") + b"ustar\x0000".ljust(767, b"\0"),
+}
+"""A real one, and the first bytes of others."""
 
 
 def _ply(header: str, body: bytes = b"") -> bytes:
@@ -144,8 +133,8 @@ RAW_FILES: dict[str, tuple[str, str, bytes]] = (
         "text as archive": ("unsupported_format", ".zip", b"v 0 0 0"),
     }
     | {
-        f"{pack.__name__} as {suffix}": ("archive_refused", suffix, pack(b"v 0 0 0\n" * 100_000))
-        for suffix in (".obj", ".glb", ".stl", ".ply") for pack in (_zip, _tar, gzip.compress)
+        f"{kind} as {suffix}": ("archive_refused", suffix, data)
+        for suffix in (".obj", ".glb", ".stl", ".ply") for kind, data in ARCHIVES.items()
     }
     | {
         f"{form} ply bomb {count} {element}": (
@@ -171,20 +160,6 @@ def test_bad_files(tmp_path: Path, name: str) -> None:
     assert reason_of(path) == reason
 
 
-@for_each("keep", [0.1, 0.5, 0.97])
-def test_files_that_were_cut_off(tmp_path: Path, keep: float) -> None:
-    for path in (
-        write_glb(tmp_path / "a.glb", *gltf_tree(BALL)),
-        write_stl(tmp_path / "a.stl", BALL),
-        write_ply(tmp_path / "a.ply", BALL),
-        write_off(tmp_path / "a.off", BALL),
-    ):
-        data = path.read_bytes()
-        path.write_bytes(data[: int(keep * len(data))])
-        expected = {"cut_off", "load_error", "header_size_mismatch", "index_range", "no_faces"}
-        assert reason_of(path) in expected
-
-
 @for_each("write", [write_stl, write_ply, write_off, write_obj])
 def test_limits_of_size(tmp_path: Path, write: Callable[[Path, TriangleMesh], Path]) -> None:
     path = write(tmp_path / f"a.{write.__name__[-3:]}", BALL)
@@ -200,16 +175,6 @@ def test_a_header_of_too_many_faces_is_enough(tmp_path: Path) -> None:
     path.write_bytes(header + end + b"\xff" * len(body))
     assert reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
     assert reason_of(path, AssetSettings(max_source_faces=80)) != "too_many_faces"
-
-
-def test_errors_beyond_the_bound_are_stated_and_their_levels_left_out(tmp_path: Path) -> None:
-    path = write_obj(tmp_path / "a.obj", knot())
-    settings = AssetSettings(budgets=(1000,), gate=GateSettings(max_error_p99=1e-4))
-    with pytest.raises(Rejected, match=r"error_over_bound: p99 distance \d+\.\d+%"):
-        prepare(path, settings)
-    gate = GateSettings(max_error_p99=0.01)
-    asset = prepare(path, AssetSettings(budgets=(1400, 60), gate=gate))
-    assert [level.record.budget for level in asset.levels] == [1400]
 
 
 def test_what_is_no_file_and_odd_names_of_what_is_one(tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ from tests.pipeline.assets.source_materials.usd_kit import (
     new_stage,
     set_inputs,
     textured_usd,
+    transform_coordinates,
     usd_mesh,
 )
 
@@ -202,21 +203,14 @@ def test_a_quad_keeps_its_corner_colours(tmp_path: Path, suffix: str) -> None:
     assert geometry(prepare(path)) == geometry(asset)
 
 
-def test_coordinates_of_each_corner_are_read(tmp_path: Path) -> None:
-    def corners(stage: Usd.Stage) -> None:
-        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(MESH))
-        coordinates(mesh, kit.UV_UP[kit.SQUARE.faces].reshape(-1, 2), "faceVarying")
-
-    kit.assert_corners(made(tmp_path, corners))
-
-
 def test_a_quad_of_four_corners_and_a_place_of_its_own(tmp_path: Path) -> None:
-    """One polygon, a quarter turn and a mirror above it: the picture goes with the surface."""
+    """One polygon with coordinates of its corners, a quarter turn above it."""
 
     def placed(stage: Usd.Stage) -> None:
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath(MESH))
         mesh.GetFaceVertexCountsAttr().Set([4])
         mesh.GetFaceVertexIndicesAttr().Set([0, 1, 2, 3])
+        coordinates(mesh, kit.UV_UP, "faceVarying")
         UsdGeom.Xformable(stage.GetPrimAtPath("/W")).AddRotateYOp().Set(90)
 
     # +y by 90 degrees: x to -z, and z to x
@@ -301,13 +295,6 @@ def test_the_colour_space_of_the_shader_counts(
     assert np.abs(kit.seen_at(asset, 0.25, -0.25) - linear * (1 - kit.F)).max() < kit.STORED
 
 
-def test_scale_and_bias_and_a_single_channel(tmp_path: Path) -> None:
-    change = _inputs({"scale": Gf.Vec4f(1, 0.5, 1, 1), "bias": Gf.Vec4f(0, 0.25, 0, 0)})
-    asset = made(tmp_path, change, connect={"diffuseColor": "g"})
-    assert np.abs(kit.seen_at(asset, 0.25, -0.25) - 0.75 * (1 - kit.F)).max() < kit.SLOPE  # green
-    assert np.abs(kit.seen_at(asset, -0.25, -0.25) - 0.25 * (1 - kit.F)).max() < kit.SLOPE  # red
-
-
 @for_each(
     "wrap, wanted",
     [("repeat", kit.RED), ("mirror", kit.GREEN), ("clamp", kit.GREEN), ("black", (0, 0, 0))],
@@ -323,17 +310,7 @@ def test_a_transform_scales_turns_and_shifts_in_this_order(tmp_path: Path) -> No
     """A quarter turn counter-clockwise and a shift back: (s, t) reads (1 - t, s)."""
 
     def move(stage: Usd.Stage) -> None:
-        node = UsdShade.Shader.Define(stage, "/W/mat/move")
-        node.CreateIdAttr("UsdTransform2d")
-        set_inputs(stage, "/W/mat/move", {"rotation": 90.0})
-        node.CreateInput("translation", Sdf.ValueTypeNames.Float2).Set(Gf.Vec2f(1, 0))
-        reader = UsdShade.Shader(stage.GetPrimAtPath(f"{TEXTURE}_reader"))
-        node.CreateInput("in", Sdf.ValueTypeNames.Float2).ConnectToSource(
-            reader.ConnectableAPI(), "result"
-        )
-        UsdShade.Shader(stage.GetPrimAtPath(TEXTURE)).GetInput("st").ConnectToSource(
-            node.ConnectableAPI(), "result"
-        )
+        transform_coordinates(stage, 90.0, (1, 1), (1, 0))
 
     kit.assert_corners(made(tmp_path, move), lambda right, up: (up, -right))
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from pipeline.assets.cleaning import surface_around
 from pipeline.assets.cleaning.orient import orient_outward
-from pipeline.assets.quality.distance import Surface
 from pipeline.assets.quality.level_checks import require_watertight
+from pipeline.assets.quality.measure import Surface
 from pipeline.assets.recipe import methods_of
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh

@@ -15,13 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.foreign.light_pictures import read_linear_picture
 from pipeline.foreign.linear_picture import (
     REC709,
     LinearPicture,
     luminance_weights,
     rec709_from,
 )
+from pipeline.foreign.picture import read_linear_picture
 from storage.errors import Rejected, TrilightError
 from storage.records.exr import channel_names, decode_exr
 from tests.for_each import for_each

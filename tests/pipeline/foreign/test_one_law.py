@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
+from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
 
 from pipeline.assets.source_materials.skin import _parts
 from pipeline.assets.source_materials.source_surface import SourceSurface
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_json import read_description
-from pipeline.foreign.light_pictures import read_linear_picture
 from pipeline.foreign.material import LEAST_ROUGHNESS
 from pipeline.foreign.numbers import FINITE
-from pipeline.foreign.picture import Decoder
+from pipeline.foreign.picture import Decoder, read_linear_picture
 from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected, TrilightError
 from storage.records.lookup import textured_rows
@@ -68,18 +67,7 @@ def stated(path: str, values: Mapping[str, Any]) -> Callable[[Usd.Stage], None]:
 
 
 def turned(stage: Usd.Stage) -> None:
-    node = UsdShade.Shader.Define(stage, "/W/mat/move")
-    node.CreateIdAttr("UsdTransform2d")
-    usd_kit.set_inputs(stage, "/W/mat/move", {"rotation": 90.0})
-    node.CreateInput("scale", Sdf.ValueTypeNames.Float2).Set(Gf.Vec2f(0.5, 0.75))
-    node.CreateInput("translation", Sdf.ValueTypeNames.Float2).Set(Gf.Vec2f(1, 0.125))
-    reader = UsdShade.Shader(stage.GetPrimAtPath(f"{usd_kit.TEXTURE}_reader"))
-    node.CreateInput("in", Sdf.ValueTypeNames.Float2).ConnectToSource(
-        reader.ConnectableAPI(), "result"
-    )
-    UsdShade.Shader(stage.GetPrimAtPath(usd_kit.TEXTURE)).GetInput("st").ConnectToSource(
-        node.ConnectableAPI(), "result"
-    )
+    usd_kit.transform_coordinates(stage, 90.0, (0.5, 0.75), (1, 0.125))
 
 
 def tinted(stage: Usd.Stage) -> None:

@@ -8,9 +8,8 @@ import os
 import signal
 from pathlib import Path
 
-from pipeline.assets.attempt import AssetAttempt
 from pipeline.assets.settings import AssetSettings
-from pipeline.assets.stage import attempt_in_child
+from pipeline.assets.stage import AssetAttempt, attempt_in_child
 from pipeline.generation.scene_worker import SceneAttempt, SceneWorker
 
 OBJECT = "poison.obj"

@@ -22,7 +22,7 @@ from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.prepare_isolated import asset_store
 from pipeline.generation.revisited_scenes import AcceptedObjects
 from pipeline.generation.scene_worker import SceneAttempt
-from pipeline.objects.maps.prepared import MapFiles, prepare_map
+from pipeline.objects.maps.prepared import prepare_map
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.scenes.compose import compose_scene
@@ -384,7 +384,7 @@ def test_files_that_lie_are_refused_with_their_part(tmp_path: Path) -> None:
     broken.write_bytes(b"\x89PNG\r\n\x1a\n")
     files = {"base": png(tmp_path / "a.png", noise(1)), "roughness": broken}
     with pytest.raises(Rejected, match="roughness: it is cut off, or no PNG"):
-        prepare_map(MapFiles(kind=TEXTURE, files=files, size=4))
+        prepare_map(TEXTURE, files, 4)
     wide = exr(tmp_path / "wide.exr", np.ones((1, 8193, 3), np.float32))
     with pytest.raises(Rejected, match="twice as wide as high"):
-        prepare_map(MapFiles(kind=SKY, files={"map": wide}, size=4))
+        prepare_map(SKY, {"map": wide}, 4)

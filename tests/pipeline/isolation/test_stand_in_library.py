@@ -74,7 +74,7 @@ for name in ("libGL.so.1", "libOpenGL.so.0", "libatomic.so.1"):
 @pytest.mark.parametrize(
     "use",
     [
-        "from pipeline.assets.check_pymeshlab import missing_filters as it; assert it() == []",
+        "from pipeline.assets.recipe import missing_filters as it; assert it() == []",
         "from pipeline.renders import mitsuba_variant as it; it.activate(it.choose_variant());"
         "import drjit, mitsuba; assert drjit.sum(drjit.arange(mitsuba.UInt32, 1000000))[0] > 0",
     ],

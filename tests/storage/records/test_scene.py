@@ -15,7 +15,7 @@ import pytest
 import trimesh
 from safetensors.numpy import save
 
-from pipeline.objects.ply import encode_ply
+from pipeline.objects.generated import encode_ply
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.asset import Asset, Level, LevelRecord, decode_asset, encode_asset

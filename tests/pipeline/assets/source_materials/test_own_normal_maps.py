@@ -23,6 +23,7 @@ from tests.pipeline.assets.source_materials.textured_kit import (
     textured_tree,
 )
 from tests.pipeline.assets.source_materials.usd_kit import TEXTURE, set_inputs, textured_usd
+from tests.pipeline.foreign.gltf.gltf_writer import GltfWriter
 
 MAPS = dataclasses.replace(KEEP, own_materials=dataclasses.replace(OWN, normal_maps=True))
 PLACES = np.array([(-0.25, 0.25), (0.25, 0.25), (-0.25, -0.25), (0.25, -0.25)])
@@ -52,16 +53,11 @@ def _glb(path: Path, uv: ArrayLike = UV_UP, tangent: ArrayLike | None = None, **
     material["normalTexture"] = {"index": 0, **info}
     material["pbrMetallicRoughness"] = {"baseColorFactor": [0.5, 0.5, 0.5, 1]}
     if tangent is not None:
-        data = np.tile(np.asarray(tangent, "<f4"), (4, 1)).tobytes()
-        tree["bufferViews"].append(
-            {"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data)}
-        )
-        tree["buffers"][0]["byteLength"] = len(buffer) + len(data)
-        accessor = {"componentType": 5126, "count": 4, "type": "VEC4"}
-        tree["accessors"].append({"bufferView": len(tree["bufferViews"]) - 1, **accessor})
+        file = GltfWriter(tree=tree, data=bytearray(buffer))
         attributes = tree["meshes"][0]["primitives"][0]["attributes"]
-        attributes["TANGENT"] = len(tree["accessors"]) - 1
-        buffer += data
+        attributes["TANGENT"] = file.accessor(np.tile(np.asarray(tangent), (4, 1)), "f4")
+        buffer = bytes(file.data)
+        tree["buffers"][0]["byteLength"] = len(buffer)
     return write_glb(path, tree, buffer)
 
 

@@ -15,6 +15,7 @@ from pipeline.foreign.mesh import TriangleMesh
 from storage.records.asset import Asset
 from storage.records.lookup import texture_values
 from tests.pipeline.assets.meshes_by_hand import gltf_tree, prepare, write_glb
+from tests.pipeline.foreign.gltf.gltf_writer import GltfWriter
 
 RED, GREEN, BLUE, WHITE = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
 CORNERS = np.array([[BLUE, WHITE], [RED, GREEN]], np.uint8)
@@ -56,32 +57,21 @@ def textured_tree(
 ) -> tuple[dict[str, Any], bytes]:
     """Return a glTF of a mesh with a picture, embedded or by its URI."""
     tree, buffer = gltf_tree(mesh)
+    file = GltfWriter(tree=tree, data=bytearray(buffer))
     primitive = tree["meshes"][0]["primitives"][0]
     primitive["material"] = 0
     tree["materials"] = [
         {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0}}
     ]
     tree["textures"] = [{"source": 0}]
-
-    def view(data: bytes) -> int:
-        nonlocal buffer
-        buffer += bytes(-len(buffer) % 4)
-        place = {"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data)}
-        tree["bufferViews"].append(place)
-        buffer += data
-        tree["buffers"][0]["byteLength"] = len(buffer)
-        return len(tree["bufferViews"]) - 1
-
     if uv_up is not None:
         uv = np.asarray(uv_up, np.float64) * [1, -1] + [0, 1]  # glTF has v down
-        accessor = {"componentType": 5126, "count": len(uv), "type": "VEC2"}
-        tree["accessors"].append({"bufferView": view(uv.astype("<f4").tobytes()), **accessor})
-        primitive["attributes"]["TEXCOORD_0"] = len(tree["accessors"]) - 1
+        primitive["attributes"]["TEXCOORD_0"] = file.accessor(uv, "f4")
+    tree["images"] = [{"uri": picture}]
     if isinstance(picture, bytes):
-        tree["images"] = [{"bufferView": view(picture), "mimeType": "image/png"}]
-    else:
-        tree["images"] = [{"uri": picture}]
-    return tree, buffer
+        tree["images"] = [{"bufferView": file.view(picture), "mimeType": "image/png"}]
+    tree["buffers"][0]["byteLength"] = len(file.data)
+    return tree, bytes(file.data)
 
 
 def textured_glb(

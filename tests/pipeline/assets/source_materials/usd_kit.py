@@ -89,6 +89,24 @@ def connect_texture(
         shader.CreateInput(name, kind).ConnectToSource(node.ConnectableAPI(), output)
 
 
+def transform_coordinates(
+    stage: Usd.Stage, rotation: float, scale: tuple[float, float], move: tuple[float, float]
+) -> None:
+    """Put a UsdTransform2d between the texture and its coordinates."""
+    node = UsdShade.Shader.Define(stage, "/W/mat/move")
+    node.CreateIdAttr("UsdTransform2d")
+    set_inputs(stage, "/W/mat/move", {"rotation": rotation})
+    for name, pair in (("scale", scale), ("translation", move)):
+        node.CreateInput(name, Sdf.ValueTypeNames.Float2).Set(Gf.Vec2f(*pair))
+    reader = UsdShade.Shader(stage.GetPrimAtPath(f"{TEXTURE}_reader"))
+    texture = UsdShade.Shader(stage.GetPrimAtPath(TEXTURE))
+    for source, target in (
+        (reader, node.CreateInput("in", Sdf.ValueTypeNames.Float2)),
+        (node, texture.GetInput("st")),
+    ):
+        target.ConnectToSource(source.ConnectableAPI(), "result")
+
+
 def textured_usd(
     path: Path,
     picture: bytes,

@@ -16,7 +16,7 @@ from pipeline.exchange.gltf.read_gltf import read_gltf
 from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.load_mesh import load_mesh
-from pipeline.foreign.material import MaterialSamples, SourceMaterial, source_columns
+from pipeline.foreign.material import SourceMaterial, source_columns
 from pipeline.foreign.picture import Decoder
 from pipeline.foreign.source_file import read_source
 from storage.errors import Rejected, TrilightError
@@ -50,7 +50,7 @@ def surface(path: Path) -> NDArray[np.float64]:
             base = slot.picture.sample(uv, np.zeros(len(chosen), np.int64))
         if parts.color is not None:
             base[:, :3] *= parts.color[chosen].mean(axis=1)
-        colors[chosen] = source_columns(material, MaterialSamples(base=base), len(chosen))[:, :3]
+        colors[chosen] = source_columns(material, {"base": base}, len(chosen))[:, :3]
     return ordered(corners, colors)
 
 

@@ -12,7 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
 from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.usd.read_usd import read_usd
-from pipeline.foreign.material import MaterialSamples, source_columns
+from pipeline.foreign.material import source_columns
 from pipeline.foreign.source_file import read_source
 from pipeline.foreign.usd.materials import usd_textured_mesh
 from storage.errors import Rejected, TrilightError
@@ -58,7 +58,7 @@ def of_object(path: Path) -> Looks:
     columns = np.zeros((len(tint), 7))
     for row in np.unique(parts.material):
         own = parts.material == row
-        samples = MaterialSamples(base=tint[own].astype(np.float32))
+        samples = {"base": tint[own].astype(np.float32)}
         columns[own] = source_columns(parts.materials[row], samples, int(own.sum()))
     return looks_of(parts.mesh.positions[parts.mesh.faces], columns[:, :3], columns[:, 6])
 

@@ -10,12 +10,11 @@ from PIL import Image
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.maps.listing import FoundMaps, find_maps
 from pipeline.objects.maps.prepared import (
-    MapFiles,
     decode_prepared,
     prepare_map,
     texture_set,
+    usable_map,
 )
-from pipeline.objects.maps.radiance import usable_map
 from pipeline.objects.maps.resample import area_means, flux, solid_angle_means
 from pipeline.objects.maps.texture_names import _parse_name, group_textures
 from storage.conventions import linear_from_srgb8
@@ -165,7 +164,7 @@ def test_packed_pictures_gloss_and_floats_are_parts(tmp_path: Path) -> None:
 
     def roughness(**files: Path) -> float:
         base = png(tmp_path / "b.png", color)
-        data, _ = prepare_map(MapFiles(kind=TEXTURE, files={"base": base, **files}, size=4))
+        data, _ = prepare_map(TEXTURE, {"base": base, **files}, 4)
         return float(decode_prepared(data, "a").arrays["roughness"].mean())
 
     assert roughness(orm=png(tmp_path / "p.png", packed)) == pytest.approx(0.2)
@@ -173,17 +172,15 @@ def test_packed_pictures_gloss_and_floats_are_parts(tmp_path: Path) -> None:
     floats = exr(tmp_path / "r.exr", np.full((4, 4, 3), 0.07, np.float32))
     assert roughness(roughness=floats) == pytest.approx(0.07)
     twins = [png(tmp_path / "b.png", color), exr(tmp_path / "b.exr", linear)]
-    prepared = [
-        prepare_map(MapFiles(kind=TEXTURE, files={"base": path}, size=4))[0] for path in twins
-    ]
+    prepared = [prepare_map(TEXTURE, {"base": path}, 4)[0] for path in twins]
     eight, half = (decode_prepared(data, "a").arrays["diffuse"] for data in prepared)
     np.testing.assert_allclose(eight, half, rtol=1e-5)
     wide = exr(tmp_path / "w.exr", np.full((4, 4, 3), 1.5, np.float32))
-    _, unread = prepare_map(MapFiles(kind=TEXTURE, files={"base": wide}, size=4))
+    _, unread = prepare_map(TEXTURE, {"base": wide}, 4)
     assert unread == ("values beyond [0, 1] (0 to 1.5) of its base",)
     up = png(tmp_path / "n.png", np.broadcast_to(np.array([140, 120, 254], np.uint8), (4, 4, 3)))
     with pytest.raises(Rejected, match="unit vectors, as of a normal map"):
-        prepare_map(MapFiles(kind=TEXTURE, files={"base": up}, size=4))
+        prepare_map(TEXTURE, {"base": up}, 4)
 
 
 def test_licences_are_those_of_the_catalogue_or_the_stated_one(tmp_path: Path) -> None:
