@@ -1,7 +1,7 @@
 """Writes prims and attributes straight into a layer, with a hundredth of the calls of schemas.
 
-An attribute is a pair (USD type name, value). The writer and the exact reader use the same tables
-of attributes by name: one writes the values, the other compares them.
+The writer and the exact reader use the same tables of attributes by name: one writes the values,
+the other compares them.
 """
 
 import functools
@@ -13,8 +13,12 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.usd.prim_names import NAMESPACE
 
-Attributes = Mapping[str, tuple[str, Any]]
-"""Type name and value of each attribute by name; the prefix "uniform " sets its variability."""
+Attributes = Mapping[str, tuple[str, Any] | tuple[str, Any, str]]
+"""Type name, value and connected output, if any, of each attribute by name.
+
+The prefix "uniform " of a type sets its variability. Inputs and outputs may have the value None. An
+output is named by its path below the material.
+"""
 
 UNIFORM = "uniform "
 
@@ -31,11 +35,11 @@ def add_prim(layer: Any, path: str, type_name: str, schemas: Sequence[str] = ())
     return prim
 
 
-def add_attributes(prim: Any, attributes: Attributes) -> None:
-    """Write attributes with their default values."""
+def add_attributes(prim: Any, attributes: Attributes, material: str = "") -> None:
+    """Write attributes with default values, and connections to outputs below `material`."""
     from pxr import Sdf
 
-    for name, (kind, value) in attributes.items():
+    for name, (kind, value, *sources) in attributes.items():
         uniform = kind.startswith(UNIFORM)
         attribute = Sdf.AttributeSpec(
             prim,
@@ -44,7 +48,11 @@ def add_attributes(prim: Any, attributes: Attributes) -> None:
             Sdf.VariabilityUniform if uniform else Sdf.VariabilityVarying,
             name.startswith(NAMESPACE),
         )
-        attribute.default = usd_value(kind, value)
+        if value is not None:
+            attribute.default = usd_value(kind, value)
+        if sources:
+            paths = [_target(f"{material}/{source}") for source in sources]
+            attribute.connectionPathList.explicitItems = paths
 
 
 def add_relationship(prim: Any, name: str, target: str) -> None:
@@ -53,18 +61,6 @@ def add_relationship(prim: Any, name: str, target: str) -> None:
 
     relationship = Sdf.RelationshipSpec(prim, name, False)
     relationship.targetPathList.explicitItems = [_target(target)]
-
-
-def add_link(prim: Any, name: str, kind: str, source: str | None = None) -> None:
-    """Write an input or output, connected to the output `source` where that is given.
-
-    An existing attribute keeps its value.
-    """
-    from pxr import Sdf
-
-    link = prim.attributes.get(name) or Sdf.AttributeSpec(prim, name, _value_type(kind))
-    if source is not None:
-        link.connectionPathList.explicitItems = [_target(source)]
 
 
 def _target(path: str) -> Any:

@@ -25,7 +25,6 @@ from pipeline.exchange.usd.held_materials import (
     restore_stated,
 )
 from pipeline.exchange.usd.prim_names import added_column
-from pipeline.exchange.usd.read_exact_scene import read_written_rows
 from pipeline.foreign.part import Part, drop_empty, unit_normals
 from pipeline.foreign.usd.materials import MeshMaterials
 from pipeline.foreign.usd.object_stage import UsdStage
@@ -151,12 +150,15 @@ class _Extras:
 class StageSurfaces:
     """Converts the meshes of a stage to triangles with materials and textures."""
 
-    def __init__(self, stage: UsdStage, licence: str) -> None:
+    def __init__(
+        self, stage: UsdStage, licence: str, written: Mapping[str, NDArray[np.float32]]
+    ) -> None:
         """Read all materials; the stage's notes receive their losses.
 
         Args:
             stage: the open stage with its meshes.
             licence: licence of textures.
+            written: material rows as Trilight wrote them, by the paths of their prims.
 
         Raises:
             Rejected: a picture is outside of the folder, or too large.
@@ -166,7 +168,7 @@ class StageSurfaces:
         self._lost = stage.opened.lost
         self._opened = stage.opened
         self._licence = licence
-        self._written = read_written_rows(self._opened)
+        self._written = written
         self._converter = PartConverter(self._lost)
         self._extras: list[_Extras] = []
         self._looks = MeshMaterials(

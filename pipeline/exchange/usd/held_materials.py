@@ -8,7 +8,6 @@ edit it there. Blender writes no specular albedo, so that the exact one stays.
 """
 
 import dataclasses
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -24,16 +23,22 @@ from pipeline.exchange.linear_maps import (
 )
 from pipeline.exchange.pictures import MAX_BYTES, MAX_PIXELS
 from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles
-from pipeline.exchange.usd.openpbr import read_openpbr, written_columns
 from pipeline.exchange.usd.prim_names import (
     ADDED_COLUMNS,
     DIGEST,
     MATERIAL_ATTRIBUTES,
     column_attribute,
+    parse_map_text,
     texture_attribute,
 )
-from pipeline.exchange.usd.write_materials import PREVIEW_INPUTS
-from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, OPENPBR, decode_texture
+from pipeline.exchange.usd.write_materials import (
+    COAT_ROUGHNESS,
+    OPENPBR,
+    PREVIEW_INPUTS,
+    decode_texture,
+    read_openpbr,
+    written_columns,
+)
 from pipeline.foreign.picture import decode_image
 from pipeline.foreign.usd.shaders import (
     DEFAULTS,
@@ -138,18 +143,6 @@ def read_held_material(
         openpbr=read_openpbr(material, time, opened) if is_marked else {},
         written={name: rows[where][parts[name]] for name in columns} if where in rows else {},
     )
-
-
-def parse_map_text(text: Any) -> tuple[str, MapSource] | None:
-    """Parse a line of `names.format_map` to digest and source; return None for other text."""
-    try:
-        fields = json.loads(text)
-        sha256 = fields.pop("sha256")
-        source = MapSource(**fields)
-    except (TypeError, ValueError, KeyError, AttributeError):
-        return None
-    texts = (sha256, *dataclasses.astuple(source))
-    return (sha256, source) if all(isinstance(each, str) for each in texts) else None
 
 
 def restore_stated(
