@@ -22,6 +22,7 @@ from pipeline.exchange.formats import (
 )
 from pipeline.exchange.open_scene import load_source, source_keys
 from pipeline.exchange.reader import file_child, reach_of
+from pipeline.exchange.scene_budget import within_budget
 from pipeline.isolation import ChildFailed, call_with_retries
 from storage.atomic import write_error
 from storage.errors import TrilightError
@@ -162,8 +163,6 @@ def _load_within_budget(
     loaded = load_source(source, pictures=pictures)
     if budget is None or loaded.scene.num_triangles <= budget:
         return loaded
-    from pipeline.exchange.scene_budget import within_budget  # loads mesh libraries
-
     scene, notes = within_budget(loaded.scene, budget)
     if loaded.radiance_rgb is not None:
         notes = (*notes, "pictures left out: they show the scene before that")

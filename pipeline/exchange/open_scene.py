@@ -11,6 +11,7 @@
 Only this module splits `FILE::KEY`, so that no library that parses URLs ever sees it.
 """
 
+import dataclasses
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -96,7 +97,7 @@ def load_cameras(source: SceneSource) -> Cameras:
     return scene.c2w, scene.fov_deg
 
 
-def load_source(source: SceneSource, *, pictures: bool = False) -> LoadedScene:
+def load_source(source: SceneSource, pictures: bool = False) -> LoadedScene:
     """Read a scene with all of its cameras.
 
     Only child processes call this, since meshes may be read.
@@ -113,7 +114,9 @@ def load_source(source: SceneSource, *, pictures: bool = False) -> LoadedScene:
     loaded = read(source, pictures)
     if not FORMATS.is_ours(source.path.suffix.lower()):
         loaded.scene.check()
-    return loaded
+        return loaded
+    notes = tuple(f"{source.name}: {text}" for text in loaded.notes)
+    return dataclasses.replace(loaded, notes=notes)
 
 
 def _form_of(source: SceneSource) -> SceneFormat:

@@ -10,6 +10,7 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.formats import Cameras, LoadedScene, SceneSource
 from pipeline.exchange.from_description import AlbedoOverOne, LoadedMesh
 from pipeline.exchange.open_scene import load_cameras, load_source, source_keys
+from pipeline.exchange.scene_budget import within_budget
 from pipeline.exchange.scene_files import load_mesh_file
 from pipeline.isolation import (
     NO_FILES,
@@ -55,7 +56,7 @@ class SceneReader:
         """Read one scene; see `pipeline.exchange.open_scene.load_source`."""
         source = dataclasses.replace(source, albedo_over_one=self._over_one)
         self._child.allow_files(reach_of(source))
-        return self._read(_load_with_pictures if pictures else load_source, source)
+        return self._read(load_source, source, pictures)
 
     def cameras(self, source: SceneSource) -> Cameras:
         """Read poses and angles; see `pipeline.exchange.open_scene.load_cameras`."""
@@ -77,7 +78,8 @@ class SceneReader:
 
     def within_budget(self, scene: Scene, max_triangles: int) -> LoadedScene:
         """Reduce a scene in the child; see `pipeline.exchange.scene_budget.within_budget`."""
-        return self._call("scene", _within_budget, scene, max_triangles)
+        reduced, notes = self._call("scene", within_budget, scene, max_triangles)
+        return LoadedScene(scene=reduced, notes=notes)
 
     def close(self) -> None:
         """End the child."""
@@ -89,13 +91,13 @@ class SceneReader:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _read(self, function: Callable[[SceneSource], Result], source: SceneSource) -> Result:
+    def _read(self, function: Callable[..., Result], source: SceneSource, *args: bool) -> Result:
         """Call a function of a source; a complaint about its file names the path as it was given.
 
         Readers say the name alone, since others write what they say into datasets.
         """
         try:
-            return self._call(source.name, function, source)
+            return self._call(source.name, function, source, *args)
         except TrilightError as error:
             name = source.path.name
             if not str(error).startswith(name):
@@ -107,17 +109,6 @@ class SceneReader:
             return call_with_retries(self._child, function, *args)
         except ChildFailed as failure:
             raise TrilightError(f"{name}: could not be read ({failure}).") from failure
-
-
-def _load_with_pictures(source: SceneSource) -> LoadedScene:
-    return load_source(source, pictures=True)
-
-
-def _within_budget(scene: Scene, max_triangles: int) -> LoadedScene:
-    from pipeline.exchange.scene_budget import within_budget  # loads mesh libraries
-
-    reduced, notes = within_budget(scene, max_triangles)
-    return LoadedScene(scene=reduced, notes=notes)
 
 
 _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)

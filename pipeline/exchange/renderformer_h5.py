@@ -100,11 +100,14 @@ def write_renderformer_h5(
     radiance_rgb: NDArray[np.float32] | None = None,
     *,
     texture_type: TextureType = "float32",
-) -> None:
+) -> tuple[str, ...]:
     """Write a scene, and its pictures [V, R, R, 3] if given; equal scenes give equal bytes.
 
     The public converter writes `float16`, the authors' later tools `float32`. The file appears
     whole or not at all; memory is its compressed size and one block of textures.
+
+    Returns:
+        Sentences about members in CARRIED that lose something.
 
     Raises:
         TrilightError: a value exceeds half floats, or the file cannot be written.
@@ -125,6 +128,14 @@ def write_renderformer_h5(
             _write(file, "img", np.concatenate([to_half(radiance_rgb), opaque], axis=3))
             _write(file, "mvp", _mvp(scene))
     write_atomically(path, stream.getvalue())
+    lost = []
+    reflects = (scene.materials[:, : SPECULAR.stop] > 0).any(axis=1)
+    reflects &= (scene.materials[:, EMISSION] > 0).any(axis=1)
+    if reflects.any():
+        lost.append(f"albedos of {int(reflects.sum())} emitting materials")
+    if count := int(textured_triangles(scene).sum()):
+        lost.append(f"more of {count} textured triangles than the means of 32 x 32 cells each")
+    return tuple(lost)
 
 
 def texture_rows(scene: Scene, texture_type: TextureType) -> NDArray[np.floating]:
@@ -159,13 +170,6 @@ def texture_rows(scene: Scene, texture_type: TextureType) -> NDArray[np.floating
     rises = half[:, albedos] > rows[:, albedos]
     half[:, albedos] = np.where(over & rises, lower, half[:, albedos])
     return half[scene.material_index]
-
-
-def note_reflecting_emitters(scene: Scene) -> tuple[str, ...]:
-    """Return a note that a written file changes the albedos of emitters, where they reflect."""
-    emits = (scene.materials[:, EMISSION] > 0).any(axis=1)
-    reflects = (scene.materials[emits][:, : SPECULAR.stop] > 0).any(axis=1)
-    return (f"albedos of {int(reflects.sum())} emitting materials",) if reflects.any() else ()
 
 
 def _write(file: Any, name: str, values: NDArray) -> None:
@@ -216,8 +220,8 @@ _ROUNDING = 2.0**-10
 _PUBLISHED_EMITTER = np.array([1, 1, 1, 0, 0, 0, 1], np.float32)
 
 
-def read_renderformer_h5(path: Path) -> LoadedScene:
-    """Read a file of the published layout.
+def read_renderformer_h5(path: Path, *, pictures: bool = True) -> LoadedScene:
+    """Read a file of the published layout, and its pictures where that is asked.
 
     Corners with equal position and normal become one vertex, so that flat and smooth shading stay
     as they are. Equal materials become one row, but each emitting triangle has a separate row.
@@ -237,7 +241,7 @@ def read_renderformer_h5(path: Path) -> LoadedScene:
         sky = read_sky(file, UNKNOWN_LICENCE, lost) if second else None
         c2w = read_whole(plain_array(file, "c2w", (None, 4, 4), MAX_VIEWS))
         fov_deg = read_whole(plain_array(file, "fov", (len(c2w),), MAX_VIEWS))
-        pictures = _pictures(file, len(c2w), lost) if "img" in list_names(file) else None
+        radiance_rgb = _pictures(file, len(c2w), lost) if "img" in list_names(file) else None
         positions, normals, faces = _index_vertices(triangles, _normalize(triangles, normals, lost))
         scene = Scene(
             vertex_positions=positions,
@@ -251,7 +255,9 @@ def read_renderformer_h5(path: Path) -> LoadedScene:
         )
         scene = with_cells(scene, stored, UNKNOWN_LICENCE)
         scene.check()
-    return LoadedScene(scene=scene, radiance_rgb=pictures, notes=tuple(lost))
+    return LoadedScene(
+        scene=scene, radiance_rgb=radiance_rgb if pictures else None, notes=tuple(lost)
+    )
 
 
 def _list_unknown(file: Any) -> list[str]:

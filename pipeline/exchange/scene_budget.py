@@ -7,7 +7,6 @@ material of the nearest old one, and smooth normals are computed again.
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.remesh import remesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.posing import without_slivers
@@ -106,6 +105,8 @@ def _reduce_piece(piece: ScenePiece, count: int) -> ScenePiece:
 
 
 def _decimate_mesh(piece: ScenePiece, count: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    from pipeline.assets.remesh import remesh  # loads mesh libraries
+
     faces = piece.mesh.faces.astype(np.int64)
     raw = TriangleMesh(positions=piece.mesh.positions.astype(np.float64), faces=faces)
     try:

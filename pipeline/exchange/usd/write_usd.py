@@ -83,8 +83,8 @@ CARRIED = frozenset(
 """Members of a scene that the file holds (pipeline.exchange.formats)."""
 
 
-def write_usd(path: Path, scene: Scene) -> None:
-    """Write one scene; the file appears whole or not at all.
+def write_usd(path: Path, scene: Scene) -> tuple[()]:
+    """Write one scene; the file appears whole or not at all. Nothing in CARRIED loses anything.
 
     Raises:
         TrilightError: the suffix is not USD's, the scene breaks a law or holds text that USD cannot
@@ -92,6 +92,7 @@ def write_usd(path: Path, scene: Scene) -> None:
     """
     layer = _new_layer(path, ROOT)
     _save(path, layer, _add_scene(layer, ROOT, scene))
+    return ()
 
 
 def write_usd_shard(path: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
