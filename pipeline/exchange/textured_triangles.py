@@ -102,21 +102,25 @@ class TexturedPiece:
     """Texture set of each material row of `piece`."""
 
 
+def index_corners(
+    positions: NDArray[np.float32], normals: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
+    """Return positions, normals and faces of corners [T, 3, 3], vertices in order of first use."""
+    corners = np.concatenate([positions, normals], axis=2).reshape(-1, 6)
+    first, rows = distinct_rows(corners)
+    vertices = corners[first]
+    faces = rows.astype(np.uint32).reshape(-1, 3)
+    return vertices[:, :3].copy(), vertices[:, 3:].copy(), faces
+
+
 def build_piece(entry: SceneObject, triangles: TexturedTriangles) -> TexturedPiece:
     """Build an object of a scene from its triangles."""
-    corners = np.concatenate([triangles.positions, triangles.normals], axis=2).reshape(-1, 6)
-    first, index = distinct_rows(corners)
-    vertices = corners[first]
-    faces = index.reshape(-1, 3).astype(np.uint32)
+    positions, normals, faces = index_corners(triangles.positions, triangles.normals)
     rows = _with_means(triangles)
     appearance = np.column_stack([rows, triangles.texture_set_index.astype(np.float32)])
     palette, material_index = distinct_rows(appearance)
-    mesh = ShadedMesh(
-        positions=vertices[:, :3].copy(),
-        normals=vertices[:, 3:].copy(),
-        faces=faces,
-        groups=np.zeros(len(faces), np.int64),
-    )
+    groups = np.zeros(len(faces), np.int64)
+    mesh = ShadedMesh(positions=positions, normals=normals, faces=faces, groups=groups)
     return TexturedPiece(
         piece=ScenePiece(
             entry=entry, mesh=mesh, materials=rows[palette], material_index=material_index
