@@ -1,4 +1,7 @@
-"""Builds a `Scene` from a scene description and its meshes.
+"""Records of a scene file (objects with mesh paths and materials, cameras), and their `Scene`.
+
+Values are as the file states them. Types, ranges and defaults are those of the file, which
+`pipeline.exchange.renderformer_json` reads.
 
 The transform of a mesh follows the order of the published converter: with `normalize`, the mesh is
 brought into a sphere of diameter 1 (the mean of the file's vertices becomes the origin, the
@@ -15,17 +18,11 @@ than 1 are scaled or refused (`limit_albedos`); the provenance names the scaled 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NoReturn
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.description import (
-    DescribedCamera,
-    DescribedMaterial,
-    DescribedObject,
-    SceneDescription,
-)
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded, smooth_shaded
@@ -34,6 +31,91 @@ from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.records.scene import ALBEDO_SUM_TOLERANCE, ObjectKind, Scene, SceneObject
+from storage.settings.ranges import Within
+
+Vector = tuple[float, float, float]
+
+_Length = Annotated[float, Within(-1e6, 1e6)]
+Lengths = tuple[_Length, _Length, _Length]
+"""Coordinates or factors; beyond 1e6 float32 positions are off by centimeters."""
+_Angle = Annotated[float, Within(-1e6, 1e6, unit="degrees")]
+Angles = tuple[_Angle, _Angle, _Angle]
+Fraction = Annotated[float, Within(0, 1)]
+Albedo = tuple[Fraction, Fraction, Fraction]
+_Radiance = Annotated[float, Within(0, 1e9)]
+Radiance = tuple[_Radiance, _Radiance, _Radiance]
+
+ColorGroups = Literal["per-triangle", "per-shading-group"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescribedTransform:
+    """Transform of a mesh into world space."""
+
+    translation: Lengths  # world units, the last step
+    rotation_deg: Angles  # angles about the world's X, then Y, then Z
+    scale: Lengths  # factors along the world's axes, after the rotation; a negative one mirrors
+    normalize: bool = True
+    """True brings the mesh into a sphere of diameter 1 around the origin first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescribedMaterial:
+    """Reflectance and emission of an object; colors are linear."""
+
+    diffuse: Albedo  # diffuse albedo, unless the object has random colors
+    specular: Albedo  # specular albedo
+    roughness: Fraction  # the GGX width is its square
+    emissive: Radiance
+    """Radiance of every triangle, to both sides; the object is an emitter where one is above 0."""
+    smooth_shading: bool
+    """True interpolates normals across edges of up to 30 degrees; False shades flat."""
+    random_diffuse_max: Fraction = 1.0  # upper bound of the random colors
+    random_diffuse_type: ColorGroups = "per-shading-group"  # triangles that share a random color
+    rand_tri_diffuse_seed: Annotated[int, Within(0, 2**32 - 1)] | None = None
+    """Seed of random colors that replace `diffuse`; None keeps `diffuse`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescribedObject:
+    """One entry of `objects`."""
+
+    name: str  # key of the entry
+    mesh_path: str  # relative to the scene file
+    transform: DescribedTransform  # from mesh to world space
+    material: DescribedMaterial  # reflectance and emission
+    remesh: bool = False  # True replaces the mesh by one of even triangles
+    remesh_target_face_num: Annotated[int, Within(4, 1_000_000, unit="triangles")] = 2048
+    """Maximum number of triangles of the remeshed mesh."""
+
+    @property
+    def remesh_faces(self) -> int | None:
+        """Maximum number of triangles after remeshing; None where the mesh stays as it is."""
+        return self.remesh_target_face_num if self.remesh else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescribedCamera:
+    """One entry of `cameras`."""
+
+    position: Lengths  # world units
+    look_at: Lengths  # the point in the middle of the picture
+    up: Lengths  # roughly upwards in the picture; neither unit nor orthogonal
+    fov_deg: Annotated[float, Within(0.001, 179, unit="degrees")]
+    """Full field of view, horizontal and vertical."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneDescription:
+    """One scene file."""
+
+    file: str  # name of the file, for messages and provenance
+    scene_name: str  # what its author calls it
+    objects: tuple[DescribedObject, ...]  # in the order of the file
+    cameras: tuple[DescribedCamera, ...]  # in the order of the file
+    unknown_fields: tuple[str, ...]
+    """Dotted names of unknown fields, which were left out."""
+
 
 AlbedoOverOne = Literal["scale", "refuse"]
 """Treatment of materials whose diffuse and specular albedos add up to more than 1."""
@@ -98,7 +180,14 @@ def scene_from_description(
         except TrilightError as error:
             raise TrilightError(f"{description.file}: objects.{described.name}: {error}") from error
     try:
-        _check_counts(pieces)
+        emitters = sum(piece.entry.kind == "emitter" for piece in pieces)
+        require_at_most(
+            {
+                "triangles": (sum(len(piece.mesh.faces) for piece in pieces), MAX_TRIANGLES),
+                "emitting triangles": (emitters, MAX_EMITTERS),
+                "materials": (sum(len(piece.materials) for piece in pieces), MAX_MATERIALS),
+            }
+        )
         c2w, fov_deg = build_cameras(description.cameras[:num_views])
         scene = Scene(
             **concatenate_pieces(pieces),
@@ -137,6 +226,7 @@ def _pieces(
     described: DescribedObject, mesh: LoadedMesh, over_one: AlbedoOverOne
 ) -> tuple[list[ScenePiece], float]:
     """Return the pieces of an object, and the least factor of its materials."""
+    material = described.material
     positions = place_mesh(mesh, described)
     mirrored = np.prod(described.transform.scale) < 0
     faces = (mesh.faces[:, ::-1] if mirrored else mesh.faces).astype(np.uint32)
@@ -145,74 +235,43 @@ def _pieces(
         raise TrilightError(
             f"no triangle of {mesh.uid} has an area after its transform; expected at least one."
         )
-    if described.material.emits:
-        return _emitters(described, mesh, positions, faces, over_one)
-    smooth = described.material.smooth_shading
-    shaded = (
-        smooth_shaded(positions, faces, SMOOTH_ANGLE_DEG)
-        if smooth
-        else flat_shaded(positions, faces)
-    )
-    piece, scale = _surface(described, mesh, shaded, over_one)
-    return [piece], scale
-
-
-def _surface(
-    described: DescribedObject, mesh: LoadedMesh, shaded: ShadedMesh, over_one: AlbedoOverOne
-) -> tuple[ScenePiece, float]:
-    material = described.material
-    rows = np.zeros(len(shaded.faces), np.int64)
+    names = [described.name]
     diffuse = np.array([material.diffuse])
-    if material.rand_tri_diffuse_seed is not None:
-        rows = color_groups(shaded, material)
-        count = int(rows.max()) + 1
-        diffuse = random_diffuse(material.rand_tri_diffuse_seed, material.random_diffuse_max, count)
-    materials, scale = _build_materials(diffuse, material, over_one)
     kind: ObjectKind = "shell" if mesh.uid.startswith(SHELL_FOLDER) else "object"
-    entry = _entry(described.name, kind, mesh)
-    return ScenePiece(entry=entry, mesh=shaded, materials=materials, material_index=rows), scale
-
-
-def _build_materials(
-    diffuse: NDArray[np.float64], material: DescribedMaterial, over_one: AlbedoOverOne
-) -> tuple[NDArray[np.float32], float]:
-    """Return non-emitting rows for diffuse albedos [M, 3], and the least albedo factor."""
+    if max(material.emissive) > 0:
+        require_at_most({"emitting triangles": (len(faces), MAX_EMITTERS)})
+        kind = "emitter"
+        parts = [flat_shaded(positions, faces[row : row + 1]) for row in range(len(faces))]
+        rows = np.zeros(1, np.int64)
+        if len(parts) > 1:
+            names = [f"{described.name}.{row}" for row in range(len(parts))]
+    else:
+        parts = [
+            smooth_shaded(positions, faces, SMOOTH_ANGLE_DEG)
+            if material.smooth_shading
+            else flat_shaded(positions, faces)
+        ]
+        rows = np.zeros(len(parts[0].faces), np.int64)
+        if (seed := material.rand_tri_diffuse_seed) is not None:
+            rows = color_groups(parts[0], material)
+            diffuse = random_diffuse(seed, material.random_diffuse_max, int(rows.max()) + 1)
     diffuse, specular, scale = limit_albedos(diffuse, np.array(material.specular), over_one)
     materials = default_rows(len(diffuse))
     materials[:, DIFFUSE] = diffuse
     materials[:, SPECULAR] = specular
     materials[:, ROUGHNESS] = material.roughness
-    return materials, scale
-
-
-def _emitters(
-    described: DescribedObject,
-    mesh: LoadedMesh,
-    positions: NDArray[np.float32],
-    faces: NDArray[np.uint32],
-    over_one: AlbedoOverOne,
-) -> tuple[list[ScenePiece], float]:
-    if len(faces) > MAX_EMITTERS:
-        _refuse_count("emitting triangles", len(faces), MAX_EMITTERS)
-    diffuse = np.array([described.material.diffuse])
-    materials, scale = _build_materials(diffuse, described.material, over_one)
-    materials[:, EMISSION] = described.material.emissive
-    single = len(faces) == 1
+    materials[:, EMISSION] = material.emissive
+    uid = mesh.uid if kind == "object" else ""
     pieces = [
         ScenePiece(
-            entry=_entry(described.name if single else f"{described.name}.{row}", "emitter", mesh),
-            mesh=flat_shaded(positions, faces[row : row + 1]),
+            entry=SceneObject(name=name, kind=kind, uid=uid, licence=mesh.licence),
+            mesh=part,
             materials=materials,
-            material_index=np.zeros(1, np.int64),
+            material_index=rows,
         )
-        for row in range(len(faces))
+        for name, part in zip(names, parts, strict=True)
     ]
     return pieces, scale
-
-
-def _entry(name: str, kind: ObjectKind, mesh: LoadedMesh) -> SceneObject:
-    uid = mesh.uid if kind == "object" else ""
-    return SceneObject(name=name, kind=kind, uid=uid, licence=mesh.licence)
 
 
 def build_cameras(
@@ -235,19 +294,11 @@ def _pose(camera: DescribedCamera, row: int) -> NDArray[np.float64]:
     return c2w
 
 
-def _check_counts(pieces: Sequence[ScenePiece]) -> None:
-    emitters = sum(piece.entry.kind == "emitter" for piece in pieces)
-    for what, count, most in (
-        ("triangles", sum(len(piece.mesh.faces) for piece in pieces), MAX_TRIANGLES),
-        ("emitting triangles", emitters, MAX_EMITTERS),
-        ("materials", sum(len(piece.materials) for piece in pieces), MAX_MATERIALS),
-    ):
+def require_at_most(counts: Mapping[str, tuple[int, int]]) -> None:
+    """Raise TrilightError where a count of a scene is larger than its maximum, by what it is of."""
+    for what, (count, most) in counts.items():
         if count > most:
-            _refuse_count(what, count, most)
-
-
-def _refuse_count(what: str, count: int, most: int) -> NoReturn:
-    raise TrilightError(f"{count} {what}; expected at most {most} in a scene.")
+            raise TrilightError(f"{count} {what}; expected at most {most} in a scene.")
 
 
 def limit_albedos(

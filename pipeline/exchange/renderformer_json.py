@@ -23,13 +23,15 @@ from typing import Annotated, Any, NoReturn, get_args, get_origin, get_type_hint
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.description import (
+from pipeline.exchange.from_description import (
+    SHELL_FOLDER,
+    SMOOTH_ANGLE_DEG,
     ColorGroups,
     DescribedCamera,
     DescribedObject,
     SceneDescription,
+    require_at_most,
 )
-from pipeline.exchange.from_description import SHELL_FOLDER, SMOOTH_ANGLE_DEG
 from pipeline.exchange.textured_triangles import group_triangles
 from pipeline.foreign.numbers import Malformed
 from pipeline.scenes.posing import without_slivers
@@ -336,7 +338,13 @@ def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
             "cameras": list(map(camera_entry, scene.c2w, scene.fov_deg)),
         }
     ).encode()
-    _require_size(scene, data, len(objects))
+    require_at_most(
+        {
+            "objects of one material": (len(objects), MAX_OBJECTS),
+            "cameras": (scene.num_views, MAX_CAMERAS),
+            "bytes of a scene file": (len(data), MAX_BYTES),
+        }
+    )
     read_description(data, f"{stem}.json")  # raises for anything that readers would refuse
     return DescribedFiles(json=data, meshes=meshes, lost=(*_losses(scene), *lost))
 
@@ -446,13 +454,3 @@ def _losses(scene: Scene) -> list[str]:
     if (scene.materials[:, EMISSION] > HALF_FLOAT_MAX).any():
         losses.append(f"emission over {HALF_FLOAT_MAX:.0f}, which the published converter cuts off")
     return losses
-
-
-def _require_size(scene: Scene, data: bytes, objects: int) -> None:
-    for what, count, most in (
-        ("objects of one material", objects, MAX_OBJECTS),
-        ("cameras", scene.num_views, MAX_CAMERAS),
-        ("bytes", len(data), MAX_BYTES),
-    ):
-        if count > most:
-            raise TrilightError(f"scene: {count} {what}; a scene file holds at most {most}.")

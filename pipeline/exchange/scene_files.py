@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange.description import DescribedObject, SceneDescription
 from pipeline.exchange.from_description import (
     AlbedoOverOne,
     LoadedMesh,
+    SceneDescription,
     build_cameras,
     scene_from_description,
 )
@@ -137,10 +137,15 @@ def build_scene(
     for described in description.objects:
         key = (described.mesh_path, described.remesh_faces)
         if key not in meshes:
-            meshes[key], digest = _load_mesh(root, described, name, settings, licence)
-            digests[meshes[key].uid] = digest
+            where = f"{name}: objects.{described.name}.mesh_path"
+            path = _below(root, described.mesh_path, where)
+            uid = path.relative_to(root).as_posix()
+            display_name = f"{where} is {described.mesh_path}"
+            meshes[key], digests[uid] = load_mesh_file(
+                path, uid, display_name, settings, licence, described.remesh_faces
+            )
             if notes is not None:
-                notes += (f"{meshes[key].uid}: {text}" for text in meshes[key].unread)
+                notes += (f"{uid}: {text}" for text in meshes[key].unread)
     scene = scene_from_description(
         description,
         [meshes[described.mesh_path, described.remesh_faces] for described in description.objects],
@@ -152,32 +157,15 @@ def build_scene(
             "attempt": 0,
             "seed": seed,
             "camera_attempts": [0] * num_views,
-            "scene_file": _file_provenance(description, digests[name], num_views),
+            "scene_file": {
+                "name": description.file,
+                "sha256": digests[name],
+                "scene_name": description.scene_name,
+                "cameras": list(range(num_views)),
+            },
         },
     )
     return scene, digests
-
-
-def _file_provenance(
-    description: SceneDescription, sha256: str, num_views: int
-) -> Mapping[str, str | list[int]]:
-    return {
-        "name": description.file,
-        "sha256": sha256,
-        "scene_name": description.scene_name,
-        "cameras": list(range(num_views)),
-    }
-
-
-def _load_mesh(
-    root: Path, described: DescribedObject, name: str, settings: AssetSettings, licence: str
-) -> tuple[LoadedMesh, str]:
-    """Return the mesh of an object, and the digest of its file."""
-    where = f"{name}: objects.{described.name}.mesh_path"
-    path = _below(root, described.mesh_path, where)
-    uid = path.relative_to(root).as_posix()
-    display_name = f"{where} is {described.mesh_path}"
-    return load_mesh_file(path, uid, display_name, settings, licence, described.remesh_faces)
 
 
 def load_mesh_file(

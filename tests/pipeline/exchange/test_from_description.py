@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.exchange.description import DescribedObject
-from pipeline.exchange.from_description import scaled_albedo_notes
+from pipeline.exchange.from_description import DescribedObject, scaled_albedo_notes
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene

@@ -174,5 +174,5 @@ def test_too_much_light_and_too_many_objects(monkeypatch: pytest.MonkeyPatch) ->
     bright.materials[LIGHT, 7:] = 65505
     assert any("cuts off" in text for text in describe_scene(bright, "a").lost)
     monkeypatch.setattr("pipeline.exchange.renderformer_json.MAX_OBJECTS", 1)
-    with pytest.raises(TrilightError, match="2 objects of one material; a scene file holds at"):
+    with pytest.raises(TrilightError, match="2 objects of one material; expected at most 1"):
         describe_scene(tiny_scene(), "a")
