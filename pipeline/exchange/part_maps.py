@@ -38,16 +38,6 @@ _INSIDE = 1e-4
 """Tolerance for coordinates that leave [0, 1] by rounding."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Tiles:
-    """Range of tiles along u or v that a picture covers."""
-
-    first: int
-    """Number of the first tile; tile 0 is [0, 1]."""
-    count: int
-    """Number of tiles from the first on."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlacedSlots:
     """Pictures of a material, and the coordinates of a mesh in their maps."""
@@ -56,8 +46,8 @@ class PlacedSlots:
     """Slots by the field of `MaterialSamples`."""
     same_chart: Sequence[str]
     """Names of the slots whose maps vary over the mesh; others are their means."""
-    tiles: tuple[_Tiles, _Tiles] | None
-    """Tiles of these maps along u and v; None where all maps are constants."""
+    tiles: tuple[range, range] | None
+    """Tiles of these maps along u and v, tile 0 is [0, 1]; None where all maps are constants."""
     uv: NDArray[np.float32] | None
     """[T, 3, 2] coordinates in the maps; None where all maps are constants."""
 
@@ -65,7 +55,7 @@ class PlacedSlots:
     def texels(self) -> int:
         """Return the number of texels of the largest map."""
         shapes = [self.slots[name].picture.values.shape for name in self.same_chart]
-        tiles = 1 if self.tiles is None else self.tiles[0].count * self.tiles[1].count
+        tiles = 1 if self.tiles is None else len(self.tiles[0]) * len(self.tiles[1])
         return max((shape[0] * shape[1] * tiles for shape in shapes), default=1)
 
     def build_maps(self) -> dict[str, Map]:
@@ -104,18 +94,19 @@ def place_slots(part: Part, lost: list[str]) -> PlacedSlots:
             f"{part.where}textures with other coordinates than the first of a material: replaced "
             "by means"
         )
-    across, up = (
-        _choose_tiles([slots[name].picture for name in same_chart], uv[..., axis], axis)
-        for axis in range(2)
+    pictures = [slots[name].picture for name in same_chart]
+    (across, all_across), (up, all_up) = (
+        _choose_tiles(pictures, uv[..., axis], axis) for axis in range(2)
     )
-    tiles = across[0], up[0]
-    moved = (uv - [each.first for each in tiles]) / [each.count for each in tiles]
+    moved = (uv - [across.start, up.start]) / [len(across), len(up)]
     near, all_near = _shift_near_zero(moved)
-    if not (across[1] and up[1] and all_near):
+    if not (all_across and all_up and all_near):
         lost.append(
             f"{part.where}coordinates far outside [0, 1]: some textures look different there"
         )
-    return PlacedSlots(slots=slots, same_chart=same_chart, tiles=tiles, uv=near.astype(np.float32))
+    return PlacedSlots(
+        slots=slots, same_chart=same_chart, tiles=(across, up), uv=near.astype(np.float32)
+    )
 
 
 def _chart(slot: Slot) -> tuple[int, bytes, bytes]:
@@ -125,7 +116,7 @@ def _chart(slot: Slot) -> tuple[int, bytes, bytes]:
 
 def _choose_tiles(
     pictures: Sequence[Picture], at: NDArray[np.floating], axis: int
-) -> tuple[_Tiles, bool]:
+) -> tuple[range, bool]:
     """Return the tiles of one material's pictures along an axis, and whether they suffice.
 
     One tile where all pictures repeat, no coordinate leaves [0, 1], or too many would be needed.
@@ -136,30 +127,22 @@ def _choose_tiles(
         axis: 0 for u, 1 for v.
     """
     most_texels = max(picture.values.shape[1 - axis] for picture in pictures)
-    needed_tiles = _needed_tiles([picture.wrap[axis] for picture in pictures], at)
-    if needed_tiles.count <= _MAX_TILES and needed_tiles.count * most_texels <= MAX_RESOLUTION:
-        return needed_tiles, True
-    return _Tiles(first=0, count=1), needed_tiles.count == 1
-
-
-def _needed_tiles(wraps: Sequence[Wrap], at: NDArray[np.floating]) -> _Tiles:
     low, high = (float(at.min()), float(at.max())) if at.size else (0.0, 1.0)
-    modes = {wrap for wrap in wraps if wrap != "repeat"}
+    modes = {picture.wrap[axis] for picture in pictures} - {"repeat"}
     if not modes or (low >= -_INSIDE and high <= 1 + _INSIDE):
-        return _Tiles(first=0, count=1)
-    if modes == {"mirror"}:
-        return _Tiles(first=0, count=2)
-    first = int(np.floor(low))
-    last = int(np.ceil(high))
-    return _Tiles(first=first, count=last - first)
+        needed = range(1)
+    elif modes == {"mirror"}:
+        needed = range(2)
+    else:
+        needed = range(int(np.floor(low)), int(np.ceil(high)))
+    if len(needed) <= _MAX_TILES and len(needed) * most_texels <= MAX_RESOLUTION:
+        return needed, True
+    return range(1), len(needed) == 1
 
 
-def _expand_tiles(values: NDArray, wrap: Wrap, tiles: _Tiles, axis: int) -> NDArray:
+def _expand_tiles(values: NDArray, wrap: Wrap, tiles: range, axis: int) -> NDArray:
     """Return the tiles of a picture [H, W, C] side by side along axis 0 (v) or 1 (u)."""
-    tile_values = [
-        _tile(values, wrap, number, axis)
-        for number in range(tiles.first, tiles.first + tiles.count)
-    ]
+    tile_values = [_tile(values, wrap, number, axis) for number in tiles]
     return np.concatenate(tile_values, axis=axis) if len(tile_values) > 1 else tile_values[0]
 
 

@@ -1,21 +1,22 @@
-"""Joins triangles with materials and textures into the objects of a Scene.
+"""Joins triangles with materials and textures, and cameras, of other programs to a Scene.
 
 Each triangle has three separate corners. Corners of equal position and normal become one vertex,
 and equal materials one row. Textures of one color become constants.
 """
 
 import dataclasses
+import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.cameras import fit_camera
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded
+from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import (
@@ -33,6 +34,9 @@ TextureSet = tuple[Texture | None, Texture | None, Texture | None]
 """Textures in the order of TEXTURED; None where the material column is the value."""
 
 NO_TEXTURES: TextureSet = (None, None, None)
+
+_FOV_DEG = 40.0
+"""Field of view of the camera that is added to a scene without cameras."""
 
 MAX_TRIANGLES = 1_500_000
 MAX_ROWS = 1 << 16
@@ -58,14 +62,11 @@ class TexturedTriangles:
 
     def select(self, mask: NDArray[np.bool_]) -> "TexturedTriangles":
         """Return the triangles that a mask [T] selects."""
-        return TexturedTriangles(
-            positions=self.positions[mask],
-            normals=self.normals[mask],
-            rows=self.rows[mask],
-            uv=self.uv[mask],
-            texture_set_index=self.texture_set_index[mask],
-            texture_sets=self.texture_sets,
-        )
+        arrays: dict[str, Any] = {name: getattr(self, name)[mask] for name in _PER_TRIANGLE}
+        return dataclasses.replace(self, **arrays)
+
+
+_PER_TRIANGLE = ("positions", "normals", "rows", "uv", "texture_set_index")
 
 
 def join_triangles(
@@ -74,19 +75,16 @@ def join_triangles(
     """Return the triangles of several parts, in the order of `places` [T], which they cover."""
     order = np.argsort(np.concatenate(places), kind="stable")
     starts = np.cumsum([0, *(len(part.texture_sets) for part in parts)])
-
-    def join(arrays: Iterable[NDArray]) -> NDArray:
-        return np.concatenate(list(arrays))[order]
-
+    shifted = [
+        dataclasses.replace(part, texture_set_index=part.texture_set_index + start)
+        for part, start in zip(parts, starts, strict=False)
+    ]
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in shifted])[order]
+        for name in _PER_TRIANGLE
+    }
     return TexturedTriangles(
-        positions=join(part.positions for part in parts),
-        normals=join(part.normals for part in parts),
-        rows=join(part.rows for part in parts),
-        uv=join(part.uv for part in parts),
-        texture_set_index=join(
-            part.texture_set_index + start for part, start in zip(parts, starts, strict=False)
-        ),
-        texture_sets=[each for part in parts for each in part.texture_sets],
+        **arrays, texture_sets=[each for part in parts for each in part.texture_sets]
     )
 
 
@@ -189,6 +187,31 @@ def _drop_constant_textures(textures: TextureSet) -> TextureSet:
     return one, two, three
 
 
+def _fit_camera(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
+    """Return the pose and angle of a camera that sees all points [N, 3], obliquely from above."""
+    low = points.min(axis=0).astype(np.float64)
+    high = points.max(axis=0).astype(np.float64)
+    center = (low + high) / 2
+    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    direction = np.array([0.6, -1.0, 0.6]) / np.linalg.norm([0.6, -1.0, 0.6])
+    eye = center + direction * radius / math.sin(math.radians(_FOV_DEG) / 2)
+    return look_at_c2w(eye=eye, target=center, up=[0, 0, 1]), _FOV_DEG
+
+
+def rigid_pose(matrix: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return a transform [4, 4] without its scale; None where it has no direction."""
+    backward = matrix[:3, 2]
+    right = matrix[:3, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        backward = backward / np.linalg.norm(backward)
+        right = right - backward * np.einsum("i,i->", right, backward)
+        right = right / np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(backward, right), backward], axis=1)
+    pose[:3, 3] = matrix[:3, 3]
+    return pose if np.isfinite(pose).all() else None
+
+
 def group_triangles(scene: Scene) -> list[tuple[int, int, NDArray[np.intp]]]:
     """Return (object, material, triangles), sorted by object and then by material."""
     keys = scene.object_index.astype(np.int64) * len(scene.materials) + scene.material_index
@@ -270,7 +293,7 @@ class SceneParts:
         points = self.surface_points()
         if not cameras:
             lost.append("no camera: one was added that sees everything")
-            cameras = [fit_camera(points)]
+            cameras = [_fit_camera(points)]
         scene = Scene(
             **concatenate_pieces([one.piece for one in self._pieces]),
             objects=tuple(one.piece.entry for one in self._pieces),

@@ -8,8 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.cameras import rigid_pose
-from pipeline.exchange.textured_triangles import SceneParts, TexturedTriangles, build_lamp
+from pipeline.exchange.textured_triangles import (
+    SceneParts,
+    TexturedTriangles,
+    build_lamp,
+    rigid_pose,
+)
 from pipeline.exchange.usd.foreign_lights import (
     compute_radiance,
     light_triangles,
