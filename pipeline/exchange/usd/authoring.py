@@ -23,6 +23,11 @@ output is named by its path below the material.
 UNIFORM = "uniform "
 
 
+def text_attributes(fields: Mapping[str, str], record: Any) -> dict[str, tuple[str, Any]]:
+    """Return attributes of a record's fields that are texts; `fields` has their names."""
+    return {name: ("string", getattr(record, field)) for field, name in fields.items()}
+
+
 def add_prim(layer: Any, path: str, type_name: str, schemas: Sequence[str] = ()) -> Any:
     """Return a new prim of a type, with API schemas applied."""
     from pxr import Sdf

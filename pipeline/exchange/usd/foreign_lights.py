@@ -15,15 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.pictures import MAX_BYTES, decode_pixels, linear_rgb
-from pipeline.exchange.usd.prim_names import (
-    MAP_PATH,
-    SKY_ROWS,
-    SKY_SOURCE,
-    SKY_VISIBLE,
-    TO_OUR_AXES,
-    VISIBLE_TO_CAMERA,
-    parse_map_text,
-)
+from pipeline.exchange.usd import prim_names as names
 from pipeline.foreign.numbers import FINITE, read_number, read_numbers
 from pipeline.foreign.usd.colors import convert_to_rec709
 from pipeline.foreign.usd.placed import PlacedPrim
@@ -231,10 +223,10 @@ def read_foreign_dome(
     if np.linalg.det(rotation) < 0:
         opened.lost.append(f"{prim_path}: a mirrored dome; its light was left out")
         return None
-    visibility = prim.GetAttribute(VISIBLE_TO_CAMERA)
+    visibility = prim.GetAttribute(names.VISIBLE_TO_CAMERA)
     sky = Environment(
         radiance_rgb=tinted.astype(np.float32),
-        rotation=(rotation @ TO_OUR_AXES.T).astype(np.float32),
+        rotation=(rotation @ names.TO_OUR_AXES.T).astype(np.float32),
         is_seen=bool(visibility and visibility.Get(time)),
         source=MapSource(name=prim.GetName(), licence=licence),
     )
@@ -249,14 +241,20 @@ def read_foreign_dome(
 def _take_held(sky: Environment, dome: Any, time: Any) -> Environment:
     """Return an environment with the values that Trilight wrote on the prim of the scene."""
     stage = dome.GetStage()
-    holder = next((prim for prim in stage.Traverse() if prim.HasAttribute(SKY_SOURCE)), None)
-    held = None if holder is None else parse_map_text(holder.GetAttribute(SKY_SOURCE).Get(time))
-    if holder is None or held is None or held[0] != sky.sha256:
+    holder = next((prim for prim in stage.Traverse() if prim.HasAttribute(names.SKY_SOURCE)), None)
+    if holder is None:
+        return sky
+
+    def stated(name: str) -> Any:
+        return holder.GetAttribute(name).Get(time)
+
+    held = names.parse_map_text(stated(names.SKY_SOURCE))
+    if held is None or held[0] != sky.sha256:
         return sky
     sky = dataclasses.replace(sky, source=held[1])
-    if not dome.HasAttribute(VISIBLE_TO_CAMERA):
-        sky = dataclasses.replace(sky, is_seen=bool(holder.GetAttribute(SKY_VISIBLE).Get(time)))
-    rows = [holder.GetAttribute(name).Get(time) for name in SKY_ROWS]
+    if not dome.HasAttribute(names.VISIBLE_TO_CAMERA):
+        sky = dataclasses.replace(sky, is_seen=bool(stated(names.SKY_VISIBLE)))
+    rows = list(map(stated, names.SKY_ROWS))
     if None in rows or not np.allclose(rows, sky.rotation, atol=_SAME_ROTATION):
         return sky
     return dataclasses.replace(sky, rotation=np.array(rows, np.float32))
@@ -277,7 +275,7 @@ def _pole_rotation(prim: Any) -> NDArray[np.float64]:
 def _read_map(prim: Any, time: Any, opened: OpenedStage) -> NDArray[np.float64] | None:
     """Return the map [H, 2 H, 3] of a dome; uniform radiance 1 where it names no file."""
     prim_path = str(prim.GetPath())
-    attribute = prim.GetAttribute(MAP_PATH)
+    attribute = prim.GetAttribute(names.MAP_PATH)
     asset = attribute.Get(time) if attribute else None
     if asset is None or not asset.path:
         return np.ones((1, 2, 3))

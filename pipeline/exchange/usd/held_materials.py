@@ -23,14 +23,7 @@ from pipeline.exchange.linear_maps import (
 )
 from pipeline.exchange.pictures import MAX_BYTES, MAX_PIXELS
 from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles
-from pipeline.exchange.usd.prim_names import (
-    ADDED_COLUMNS,
-    DIGEST,
-    MATERIAL_ATTRIBUTES,
-    column_attribute,
-    parse_map_text,
-    texture_attribute,
-)
+from pipeline.exchange.usd import prim_names as names
 from pipeline.exchange.usd.write_materials import (
     COAT_ROUGHNESS,
     OPENPBR,
@@ -113,7 +106,7 @@ def read_held_material(
     """
     prim = material.GetPrim()
     columns = dict[str, NDArray[np.float32]]()
-    for name, attribute in MATERIAL_ATTRIBUTES.items():
+    for name, attribute in names.MATERIAL_ATTRIBUTES.items():
         value = prim.GetAttribute(attribute)
         column = declared_column(name)
         stated = parse_numbers(value.Get(time) if value else None)
@@ -127,13 +120,13 @@ def read_held_material(
         columns[name] = stated.astype(np.float32)
     maps = {}
     for name in TEXTURED:
-        text = prim.GetAttribute(texture_attribute(name))
-        held = parse_map_text(text.Get(time) if text else None)
+        text = prim.GetAttribute(names.texture_attribute(name))
+        held = names.parse_map_text(text.Get(time) if text else None)
         if held is not None:
             maps[name] = held
     where = str(prim.GetPath())
     root = prim.GetParent().GetParent()
-    is_marked = bool(root) and root.HasAttribute(DIGEST)
+    is_marked = bool(root) and root.HasAttribute(names.DIGEST)
     parts = {column.name: part for column, part in laid_out()}
     return HeldMaterial(
         where=where,
@@ -254,7 +247,7 @@ def _find_changed(
     """
     of_preview = {each: stated.constants[name] for each, name in PREVIEW_INPUTS.items()}
     places: dict[str, NDArray[Any]] = {
-        column_attribute(column): held.columns[column],
+        names.column_attribute(column): held.columns[column],
         _name_shader(stated): of_preview[column],
     }
     if column in held.openpbr:
@@ -355,8 +348,8 @@ def name_lost_columns(material: Any) -> list[str]:
     prim = material.GetPrim()
     return [
         f"{prim.GetPath()}: material column {name!r} is not in the file any more; default used"
-        for name in str(prim.GetAttribute(ADDED_COLUMNS).Get() or "").split()
-        if not prim.HasAttribute(column_attribute(name))
+        for name in str(prim.GetAttribute(names.ADDED_COLUMNS).Get() or "").split()
+        if not prim.HasAttribute(names.column_attribute(name))
     ]
 
 

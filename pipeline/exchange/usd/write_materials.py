@@ -27,16 +27,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim, usd_value
-from pipeline.exchange.usd.prim_names import (
-    ADDED_COLUMNS,
-    MAP_TEXTS,
-    MATERIAL_ATTRIBUTES,
-    TEXTURE_ROW,
-    column_attribute,
-    format_map,
-    material_name,
-    texture_attribute,
+from pipeline.exchange.usd import prim_names as names
+from pipeline.exchange.usd.authoring import (
+    Attributes,
+    add_attributes,
+    add_prim,
+    text_attributes,
+    usd_value,
 )
 from pipeline.foreign.usd.colors import convert_to_rec709
 from pipeline.foreign.usd.shaders import (
@@ -139,14 +136,14 @@ def add_materials(layer: Any, folder: str, scene: Scene) -> None:
 
     add_prim(layer, folder, "Scope")
     first = None
-    names = stored_columns(scene.materials)
+    columns = stored_columns(scene.materials)
     for row, values in enumerate(scene.materials):
-        path = f"{folder}/{material_name(row)}"
+        path = f"{folder}/{names.material_name(row)}"
         used = _used_textures(scene, row)
         copied = first is not None and not used
         if copied:
             Sdf.CopySpec(layer, first, layer, path)
-        for below, attributes in material_tables(values, names, used).items():
+        for below, attributes in material_tables(values, columns, used).items():
             if not copied:
                 prim = add_prim(layer, path + below, "Shader" if below else "Material")
                 add_attributes(prim, attributes, path)
@@ -185,8 +182,8 @@ def material_tables(
     roughness = float(values[ROUGHNESS])
     material = _exact_attributes(values, columns)
     for name, (_, texture) in used.items():
-        source = format_map(texture.sha256, texture.source)
-        material[texture_attribute(name)] = ("string", source)
+        source = names.format_map(texture.sha256, texture.source)
+        material[names.texture_attribute(name)] = ("string", source)
     material["outputs:surface"] = ("token", None, f"{PREVIEW}.outputs:surface")
     preview: _Table = {
         "info:id": ("uniform token", "UsdPreviewSurface"),
@@ -232,12 +229,12 @@ def _exact_attributes(values: NDArray[np.float32], columns: Sequence[str]) -> _T
         if column.name in columns:
             kind = "color3f" if column.is_colour else "float" if column.width == 1 else "float[]"
             value = _rgb(values[part]) if column.is_colour else values[part]
-            attributes[column_attribute(column.name)] = (
+            attributes[names.column_attribute(column.name)] = (
                 kind,
                 float(value[0]) if kind == "float" else value,
             )
-    if added := [name for name in columns if name not in MATERIAL_ATTRIBUTES]:
-        attributes[ADDED_COLUMNS] = ("string", " ".join(added))
+    if added := [name for name in columns if name not in names.MATERIAL_ATTRIBUTES]:
+        attributes[names.ADDED_COLUMNS] = ("string", " ".join(added))
     return attributes
 
 
@@ -255,8 +252,8 @@ def _texture_table(row: int, texture: Texture) -> _Table:
         "inputs:wrapS": ("token", "repeat"),
         "inputs:wrapT": ("token", "repeat"),
         "inputs:fallback": ("float4", (*mean, 1.0)),
-        TEXTURE_ROW: ("int", row),
-        **{name: ("string", getattr(texture.source, field)) for field, name in MAP_TEXTS.items()},
+        names.TEXTURE_ROW: ("int", row),
+        **text_attributes(names.MAP_TEXTS, texture.source),
     }
 
 
@@ -389,9 +386,9 @@ def read_openpbr(material: Any, time: Any, opened: OpenedStage) -> dict[str, NDA
 
 def _multiply(values: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
     columns = {}
-    for column, names in _INPUTS.items():
-        if all(name in values for name in names):
-            factors = [np.broadcast_to(values[name], 3).astype(float) for name in names]
+    for column, inputs in _INPUTS.items():
+        if all(name in values for name in inputs):
+            factors = [np.broadcast_to(values[name], 3).astype(float) for name in inputs]
             if column == "specular":
                 factors[-1] = reflect_head_on(factors[-1])
             columns[column] = np.prod(factors, axis=0)

@@ -26,39 +26,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.usd import prim_names as names
 from pipeline.exchange.usd.authoring import (
     Attributes,
     add_attributes,
     add_prim,
     add_relationship,
-)
-from pipeline.exchange.usd.prim_names import (
-    DIGEST,
-    EXACT_POSITIONS,
-    EXACT_ROWS,
-    FACE_ROWS,
-    FOV_DEG,
-    INDEX,
-    MAP_PATH,
-    MAP_TEXTS,
-    OBJECT_TEXTS,
-    PROVENANCE,
-    ROOT,
-    SHARD_ROOT,
-    SKY_ROWS,
-    SKY_SOURCE,
-    SKY_VISIBLE,
-    TO_OUR_AXES,
-    UNUSED_NORMALS,
-    UNUSED_POSITIONS,
-    UNUSED_ROWS,
-    VARIANT_SET,
-    VERSION,
-    VERTEX_ROWS,
-    VISIBLE_TO_CAMERA,
-    camera_name,
-    format_map,
-    material_name,
+    text_attributes,
 )
 from pipeline.exchange.usd.write_materials import ST, add_materials, texture_files
 from storage.atomic import write_atomically
@@ -78,7 +52,7 @@ ENVIRONMENT = "Environment"
 
 CARRIED = frozenset(
     {*ARRAY_FIELDS, "provenance", "textures", "normal_textures", "environment"}
-    | {f"objects.{field}" for field in OBJECT_TEXTS}
+    | {f"objects.{field}" for field in names.OBJECT_TEXTS}
 )
 """Members of a scene that the file holds (pipeline.exchange.formats)."""
 
@@ -90,8 +64,8 @@ def write_usd(path: Path, scene: Scene) -> tuple[()]:
         TrilightError: the suffix is not USD's, the scene breaks a law or holds text that USD cannot
             store, or the file cannot be written.
     """
-    layer = _new_layer(path, ROOT)
-    _save(path, layer, _add_scene(layer, ROOT, scene))
+    layer = _new_layer(path, names.ROOT)
+    _save(path, layer, _add_scene(layer, names.ROOT, scene))
     return ()
 
 
@@ -103,19 +77,19 @@ def write_usd_shard(path: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
     """
     from pxr import Sdf
 
-    layer = _new_layer(path, SHARD_ROOT)
-    root = add_prim(layer, SHARD_ROOT, "Xform")
-    root.variantSetNameList.Prepend(VARIANT_SET)
+    layer = _new_layer(path, names.SHARD_ROOT)
+    root = add_prim(layer, names.SHARD_ROOT, "Xform")
+    root.variantSetNameList.Prepend(names.VARIANT_SET)
     keys = []
     files = dict[str, bytes]()
     for key, scene in scenes:
-        variant = f"{SHARD_ROOT}{{{VARIANT_SET}={key}}}"
+        variant = f"{names.SHARD_ROOT}{{{names.VARIANT_SET}={key}}}"
         Sdf.CreatePrimInLayer(layer, variant)
-        files |= _add_scene(layer, variant + ROOT.removeprefix("/"), scene)
+        files |= _add_scene(layer, variant + names.ROOT.removeprefix("/"), scene)
         keys.append(key)
     if not keys:
         raise TrilightError(f"{path.name}: no scenes to write; expected at least one.")
-    root.variantSelections[VARIANT_SET] = keys[0]
+    root.variantSelections[names.VARIANT_SET] = keys[0]
     _save(path, layer, files)
 
 
@@ -125,12 +99,12 @@ def root_attributes(scene: Scene) -> Attributes:
     unused[scene.faces] = False
     rows = np.flatnonzero(unused)
     return {
-        VERSION: ("int", SCHEMA_VERSION),
-        DIGEST: ("string", scene_digest(scene)),
-        PROVENANCE: ("string", canonical_json(dict(scene.provenance)).decode()),
-        UNUSED_ROWS: ("int[]", rows.astype(np.int32)),
-        UNUSED_POSITIONS: ("point3f[]", scene.vertex_positions[rows]),
-        UNUSED_NORMALS: ("normal3f[]", scene.vertex_normals[rows]),
+        names.VERSION: ("int", SCHEMA_VERSION),
+        names.DIGEST: ("string", scene_digest(scene)),
+        names.PROVENANCE: ("string", canonical_json(dict(scene.provenance)).decode()),
+        names.UNUSED_ROWS: ("int[]", rows.astype(np.int32)),
+        names.UNUSED_POSITIONS: ("point3f[]", scene.vertex_positions[rows]),
+        names.UNUSED_NORMALS: ("normal3f[]", scene.vertex_normals[rows]),
         **_sky_attributes(scene.environment),
     }
 
@@ -245,23 +219,23 @@ def prim_names(scene: Scene) -> list[str]:
     from pxr import Tf
 
     taken: set[str] = set()
-    names = []
+    unique = []
     for row, entry in enumerate(scene.objects):
         name = Tf.MakeValidIdentifier(entry.name or "object")
         while name in taken:
             name = f"{name}_{row}"
         taken.add(name)
-        names.append(name)
-    return names
+        unique.append(name)
+    return unique
 
 
 def object_attributes(scene: Scene, row: int) -> Attributes:
     """Return the attributes of an object's prim other than its arrays."""
     entry = scene.objects[row]
     return {
-        INDEX: ("int", row),
-        **{name: ("string", getattr(entry, field)) for field, name in OBJECT_TEXTS.items()},
-        VISIBLE_TO_CAMERA: ("bool", entry.kind != "emitter"),
+        names.INDEX: ("int", row),
+        **text_attributes(names.OBJECT_TEXTS, entry),
+        names.VISIBLE_TO_CAMERA: ("bool", entry.kind != "emitter"),
         **(LIGHT if entry.kind == "emitter" else {}),
     }
 
@@ -280,9 +254,9 @@ def _add_object(
     _add_arrays(prim, scene, faces)
     index = scene.material_index[faces]
     used = np.unique(index)
-    add_relationship(prim, BINDING, f"{materials}/{material_name(used[0])}")
+    add_relationship(prim, BINDING, f"{materials}/{names.material_name(used[0])}")
     for material in used:
-        name = material_name(material)
+        name = names.material_name(material)
         subset = add_prim(layer, f"{path}/{name}", "GeomSubset", ["MaterialBindingAPI"])
         chosen = np.flatnonzero(index == material).astype(np.int32)
         add_attributes(subset, {**SUBSET, "indices": ("int[]", chosen)})
@@ -313,8 +287,8 @@ def position_attributes(
     return {
         CENTER: ("double3", center.tolist()),
         "xformOpOrder": ("uniform token[]", (CENTER,)),
-        EXACT_ROWS: ("int[]", rows.astype(np.int32)),
-        EXACT_POSITIONS: ("point3f[]", positions[rows]),
+        names.EXACT_ROWS: ("int[]", rows.astype(np.int32)),
+        names.EXACT_POSITIONS: ("point3f[]", positions[rows]),
     }
 
 
@@ -331,8 +305,8 @@ def _add_arrays(prim: Any, scene: Scene, faces: NDArray[np.intp]) -> None:
             "points": ("point3f[]", points),
             "normals": ("normal3f[]", scene.vertex_normals[rows]),
             "extent": ("float3[]", extent),
-            VERTEX_ROWS: ("int[]", rows.astype(np.int32)),
-            FACE_ROWS: ("int[]", faces.astype(np.int32)),
+            names.VERTEX_ROWS: ("int[]", rows.astype(np.int32)),
+            names.FACE_ROWS: ("int[]", faces.astype(np.int32)),
         },
     )
     prim.attributes["normals"].SetInfo("interpolation", "vertex")
@@ -366,16 +340,15 @@ def _map_file(sky: Environment) -> str:
 def _dome_attributes(sky: Environment) -> Attributes:
     """Return the attributes of the prim of an environment."""
     to_world = np.eye(4)
-    to_world[:3, :3] = sky.rotation.astype(np.float64) @ TO_OUR_AXES
-    texts = {name: ("string", getattr(sky.source, field)) for field, name in MAP_TEXTS.items()}
+    to_world[:3, :3] = sky.rotation.astype(np.float64) @ names.TO_OUR_AXES
     return {
         "xformOp:transform": ("matrix4d", to_world.T.tolist()),  # USD multiplies from the left
         "xformOpOrder": ("uniform token[]", ("xformOp:transform",)),
-        MAP_PATH: ("asset", f"./{_map_file(sky)}"),
+        names.MAP_PATH: ("asset", f"./{_map_file(sky)}"),
         "inputs:texture:format": ("token", "latlong"),
         "inputs:intensity": ("float", 1.0),
-        VISIBLE_TO_CAMERA: ("bool", sky.is_seen),
-        **texts,
+        names.VISIBLE_TO_CAMERA: ("bool", sky.is_seen),
+        **text_attributes(names.MAP_TEXTS, sky.source),
     }
 
 
@@ -386,10 +359,10 @@ def _sky_attributes(sky: Environment | None) -> Attributes:
     return {
         **{
             name: ("float3", tuple(map(float, row)))
-            for name, row in zip(SKY_ROWS, sky.rotation, strict=True)
+            for name, row in zip(names.SKY_ROWS, sky.rotation, strict=True)
         },
-        SKY_VISIBLE: ("bool", sky.is_seen),
-        SKY_SOURCE: ("string", format_map(sky.sha256, sky.source)),
+        names.SKY_VISIBLE: ("bool", sky.is_seen),
+        names.SKY_SOURCE: ("string", names.format_map(sky.sha256, sky.source)),
     }
 
 
@@ -403,7 +376,7 @@ def add_cameras(layer: Any, folder: str, scene: Scene) -> None:
     """Write a prim for each camera below `folder`."""
     add_prim(layer, folder, "Scope")
     for row in range(scene.num_views):
-        camera = add_prim(layer, f"{folder}/{camera_name(row)}", "Camera")
+        camera = add_prim(layer, f"{folder}/{names.camera_name(row)}", "Camera")
         add_attributes(camera, camera_attributes(scene.c2w[row], float(scene.fov_deg[row])))
 
 
@@ -419,7 +392,7 @@ def camera_attributes(c2w: NDArray[np.float32], fov_deg: float) -> Attributes:
         "horizontalAperture": ("float", float(np.float32(APERTURE))),
         "verticalAperture": ("float", float(np.float32(APERTURE))),
         "clippingRange": ("float2", CLIP_METRES),
-        FOV_DEG: ("float", fov_deg),
+        names.FOV_DEG: ("float", fov_deg),
     }
 
 
