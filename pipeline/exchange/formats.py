@@ -238,19 +238,16 @@ def list_lost_members(scene: Scene, carried: Collection[str]) -> tuple[str, ...]
 def _members_in_use(scene: Scene) -> Iterator[str]:
     """Yield the members of a scene that are not at their defaults."""
     for field in dataclasses.fields(Scene):
+        value = getattr(scene, field.name)
         if field.name == "materials":
-            yield from (f"materials.{name}" for name in columns_in_use(scene.materials))
+            yield from (f"materials.{name}" for name in columns_in_use(value))
         elif field.name == "objects":
-            for part_field in dataclasses.fields(SceneObject):
-                if any(
-                    getattr(entry, part_field.name) != part_field.default for entry in scene.objects
-                ):
-                    yield f"objects.{part_field.name}"
-        elif field.name == "environment":
-            yield from ("environment",) if scene.environment is not None else ()
-        elif field.name == "normal_textures":
-            yield from ("normal_textures",) if scene.normal_textures is not None else ()
-        elif field.name not in MAP_ARRAYS and len(getattr(scene, field.name)):
+            for part in dataclasses.fields(SceneObject):
+                if any(getattr(entry, part.name) != part.default for entry in value):
+                    yield f"objects.{part.name}"
+        elif field.name in ("environment", "normal_textures"):
+            yield from () if value is None else (field.name,)
+        elif field.name not in MAP_ARRAYS and len(value):
             yield field.name  # other MAP_ARRAYS belong to `textures`
 
 

@@ -402,13 +402,14 @@ def _read_cells(file: Any, varies: NDArray[np.bool_]) -> NDArray[np.float32]:
 
 def _with_cells(scene: Scene, cells: NDArray[np.float32], varies: NDArray[np.bool_]) -> Scene:
     """Return a scene with the textures of its cells; varying triangles share a material."""
-    atlas = build_atlas(cells, MapSource(name="cells of triangles", licence=UNKNOWN_LICENCE))
+    source = MapSource(name="cells of triangles", licence=UNKNOWN_LICENCE)
+    maps, corner_uv = build_atlas(cells, source)
     uv = np.zeros((scene.num_triangles, 3, 2), np.float32)
-    uv[varies] = atlas.uv
+    uv[varies] = corner_uv
     index = np.full((len(scene.materials), len(TEXTURED)), CONSTANT, np.int32)
-    textures = {texture.sha256: texture for texture in atlas.textures}
+    textures = {texture.sha256: texture for texture in maps}
     used = np.unique(scene.material_index[varies])
-    index[used] = [list(textures).index(texture.sha256) for texture in atlas.textures]
+    index[used] = [list(textures).index(texture.sha256) for texture in maps]
     scene = with_textures(scene, uv.reshape(-1, 2), tuple(textures.values()), index)
     return without_constant_textures(scene)
 

@@ -1,17 +1,11 @@
 """Selects samples of a dataset by split and by key."""
 
-import os
 from collections.abc import Iterator
 
 from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
 from storage.records.sample import Sample, sample_key
-
-
-def is_dataset(source: str) -> bool:
-    """Return whether a source is a dataset (URL or folder) rather than a scene file."""
-    return "://" in source or os.path.isdir(source)
 
 
 def select_samples(

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.linear_maps import (
+    EXCESS,
     color_textures,
     constant_map,
     linear_map,
-    may_exceed_one,
 )
 from pipeline.exchange.pictures import MAX_BYTES, MAX_PIXELS
 from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles
@@ -62,9 +62,6 @@ from storage.records.texture import TEXTURED, MapSource, Texture
 
 _OPENPBR = f"its shader {OPENPBR}"
 """Words for the shader, for notes."""
-
-_EXCESS = 1e-6
-"""Tolerance for the rounding of two float32 albedos that add up to 1."""
 
 ROUGHNESS_PART = slice(ROUGHNESS, ROUGHNESS + 1)
 
@@ -315,7 +312,7 @@ def keep_exact(
         for column, part in zip(TEXTURED, (DIFFUSE, SPECULAR, ROUGHNESS_PART), strict=True):
             if column in exact:
                 rows[:, part] = exact[column].mean
-        excess = (rows[:, DIFFUSE] + rows[:, SPECULAR]).max(axis=1, initial=0) > 1 + _EXCESS
+        excess = (rows[:, DIFFUSE] + rows[:, SPECULAR]).max(axis=1, initial=0) > 1 + EXCESS
         if excess.any():
             lost.append(note)
             rows[excess, DIFFUSE] = np.minimum(rows[excess, DIFFUSE], 1 - rows[excess, SPECULAR])
@@ -327,7 +324,8 @@ def keep_exact(
             for column, texture in zip(TEXTURED, texture_set, strict=True)
         )
         assert diffuse is not None and specular is not None
-        if not {"diffuse", "specular"} <= exact.keys() and may_exceed_one(diffuse, specular):
+        exceeds = (diffuse.greatest + specular.greatest > 1 + EXCESS).any()
+        if exceeds and not {"diffuse", "specular"} <= exact.keys():
             lost.append(note)
             source = diffuse.source
             diffuse, specular = color_textures(linear_map(diffuse), linear_map(specular), source)

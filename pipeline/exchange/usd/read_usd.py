@@ -12,7 +12,6 @@ Only child processes with limits import this (pipeline.isolation): native code p
 import dataclasses
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -275,16 +274,13 @@ def _read_scene(root: Any, opened: OpenedStage) -> Scene:
         vertex_normals=normals,
         faces=faces,
         material_index=material_index,
-        materials=materials.rows,
         object_index=object_index,
         c2w=c2w,
         fov_deg=fov_deg,
         objects=objects,
         provenance=scene_provenance(json.loads(root.attributes[names.PROVENANCE].default)),
-        uv=_read_coordinates(meshes, len(faces)) if materials.textures else None,
-        textures=materials.textures,
-        material_textures=materials.material_textures,
-        normal_textures=materials.normal_textures,
+        uv=_read_coordinates(meshes, len(faces)) if materials["textures"] else None,
+        **materials,
         environment=sky,
     )
 
@@ -380,22 +376,8 @@ def _read_cameras(folder: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]
     return c2w, fov_deg
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Materials:
-    """Material arrays of a scene, as the prims of all materials hold them."""
-
-    rows: NDArray[np.float32]
-    """[M, 10 or more] rows of `Scene.materials`."""
-    textures: tuple[Texture, ...]
-    """Distinct textures, the value of `Scene.textures`."""
-    material_textures: NDArray[np.int32] | None
-    """[M, 3] the value of `Scene.material_textures`; None without textures."""
-    normal_textures: NDArray[np.int32] | None
-    """[M] the value of `Scene.normal_textures`; None without normal maps."""
-
-
-def _read_materials(folder: Any, opened: OpenedStage) -> _Materials:
-    """Read the materials below a prim; raises UndeclaredColumn."""
+def _read_materials(folder: Any, opened: OpenedStage) -> dict[str, Any]:
+    """Return the fields of a scene on materials and textures; raises UndeclaredColumn."""
     prims = _list_by_row(folder, names.material_name)
     rows = default_rows(len(prims))
     columns = _list_columns(prims[0])
@@ -406,16 +388,15 @@ def _read_materials(folder: Any, opened: OpenedStage) -> _Materials:
         for column, part in laid_out():
             if column.name in columns:
                 rows[row, part] = prim.attributes[names.column_attribute(column.name)].default
-        used = _read_textures(prim, textures, opened)
-        for name, texture in used.items():
+        for name, texture in _read_textures(prim, textures, opened).items():
             index[row, places.index(name)] = texture
     normals = index[:, len(TEXTURED)].copy()
-    return _Materials(
-        rows=rows,
-        textures=tuple(textures[row] for row in range(len(textures))),
-        material_textures=index[:, : len(TEXTURED)].copy() if textures else None,
-        normal_textures=normals if (normals != CONSTANT).any() else None,
-    )
+    return {
+        "materials": rows,
+        "textures": tuple(textures[row] for row in range(len(textures))),
+        "material_textures": index[:, : len(TEXTURED)].copy() if textures else None,
+        "normal_textures": normals if (normals != CONSTANT).any() else None,
+    }
 
 
 def _read_textures(prim: Any, textures: dict[int, Texture], opened: OpenedStage) -> dict[str, int]:
