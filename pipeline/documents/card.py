@@ -9,7 +9,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from pipeline.documents.distributions import MEASURED, Distributions
+from pipeline.documents.distributions import MEASURED, Distributions, setting
 from pipeline.documents.pages import render_markdown
 from pipeline.documents.rights import Rights, hub_licence, licence_facts
 from storage.dataset.derived import derivation_of
@@ -50,7 +50,7 @@ def encode_card(
     layouts = Counter[str]()
     for (template, _), count in sorted(distributions.scenes.items()):
         layouts[template] += count
-    settings = [(label, _setting(manifest.settings, name)) for label, name in _SETTINGS]
+    settings = [(label, setting(manifest.settings, name)) for label, name in _SETTINGS]
     settings += [(label, manifest.environment.get(name)) for label, name in _ENVIRONMENT]
     return render_markdown(
         "card.jinja",
@@ -59,7 +59,7 @@ def encode_card(
         folder=folder,
         manifest=manifest,
         found=distributions,
-        resolution=_setting(manifest.settings, "renders.resolution"),
+        resolution=setting(manifest.settings, "renders.resolution"),
         splits=_by_split(manifest, distributions),
         states_expected=summary(distributions.all("expected_error_db"))["count"] > 0,
         layouts=layouts,
@@ -184,11 +184,3 @@ def _arrays(packings: Collection[str]) -> list[str]:
     """Return expressions for a sample's arrays; a merged dataset may have both packings."""
     *rest, last = sorted(packings) or [PLAIN]
     return [*(f'sample.get("{packing}")' for packing in rest), f'sample["{last}"]']
-
-
-def _setting(settings: Mapping[str, Any], name: str) -> Any:
-    """Return a setting by its dotted name; None if the manifest lacks it."""
-    value: Any = settings
-    for part in name.split("."):
-        value = value.get(part) if isinstance(value, Mapping) else None
-    return value

@@ -23,8 +23,7 @@ from pipeline.documents.figures import (
     short_label,
 )
 from pipeline.documents.gallery import write_gallery
-from pipeline.documents.report import write_report
-from pipeline.documents.report_sections import _rejections
+from pipeline.documents.report import _rejections, write_report
 from pipeline.documents.rights import rights_of
 from pipeline.documents.scene_page import Neighbours, encode_scene_page, shown_maps
 from storage.dataset.dataset import Dataset, open_dataset

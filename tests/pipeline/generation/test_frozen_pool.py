@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.documents.attribution import encode_attribution
+from pipeline.documents.rights import encode_attribution
 from pipeline.generation import accept_maps as accepting
 from pipeline.generation import freeze_objects, frozen_pool, pipeline, restore_object
 from pipeline.generation.accept_maps import AcceptedMaps, MapFolders, accept_maps, map_folders
