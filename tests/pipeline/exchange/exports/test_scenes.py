@@ -14,7 +14,7 @@ from PIL import Image
 
 from model.scene_tensors import scene_tensors
 from pipeline.exchange.exports.export import FORMS
-from pipeline.exchange.exports.scenes import MOST_NOTES, WRITERS, _limit_notes, picture_name
+from pipeline.exchange.exports.scenes import MOST_NOTES, SCENE_FORMS, _limit_notes, picture_name
 from pipeline.exchange.open_scene import load_source, scene_source
 from storage.conventions import in_camera, preview_srgb8
 from storage.dataset.dataset import open_dataset
@@ -154,7 +154,7 @@ def test_many_losses_are_counted_once_each_is_told() -> None:
     assert _limit_notes("h5", ["a", "b"]) == ["h5 cannot hold a", "h5 cannot hold b"]
     told = _limit_notes("json", [str(number) for number in range(MOST_NOTES + 3)])
     assert len(told) == MOST_NOTES + 1 and told[-1] == "json loses 3 more things of this kind"
-    assert set(WRITERS) == {"h5", "json", "usd", "exr"}
+    assert set(SCENE_FORMS) == {"h5", "json", "usd", "exr"}
 
 
 SIZE = 16
