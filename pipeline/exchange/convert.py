@@ -41,17 +41,14 @@ class ConvertResult:
 def convert_scene(
     source: SceneSource, target: Path, *, budget: int | None, done: Callable[[int, int], None]
 ) -> ConvertResult:
-    """Read a source and write it in the format of the target's suffix.
+    """Read a source of one or many scenes and write it in the format of the target's suffix.
 
-    Args:
-        source: one scene, or a file of many.
-        target: the file to write.
-        budget: most triangles of each scene, or None for all of them.
-        done: called with (finished, all) files.
+    Scenes get at most `budget` triangles; None is all of them. `done` is called with (finished,
+    all) files.
 
     Raises:
-        TrilightError: the source is unusable, the target's format cannot hold it, or it cannot
-            be written.
+        TrilightError: the source is unusable, the target's format cannot hold it, or it cannot be
+            written.
     """
     form = _form_of(target)
     child = file_child(reach_of(source, writes=[_make_folder(target)]))
@@ -83,10 +80,7 @@ def write_scene(
 ) -> tuple[str, ...]:
     """Write a scene in the format of the target's suffix; return what that cannot hold.
 
-    Args:
-        target: the file to write.
-        scene: passes `Scene.check`.
-        radiance_rgb: [V, R, R, 3] pictures of its views, which HDF5 alone holds.
+    HDF5 alone holds the pictures [V, R, R, 3] of its views.
 
     Raises:
         TrilightError: the format cannot hold it, or it cannot be written.

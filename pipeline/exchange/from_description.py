@@ -153,18 +153,10 @@ def scene_from_description(
     provenance: Mapping[str, Any],
     albedo_over_one: AlbedoOverOne = "scale",
 ) -> Scene:
-    """Build the scene that a file describes.
+    """Build the scene that a file describes, with its first `num_views` cameras.
 
-    Args:
-        description: the file.
-        meshes: one per object, in its order.
-        num_views: number of the file's cameras to take, from the first.
-        provenance: provenance of the scene; `albedo_scale` is added where materials were scaled.
-        albedo_over_one: treatment of albedos that add up to more than 1.
-
-    Returns:
-        A checked scene; objects in the order of the file, an emitting object as one object per
-        triangle.
+    Objects are in the order of the file, an emitting object as one object per triangle; `meshes`
+    has one per object. The provenance gets `albedo_scale` where materials were scaled.
 
     Raises:
         TrilightError: an object or camera, which is named, is unusable; or a count is too large.
@@ -304,21 +296,13 @@ def require_at_most(counts: Mapping[str, tuple[int, int]]) -> None:
 def limit_albedos(
     diffuse: NDArray[np.float64], specular: NDArray[np.float64], over_one: AlbedoOverOne
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return albedos that add up to at most 1, and the least factor that this took.
+    """Return albedos [M, 3] that add up to at most 1, and the least factor that this took.
 
     A surface beyond 1 reflects more light than it receives; published scene files have some (1.1).
     Both albedos of such a material are multiplied by 1 / their largest sum over the channels. One
     factor for all channels keeps both hues, and one for both albedos keeps their ratio; a factor
-    for each channel would bleach a red of 1.1 towards white.
-
-    Args:
-        diffuse: [M, 3] albedos of M materials.
-        specular: [3] albedo of all of them.
-        over_one: "scale" or "refuse" for materials beyond 1.
-
-    Returns:
-        Diffuse and specular albedos [M, 3], and the smallest factor of a material; 1.0 where none
-        was beyond 1, and then both are unchanged.
+    for each channel would bleach a red of 1.1 towards white. Where none of the diffuse albedos [M,
+    3] with the specular albedo [3] of all is beyond 1, they are unchanged and the factor is 1.0.
 
     Raises:
         TrilightError: a material is beyond 1, and `over_one` is "refuse".
@@ -351,20 +335,15 @@ def color_groups(mesh: ShadedMesh, material: DescribedMaterial) -> NDArray[np.in
 def random_diffuse(seed: int, bound: float, count: int) -> NDArray[np.float64]:
     """Return `count` diffuse albedos [count, 3]: integers below ceil(256 bound), over 255.
 
-    The published converter seeds numpy's legacy Mersenne Twister and draws one triple per group, in
-    the order in which trimesh splits the shaded mesh. On flat meshes that is the order of faces,
-    and colors are exactly the published ones. On smooth meshes trimesh has another order, and other
-    groups where an object has large flat regions; our groups are in the order of their first faces,
-    so that the same numbers may fall on other groups than published.
+    The published converter seeds numpy's legacy Mersenne Twister, also by 0, and draws one triple
+    per group, in the order in which trimesh splits the shaded mesh. On flat meshes that is the
+    order of faces, and colors are exactly the published ones. On smooth meshes trimesh has another
+    order, and other groups where an object has large flat regions; our groups are in the order of
+    their first faces, so that the same numbers may fall on other groups than published.
 
     The published tokens hold the numbers as linear albedos, and so does Trilight. Published renders
     passed them through vertex colors that Blender decodes as sRGB, so the same numbers meant darker
     surfaces there, which Trilight does not imitate.
-
-    Args:
-        seed: seed of the legacy generator, 0 to 2^32 - 1; 0 is an ordinary seed.
-        bound: `random_diffuse_max`; a channel may exceed it by at most 1/255.
-        count: number of colors.
     """
     generator = np.random.RandomState(seed)
     return generator.randint(0, max(1, math.ceil(256 * bound)), (count, 3)) / 255

@@ -120,11 +120,7 @@ def _choose_tiles(
     """Return the tiles of one material's pictures along an axis, and whether they suffice.
 
     One tile where all pictures repeat, no coordinate leaves [0, 1], or too many would be needed.
-
-    Args:
-        pictures: pictures of equal coordinates.
-        at: coordinates of all corners along the axis.
-        axis: 0 for u, 1 for v.
+    `at` has the coordinates of all corners along the axis, 0 for u and 1 for v.
     """
     most_texels = max(picture.values.shape[1 - axis] for picture in pictures)
     low, high = (float(at.min()), float(at.max())) if at.size else (0.0, 1.0)

@@ -52,9 +52,8 @@ class PartConverter:
     def convert(self, part: Part, source: MapSource) -> TexturedTriangles:
         """Return the triangles of a part with the textures and rows of its material.
 
-        Args:
-            part: the triangles; its material is the same object as of others that share textures.
-            source: name and rights of the textures.
+        Parts whose material is the same object share textures, which get the name and rights of
+        `source`.
         """
         count = len(part.positions)
         placed = place_slots(part, self._lost)

@@ -37,8 +37,7 @@ def write_passes(
         source: a dataset (folder or URL), or a scene in any form that `trilight convert` reads.
         out: the folder, which is created.
         names: of the passes.
-        scene: key of the only scene, with or without zeros before it; None for all.
-        view: the only view; None for all.
+        scene, view: key of the only scene, with or without zeros, and the only view; None for all.
         resolution: width and height in pixels; None for that of the dataset's pictures, or 256.
         rays_a_side: rays along each side of a pixel.
         done: called with each written file.

@@ -44,12 +44,7 @@ def textured_triangles(scene: Scene) -> NDArray[np.bool_]:
 
 
 def compute_cells(scene: Scene, triangle: int) -> list[tuple[slice, NDArray[np.float32]]]:
-    """Return the channels and cells [C, 32, 32] of each textured column of a triangle.
-
-    Args:
-        scene: a scene with textures.
-        triangle: row of the triangle.
-    """
+    """Return the channels and cells [C, 32, 32] of each textured column of a triangle."""
     assert scene.material_textures is not None and scene.uv is not None
     index = scene.material_textures[scene.material_index[triangle]]
     uv = scene.uv.reshape(-1, 3, 2)[triangle].astype(np.float64)

@@ -60,11 +60,7 @@ _OUR_NAMES = {"rotation": "rotation_deg", "fov": "fov_deg"}
 
 
 def read_description(data: bytes, name: str) -> SceneDescription:
-    """Parse a scene file.
-
-    Args:
-        data: the bytes of the file.
-        name: name of the file, for messages.
+    """Parse the bytes of a scene file; messages call it `name`.
 
     Raises:
         TrilightError: the file exceeds MAX_BYTES or is not JSON; a JSON object repeats a name; or a
@@ -302,11 +298,9 @@ class DescribedFiles:
 
 
 def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
-    """Return a scene as the files that the published tools read.
+    """Return a scene that passes `Scene.check` as the files that the published tools read.
 
-    Args:
-        scene: passes `Scene.check`.
-        stem: stem of the scene file and name of its mesh folders.
+    `stem` is the stem of the scene file and the name of its mesh folders.
 
     Raises:
         TrilightError: more objects or cameras than a file may have, a number out of range, or no

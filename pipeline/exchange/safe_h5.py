@@ -62,11 +62,7 @@ def list_names(group: Any) -> list[str]:
 def plain_array(group: Any, name: str, shape: Sequence[int | None], longest: int) -> Any:
     """Return an h5py dataset, unread: little-endian floats that the file itself holds.
 
-    Args:
-        group: a group of an open file.
-        name: name of the array.
-        shape: required shape; None is any length from 1 to `longest`.
-        longest: maximum length of an axis.
+    In the required shape, None is any length from 1 to `longest`.
 
     Raises:
         TrilightError: the array is missing, a link, or of another type or shape.

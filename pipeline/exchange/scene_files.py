@@ -46,13 +46,9 @@ class SceneFiles:
     notes: tuple[str, ...] = ()  # sentences about the built scenes
 
     def scene(self, scene_index: int, assets: AssetSettings, *, num_views: int, seed: int) -> Scene:
-        """Build a scene; only child processes call this, since it reads meshes.
+        """Build the scene of the file `names[scene_index]`; only child processes call this.
 
-        Args:
-            scene_index: index of the scene file in `names`.
-            assets: limits on meshes.
-            num_views: number of cameras to take from the file.
-            seed: seed of the dataset; recorded in the provenance only.
+        `num_views` cameras are taken; the provenance records the dataset's `seed`.
 
         Raises:
             Rejected: "unusable_scene_file", for a file of which no scene can be made.
@@ -113,13 +109,11 @@ def build_scene(
     """Build the scene of one file; only child processes call this, since it reads meshes.
 
     Args:
-        root: the folder, with links resolved.
-        name: name of the scene file in it.
+        root: the folder, with links resolved; `name` is the scene file in it.
         settings: limits on meshes.
         licence: licence of the objects.
         num_views: number of cameras to take from the file; None for all.
-        scene_index: index of the scene in the dataset; recorded in the provenance only.
-        seed: seed of the dataset; recorded in the provenance only.
+        scene_index, seed: of the dataset; recorded in the provenance only.
         albedo_over_one: treatment of albedos that add up to more than 1.
         notes: receives a sentence for each ignored part of a mesh file.
 
@@ -176,18 +170,10 @@ def load_mesh_file(
     licence: str,
     remesh_faces: int | None = None,
 ) -> tuple[LoadedMesh, str]:
-    """Read the mesh of a scene; only child processes call this.
+    """Read the mesh of a scene, and the sha256 of its file; only child processes call this.
 
-    Args:
-        path: the file.
-        uid: identifier of the mesh in the scene.
-        display_name: name of the mesh for messages.
-        settings: limits on meshes.
-        licence: licence of the object.
-        remesh_faces: maximum number of triangles after remeshing; None keeps the mesh.
-
-    Returns:
-        The mesh, and the sha256 of its file.
+    The mesh gets the identifier `uid`; messages call it `display_name`. `remesh_faces` is the
+    maximum number of triangles after remeshing; None keeps the mesh.
 
     Raises:
         TrilightError: the file is not a usable mesh, or cannot be read.

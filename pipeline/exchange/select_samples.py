@@ -13,10 +13,7 @@ def select_samples(
 ) -> Iterator[tuple[str, Sample]]:
     """Yield (split, sample) of a dataset in its order, with pictures.
 
-    Args:
-        dataset: the dataset to read.
-        split: the only split; None for all.
-        scene: key of the only scene, with or without the zeros before it; None for all.
+    `split` and `scene` choose one; the key of a scene may lack the zeros before it.
 
     Raises:
         TrilightError: the split or scene does not exist, or the dataset is empty or damaged.

@@ -284,11 +284,8 @@ class SceneParts:
     ) -> Scene:
         """Build and check the scene; a camera that sees everything is added where there is none.
 
-        Args:
-            cameras: pose [4, 4] and full angle in degrees of each.
-            sky: its environment, if any.
-            provenance: template and file.
-            lost: receives a sentence for each loss.
+        `cameras` has the pose [4, 4] and full angle in degrees of each, `sky` the environment, if
+        any; `lost` receives a sentence for each loss.
         """
         points = self.surface_points()
         if not cameras:

@@ -53,17 +53,11 @@ def export_dataset(
     scene: str | None,
     done: Callable[[int], None],
 ) -> Sequence[str]:
-    """Write samples of a dataset in the format of another library, with the rights of its objects.
+    """Write samples of a dataset in a format of FORMS, with the rights of its objects.
 
-    Args:
-        source: folder or URL of a dataset.
-        form: a name of FORMS.
-        out: a folder that is empty, or does not exist.
-        split, scene: as `select_samples`.
-        done: called after each sample with its number of views.
-
-    Returns:
-        Sentences about what the format cannot hold.
+    `out` is empty or does not exist; `split` and `scene` are those of `select_samples`. `done` is
+    called after each sample with its number of views. The returned sentences tell what the format
+    cannot hold.
 
     Raises:
         TrilightError: the dataset is unusable, there is no such split or scene, or the folder is

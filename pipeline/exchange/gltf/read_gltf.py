@@ -53,11 +53,9 @@ _SIZE = 0.01
 
 
 def read_gltf(path: Path, licence: str) -> LoadedScene:
-    """Read the default scene of a file.
+    """Read the default scene of a file; buffers and pictures are in its folder or in the file.
 
-    Args:
-        path: the file; buffers and pictures are in its folder or in the file.
-        licence: licence of its objects and textures, which glTF cannot state.
+    Objects and textures get the licence, which glTF cannot state.
 
     Raises:
         TrilightError: the file is unusable or too large, or a `Scene` cannot hold it.
@@ -204,11 +202,7 @@ def _light_triangles(
 ) -> TexturedTriangles | None:
     """Return an octahedron for a punctual light; None for other lights and dark ones.
 
-    Args:
-        light: JSON of the light.
-        placed: node of the light.
-        reach: diagonal of the scene in meters.
-        lost: receives a sentence for each loss.
+    `light` is its JSON, and `reach` the diagonal of the scene in meters.
     """
     kind = light.get("type")
     if kind not in ("point", "spot"):
@@ -240,9 +234,7 @@ def _build_sun_sky(
 ) -> Environment | None:
     """Return a black sky with the directional lights; None where none of them shines.
 
-    Args:
-        suns: JSON of each light, and the pose [4, 4] of its node; it shines along -z.
-        lost: receives a sentence for each loss.
+    `suns` has the JSON of each light, and the pose [4, 4] of its node; it shines along -z.
     """
     radiance = np.zeros((_SUN_ROWS, 2 * _SUN_ROWS, 3), np.float64)
     rotation = np.eye(3)

@@ -113,11 +113,8 @@ def encode_mesh_glb(
 ) -> bytes:
     """Return a textured mesh as the bytes of a GLB file.
 
-    Args:
-        positions: [V, 3], +Z up.
-        faces: [F, 3] rows of `positions`.
-        uv: [F, 3, 2] texture coordinates of the corners, v up.
-        textures: diffuse, specular and roughness.
+    Vertices [V, 3] are +Z up, faces [F, 3] rows of them, and coordinates [F, 3, 2] of corners v up.
+    The textures are diffuse, specular and roughness.
     """
     file = GlbFile()
     maps = {name: linear_map(texture) for name, texture in zip(TEXTURED, textures, strict=True)}

@@ -74,11 +74,8 @@ def compute_radiance(
 ) -> NDArray[np.float32]:
     """Return the radiance [3] that the light API of a prim states.
 
-    Args:
-        placed: a light, or a mesh with the light API.
-        triangles: [T, 3, 3] in meters, for the area.
-        time: time code of the values.
-        lost: receives a sentence for each loss.
+    The prim is a light, or a mesh with the light API; its triangles [T, 3, 3] in meters have the
+    area.
     """
     emitted = _read_light_color(placed.prim, time, lost)
     if placed.prim.GetAttribute("inputs:normalize").Get(time):
@@ -203,12 +200,7 @@ def read_foreign_dome(
 ) -> Environment | None:
     """Read the environment of any DomeLight; return None, with a note, where it is unusable.
 
-    Args:
-        prim: the light.
-        to_world: [4, 4] transform to world space.
-        time: time code of the values.
-        opened: the open file, which collects notes on losses.
-        licence: licence of a map that states none.
+    `to_world` [4, 4] is its transform; a map that states no licence gets `licence`.
 
     Raises:
         TrilightError: the map file is outside the folder or on the network.

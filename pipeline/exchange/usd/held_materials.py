@@ -93,13 +93,9 @@ def read_held_material(
     opened: OpenedStage,
     rows: Mapping[str, NDArray[np.float32]],
 ) -> HeldMaterial | None:
-    """Read the exact values of a material; return None where one is missing.
+    """Read the exact values of a UsdShade.Material; return None where one is missing.
 
-    Args:
-        material: the UsdShade.Material.
-        time: time of the values.
-        opened: the file, which receives notes.
-        rows: material rows as Trilight wrote them, by the paths of their prims, where known.
+    `rows` are material rows as Trilight wrote them, by the paths of their prims, where known.
     """
     prim = material.GetPrim()
     columns = dict[str, NDArray[np.float32]]()

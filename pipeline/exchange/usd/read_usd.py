@@ -184,11 +184,7 @@ def _is_marked(layer: Any) -> bool:
 
 
 def _read_exact(opened: OpenedStage, key: str | None = None) -> Scene | None:
-    """Read the scene of a file or of a shard's key; return None where it was changed.
-
-    Args:
-        opened: the open file of one scene or of a shard.
-        key: key of the scene in a shard.
+    """Read the scene of a file, or of a key of a shard; return None where it was changed.
 
     Raises:
         TrilightError: the file has an unsupported version or an undeclared material column, or the

@@ -173,10 +173,7 @@ def material_tables(
 ) -> dict[str, Attributes]:
     """Return the attributes of a material row's prims, by their path below the material.
 
-    Args:
-        values: the row, with all declared columns.
-        columns: names of the stored columns (storage.records.material.stored_columns).
-        used: textures of the row.
+    The row has all declared columns; `columns` names the stored ones, and `used` its textures.
     """
     diffuse, specular, emission = (_rgb(values[part]) for part in (DIFFUSE, SPECULAR, EMISSION))
     roughness = float(values[ROUGHNESS])
