@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.exchange.usd.prim_names import NAMESPACE
 
@@ -90,26 +89,9 @@ def usd_value(kind: str, value: Any) -> Any:
 @functools.cache
 def _converter(kind: str) -> Callable[[Any], Any]:
     """Return the converter to a USD type; cached, since scenes have 10^5 values."""
-    from pxr import Gf, Sdf, Vt
+    from pxr import Sdf
 
-    known: dict[str, Callable[[Any], Any]] = {
-        "token[]": Vt.TokenArray,
-        "int[]": Vt.IntArray.FromNumpy,
-        "float[]": Vt.FloatArray.FromNumpy,
-        "texCoord2f[]": Vt.Vec2fArray.FromNumpy,
-        "color3f": Gf.Vec3f,
-        "float4": lambda value: Gf.Vec4f(*value),
-        "asset": Sdf.AssetPath,
-        "float2": Gf.Vec2f,
-        "float3": lambda value: Gf.Vec3f(*value),
-        "matrix4d": Gf.Matrix4d,
-        "double3": lambda value: Gf.Vec3d(*value),
-    }
-    plain = kind.removeprefix(UNIFORM)
-    return known.get(plain, _vectors if plain.endswith("[]") else lambda value: value)
-
-
-def _vectors(values: NDArray[np.float32]) -> Any:
-    from pxr import Vt
-
-    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values))
+    python_class = Sdf.AssetPath if kind == "asset" else _value_type(kind).type.pythonClass
+    if hasattr(python_class, "FromNumpy"):
+        return lambda values: python_class.FromNumpy(np.ascontiguousarray(values))
+    return python_class or (lambda value: value)  # numbers and texts have no class

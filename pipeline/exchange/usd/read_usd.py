@@ -283,10 +283,7 @@ def _read_scene(root: Any, opened: OpenedStage) -> Scene:
 
 def _read_dome(prim: Any, layer: Any, opened: OpenedStage) -> Environment:
     """Read the environment that was written; raises LookupError without its file."""
-    resolved = opened.resolve(layer, prim.attributes[names.MAP_PATH].default.path)
-    data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
-    if data is None:
-        raise LookupError(names.MAP_PATH)
+    data = _read_asset(layer, opened, prim.attributes[names.MAP_PATH].default.path)
     matrix = np.array(prim.attributes["xformOp:transform"].default).T
     texts = {field: prim.attributes[name].default for field, name in names.MAP_TEXTS.items()}
     return Environment(
@@ -411,17 +408,21 @@ def _read_textures(prim: Any, textures: dict[int, Texture], opened: OpenedStage)
 
 def _read_texture(attributes: Any, layer: Any, opened: OpenedStage) -> Texture:
     named = attributes["inputs:file"].default.path
-    resolved = opened.resolve(layer, named)
-    data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
-    if data is None:
-        raise LookupError(named)
     texts = {field: attributes[name].default for field, name in names.MAP_TEXTS.items()}
     return decode_texture(
-        data,
+        _read_asset(layer, opened, named),
         is_exr=named.endswith(".exr"),
         is_srgb=attributes["inputs:sourceColorSpace"].default == "sRGB",
         source=MapSource(**texts),
     )
+
+
+def _read_asset(layer: Any, opened: OpenedStage, path: str) -> bytes:
+    resolved = opened.resolve(layer, path)
+    data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
+    if data is None:
+        raise LookupError(path)
+    return data
 
 
 def _list_columns(prim: Any) -> tuple[str, ...]:

@@ -130,8 +130,8 @@ def author_scene(layer: Any, path: str, scene: Scene) -> Any:
         root = add_prim(layer, path, "Xform")
         add_attributes(root, root_attributes(scene))
         add_materials(layer, f"{path}/Materials", scene)
-        add_objects(layer, f"{path}/Objects", scene, f"{path}/Materials")
-        add_cameras(layer, f"{path}/Cameras", scene)
+        _add_objects(layer, f"{path}/Objects", scene, f"{path}/Materials")
+        _add_cameras(layer, f"{path}/Cameras", scene)
         if scene.environment is not None:
             dome = add_prim(layer, f"{path}/{ENVIRONMENT}", "DomeLight")
             add_attributes(dome, _dome_attributes(scene.environment))
@@ -180,15 +180,15 @@ def _save(path: Path, layer: Any, files: Mapping[str, bytes]) -> None:
     write_atomically(path, data)  # last, so that the files that it names exist
 
 
-BINDING = "material:binding"
-LIGHT: Attributes = {
+_BINDING = "material:binding"
+_LIGHT: Attributes = {
     "inputs:intensity": ("float", 1.0),
     "inputs:exposure": ("float", 0.0),
     "inputs:color": ("color3f", (1.0, 1.0, 1.0)),
     "inputs:normalize": ("bool", False),
     "light:materialSyncMode": ("uniform token", "materialGlowTintsLight"),
 }
-MESH: Attributes = {
+_MESH: Attributes = {
     "doubleSided": ("uniform bool", True),
     "orientation": ("uniform token", "rightHanded"),
     "subdivisionScheme": ("uniform token", "none"),
@@ -197,13 +197,13 @@ MESH: Attributes = {
 CENTER = "xformOp:translate"
 """Name of the transform to the center, which USD's common API sets."""
 
-SUBSET: Attributes = {
+_SUBSET: Attributes = {
     "elementType": ("uniform token", "face"),
     "familyName": ("uniform token", "materialBind"),
 }
 
 
-def add_objects(layer: Any, folder: str, scene: Scene, materials: str) -> None:
+def _add_objects(layer: Any, folder: str, scene: Scene, materials: str) -> None:
     """Write a prim for each object below `folder`; the materials are below `materials`."""
     add_prim(layer, folder, "Scope")
     order = np.argsort(scene.object_index, kind="stable")
@@ -229,48 +229,35 @@ def prim_names(scene: Scene) -> list[str]:
     return unique
 
 
-def object_attributes(scene: Scene, row: int) -> Attributes:
-    """Return the attributes of an object's prim other than its arrays."""
-    entry = scene.objects[row]
-    return {
-        names.INDEX: ("int", row),
-        **text_attributes(names.OBJECT_TEXTS, entry),
-        names.VISIBLE_TO_CAMERA: ("bool", entry.kind != "emitter"),
-        **(LIGHT if entry.kind == "emitter" else {}),
-    }
-
-
 def _add_object(
     layer: Any, path: str, scene: Scene, row: int, faces: NDArray[np.intp], materials: str
 ) -> None:
-    emits = scene.objects[row].kind == "emitter"
+    entry = scene.objects[row]
+    emits = entry.kind == "emitter"
+    attributes = {
+        names.INDEX: ("int", row),
+        **text_attributes(names.OBJECT_TEXTS, entry),
+        names.VISIBLE_TO_CAMERA: ("bool", not emits),
+        **(_LIGHT if emits else {}),
+    }
     if len(faces) == 0:
-        empty = add_prim(layer, path, "Xform")
-        add_attributes(empty, object_attributes(scene, row))
+        add_attributes(add_prim(layer, path, "Xform"), attributes)
         return
     schemas = ["MaterialBindingAPI", *(["MeshLightAPI"] if emits else [])]
     prim = add_prim(layer, path, "Mesh", schemas)
-    add_attributes(prim, {**object_attributes(scene, row), **MESH})
-    _add_arrays(prim, scene, faces)
+    add_attributes(prim, {**attributes, **_MESH, **_mesh_arrays(scene, faces)})
+    prim.attributes["normals"].SetInfo("interpolation", "vertex")
+    if scene.uv is not None:
+        prim.attributes[ST].SetInfo("interpolation", "faceVarying")
     index = scene.material_index[faces]
     used = np.unique(index)
-    add_relationship(prim, BINDING, f"{materials}/{names.material_name(used[0])}")
+    add_relationship(prim, _BINDING, f"{materials}/{names.material_name(used[0])}")
     for material in used:
         name = names.material_name(material)
         subset = add_prim(layer, f"{path}/{name}", "GeomSubset", ["MaterialBindingAPI"])
         chosen = np.flatnonzero(index == material).astype(np.int32)
-        add_attributes(subset, {**SUBSET, "indices": ("int[]", chosen)})
-        add_relationship(subset, BINDING, f"{materials}/{name}")
-
-
-def center_points(
-    positions: NDArray[np.float32],
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return the center [3] of positions [V, 3] as float32 values, and points relative to it."""
-    wide = positions.astype(np.float64)
-    middle = (wide.min(axis=0) + wide.max(axis=0)) / 2
-    center = middle.astype(np.float32).astype(np.float64)
-    return center, (wide - center).astype(np.float32)
+        add_attributes(subset, {**_SUBSET, "indices": ("int[]", chosen)})
+        add_relationship(subset, _BINDING, f"{materials}/{name}")
 
 
 def sum_positions(center: NDArray[np.float64], points: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -278,42 +265,31 @@ def sum_positions(center: NDArray[np.float64], points: NDArray[np.float32]) -> N
     return (points.astype(np.float64) + center).astype(np.float32)
 
 
-def position_attributes(
-    center: NDArray[np.float64], points: NDArray[np.float32], positions: NDArray[np.float32]
-) -> Attributes:
-    """Return the center of a mesh, and exact positions where center plus point differs."""
+def _mesh_arrays(scene: Scene, faces: NDArray[np.intp]) -> Attributes:
+    """Return the arrays of a mesh, with exact positions where center plus point differs."""
+    rows, corners = np.unique(scene.faces[faces], return_inverse=True)
+    positions = scene.vertex_positions[rows]
+    wide = positions.astype(np.float64)
+    middle = (wide.min(axis=0) + wide.max(axis=0)) / 2
+    center = middle.astype(np.float32).astype(np.float64)
+    points = (wide - center).astype(np.float32)
     same = sum_positions(center, points).view(np.uint32) == positions.view(np.uint32)
-    rows = np.flatnonzero(~same.all(axis=1))
+    exact = np.flatnonzero(~same.all(axis=1))
+    uv = None if scene.uv is None else scene.uv.reshape(-1, 3, 2)[faces].reshape(-1, 2)
     return {
         CENTER: ("double3", center.tolist()),
         "xformOpOrder": ("uniform token[]", (CENTER,)),
-        names.EXACT_ROWS: ("int[]", rows.astype(np.int32)),
-        names.EXACT_POSITIONS: ("point3f[]", positions[rows]),
+        names.EXACT_ROWS: ("int[]", exact.astype(np.int32)),
+        names.EXACT_POSITIONS: ("point3f[]", positions[exact]),
+        "faceVertexCounts": ("int[]", np.full(len(faces), 3, np.int32)),
+        "faceVertexIndices": ("int[]", corners.ravel().astype(np.int32)),
+        "points": ("point3f[]", points),
+        "normals": ("normal3f[]", scene.vertex_normals[rows]),
+        "extent": ("float3[]", np.stack([points.min(axis=0), points.max(axis=0)])),
+        names.VERTEX_ROWS: ("int[]", rows.astype(np.int32)),
+        names.FACE_ROWS: ("int[]", faces.astype(np.int32)),
+        **({} if uv is None else {ST: ("texCoord2f[]", uv)}),
     }
-
-
-def _add_arrays(prim: Any, scene: Scene, faces: NDArray[np.intp]) -> None:
-    rows, corners = np.unique(scene.faces[faces], return_inverse=True)
-    center, points = center_points(scene.vertex_positions[rows])
-    extent = np.stack([points.min(axis=0), points.max(axis=0)])
-    add_attributes(
-        prim,
-        {
-            **position_attributes(center, points, scene.vertex_positions[rows]),
-            "faceVertexCounts": ("int[]", np.full(len(faces), 3, np.int32)),
-            "faceVertexIndices": ("int[]", corners.ravel().astype(np.int32)),
-            "points": ("point3f[]", points),
-            "normals": ("normal3f[]", scene.vertex_normals[rows]),
-            "extent": ("float3[]", extent),
-            names.VERTEX_ROWS: ("int[]", rows.astype(np.int32)),
-            names.FACE_ROWS: ("int[]", faces.astype(np.int32)),
-        },
-    )
-    prim.attributes["normals"].SetInfo("interpolation", "vertex")
-    if scene.uv is not None:
-        corner_uv = np.ascontiguousarray(scene.uv.reshape(-1, 3, 2)[faces].reshape(-1, 2))
-        add_attributes(prim, {ST: ("texCoord2f[]", corner_uv)})
-        prim.attributes[ST].SetInfo("interpolation", "faceVarying")
 
 
 def _map_files(sky: Environment | None) -> dict[str, bytes]:
@@ -366,38 +342,34 @@ def _sky_attributes(sky: Environment | None) -> Attributes:
     }
 
 
-APERTURE = 0.36
+_APERTURE = 0.36
 """Width and height of the film in tenths of a meter."""
 
-CLIP_METRES = (1e-3, 1e4)
+_CLIP_METERS = (1e-3, 1e4)
 
 
-def add_cameras(layer: Any, folder: str, scene: Scene) -> None:
+def _add_cameras(layer: Any, folder: str, scene: Scene) -> None:
     """Write a prim for each camera below `folder`."""
     add_prim(layer, folder, "Scope")
-    for row in range(scene.num_views):
+    for row, (c2w, fov_deg) in enumerate(zip(scene.c2w, scene.fov_deg.tolist(), strict=True)):
+        focal = _APERTURE / (2 * math.tan(math.radians(fov_deg) / 2))
         camera = add_prim(layer, f"{folder}/{names.camera_name(row)}", "Camera")
-        add_attributes(camera, camera_attributes(scene.c2w[row], float(scene.fov_deg[row])))
+        attributes: Attributes = {
+            # USD multiplies rows from the left
+            "xformOp:transform": ("matrix4d", c2w.astype(np.float64).T.tolist()),
+            "xformOpOrder": ("uniform token[]", ("xformOp:transform",)),
+            "projection": ("token", "perspective"),
+            "focalLength": ("float", float(np.float32(focal))),
+            "horizontalAperture": ("float", float(np.float32(_APERTURE))),
+            "verticalAperture": ("float", float(np.float32(_APERTURE))),
+            "clippingRange": ("float2", _CLIP_METERS),
+            names.FOV_DEG: ("float", fov_deg),
+        }
+        add_attributes(camera, attributes)
 
 
-def camera_attributes(c2w: NDArray[np.float32], fov_deg: float) -> Attributes:
-    """Return the attributes of a camera from its pose [4, 4] and full field of view in degrees."""
-    focal = APERTURE / (2 * math.tan(math.radians(fov_deg) / 2))
-    rows = c2w.astype(np.float64).T.tolist()  # USD multiplies rows from the left
-    return {
-        "xformOp:transform": ("matrix4d", rows),
-        "xformOpOrder": ("uniform token[]", ("xformOp:transform",)),
-        "projection": ("token", "perspective"),
-        "focalLength": ("float", float(np.float32(focal))),
-        "horizontalAperture": ("float", float(np.float32(APERTURE))),
-        "verticalAperture": ("float", float(np.float32(APERTURE))),
-        "clippingRange": ("float2", CLIP_METRES),
-        names.FOV_DEG: ("float", fov_deg),
-    }
-
-
-ALIGNMENT = 64
-LAYER_NAME = "scene.usdc"
+_ALIGNMENT = 64
+_LAYER_NAME = "scene.usdc"
 
 _HEADER_BYTES = 30
 _PADDING_ID = 0x1986
@@ -408,10 +380,10 @@ def encode_usdz(layer: bytes, files: Mapping[str, bytes] | None = None) -> bytes
     """Return the `.usdz` archive of a `.usdc` layer and its files, without time stamps."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
-        for name, data in {LAYER_NAME: layer, **(files or {})}.items():
+        for name, data in {_LAYER_NAME: layer, **(files or {})}.items():
             entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
             begin = stream.tell() + _HEADER_BYTES + len(name)
-            padding = -(begin + 4) % ALIGNMENT
+            padding = -(begin + 4) % _ALIGNMENT
             entry.extra = _PADDING_ID.to_bytes(2, "little") + padding.to_bytes(2, "little")
             entry.extra += bytes(padding)
             entry.external_attr = 0o644 << 16
