@@ -1,5 +1,6 @@
 """Reads scenes of untrusted files in a child process with limits; returns checked scenes only."""
 
+import contextlib
 import dataclasses
 import logging
 from collections.abc import Callable, Iterable
@@ -28,7 +29,7 @@ from storage.records.scene import Scene
 log = logging.getLogger("trilight.exchange")
 
 
-class SceneReader:
+class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
     """A child process that reads any number of sources; close it, or use a `with` block."""
 
     def __init__(self, albedo_over_one: AlbedoOverOne = "scale") -> None:
@@ -84,9 +85,6 @@ class SceneReader:
     def close(self) -> None:
         """End the child."""
         self._child.close()
-
-    def __enter__(self) -> "SceneReader":
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

@@ -26,7 +26,7 @@ from storage.records.material import (
     distinct_rows,
     laid_out,
 )
-from storage.records.retextured import AnyScene, with_textures
+from storage.records.retextured import with_textures
 from storage.records.scene import ObjectKind, Scene, SceneObject
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
@@ -89,7 +89,7 @@ def join_triangles(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TexturedPiece:
+class _Piece:
     """An object of a scene with its textures."""
 
     piece: ScenePiece
@@ -111,7 +111,7 @@ def index_corners(
     return vertices[:, :3].copy(), vertices[:, 3:].copy(), faces
 
 
-def build_piece(entry: SceneObject, triangles: TexturedTriangles) -> TexturedPiece:
+def _build_piece(entry: SceneObject, triangles: TexturedTriangles) -> _Piece:
     """Build an object of a scene from its triangles."""
     positions, normals, faces = index_corners(triangles.positions, triangles.normals)
     rows = _with_means(triangles)
@@ -119,7 +119,7 @@ def build_piece(entry: SceneObject, triangles: TexturedTriangles) -> TexturedPie
     palette, material_index = distinct_rows(appearance)
     groups = np.zeros(len(faces), np.int64)
     mesh = ShadedMesh(positions=positions, normals=normals, faces=faces, groups=groups)
-    return TexturedPiece(
+    return _Piece(
         piece=ScenePiece(
             entry=entry, mesh=mesh, materials=rows[palette], material_index=material_index
         ),
@@ -149,21 +149,6 @@ def build_lamp(
         texture_set_index=np.zeros(count, np.int64),
         texture_sets=(NO_TEXTURES,),
     )
-
-
-def with_texture_sets(scene: AnyScene, pieces: Sequence[TexturedPiece]) -> AnyScene:
-    """Return the scene of these pieces, in their order, with their textures."""
-    textures: dict[str, Texture] = {}
-    sets = [texture_set for each in pieces for texture_set in each.texture_sets]
-    for texture in (texture for texture_set in sets for texture in texture_set if texture):
-        textures.setdefault(texture.sha256, texture)
-    order = {sha256: row for row, sha256 in enumerate(textures)}
-    index = [[order[each.sha256] if each else CONSTANT for each in row] for row in sets]
-    if not textures:
-        return scene
-    uv = np.concatenate([each.uv.reshape(-1, 2) for each in pieces]).astype(np.float32)
-    rows = np.array(index, np.int32).reshape(-1, len(TEXTURED))
-    return with_textures(scene, uv, tuple(textures.values()), rows)
 
 
 def _with_means(triangles: TexturedTriangles) -> NDArray[np.float32]:
@@ -229,8 +214,8 @@ class SceneParts:
     def __init__(self, file: str) -> None:
         self._file = file
         self._names: dict[str, int] = {}
-        self._pieces: list[TexturedPiece] = []
-        self._surfaces: list[TexturedPiece] = []
+        self._pieces: list[_Piece] = []
+        self._surfaces: list[_Piece] = []
         self._counts = Counter[str]()
 
     def add(
@@ -248,7 +233,7 @@ class SceneParts:
             if not mask.any():
                 continue
             unique = dataclasses.replace(entry, name=self._make_unique(entry.name), kind=kind)
-            piece = build_piece(unique, triangles.select(mask))
+            piece = _build_piece(unique, triangles.select(mask))
             self._pieces.append(piece)
             self._surfaces += [] if is_lamp else [piece]
             self._counts["triangles"] += len(piece.piece.mesh.faces)
@@ -299,9 +284,22 @@ class SceneParts:
             provenance=provenance,
             environment=sky,
         )
-        scene = with_texture_sets(scene, self._pieces)
+        scene = self._with_textures(scene)
         scene.check()
         return scene
+
+    def _with_textures(self, scene: Scene) -> Scene:
+        textures: dict[str, Texture] = {}
+        sets = [texture_set for each in self._pieces for texture_set in each.texture_sets]
+        for texture in (texture for texture_set in sets for texture in texture_set if texture):
+            textures.setdefault(texture.sha256, texture)
+        if not textures:
+            return scene
+        order = {sha256: row for row, sha256 in enumerate(textures)}
+        index = [[order[each.sha256] if each else CONSTANT for each in row] for row in sets]
+        uv = np.concatenate([each.uv.reshape(-1, 2) for each in self._pieces]).astype(np.float32)
+        rows = np.array(index, np.int32).reshape(-1, len(TEXTURED))
+        return with_textures(scene, uv, tuple(textures.values()), rows)
 
     def _make_unique(self, base: str) -> str:
         count = self._names.get(base, 0) + 1

@@ -78,7 +78,7 @@ def encode_scene_glb(scene: Scene) -> bytes:
     nodes: list[dict[str, Any]] = [{"rotation": list(_TO_Y_UP), "children": []}]
     meshes = list[dict[str, Any]]()
     for row, entry in enumerate(scene.objects):
-        primitives = [_primitive(file, scene, *part[1:]) for part in parts if part[0] == row]
+        primitives = [_scene_primitive(file, scene, *part[1:]) for part in parts if part[0] == row]
         if primitives:
             nodes.append({"name": entry.name, "mesh": len(meshes)})
             meshes.append({"name": entry.name, "primitives": primitives})
@@ -118,9 +118,8 @@ def encode_mesh_glb(
     """
     file = GlbFile()
     maps = {name: linear_map(texture) for name, texture in zip(TEXTURED, textures, strict=True)}
-    attributes = _attributes(file, positions[faces].reshape(-1, 3), None, uv.reshape(-1, 2))
-    indices = file.accessor(np.arange(faces.size, dtype="<u4"), "SCALAR", UNSIGNED)
-    primitive = {"attributes": attributes, "indices": indices, "material": 0}
+    corners = positions[faces].reshape(-1, 3)
+    primitive = _primitive(file, 0, np.arange(faces.size), corners, None, uv.reshape(-1, 2))
     file.tree |= {
         "nodes": [{"mesh": 0, "rotation": list(_TO_Y_UP)}],
         "meshes": [{"primitives": [primitive]}],
@@ -130,33 +129,30 @@ def encode_mesh_glb(
     return file.encode()
 
 
-def _primitive(
+def _scene_primitive(
     file: "GlbFile", scene: Scene, material: int, triangles: NDArray[np.intp]
 ) -> dict[str, Any]:
     corners = scene.faces[triangles].reshape(-1)
     if scene.uv is None:
         vertices, indices = np.unique(corners, return_inverse=True)
+        uv = None
     else:
         vertices = corners
         indices = np.arange(len(corners))
-    uv = None if scene.uv is None else scene.uv.reshape(-1, 3, 2)[triangles].reshape(-1, 2)
-    attributes = _attributes(
-        file, scene.vertex_positions[vertices], scene.vertex_normals[vertices], uv
-    )
-    return {
-        "attributes": attributes,
-        "indices": file.accessor(indices.astype("<u4"), "SCALAR", UNSIGNED),
-        "material": material,
-    }
+        uv = scene.uv.reshape(-1, 3, 2)[triangles].reshape(-1, 2)
+    points = scene.vertex_positions[vertices]
+    return _primitive(file, material, indices, points, scene.vertex_normals[vertices], uv)
 
 
-def _attributes(
+def _primitive(
     file: "GlbFile",
+    material: int,
+    indices: NDArray[np.integer],
     points: NDArray[np.floating],
     normals: NDArray[np.floating] | None,
     uv: NDArray[np.floating] | None,
-) -> dict[str, int]:
-    """Add positions and normals [V, 3] and coordinates [V, 2], v up; return their accessors."""
+) -> dict[str, Any]:
+    """Return the JSON of positions and normals [V, 3], and coordinates [V, 2] with v up."""
     points = points.astype("<f4")
     bounds = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
     attributes = {"POSITION": file.accessor(points, "VEC3", FLOAT, bounds)}
@@ -165,7 +161,8 @@ def _attributes(
     if uv is not None:
         from_top = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype("<f4")
         attributes["TEXCOORD_0"] = file.accessor(from_top, "VEC2", FLOAT)
-    return attributes
+    index = file.accessor(indices.astype("<u4"), "SCALAR", UNSIGNED)
+    return {"attributes": attributes, "indices": index, "material": material}
 
 
 def _material(
