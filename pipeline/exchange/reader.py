@@ -46,7 +46,6 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
         Raises:
             TrilightError: the file is unusable, or holds no scene.
         """
-        self._child.allow_files(reach_of(source))
         keys = self._read(source_keys, source)
         if not keys:
             raise TrilightError(f"{source.name}: holds no scene.")
@@ -55,12 +54,10 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
     def load(self, source: SceneSource, *, pictures: bool = False) -> LoadedScene:
         """Read one scene; see `pipeline.exchange.open_scene.load_source`."""
         source = dataclasses.replace(source, albedo_over_one=self._over_one)
-        self._child.allow_files(reach_of(source))
         return self._read(load_source, source, pictures)
 
     def cameras(self, source: SceneSource) -> Cameras:
         """Read poses and angles; see `pipeline.exchange.open_scene.load_cameras`."""
-        self._child.allow_files(reach_of(source))
         return self._read(load_cameras, source)
 
     def mesh(self, path: Path, licence: str) -> LoadedMesh:
@@ -93,6 +90,7 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
 
         Readers say the name alone, since others write what they say into datasets.
         """
+        self._child.allow_files(reach_of(source))
         try:
             return self._call(source.name, function, source, *args)
         except TrilightError as error:

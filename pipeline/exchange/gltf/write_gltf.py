@@ -7,7 +7,6 @@ at every angle, as in Trilight; the tint gives the other channels. The base colo
 diffuse / (1 - F). Lamps are surfaces that emit (KHR_materials_emissive_strength).
 """
 
-import io
 import json
 import struct
 from collections.abc import Mapping
@@ -16,8 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
+from pipeline.documents.png import encode_png
 from pipeline.exchange.linear_maps import (
     Map,
     constant_map,
@@ -240,10 +239,8 @@ class GlbFile:
 
     def picture(self, values: NDArray[np.uint8]) -> int:
         """Add a picture [H, W, 3], bottom row first; return the index of its texture."""
-        stream = io.BytesIO()
-        Image.fromarray(values[::-1]).save(stream, "PNG")
         images, textures = (self.tree.setdefault(name, []) for name in ("images", "textures"))
-        images.append({"bufferView": self._view(stream.getvalue()), "mimeType": "image/png"})
+        images.append({"bufferView": self._view(encode_png(values[::-1])), "mimeType": "image/png"})
         textures.append({"source": len(images) - 1})
         return len(textures) - 1
 

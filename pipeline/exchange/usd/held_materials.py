@@ -55,6 +55,7 @@ from storage.records.material import (
     EMISSION,
     ROUGHNESS,
     SPECULAR,
+    MaterialColumn,
     declared_column,
     laid_out,
 )
@@ -102,8 +103,8 @@ def read_held_material(
     for name, attribute in names.MATERIAL_ATTRIBUTES.items():
         value = prim.GetAttribute(attribute)
         column = declared_column(name)
-        stated = parse_numbers(value.Get(time) if value else None)
-        if len(stated) != column.width or not np.all(column.within.holds(stated)):
+        stated = read_column(value, column, time)
+        if stated is None:
             if value and value.HasAuthoredValue():
                 opened.lost.append(
                     f"{value.GetPath()}: expected {column.width} numbers {column.within}; the "
@@ -131,7 +132,30 @@ def read_held_material(
     )
 
 
-def restore_stated(
+def restore_exact(
+    held: HeldMaterial,
+    stated: StatedMaterial | None,
+    material: Any,
+    time: Any,
+    opened: OpenedStage,
+) -> tuple[StatedMaterial, dict[str, Texture] | None]:
+    """Return the inputs of a material that Trilight wrote, and its exact columns."""
+    if stated is None:
+        opened.lost.append(f"{held.where}: no shader; the values that Trilight wrote are used")
+        stated = _as_stated(held)
+    elif not stated.is_specular and (
+        "metallic" in stated.textures or stated.constants["metallic"].any()
+    ):
+        opened.lost.append(
+            f"{held.where}: became a metal since Trilight wrote it; read as any other material"
+        )
+        return stated, None
+    else:
+        stated = _restore_stated(held, stated, material, time, opened)
+    return _find_exact(held, stated, opened.lost)
+
+
+def _restore_stated(
     held: HeldMaterial, stated: StatedMaterial, material: Any, time: Any, opened: OpenedStage
 ) -> StatedMaterial:
     """Return the inputs of a shader in the workflow that Trilight writes.
@@ -178,7 +202,7 @@ def _note_unused(
             lost.append(f"{stated.where}.{name}: has no place here")
 
 
-def as_stated(held: HeldMaterial) -> StatedMaterial:
+def _as_stated(held: HeldMaterial) -> StatedMaterial:
     """Return a material of the values that Trilight wrote, for one that has lost its shader."""
     values = {name: _fill(held.columns[column]) for column, name in PREVIEW_INPUTS.items()}
     return StatedMaterial(
@@ -197,7 +221,7 @@ def as_stated(held: HeldMaterial) -> StatedMaterial:
     )
 
 
-def find_exact(
+def _find_exact(
     held: HeldMaterial, stated: StatedMaterial, lost: list[str]
 ) -> tuple[StatedMaterial, dict[str, Texture]]:
     """Return the inputs with the values that count, and the columns as Trilight wrote them.
@@ -347,9 +371,10 @@ def name_lost_columns(material: Any) -> list[str]:
     ]
 
 
-def parse_numbers(value: Any) -> NDArray[np.float64]:
-    """Return an attribute's value as a row of numbers; empty for other values."""
+def read_column(attribute: Any, column: MaterialColumn, time: Any) -> NDArray[np.float64] | None:
+    """Return the lawful value of a column's attribute as a row of numbers; else None."""
     try:
-        return np.array(value, np.float64).reshape(-1)
+        value = np.array(attribute.Get(time) if attribute else None, np.float64).reshape(-1)
     except (TypeError, ValueError):
-        return np.zeros(0)
+        return None
+    return value if len(value) == column.width and np.all(column.within.holds(value)) else None

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.documents.png import encode_png
 from pipeline.exchange.usd import prim_names as names
 from pipeline.exchange.usd.authoring import (
     Attributes,
@@ -271,21 +272,17 @@ def encode_texture(texture: Texture) -> bytes:
     Raises:
         TrilightError: the texture is larger than the USD reader accepts.
     """
-    from PIL import Image
-
     height, width, channels = texture.texels.shape
     if max(height, width) > MAX_RESOLUTION:
         raise TrilightError(
             f"texture: {width} x {height} texels; expected at most {MAX_RESOLUTION} each way in "
             "USD. Write it as .safetensors, or make it smaller."
         )
-    picture = np.ascontiguousarray(texture.texels[::-1])
+    picture: NDArray[Any] = np.ascontiguousarray(texture.texels[::-1])
     if picture.dtype == np.float32:
         values = picture if channels == 3 else picture[..., 0]
         return encode_channels({_CHANNELS[channels]: np.ascontiguousarray(values)})
-    stream = io.BytesIO()
-    Image.fromarray(picture if channels == 3 else picture[..., 0]).save(stream, "PNG")
-    return stream.getvalue()
+    return encode_png(picture if channels == 3 else picture[..., 0])
 
 
 def decode_texture(data: bytes, *, is_exr: bool, is_srgb: bool, source: MapSource) -> Texture:
