@@ -16,8 +16,8 @@
 - The normal channels are (.5, .5, 1): no bump, in the file's tangent space.
 - The texture of an emitter states diffuse (1, 1, 1) and roughness 1, as published, though emitters
   reflect nothing here (nor do the published ones when rendered).
-- Half floats end at 65504 and keep 11 bits: albedos change by up to 2^-11, and brighter lights are
-  refused.
+- The public converter writes textures as half floats, which end at 65504 and keep 11 bits. Ours are
+  float32, as those of the authors' later tools.
 - Every array is compressed by gzip at level 9, in chunks that h5py chooses.
 - Pictures have no alpha here: it is written as 1, and the empty background is radiance zero.
 - `mvp` is OpenGL's, for column vectors; the published training multiplies it by zero.
@@ -33,7 +33,7 @@ with a note.
 
 import io
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +57,6 @@ from pipeline.exchange.safe_h5 import (
 )
 from pipeline.exchange.textured_triangles import index_corners
 from storage.atomic import write_atomically
-from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.exr import MAX_RESOLUTION, to_half
@@ -101,36 +100,30 @@ FAR = 5.0
 """Clip distances of `mvp`, in meters."""
 GZIP_LEVEL = 9
 
-TextureType = Literal["float16", "float32"]
-
 
 def write_renderformer_h5(
     path: Path,
     scene: Scene,
     radiance_rgb: NDArray[np.float32] | None = None,
-    *,
-    texture_type: TextureType = "float32",
 ) -> tuple[str, ...]:
     """Write a scene, and its pictures [V, R, R, 3] if given; equal scenes give equal bytes.
 
-    The public converter writes `float16`, the authors' later tools `float32`. The file appears
-    whole or not at all; memory is its compressed size and one block of textures.
+    The file appears whole or not at all; memory is its compressed size and one block of textures.
 
     Returns:
         Sentences about members in CARRIED that lose something.
 
     Raises:
-        TrilightError: a value exceeds half floats, or the file cannot be written.
+        TrilightError: a picture exceeds half floats, or the file cannot be written.
     """
     import h5py
 
-    texture = texture_rows(scene, texture_type)
     corners = scene.faces.astype(np.int64)
     stream = io.BytesIO()
     with h5py.File(stream, "w") as file:
         _write(file, "triangles", scene.vertex_positions[corners])
         _write(file, "vn", scene.vertex_normals[corners])
-        _write_texture(file, texture, scene)
+        _write_texture(file, _texture_rows(scene), scene)
         _write(file, "c2w", scene.c2w)
         _write(file, "fov", scene.fov_deg)
         if radiance_rgb is not None:
@@ -148,45 +141,22 @@ def write_renderformer_h5(
     return tuple(lost)
 
 
-def texture_rows(scene: Scene, texture_type: TextureType) -> NDArray[np.floating]:
-    """Return the value [T, 13] of each triangle's texture.
-
-    Where rounding to half floats would make albedos add up to more than 1, they are rounded down.
-
-    Raises:
-        TrilightError: an emission becomes infinite or zero as half floats.
-    """
+def _texture_rows(scene: Scene) -> NDArray[np.float32]:
+    """Return the value [T, 13] of each triangle's texture."""
     emits = np.any(scene.materials[:, EMISSION] > 0, axis=1)
     rows = np.zeros((len(scene.materials), CHANNELS), np.float32)
     rows[:, REFLECTING] = scene.materials[:, REFLECTING]
     rows[emits, REFLECTING] = _PUBLISHED_EMITTER
     rows[:, _NORMAL] = _FLAT_NORMAL
     rows[:, _EMISSION] = scene.materials[:, EMISSION]
-    if texture_type == "float32":
-        return rows[scene.material_index]
-    with np.errstate(over="ignore"):
-        half = rows.astype(np.float16)
-    lit = half[:, _EMISSION]
-    if not np.isfinite(lit).all() or (lit.any(axis=1) != emits).any():
-        bad = rows[~np.isfinite(lit).all(axis=1) | (lit.any(axis=1) != emits)][0]
-        raise TrilightError(
-            f"emission is {bad[_EMISSION]}; half floats hold 6e-8 to {HALF_FLOAT_MAX:.0f}. "
-            "Write float32 textures."
-        )
-    total = half[:, DIFFUSE].astype(np.float32) + half[:, SPECULAR]
-    over = np.tile(total > 1, (1, 2))
-    albedos = slice(DIFFUSE.start, SPECULAR.stop)
-    lower = np.nextafter(half[:, albedos], np.float16(0))
-    rises = half[:, albedos] > rows[:, albedos]
-    half[:, albedos] = np.where(over & rises, lower, half[:, albedos])
-    return half[scene.material_index]
+    return rows[scene.material_index]
 
 
 def _write(file: Any, name: str, values: NDArray) -> None:
     file.create_dataset(name, data=values, compression="gzip", compression_opts=GZIP_LEVEL)
 
 
-def _write_texture(file: Any, rows: NDArray[np.floating], scene: Scene) -> None:
+def _write_texture(file: Any, rows: NDArray[np.float32], scene: Scene) -> None:
     """Write textures in blocks of triangles; in memory each triangle takes 53 kB."""
     textured = textured_triangles(scene)
     shape = (len(rows), CHANNELS, CELLS, CELLS)
