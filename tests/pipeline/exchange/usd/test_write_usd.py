@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -84,14 +84,12 @@ def test_validators_would_see_a_mistake(tmp_path: Path) -> None:
 
 @for_each("suffix", SUFFIXES)
 def test_there_and_back_is_exact_and_valid(tmp_path: Path, suffix: str) -> None:
-    scene = odd_scene()
-    path = tmp_path / f"a{suffix}"
-    assert errors_of(written(tmp_path, scene, path.name)) == []
-    back = read_usd(path, None, None, "")
-    assert back.notes == () and encode_scene(back.scene) == encode_scene(scene)
+    assert_usd_keeps_all(odd_scene(), tmp_path, suffix)
+    path = tmp_path / f"again{suffix}"
+    before = path.read_bytes()
     assert usd_keys(path) == [""]
-    write_usd(tmp_path / f"b{suffix}", back.scene)
-    assert (tmp_path / f"b{suffix}").read_bytes() == path.read_bytes()
+    assert_usd_keeps_all(read_usd(path, None, None, "").scene, tmp_path, suffix)
+    assert path.read_bytes() == before
 
 
 @st.composite
@@ -226,7 +224,10 @@ def test_an_emitter_is_a_light_and_glows_on_both_sides(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_shard_shows_one_scene_at_a_time(tmp_path: Path, suffix: str) -> None:
-    kept = {"000000001": tiny_scene(), "000000007": odd_scene()}
+    scenes = [tiny_scene(), odd_scene(), bumpy_scene()]
+    scenes += [tiny_scene(environment=sky) for sky in (smooth(), None, smooth(is_seen=True))]
+    scenes += [textured_scene(seed) for seed in (0, 1, 0)]
+    kept = {f"{row:09d}": scene for row, scene in enumerate(scenes, 1)}
     write_usd_shard(tmp_path / f"s{suffix}", kept.items())
     stage = Usd.Stage.Open(str(tmp_path / f"s{suffix}"))
     assert errors_of(stage) == []
@@ -237,40 +238,42 @@ def test_a_shard_shows_one_scene_at_a_time(tmp_path: Path, suffix: str) -> None:
         found = read_usd(tmp_path / f"s{suffix}", key, None, "")
         assert encode_scene(found.scene) == encode_scene(scene)
     assert usd_keys(tmp_path / f"s{suffix}") == list(kept)
-    with pytest.raises(TrilightError, match="no scene 000000003; expected one of 000000001"):
-        read_usd(tmp_path / f"s{suffix}", "000000003", None, "")
+    if suffix != ".usdz":  # one content, one file
+        assert len(list(tmp_path.glob("sky-*.exr"))) == 1
+        assert len(list(tmp_path.glob("texture-*.png"))) == 3
+    with pytest.raises(TrilightError, match="no scene 000000033; expected one of 000000001"):
+        read_usd(tmp_path / f"s{suffix}", "000000033", None, "")
 
 
-def edits() -> Iterable[tuple[str, str, Any]]:
-    yield "/Scene/Objects/floor.points", "default", [(0, 0, 0)] * 4
-    yield "/Scene/Materials/material_0/Preview.inputs:diffuseColor", "default", (0.1, 0.1, 0.1)
-    yield "/Scene/Materials/material_0/OpenPBR.inputs:base_color", "default", (0.1, 0.1, 0.1)
-    yield "/Scene/Objects/light.inputs:intensity", "default", 3.0
-    yield "/Scene/Cameras/camera_0.focalLength", "default", 3.0
-    yield "/Scene/Objects/floor", "active", False
-    yield "/Scene/Objects/floor", "instanceable", True
+def set_default(path: str, value: Any) -> Callable[[Any], None]:
+    return lambda layer: setattr(layer.GetObjectAtPath(path), "default", value)
 
 
-@for_each("path, field, value", edits())
-def test_what_was_changed_is_no_longer_ours(
-    tmp_path: Path, path: str, field: str, value: Any
+def add_light(layer: Any) -> None:
+    UsdLux.SphereLight.Define(Usd.Stage.Open(layer), "/Scene/Objects/more")
+
+
+@for_each(
+    "edit",
+    [
+        set_default("/Scene/Objects/floor.points", [(0, 0, 0)] * 4),
+        set_default("/Scene/Materials/material_0/Preview.inputs:diffuseColor", (0.1, 0.1, 0.1)),
+        set_default("/Scene/Materials/material_0/OpenPBR.inputs:base_color", (0.1, 0.1, 0.1)),
+        set_default("/Scene/Objects/light.inputs:intensity", 3.0),
+        set_default("/Scene/Cameras/camera_0.focalLength", 3.0),
+        lambda layer: layer.GetObjectAtPath("/Scene/Objects/floor").SetInfo("active", False),
+        lambda layer: layer.GetObjectAtPath("/Scene/Objects/floor").SetInfo("instanceable", True),
+        add_light,
+    ],
+)
+def test_what_was_changed_or_added_is_no_longer_ours(
+    tmp_path: Path, edit: Callable[[Any], None]
 ) -> None:
     write_usd(tmp_path / "a.usda", tiny_scene())
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "a.usda"))
-    spec = layer.GetObjectAtPath(path)
-    if field == "default":
-        spec.default = value
-    else:
-        spec.SetInfo(field, value)
+    edit(layer)
     layer.Export(str(tmp_path / "b.usda"))
     assert read_usd(tmp_path / "b.usda", None, None, "").notes
-
-
-def test_what_was_added_is_no_longer_ours(tmp_path: Path) -> None:
-    stage = written(tmp_path, tiny_scene())
-    UsdLux.SphereLight.Define(stage, "/Scene/Objects/more")
-    stage.Save()
-    assert read_usd(tmp_path / "a.usdc", None, None, "").notes
 
 
 @pytest.mark.parametrize(
@@ -301,18 +304,6 @@ def _read(path: Path) -> LoadedScene:
 def _sky(scene: Scene) -> Environment:
     assert scene.environment is not None
     return scene.environment
-
-
-def test_scenes_of_a_shard_keep_their_skies_and_textures(tmp_path: Path) -> None:
-    scenes = [tiny_scene(environment=sky) for sky in (smooth(), None, smooth(is_seen=True))]
-    scenes += [textured_scene(seed) for seed in (0, 1, 0)]
-    scenes += [bumpy_scene()]
-    path = tmp_path / "many.usdc"
-    write_usd_shard(path, ((f"k{row}", scene) for row, scene in enumerate(scenes)))
-    assert len(list(tmp_path.glob("sky-*.exr"))) == 1  # one content, one file
-    assert len(list(tmp_path.glob("texture-*.png"))) == 3
-    for row, scene in enumerate(scenes):
-        assert encode_scene(read_usd(path, f"k{row}", None, "").scene) == encode_scene(scene)
 
 
 def test_a_normal_map_is_an_input_that_usd_defines(tmp_path: Path) -> None:
@@ -464,8 +455,6 @@ def test_textures_and_skies_come_back_bit_for_bit(tmp_path: Path, suffix: str) -
     scenes += [tiny_scene(environment=each) for each in skies]
     for folder, scene in with_folders(tmp_path, scenes):
         assert_usd_keeps_all(scene, folder, suffix)
-        found = _read(folder / f"again{suffix}").scene
-        assert scene_digest(found) == scene_digest(scene)
         before = (folder / f"again{suffix}").read_bytes()
         write_usd(folder / f"again{suffix}", scene)
         assert (folder / f"again{suffix}").read_bytes() == before
