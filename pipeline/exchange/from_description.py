@@ -194,17 +194,6 @@ def scene_from_description(
     return scene
 
 
-def place_mesh(mesh: LoadedMesh, described: DescribedObject) -> NDArray[np.float32]:
-    """Return the vertices [V, 3] of a mesh in world space."""
-    transform = described.transform
-    points = mesh.positions
-    if transform.normalize:
-        points = (points - mesh.centre) / (2 * mesh.reach)
-    rotated = rotate_points(points, rotation_xyz(transform.rotation_deg))
-    world = rotated * np.array(transform.scale) + np.array(transform.translation)
-    return world.astype(np.float32)
-
-
 def scaled_albedo_notes(scene: Scene) -> tuple[str, ...]:
     """Return a sentence for each object that became darker than its file states."""
     return tuple(
@@ -219,8 +208,14 @@ def _pieces(
 ) -> tuple[list[ScenePiece], float]:
     """Return the pieces of an object, and the least factor of its materials."""
     material = described.material
-    positions = place_mesh(mesh, described)
-    mirrored = np.prod(described.transform.scale) < 0
+    transform = described.transform
+    points = mesh.positions
+    if transform.normalize:
+        points = (points - mesh.centre) / (2 * mesh.reach)
+    rotated = rotate_points(points, rotation_xyz(transform.rotation_deg))
+    world = rotated * np.array(transform.scale) + np.array(transform.translation)
+    positions = world.astype(np.float32)
+    mirrored = np.prod(transform.scale) < 0
     faces = (mesh.faces[:, ::-1] if mirrored else mesh.faces).astype(np.uint32)
     faces = without_slivers(positions, faces)
     if len(faces) == 0:
@@ -270,20 +265,18 @@ def build_cameras(
     cameras: Sequence[DescribedCamera],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return poses [C, 4, 4] and full angles [C] in degrees; raises TrilightError."""
-    poses = [_pose(camera, at) for at, camera in enumerate(cameras)]
+    poses = []
+    for row, camera in enumerate(cameras):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            c2w = look_at_c2w(eye=camera.position, target=camera.look_at, up=camera.up)
+        if not np.isfinite(c2w).all():
+            raise TrilightError(
+                f"cameras[{row}] looks from {camera.position} at {camera.look_at} with up "
+                f"{camera.up}; expected a distance, and an up that is not along the view."
+            )
+        poses.append(c2w)
     angles = np.array([camera.fov_deg for camera in cameras], np.float32)
     return np.array(poses, np.float32).reshape(-1, 4, 4), angles
-
-
-def _pose(camera: DescribedCamera, row: int) -> NDArray[np.float64]:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        c2w = look_at_c2w(eye=camera.position, target=camera.look_at, up=camera.up)
-    if not np.isfinite(c2w).all():
-        raise TrilightError(
-            f"cameras[{row}] looks from {camera.position} at {camera.look_at} with up "
-            f"{camera.up}; expected a distance, and an up that is not along the view."
-        )
-    return c2w
 
 
 def require_at_most(counts: Mapping[str, tuple[int, int]]) -> None:

@@ -108,17 +108,9 @@ def build_scene(
 ) -> tuple[Scene, Mapping[str, str]]:
     """Build the scene of one file; only child processes call this, since it reads meshes.
 
-    Args:
-        root: the folder, with links resolved; `name` is the scene file in it.
-        settings: limits on meshes.
-        licence: licence of the objects.
-        num_views: number of cameras to take from the file; None for all.
-        scene_index, seed: of the dataset; recorded in the provenance only.
-        albedo_over_one: treatment of albedos that add up to more than 1.
-        notes: receives a sentence for each ignored part of a mesh file.
-
-    Returns:
-        The scene, and the sha256 of each of its files by path below `root`.
+    `num_views` cameras are taken, or all; index and seed stand in the provenance only. `notes`
+    receives a sentence for each ignored part of a mesh file. The scene comes with the sha256 of
+    each of its files by path below `root`, a folder whose links are resolved.
 
     Raises:
         TrilightError: the file or a mesh is unusable; the message names it.

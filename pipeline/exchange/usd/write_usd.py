@@ -113,11 +113,13 @@ def _add_scene(layer: Any, path: str, scene: Scene) -> dict[str, bytes]:
     """Write a scene into a layer; return its texture and map files by name."""
     scene.check()
     scene = without_constant_textures(scene)
-    for entry in scene.objects:
-        _require_text(entry.name, entry.uid, entry.licence, entry.attribution, entry.source_url)
-    for texture in scene.textures:
-        source = texture.source
-        _require_text(source.name, source.licence, source.attribution, source.source_url)
+    records: list[tuple[Any, dict[str, str]]] = [
+        (entry, names.OBJECT_TEXTS) for entry in scene.objects
+    ]
+    records += [(texture.source, names.MAP_TEXTS) for texture in scene.textures]
+    for text in (getattr(record, field) for record, fields in records for field in fields):
+        if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
+            raise TrilightError(f"names: {text!r:.80} has a character that USD cannot store.")
     author_scene(layer, path, scene)
     return texture_files(scene) | _map_files(scene.environment)
 
@@ -136,12 +138,6 @@ def author_scene(layer: Any, path: str, scene: Scene) -> Any:
             dome = add_prim(layer, f"{path}/{ENVIRONMENT}", "DomeLight")
             add_attributes(dome, _dome_attributes(scene.environment))
     return root
-
-
-def _require_text(*texts: str) -> None:
-    for text in texts:
-        if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
-            raise TrilightError(f"names: {text!r:.80} has a character that USD cannot store.")
 
 
 def _new_layer(path: Path, root: str) -> Any:
