@@ -325,21 +325,21 @@ def _choose_tiles(
 ) -> tuple[range, bool]:
     """Return the tiles of one material's pictures along an axis, and whether they suffice.
 
-    One tile where all pictures repeat, no coordinate leaves [0, 1], or too many would be needed.
+    One tile where all pictures repeat, no coordinate leaves [0, 1], or too many would be tiles.
     `at` has the coordinates of all corners along the axis, 0 for u and 1 for v.
     """
     most_texels = max(picture.values.shape[1 - axis] for picture in pictures)
     low, high = (float(at.min()), float(at.max())) if at.size else (0.0, 1.0)
     modes = {picture.wrap[axis] for picture in pictures} - {"repeat"}
     if not modes or (low >= -_INSIDE and high <= 1 + _INSIDE):
-        needed = range(1)
+        tiles = range(1)
     elif modes == {"mirror"}:
-        needed = range(2)
+        tiles = range(2)
     else:
-        needed = range(int(np.floor(low)), int(np.ceil(high)))
-    if len(needed) <= _MAX_TILES and len(needed) * most_texels <= MAX_RESOLUTION:
-        return needed, True
-    return range(1), len(needed) == 1
+        tiles = range(int(np.floor(low)), int(np.ceil(high)))
+    if len(tiles) <= _MAX_TILES and len(tiles) * most_texels <= MAX_RESOLUTION:
+        return tiles, True
+    return range(1), len(tiles) == 1
 
 
 def _expand_tiles(values: NDArray, wrap: Wrap, tiles: range, axis: int) -> NDArray:

@@ -123,11 +123,7 @@ Packed = TypeVar("Packed")
 
 
 def unpacking_figures(samples: Sequence[Sample], layout: str, work: Path) -> Mapping[str, float]:
-    """Unpack samples of one of LAYOUTS in memory, in one thread.
-
-    Returns:
-        Mean bytes of a sample before and after, and mean CPU milliseconds.
-    """
+    """Return mean bytes before and after, and CPU milliseconds, of unpacking samples in memory."""
     if layout in TEXTURES:
         files = [_h5_bytes(sample, work, TEXTURES[layout]) for sample in samples]
         return _time_unpacking(files, _unpacked_h5, len)
@@ -147,8 +143,7 @@ def _h5_bytes(sample: Sample, work: Path, texture_type: str) -> bytes:
     stream = io.BytesIO()
     with h5py.File(work / "scene.h5") as source, h5py.File(stream, "w") as file:
         for name, array in source.items():
-            kind = texture_type if name == "texture" else array.dtype
-            data = array[()].astype(kind)
+            data = array[()].astype(texture_type if name == "texture" else array.dtype)
             file.create_dataset(name, data=data, compression="gzip", compression_opts=9)
     return stream.getvalue()
 
