@@ -325,7 +325,7 @@ def _choose_tiles(
 ) -> tuple[range, bool]:
     """Return the tiles of one material's pictures along an axis, and whether they suffice.
 
-    One tile where all pictures repeat, no coordinate leaves [0, 1], or too many would be tiles.
+    One tile where all pictures repeat, no coordinate leaves [0, 1], or too many would be needed.
     `at` has the coordinates of all corners along the axis, 0 for u and 1 for v.
     """
     most_texels = max(picture.values.shape[1 - axis] for picture in pictures)

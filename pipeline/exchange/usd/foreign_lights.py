@@ -237,16 +237,16 @@ def _take_held(sky: Environment, dome: Any, time: Any) -> Environment:
     if holder is None:
         return sky
 
-    def stated(name: str) -> Any:
+    def read_value(name: str) -> Any:
         return holder.GetAttribute(name).Get(time)
 
-    held = names.parse_map_text(stated(names.SKY_SOURCE))
+    held = names.parse_map_text(read_value(names.SKY_SOURCE))
     if held is None or held[0] != sky.sha256:
         return sky
     sky = dataclasses.replace(sky, source=held[1])
     if not dome.HasAttribute(names.VISIBLE_TO_CAMERA):
-        sky = dataclasses.replace(sky, is_seen=bool(stated(names.SKY_VISIBLE)))
-    rows = list(map(stated, names.SKY_ROWS))
+        sky = dataclasses.replace(sky, is_seen=bool(read_value(names.SKY_VISIBLE)))
+    rows = list(map(read_value, names.SKY_ROWS))
     if None in rows or not np.allclose(rows, sky.rotation, atol=_SAME_ROTATION):
         return sky
     return dataclasses.replace(sky, rotation=np.array(rows, np.float32))
