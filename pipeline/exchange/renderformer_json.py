@@ -32,7 +32,7 @@ from pipeline.exchange.from_description import (
     SceneDescription,
     require_at_most,
 )
-from pipeline.exchange.textured_triangles import group_triangles
+from pipeline.exchange.textured_triangles import group_triangles, unique_name
 from pipeline.foreign.numbers import Malformed
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading_normals import face_normals, smooth_shaded
@@ -310,11 +310,12 @@ def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
     lost: list[str] = []
     meshes: dict[str, bytes] = {}
     objects: dict[str, Any] = {}
-    taken: set[str] = set()
+    taken: dict[str, int] = {}
     for row, material, faces in group_triangles(scene):
         if len(without_slivers(scene.vertex_positions, scene.faces[faces])) == 0:
             continue  # readers refuse a mesh without an area
-        name = _unique(_name(scene, row, material), taken)
+        # it becomes the name of a file, whose case some systems ignore
+        name = unique_name(_name(scene, row, material), taken, str.casefold)
         normals = scene.vertex_normals[scene.faces[faces]]
         path = _mesh_path(scene, row, material, stem)
         meshes[path] = _obj(scene, faces)
@@ -352,17 +353,6 @@ def _name(scene: Scene, row: int, material: int) -> str:
 def _printable(text: str) -> str:
     legal = (c if c.isprintable() and c not in _NO_FILE_LETTERS else "_" for c in text)
     return "".join(legal)[:_NAME_LETTERS]
-
-
-def _unique(name: str, taken: set[str]) -> str:
-    """Return an unused name, ignoring case, since it becomes the name of a file."""
-    candidate = name
-    count = 1
-    while candidate.casefold() in taken:
-        count += 1
-        candidate = f"{name}.{count}"
-    taken.add(candidate.casefold())
-    return candidate
 
 
 def _mesh_path(scene: Scene, row: int, material: int, stem: str) -> str:

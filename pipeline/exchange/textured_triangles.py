@@ -7,7 +7,7 @@ and equal materials one row. Textures of one color become constants.
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -232,7 +232,9 @@ class SceneParts:
         for kind, mask in kinds:
             if not mask.any():
                 continue
-            unique = dataclasses.replace(entry, name=self._make_unique(entry.name), kind=kind)
+            unique = dataclasses.replace(
+                entry, name=unique_name(entry.name, self._names), kind=kind
+            )
             piece = _build_piece(unique, triangles.select(mask))
             self._pieces.append(piece)
             self._surfaces += [] if is_lamp else [piece]
@@ -301,12 +303,14 @@ class SceneParts:
         rows = np.array(index, np.int32).reshape(-1, len(TEXTURED))
         return with_textures(scene, uv, tuple(textures.values()), rows)
 
-    def _make_unique(self, base: str) -> str:
-        count = self._names.get(base, 0) + 1
-        name = base if count == 1 else f"{base}.{count}"
-        while count > 1 and name in self._names:
-            count += 1
-            name = f"{base}.{count}"
-        self._names[base] = count
-        self._names.setdefault(name, 1)
-        return name
+
+def unique_name(base: str, counts: dict[str, int], key: Callable[[str], str] = str) -> str:
+    """Return an unused name: the base, or with `.2` and so on; `counts` holds keys of all names."""
+    count = counts.get(key(base), 0) + 1
+    name = base if count == 1 else f"{base}.{count}"
+    while count > 1 and key(name) in counts:
+        count += 1
+        name = f"{base}.{count}"
+    counts[key(base)] = count
+    counts.setdefault(key(name), 1)
+    return name
