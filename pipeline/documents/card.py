@@ -64,7 +64,8 @@ def encode_card(
         states_expected=summary(distributions.all("expected_error_db"))["count"] > 0,
         layouts=layouts,
         triangles=summary(distributions.all("triangles_per_scene")),
-        maps=_maps(distributions),
+        num_scenes=sum(distributions.scenes.values()),
+        families=Counter(kind for kind, _ in distributions.maps),
         user_maps=_user_maps(distributions),
         derivation=derivation_of(manifest.settings),
         settings=[(label, value) for label, value in settings if value is not None],
@@ -138,36 +139,6 @@ def _probably(distributions: Distributions, split: str) -> str:
     """Return the median of the expected errors of a split behind a comma; empty without one."""
     expected = summary(distributions.values[split]["expected_error_db"])
     return f", probably {expected['median']:.1f}" if expected["count"] else ""
-
-
-def _maps(distributions: Distributions) -> list[tuple[str, str]]:
-    """Return a row for textures and one for skies, if there are any."""
-    scenes = sum(distributions.scenes.values())
-    textures = distributions.all("textures_per_scene")
-    skies = distributions.all("skies_per_scene")
-    families = Counter(kind for kind, _ in distributions.maps)
-    rows = []
-    if (textures > 0).any():
-        words = (
-            f"{int((textures > 0).sum())} of {scenes} scenes, {int(textures.sum())} maps of "
-            f"{families['texture']} families, {_range(distributions, 'texture_width', 0)} texels "
-            "wide"
-        )
-        rows.append(("textures", words))
-    if (skies > 0).any():
-        words = (
-            f"{int((skies > 0).sum())} of {scenes} scenes, {families['sky']} families, mean "
-            f"radiance {_range(distributions, 'sky_radiance', 2)}; half of the light of one comes "
-            f"from {_range(distributions, 'sky_half_light_deg', 1)} degrees"
-        )
-        rows.append(("skies", words))
-    return rows
-
-
-def _range(distributions: Distributions, name: str, digits: int) -> str:
-    values = distributions.all(name)
-    low, high = (f"{value:.{digits}f}" for value in (values.min(), values.max()))
-    return low if low == high else f"{low} to {high}"
 
 
 def _user_maps(distributions: Distributions) -> list[tuple[str, int, int]]:
