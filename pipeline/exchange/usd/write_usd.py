@@ -2,7 +2,7 @@
 
 Stages are Z up, in meters, with a default prim; textures and an environment map are files next to
 the stage, or in the archive. Equal scenes give equal bytes.
-`prim_names` lists the paths; `read_exact_scene` reads them.
+`prim_names` lists the paths; `read_usd` reads them.
 A camera has a pose and a lens, in tenths of a meter, on a square film of 36 mm. A `.usdz` file is a
 zip archive of uncompressed members that begin at multiples of 64 bytes.
 
