@@ -13,14 +13,16 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.exchange.description import (
+from pipeline.exchange.from_description import (
+    SHELL_FOLDER,
     DescribedCamera,
     DescribedObject,
     DescribedTransform,
+    LoadedMesh,
     SceneDescription,
     Vector,
+    scene_from_description,
 )
-from pipeline.exchange.from_description import SHELL_FOLDER, LoadedMesh, scene_from_description
 from pipeline.exchange.reader import SceneReader
 from pipeline.objects.generated import builtin_mesh
 from pipeline.objects.licences import USER_PROVIDED

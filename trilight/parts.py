@@ -5,8 +5,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.exchange.description import DescribedMaterial, Vector
-from pipeline.exchange.from_description import LoadedMesh
+from pipeline.exchange.from_description import DescribedMaterial, LoadedMesh, Vector
 from storage.errors import TrilightError
 from storage.settings.described import checked
 from storage.settings.ranges import FLOAT32_MAX, Within

@@ -9,7 +9,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from pipeline.documents.distributions import MEASURED, Distributions
+from pipeline.documents.distributions import MEASURED, Distributions, setting
 from pipeline.documents.pages import render_markdown
 from pipeline.documents.rights import Rights, hub_licence, licence_facts
 from storage.dataset.derived import derivation_of
@@ -50,7 +50,7 @@ def encode_card(
     layouts = Counter[str]()
     for (template, _), count in sorted(distributions.scenes.items()):
         layouts[template] += count
-    settings = [(label, _setting(manifest.settings, name)) for label, name in _SETTINGS]
+    settings = [(label, setting(manifest.settings, name)) for label, name in _SETTINGS]
     settings += [(label, manifest.environment.get(name)) for label, name in _ENVIRONMENT]
     return render_markdown(
         "card.jinja",
@@ -59,12 +59,13 @@ def encode_card(
         folder=folder,
         manifest=manifest,
         found=distributions,
-        resolution=_setting(manifest.settings, "renders.resolution"),
+        resolution=setting(manifest.settings, "renders.resolution"),
         splits=_by_split(manifest, distributions),
         states_expected=summary(distributions.all("expected_error_db"))["count"] > 0,
         layouts=layouts,
         triangles=summary(distributions.all("triangles_per_scene")),
-        maps=_maps(distributions),
+        num_scenes=sum(distributions.scenes.values()),
+        families=Counter(kind for kind, _ in distributions.maps),
         user_maps=_user_maps(distributions),
         derivation=derivation_of(manifest.settings),
         settings=[(label, value) for label, value in settings if value is not None],
@@ -140,36 +141,6 @@ def _probably(distributions: Distributions, split: str) -> str:
     return f", probably {expected['median']:.1f}" if expected["count"] else ""
 
 
-def _maps(distributions: Distributions) -> list[tuple[str, str]]:
-    """Return a row for textures and one for skies, if there are any."""
-    scenes = sum(distributions.scenes.values())
-    textures = distributions.all("textures_per_scene")
-    skies = distributions.all("skies_per_scene")
-    families = Counter(kind for kind, _ in distributions.maps)
-    rows = []
-    if (textures > 0).any():
-        words = (
-            f"{int((textures > 0).sum())} of {scenes} scenes, {int(textures.sum())} maps of "
-            f"{families['texture']} families, {_range(distributions, 'texture_width', 0)} texels "
-            "wide"
-        )
-        rows.append(("textures", words))
-    if (skies > 0).any():
-        words = (
-            f"{int((skies > 0).sum())} of {scenes} scenes, {families['sky']} families, mean "
-            f"radiance {_range(distributions, 'sky_radiance', 2)}; half of the light of one comes "
-            f"from {_range(distributions, 'sky_half_light_deg', 1)} degrees"
-        )
-        rows.append(("skies", words))
-    return rows
-
-
-def _range(distributions: Distributions, name: str, digits: int) -> str:
-    values = distributions.all(name)
-    low, high = (f"{value:.{digits}f}" for value in (values.min(), values.max()))
-    return low if low == high else f"{low} to {high}"
-
-
 def _user_maps(distributions: Distributions) -> list[tuple[str, int, int]]:
     """Return how many of the user's textures and of the maps there are and are used, if any."""
     rows = []
@@ -184,11 +155,3 @@ def _arrays(packings: Collection[str]) -> list[str]:
     """Return expressions for a sample's arrays; a merged dataset may have both packings."""
     *rest, last = sorted(packings) or [PLAIN]
     return [*(f'sample.get("{packing}")' for packing in rest), f'sample["{last}"]']
-
-
-def _setting(settings: Mapping[str, Any], name: str) -> Any:
-    """Return a setting by its dotted name; None if the manifest lacks it."""
-    value: Any = settings
-    for part in name.split("."):
-        value = value.get(part) if isinstance(value, Mapping) else None
-    return value

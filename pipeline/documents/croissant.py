@@ -77,31 +77,33 @@ MOST_LISTED = 10_000
 
 
 def _distribution(shards: list[ShardEntry]) -> list[dict[str, Any]]:
-    if len(shards) <= MOST_LISTED:
-        return [*map(_shard, shards), *_file_sets([shard.name for shard in shards])]
-    every = _node(
-        "cr:FileSet",
-        "shards",
-        description="manifest.json has the size and sha256 of each",
-        encodingFormat="application/x-tar",
-        includes="**/*.tar",
-    )
-    return [every, *_file_sets(["shards"])]
+    if len(shards) > MOST_LISTED:
+        files = [
+            _node(
+                "cr:FileSet",
+                "shards",
+                description="manifest.json has the size and sha256 of each",
+                encodingFormat="application/x-tar",
+                includes="**/*.tar",
+            )
+        ]
+    else:
+        files = [
+            _node(
+                "cr:FileObject",
+                shard.name,
+                contentUrl=shard.name,
+                contentSize=f"{shard.num_bytes} B",
+                encodingFormat="application/x-tar",
+                sha256=shard.sha256,
+            )
+            for shard in shards
+        ]
+    return [*files, *_file_sets([file["name"] for file in files])]
 
 
 def _node(kind: str, name: str, **fields: Any) -> dict[str, Any]:
     return {"@type": kind, "@id": name, "name": name, **fields}
-
-
-def _shard(shard: ShardEntry) -> dict[str, Any]:
-    return _node(
-        "cr:FileObject",
-        shard.name,
-        contentUrl=shard.name,
-        contentSize=f"{shard.num_bytes} B",
-        encodingFormat="application/x-tar",
-        sha256=shard.sha256,
-    )
 
 
 def _file_sets(archives: Sequence[str]) -> list[dict[str, Any]]:

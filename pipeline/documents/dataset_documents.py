@@ -2,13 +2,12 @@
 
 import dataclasses
 
-from pipeline.documents.attribution import attribution_of
 from pipeline.documents.card import encode_card
 from pipeline.documents.checksums import renew_sums
 from pipeline.documents.croissant import encode_croissant
 from pipeline.documents.distributions import dataset_distributions
 from pipeline.documents.report import write_report
-from pipeline.documents.rights import encode_licences, rights_of
+from pipeline.documents.rights import attribution_of, encode_licences, rights_of
 from pipeline.documents.sheets import write_contact_sheet
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
-from storage.dataset.manifest import Manifest
 from storage.dataset.statistics import described_shards, of_how_many
 from storage.errors import TrilightError
 from storage.records.objects import OBJECT, Failure, LockedObject, locked_uids
@@ -172,6 +171,13 @@ MEASURED = {
 """Measured quantity of a view, by the name of its target in the settings of renders."""
 
 
+_TARGETS = {
+    "max_triangles": "scenes",
+    **dict.fromkeys((*MEASURED, "min_spp", "max_spp"), "renders"),
+}
+"""Group of settings of each target; a derived dataset may lack one."""
+
+
 def dataset_distributions(
     dataset: Dataset, *, shard_done: Callable[[str], None] = lambda name: None
 ) -> Distributions:
@@ -191,7 +197,11 @@ def dataset_distributions(
         objects=[entry for entry in locked if entry.kind == OBJECT],
         user_maps=[entry for entry in locked if entry.kind != OBJECT],
         failures=dataset.failures(),
-        targets=_targets(dataset.manifest),
+        targets={
+            name: value if isinstance(value, int | float) else None
+            for name, group in _TARGETS.items()
+            for value in [setting(dataset.manifest.settings, f"{group}.{name}")]
+        },
     )
     chunks: dict[str, list[Mapping[str, Values]]] = {}
     for shard in described_shards(dataset):
@@ -216,13 +226,9 @@ def _concatenate(rows: Sequence[Mapping[str, Values]]) -> Mapping[str, Values]:
     return {name: np.concatenate([row[name] for row in rows]) for name in QUANTITIES}
 
 
-def _targets(manifest: Manifest) -> dict[str, float | None]:
-    """Return the target values of the settings; a derived dataset may lack them."""
-    places = {"max_triangles": "scenes"}
-    places |= dict.fromkeys((*MEASURED, "min_spp", "max_spp"), "renders")
-    targets: dict[str, float | None] = {}
-    for name, group in places.items():
-        settings = manifest.settings.get(group)
-        value = settings.get(name) if isinstance(settings, Mapping) else None
-        targets[name] = value if isinstance(value, int | float) else None
-    return targets
+def setting(settings: Mapping[str, Any], name: str) -> Any:
+    """Return a setting of a manifest by its dotted name; None if the manifest lacks it."""
+    value: Any = settings
+    for part in name.split("."):
+        value = value.get(part) if isinstance(value, Mapping) else None
+    return value

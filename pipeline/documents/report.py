@@ -1,22 +1,26 @@
-"""`report.html`: a gallery of a dataset and its distributions.
+"""`report.html`: a gallery of a dataset, figures of its distributions and tables of numbers.
 
 The report is one file; the pages of the gallery are in `report/`. It holds no time and no machine:
 equal datasets give equal reports.
 """
 
 import json
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
-from pipeline.documents.distributions import MEASURED, Distributions
+import numpy as np
+
+from pipeline.documents.distributions import MEASURED, SURFACE_COUNTS, Distributions
+from pipeline.documents.figures import Panel, draw_bars, draw_panels
 from pipeline.documents.gallery import gallery_filters, write_gallery
-from pipeline.documents.pages import render_page
-from pipeline.documents.report_sections import report_sections
+from pipeline.documents.pages import data_uri, render_page
 from pipeline.documents.scene_passes import passes_command
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
-from storage.records.quantities import QUANTITIES, summary
+from storage.records.quantities import QUANTITIES, STATISTICS, summary
 
 _MOST_USED = 20
 
@@ -30,9 +34,8 @@ def write_report(
 ) -> Path:
     """Write `report.html` and the pages of its gallery, and return the path of the former.
 
-    Args:
-        max_scenes: most scenes in the gallery, up to 1000; they are spread over splits and shards.
-        out: folder to write into; None for the dataset's folder.
+    The gallery has up to `max_scenes` scenes, at most 1000, spread over splits and shards. `out` is
+    the folder to write into; None stands for the dataset's.
 
     Raises:
         TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.
@@ -96,3 +99,245 @@ def _lines(values: Mapping[str, object], prefix: str = "") -> Iterator[str]:
             yield from _lines(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}: {json.dumps(value, sort_keys=True)}"
+
+
+_MOST_BARS = 20
+"""Most bars of a figure; the table has all."""
+_ATTEMPTS = {
+    "first attempt": (0, 0),
+    "second": (1, 1),
+    "third, fourth": (2, 3),
+    "later": (4, math.inf),
+}
+"""First and last attempt by column."""
+_LIMITS = {
+    "triangles_per_scene": ("budget", "max_triangles"),
+    "spp": ("cap", "max_spp"),
+    **{measured: ("target", name) for name, measured in MEASURED.items()},
+}
+"""Word and setting of the line in a histogram, by quantity."""
+_SKY = ("sky_radiance", "sky_peak", "sky_half_light_deg")
+_KINDS = {"object": "objects", "shell": "floors and walls"}
+
+
+class Table(NamedTuple):
+    """Table whose last columns are numbers."""
+
+    texts: Sequence[str]
+    """Heads of the columns of text."""
+    numbers: Sequence[str]
+    """Heads of the columns of numbers."""
+    rows: Sequence[Sequence[object]]
+
+
+class ReportPart(NamedTuple):
+    """Figure with tables and notes beside it."""
+
+    figure: str
+    """Data URI; empty for none."""
+    alt: str
+    tables: Sequence[Table]
+    notes: Sequence[str] = ()
+
+
+def report_sections(distributions: Distributions) -> dict[str, list[ReportPart]]:
+    """Return the parts below each title; none without scenes, and without maps none on maps."""
+    if not distributions.scenes:
+        return {}
+    triangles = ("triangles_per_scene", "triangles_per_object")
+    emitted = ("lights_per_scene", "total_emission", "light_distance", "light_size")
+    seen_from = ("camera_distance", "elevation_deg", "fov_deg", "azimuth_deg")
+    measured = (*MEASURED.values(), "spp", "coverage")
+    replaced = int((distributions.all("camera_attempt") > 0).sum())
+    note = f"{replaced} cameras stand in for rejected ones."
+    floors = _floors_by_split(distributions)
+    maps = [_maps(distributions), _map_sizes(distributions)] if distributions.maps else []
+    return {
+        "Scenes": [_scenes(distributions)],
+        "Objects": [_objects(distributions)],
+        "Triangles": [_histograms(distributions, triangles)],
+        "Materials": [_materials(distributions)],
+        **({"Textures and skies": maps} if maps else {}),
+        "Lights": [_histograms(distributions, emitted)],
+        "Cameras": [_histograms(distributions, seen_from, notes=[note])],
+        "Pictures": [_histograms(distributions, measured, tables=[floors])],
+        "Rejections": [_rejections(distributions)],
+        "Licenses": [_licences(distributions)],
+    }
+
+
+def _histograms(
+    distributions: Distributions,
+    names: Sequence[str],
+    *,
+    more: Sequence[Panel] = (),
+    tables: Sequence[Table] = (),
+    notes: Sequence[str] = (),
+) -> ReportPart:
+    """Return histograms of quantities, and of whole numbers in `more`, with their statistics."""
+    panels = [*(_panel(distributions, name) for name in names), *more]
+    digits = [*(QUANTITIES[name].digits for name in names), *(0 for _ in more)]
+    rows = [
+        [panel.label, *(_statistic(summary(panel.values), name, places) for name in STATISTICS)]
+        for panel, places in zip(panels, digits, strict=True)
+    ]
+    alt = ", ".join(panel.label for panel in panels)
+    figure = data_uri(draw_panels(panels))
+    return ReportPart(figure, alt, [Table([""], STATISTICS, rows), *tables], notes)
+
+
+def _panel(distributions: Distributions, name: str) -> Panel:
+    quantity = QUANTITIES[name]
+    word, setting = _LIMITS.get(name, ("", ""))
+    limit = distributions.targets[setting] if setting else None
+    return Panel(
+        values=distributions.all(name),
+        label=quantity.label,
+        unit={"sky": "skies"}.get(quantity.per, f"{quantity.per}s"),
+        marks={} if limit is None else {f"{word} {limit:g}": limit},
+        bounds=(0, 1) if quantity.per == "surface" else None,
+        is_log=name == "sky_peak",
+        is_rose=name == "azimuth_deg",
+    )
+
+
+def _statistic(numbers: Mapping[str, float], name: str, digits: int) -> str:
+    if name not in numbers:
+        return ""
+    if name == "count":
+        return f"{numbers[name]:.0f}"
+    return f"{numbers[name]:.{max(digits, 1) if name == 'mean' else digits}f}"
+
+
+def _bars(names: Sequence[str], parts: Mapping[str, Sequence[int]], label: str) -> str:
+    """Return the address of a figure of stacked bars, the first ones of many."""
+    first = {name: lengths[:_MOST_BARS] for name, lengths in parts.items() if any(lengths)}
+    return data_uri(draw_bars(names[:_MOST_BARS], first, label=label))
+
+
+def _scenes(distributions: Distributions) -> ReportPart:
+    names = distributions.templates
+    counts = {
+        split: [distributions.scenes.get((name, split), 0) for name in names]
+        for split in distributions.splits
+    }
+    columns = {split: [*lengths, sum(lengths)] for split, lengths in counts.items()}
+    columns["all"] = [sum(row) for row in zip(*columns.values(), strict=True)]
+    rows = [
+        [name, *(column[row] for column in columns.values())]
+        for row, name in enumerate([*names, "all"])
+    ]
+    table = Table(["template"], [*columns], rows)
+    return ReportPart(_bars(names, counts, "scenes"), "scenes by template and split", [table])
+
+
+def _objects(distributions: Distributions) -> ReportPart:
+    uses = np.array(distributions.uses_per_object())
+    places = Panel(values=uses, label="places of an object in scenes", unit="objects")
+    note = f"{int((uses > 0).sum())} of {len(uses)} objects stand in a scene."
+    return _histograms(distributions, ["objects_per_scene"], more=[places], notes=[note])
+
+
+def _materials(distributions: Distributions) -> ReportPart:
+    rows = []
+    for kind, name in _KINDS.items():
+        count, *those = (distributions.surfaces.get((kind, key), 0) for key in SURFACE_COUNTS)
+        rows.append([name, count, *(_share(of_them, count) for of_them in those)])
+    shares = Table(["surfaces"], ["count", "smooth", "many colors", "textured"], rows)
+    note = (
+        "A surface is an object, a floor or a wall in one scene. Of many colors the mean over "
+        "triangles counts, of a texture its mean. Albedos are those of the strongest channel. "
+        "Smooth surfaces share vertices between triangles; the others are flat."
+    )
+    names = ("diffuse", "specular", "albedo_sum", "roughness")
+    return _histograms(distributions, names, tables=[shares], notes=[note])
+
+
+def _maps(distributions: Distributions) -> ReportPart:
+    """Return the families of textures and skies, and the shares of scenes with some."""
+    ordered = sorted(
+        distributions.maps.items(), key=lambda entry: (entry[0][0], -entry[1], entry[0])
+    )
+    bars = {
+        kind: [count if kind == this else 0 for (this, _), count in ordered]
+        for kind in dict.fromkeys(kind for (kind, _), _ in ordered)
+    }
+    figure = _bars([name for (_, name), _ in ordered], bars, "scenes")
+    shares = []
+    for name, of_scene in (("textured", "textures_per_scene"), ("below a sky", "skies_per_scene")):
+        values = distributions.all(of_scene)
+        count = int((values > 0).sum())
+        shares.append([f"scenes {name}", count, _share(count, len(values))])
+    for kind, name in _KINDS.items():
+        textured, count = (
+            distributions.surfaces.get((kind, key), 0) for key in ("textured", "all")
+        )
+        shares.append([f"{name} textured", textured, _share(textured, count)])
+    families = [[kind, name, count] for (kind, name), count in ordered]
+    tables = [
+        Table([""], ["count", "share"], shares),
+        Table(["map", "family or name"], ["scenes"], families),
+    ]
+    return ReportPart(figure, "scenes by family of texture and of sky", tables)
+
+
+def _map_sizes(distributions: Distributions) -> ReportPart:
+    textured, sky_lit = (len(distributions.all(name)) for name in ("texture_width", "sky_radiance"))
+    names = (
+        *(("textures_per_scene", "texture_width") if textured else ()),
+        *(_SKY if sky_lit else ()),
+    )
+    note = "A sun like ours has half of its light in half a degree, a constant sky in 180."
+    return _histograms(distributions, names, notes=[note] if sky_lit else [])
+
+
+def _floors_by_split(distributions: Distributions) -> Table:
+    rows = []
+    for split in distributions.splits:
+        floors = distributions.values[split]["noise_floor_db"]
+        numbers = summary(floors)
+        expected = summary(distributions.values[split]["expected_error_db"])
+        reached = distributions.reaches_targets(split)
+        rows.append(
+            [
+                split,
+                len(floors),
+                *(_statistic(numbers, name, 1) for name in ("median", "p5")),
+                _statistic(expected, "median", 1) if expected["count"] else "",
+                "" if reached is None else _share(int(reached.sum()), len(floors)),
+                _share(distributions.views_at_cap.get(split, 0), len(floors)),
+            ]
+        )
+    head = ["views", "median dB", "p5 dB", "expected, median dB", "reach the target", "at the cap"]
+    return Table(["split"], head, rows)
+
+
+def _rejections(distributions: Distributions) -> ReportPart:
+    rejections = distributions.rejections
+    if not rejections:
+        return ReportPart("", "", [], ["Nothing was rejected."])
+    parts = {
+        label: [
+            sum(number for attempt, number in counts.items() if low <= attempt <= high)
+            for counts in rejections.values()
+        ]
+        for label, (low, high) in _ATTEMPTS.items()
+    }
+    figure = _bars([f"{stage}: {reason}" for stage, reason in rejections], parts, "rejections")
+    rows = [
+        [stage, reason, counts.total(), *(lengths[row] for lengths in parts.values())]
+        for row, ((stage, reason), counts) in enumerate(rejections.items())
+    ]
+    table = Table(["stage", "reason"], ["all", *parts], rows)
+    return ReportPart(figure, "rejections by stage and reason", [table])
+
+
+def _licences(distributions: Distributions) -> ReportPart:
+    rows = [(name, *counts) for name, counts in distributions.licences.items()]
+    head = ["objects", "of them in scenes", "places in scenes"]
+    note = "attribution.csv names the author of each object."
+    return ReportPart("", "", [Table(["license"], head, rows)], [note])
+
+
+def _share(count: int, total: int) -> str:
+    return f"{count / total:.1%}" if total else ""

@@ -1,13 +1,22 @@
-"""The licences of a dataset's objects, and the union of their duties."""
+"""Licences of a dataset's objects with the union of their duties, and `attribution.csv`.
 
+That file has the authors, licences and changes of all objects, textures and maps.
+"""
+
+import csv
+import io
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from pipeline.documents.pages import render_markdown
+from storage.dataset.derived import derivation_of
 from storage.licences import DUTIES, duties_of, licence_url, union_of_duties
-from storage.records.objects import LockedObject
+from storage.markdown import inert
+from storage.records.asset import AssetRow
+from storage.records.objects import OBJECT, SKY, TEXTURE, LockedObject
 
 _HUB_LICENCES = frozenset(
     "0bsd apache-2.0 bsd-2-clause bsd-3-clause cc-by-2.0 cc-by-2.5 cc-by-3.0 cc-by-4.0 "
@@ -24,6 +33,17 @@ _HUB_SPELLING: Mapping[str, str] = {
        for kind in ("only", "or-later")},
 }  # fmt: skip
 """Identifiers that Hugging Face spells differently."""
+
+
+_COLUMNS = ("uid", "title", "licence", "licence_source", "attribution", "source_url", "changes")
+_REMESHED = "cleaned, remeshed and given new materials"
+_OF_KIND = {
+    TEXTURE: "resampled, and laid on other surfaces",
+    SKY: "resampled, turned, and scaled in strength",
+}
+"""Changes to textures and maps, by kind."""
+_AS_IN_FILE = "rendered as its scene file says"
+"""Changes to the meshes of scene files."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,11 +75,9 @@ def rights_of(objects: Iterable[LockedObject]) -> Rights:
 
 
 def hub_licence(rights: Rights, *, link: str) -> dict[str, str]:
-    """Return the licence fields of the front matter of a Hugging Face card.
+    """Return the licence fields of a Hugging Face card; empty without objects.
 
-    Args:
-        rights: rights to the objects; without objects the result is empty.
-        link: file with details, unless there is only one licence and Hugging Face knows it.
+    `link` is a file with details, unless there is only one licence and Hugging Face knows it.
     """
     if not rights.licences:
         return {}
@@ -85,3 +103,30 @@ def licence_facts(rights: Rights) -> dict[str, object]:
 def encode_licences(rights: Rights) -> bytes:
     """Return the file LICENSE.md."""
     return render_markdown("license.jinja", **licence_facts(rights))
+
+
+def encode_attribution(
+    objects: Iterable[LockedObject | AssetRow], *, changes: str = _REMESHED
+) -> bytes:
+    """Return the file: one row per object, sorted by uid, with the changes made to it."""
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    for entry in sorted(objects, key=lambda row: row.uid):
+        rights = (entry.licence, entry.licence_source, entry.attribution, entry.source_url)
+        done = _OF_KIND.get(getattr(entry, "kind", OBJECT), changes)
+        writer.writerow([inert(cell) for cell in (entry.uid, entry.title, *rights, done)])
+    # a lone surrogate, which JSON from outside may hold, has no UTF-8
+    return stream.getvalue().encode(errors="replace")
+
+
+def attribution_of(objects: Iterable[LockedObject], settings: Mapping[str, Any]) -> bytes:
+    """Return the file of a dataset; its settings decide the changes made to objects."""
+    return encode_attribution(objects, changes=" or ".join(sorted(_changes(settings))))
+
+
+def _changes(settings: Mapping[str, Any]) -> set[str]:
+    if derivation := derivation_of(settings):
+        return set().union(*(_changes(source["settings"]) for source in derivation.sources))
+    from_files = settings.get("splits", {}).get("listed_scenes") is not None
+    return {_AS_IN_FILE if from_files else _REMESHED}

@@ -8,7 +8,7 @@ other gray and every id is brighter.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -75,8 +75,7 @@ def finite_range(values: NDArray) -> tuple[float, float] | None:
     return (float(finite.min()), float(finite.max())) if finite.size else None
 
 
-@dataclass(frozen=True, kw_only=True)
-class PassView:
+class PassView(NamedTuple):
     """Display of one pass."""
 
     word: str
@@ -97,31 +96,16 @@ def _ids_seen(ids: NDArray) -> str:
     return f"{seen} seen, in the colors of the table Objects"
 
 
+_AXES = "x, y, z of the world from -1 to 1 as red, green, blue"
+_FRACTION = "{:.2f} to {:.2f} (no unit)"
+
 PASS_VIEWS = (
+    PassView("depth", "depth", depth_grays, _range_caption("{:.2f} to {:.2f} m, near is bright")),
+    PassView("normal", "shading normal", normal_colors, lambda _: _AXES),
+    PassView("object", "object ids", id_colors, _ids_seen),
+    PassView("diffuse", "diffuse albedo", albedo_colors, _range_caption(_FRACTION)),
     PassView(
-        word="depth",
-        title="depth",
-        pixels=depth_grays,
-        caption=_range_caption("{:.2f} to {:.2f} m, near is bright"),
-    ),
-    PassView(
-        word="normal",
-        title="shading normal",
-        pixels=normal_colors,
-        caption=lambda _: "x, y, z of the world from -1 to 1 as red, green, blue",
-    ),
-    PassView(word="object", title="object ids", pixels=id_colors, caption=_ids_seen),
-    PassView(
-        word="diffuse",
-        title="diffuse albedo",
-        pixels=albedo_colors,
-        caption=_range_caption("{:.2f} to {:.2f} (no unit)"),
-    ),
-    PassView(
-        word="roughness",
-        title="roughness",
-        pixels=fraction_grays,
-        caption=_range_caption("{:.2f} to {:.2f} (no unit), rough is bright"),
+        "roughness", "roughness", fraction_grays, _range_caption(f"{_FRACTION}, rough is bright")
     ),
 )
 
@@ -129,9 +113,8 @@ PASS_VIEWS = (
 def passes_command(*, scene: str | None = None, for_page: bool = False) -> str:
     """Return the command that writes passes beside a dataset; it is run in the dataset's folder.
 
-    Args:
-        scene: key of the only scene; None for all.
-        for_page: True for the passes of a scene's page; False for those that the command chooses.
+    `scene` is the key of the only scene; None stands for all. `for_page` chooses the passes of a
+    scene's page instead of those that the command chooses.
     """
     one = "" if scene is None else f" --scene {scene}"
     words = ",".join(pass_view.word for pass_view in PASS_VIEWS)
@@ -140,17 +123,16 @@ def passes_command(*, scene: str | None = None, for_page: bool = False) -> str:
 
 def pass_figures(sample: Sample) -> list[list[Figure]]:
     """Return small pictures of the passes, for each view."""
-    return [_figures_of_view(sample, view) for view in range(sample.scene.num_views)]
-
-
-def _figures_of_view(sample: Sample, view: int) -> list[Figure]:
     names = [pass_names([pass_view.word])[0] for pass_view in PASS_VIEWS]
-    passes = view_passes(sample.scene, names, view=view, resolution=PREVIEW_PX)
-    figures = []
-    for pass_view, name in zip(PASS_VIEWS, names, strict=True):
-        values = passes[name]
-        is_hit = np.any(values != MISS if values.dtype == np.int32 else np.isfinite(values))
-        means = pass_view.caption(values) if is_hit else "nothing is met"
-        title = f"view {view}, {pass_view.title}"
-        figures.append(Figure(png_uri(pass_view.pixels(values)), title, f"{title}: {means}"))
-    return figures
+    rows = []
+    for view in range(sample.scene.num_views):
+        passes = view_passes(sample.scene, names, view=view, resolution=PREVIEW_PX)
+        figures = []
+        for pass_view, name in zip(PASS_VIEWS, names, strict=True):
+            values = passes[name]
+            is_hit = np.any(values != MISS if values.dtype == np.int32 else np.isfinite(values))
+            means = pass_view.caption(values) if is_hit else "nothing is met"
+            title = f"view {view}, {pass_view.title}"
+            figures.append(Figure(png_uri(pass_view.pixels(values)), title, f"{title}: {means}"))
+        rows.append(figures)
+    return rows

@@ -22,6 +22,7 @@ from pipeline.exchange.formats import (
 )
 from pipeline.exchange.open_scene import load_source, source_keys
 from pipeline.exchange.reader import file_child, reach_of
+from pipeline.exchange.scene_budget import within_budget
 from pipeline.isolation import ChildFailed, call_with_retries
 from storage.atomic import write_error
 from storage.errors import TrilightError
@@ -40,17 +41,14 @@ class ConvertResult:
 def convert_scene(
     source: SceneSource, target: Path, *, budget: int | None, done: Callable[[int, int], None]
 ) -> ConvertResult:
-    """Read a source and write it in the format of the target's suffix.
+    """Read a source of one or many scenes and write it in the format of the target's suffix.
 
-    Args:
-        source: one scene, or a file of many.
-        target: the file to write.
-        budget: most triangles of each scene, or None for all of them.
-        done: called with (finished, all) files.
+    Scenes get at most `budget` triangles; None is all of them. `done` is called with (finished,
+    all) files.
 
     Raises:
-        TrilightError: the source is unusable, the target's format cannot hold it, or it cannot
-            be written.
+        TrilightError: the source is unusable, the target's format cannot hold it, or it cannot be
+            written.
     """
     form = _form_of(target)
     child = file_child(reach_of(source, writes=[_make_folder(target)]))
@@ -58,16 +56,14 @@ def convert_scene(
         keys = call_with_retries(child, source_keys, source)
         if not keys:
             raise TrilightError(f"{source.name}: holds no scene.")
-        if form.write_many and len(keys) > 1:
-            results = [call_with_retries(child, _convert_many, source, keys, target, budget)]
-            done(1, 1)
-        else:
-            results = []
-            for key in keys:
-                one_source = source if key is None else dataclasses.replace(source, key=key)
-                out = target if len(keys) == 1 else target.with_suffix(f".{key}{target.suffix}")
-                results.append(call_with_retries(child, _convert_one, one_source, out, budget))
-                done(len(results), len(keys))
+        sources = [source if key is None else dataclasses.replace(source, key=key) for key in keys]
+        outputs = [(target, sources)]
+        if len(sources) > 1 and not form.write_many:
+            outputs = [(target.with_suffix(f".{one.key}{target.suffix}"), [one]) for one in sources]
+        results = []
+        for out, group in outputs:
+            results.append(call_with_retries(child, convert_sources, group, out, budget))
+            done(len(results), len(outputs))
     except ChildFailed as failure:
         raise TrilightError(f"{source.name}: could not be converted ({failure}).") from failure
     finally:
@@ -84,10 +80,7 @@ def write_scene(
 ) -> tuple[str, ...]:
     """Write a scene in the format of the target's suffix; return what that cannot hold.
 
-    Args:
-        target: the file to write.
-        scene: passes `Scene.check`.
-        radiance_rgb: [V, R, R, 3] pictures of its views, which HDF5 alone holds.
+    HDF5 alone holds the pictures [V, R, R, 3] of its views.
 
     Raises:
         TrilightError: the format cannot hold it, or it cannot be written.
@@ -117,53 +110,43 @@ def _form_of(target: Path) -> SceneFormat:
     return form
 
 
-def _convert_one(source: SceneSource, target: Path, budget: int | None) -> ConvertResult:
-    loaded = _load_within_budget(source, budget, pictures=_form_of(target).holds_pictures)
-    lost = write_scene(target, loaded.scene, loaded.radiance_rgb)
-    notes = (*loaded.notes, *_format_losses(target, lost))
-    return ConvertResult(
-        files=_list_files(target), triangles=loaded.scene.num_triangles, notes=notes
-    )
-
-
-def _format_losses(target: Path, lost: Iterable[str]) -> Iterator[str]:
-    return (f"{target.name}: cannot hold {text}" for text in lost)
-
-
-def _convert_many(
-    source: SceneSource, keys: Sequence[str | None], target: Path, budget: int | None
+def convert_sources(
+    sources: Sequence[SceneSource], target: Path, budget: int | None
 ) -> ConvertResult:
+    """Write sources into one file; only child processes call this. Raises TrilightError."""
     form = _form_of(target)
-    assert form.write_many is not None
     triangles = 0
     notes = list[str]()
 
-    def scenes() -> Iterator[tuple[str, Scene]]:
+    def load_all() -> Iterator[tuple[str, LoadedScene]]:
         nonlocal triangles
-        for key in keys:
-            loaded = _load_within_budget(dataclasses.replace(source, key=key), budget)
+        for source in sources:
+            loaded = _load_within_budget(source, budget, pictures=form.holds_pictures)
             triangles += loaded.scene.num_triangles
-            lost = list_lost_members(loaded.scene, form.carried)
-            notes.extend((*loaded.notes, *_format_losses(target, lost)))
-            yield str(key), drop_uncarried_maps(loaded.scene, form.carried)
+            notes.extend(loaded.notes)
+            yield str(source.key), loaded
 
-    form.write_many(target, scenes())
-    return ConvertResult(files=_list_files(target), triangles=triangles, notes=tuple(notes))
+    def carried_scenes() -> Iterator[tuple[str, Scene]]:
+        for key, loaded in load_all():
+            note_losses(list_lost_members(loaded.scene, form.carried))
+            yield key, drop_uncarried_maps(loaded.scene, form.carried)
+
+    def note_losses(lost: Iterable[str]) -> None:
+        notes.extend(f"{target.name}: cannot hold {text}" for text in lost)
+
+    if form.write_many and len(sources) > 1:
+        form.write_many(target, carried_scenes())
+    else:
+        for _, loaded in load_all():
+            note_losses(write_scene(target, loaded.scene, loaded.radiance_rgb))
+    files = (target, *(form.named_files(target) if form.named_files else ()))
+    return ConvertResult(files=files, triangles=triangles, notes=tuple(notes))
 
 
-def _list_files(target: Path) -> tuple[Path, ...]:
-    named = _form_of(target).named_files
-    return (target, *(() if named is None else named(target)))
-
-
-def _load_within_budget(
-    source: SceneSource, budget: int | None, *, pictures: bool = False
-) -> LoadedScene:
+def _load_within_budget(source: SceneSource, budget: int | None, *, pictures: bool) -> LoadedScene:
     loaded = load_source(source, pictures=pictures)
     if budget is None or loaded.scene.num_triangles <= budget:
         return loaded
-    from pipeline.exchange.scene_budget import within_budget  # loads mesh libraries
-
     scene, notes = within_budget(loaded.scene, budget)
     if loaded.radiance_rgb is not None:
         notes = (*notes, "pictures left out: they show the scene before that")

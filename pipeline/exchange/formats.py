@@ -24,12 +24,7 @@ from pipeline.exchange.gltf import write_gltf as gltf
 from pipeline.exchange.gltf.read_gltf import read_gltf
 from pipeline.exchange.loaded_scene import LoadedScene as LoadedScene
 from pipeline.exchange.loaded_scene import Pictures as Pictures
-from pipeline.exchange.renderformer_cells import textured_triangles
-from pipeline.exchange.renderformer_h5 import (
-    note_reflecting_emitters,
-    read_renderformer_h5,
-    write_renderformer_h5,
-)
+from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
 from pipeline.exchange.scene_files import build_scene, read_scene_cameras, read_scene_description
 from pipeline.exchange.usd import write_usd as usd
@@ -112,26 +107,6 @@ def writable_suffixes() -> list[str]:
     return [suffix for suffix, form in FORMATS.items() if form.write]
 
 
-def _with_name(source: SceneSource, loaded: LoadedScene) -> LoadedScene:
-    """Return a scene whose notes begin with the name of its source."""
-    notes = tuple(f"{source.name}: {text}" for text in loaded.notes)
-    return dataclasses.replace(loaded, notes=notes)
-
-
-def _read_usd(source: SceneSource, pictures: bool) -> LoadedScene:
-    loaded = read_usd(source.path, source.key, source.usd_folder, USER_PROVIDED)
-    return _with_name(source, loaded)
-
-
-def _usd_keys(source: SceneSource) -> list[str | None]:
-    return [key or None for key in usd_keys(source.path, source.usd_folder)]
-
-
-def _write_usd(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
-    write_usd(target, scene)
-    return ()
-
-
 def _list_usd_pictures(target: Path) -> Sequence[Path]:
     from pxr import UsdUtils
 
@@ -148,19 +123,12 @@ def _write_many_usd(target: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
     )
 
 
-def _read_gltf(source: SceneSource, pictures: bool) -> LoadedScene:
-    return _with_name(source, read_gltf(source.path, USER_PROVIDED))
-
-
-def _write_glb(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
-    return gltf.write_gltf(target, scene)
-
-
 def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
     root = source.path.parent.resolve()
     name = source.path.name
-    unknown = read_scene_description(root, name).unknown_fields
-    unread: list[str] = []
+    notes = [
+        f"unknown field {field}" for field in read_scene_description(root, name).unknown_fields
+    ]
     scene, _ = build_scene(
         root,
         name,
@@ -170,17 +138,12 @@ def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
         scene_index=0,
         seed=0,
         albedo_over_one=source.albedo_over_one,
-        notes=unread,
+        notes=notes,
     )
-    texts = (*(f"unknown field {field}" for field in unknown), *unread, *scaled_albedo_notes(scene))
-    return _with_name(source, LoadedScene(scene=scene, notes=texts))
+    return LoadedScene(scene=scene, notes=(*notes, *scaled_albedo_notes(scene)))
 
 
-def _json_cameras(source: SceneSource) -> Cameras:
-    return read_scene_cameras(source.path.parent.resolve(), source.path.name)
-
-
-def _write_json(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
+def _write_json(target: Path, scene: Scene, pictures: Pictures) -> Iterable[str]:
     described = describe_scene(scene, target.stem)
     for path, data in described.meshes.items():
         write_atomically(target.parent / path, data)
@@ -188,29 +151,9 @@ def _write_json(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ..
     return described.lost
 
 
-def _read_h5(source: SceneSource, pictures: bool) -> LoadedScene:
-    loaded = _with_name(source, read_renderformer_h5(source.path))
-    return loaded if pictures else dataclasses.replace(loaded, radiance_rgb=None)
-
-
-def _write_h5(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
-    write_renderformer_h5(target, scene, pictures)
-    count = int(textured_triangles(scene).sum())
-    cells = (f"more of {count} textured triangles than the means of 32 x 32 cells each",)
-    return (*note_reflecting_emitters(scene), *(cells if count else ()))
-
-
-def _read_scene_file(source: SceneSource, pictures: bool) -> LoadedScene:
-    return LoadedScene(scene=read_scene_file(source.path), notes=())
-
-
-def _write_scene_file(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
+def _write_scene_file(target: Path, scene: Scene, pictures: Pictures) -> Iterable[str]:
     write_atomically(target, encode_scene(scene))
     return ()
-
-
-def _shard_keys(source: SceneSource) -> list[str | None]:
-    return [key for key, _ in iterate_samples(source.path)]
 
 
 def _read_sample(source: SceneSource, pictures: bool) -> LoadedScene:
@@ -228,39 +171,55 @@ def _read_sample(source: SceneSource, pictures: bool) -> LoadedScene:
     return LoadedScene(scene=sample.scene, notes=(), radiance_rgb=sample.radiance_rgb)
 
 
-_USD = SceneFormat(
-    read=_read_usd,
-    keys=_usd_keys,
-    write=_write_usd,
+_READ_USD = SceneFormat(
+    read=lambda source, _: read_usd(source.path, source.key, source.usd_folder, USER_PROVIDED),
+    keys=lambda source: [key or None for key in usd_keys(source.path, source.usd_folder)],
+)
+_USD = dataclasses.replace(
+    _READ_USD,
+    write=lambda target, scene, _: write_usd(target, scene),
     write_many=_write_many_usd,
     named_files=_list_usd_pictures,
     carried=usd.CARRIED,
 )
+_READ_GLTF = SceneFormat(read=lambda source, _: read_gltf(source.path, USER_PROVIDED))
 
 FORMATS: Registry[SceneFormat] = Registry(
     "scene format",
     SceneFormat,
     {
         **dict.fromkeys(usd.SUFFIXES, _USD),
-        ".usd": SceneFormat(read=_read_usd, keys=_usd_keys),
+        ".usd": _READ_USD,
         ".json": SceneFormat(
             read=_read_json,
-            cameras=_json_cameras,
+            cameras=lambda source: read_scene_cameras(
+                source.path.parent.resolve(), source.path.name
+            ),
             write=_write_json,
             carried=renderformer_json.CARRIED,
         ),
-        ".glb": SceneFormat(read=_read_gltf, write=_write_glb, carried=gltf.CARRIED),
-        ".gltf": SceneFormat(read=_read_gltf),
+        ".glb": dataclasses.replace(
+            _READ_GLTF,
+            write=lambda target, scene, _: gltf.write_gltf(target, scene),
+            carried=gltf.CARRIED,
+        ),
+        ".gltf": _READ_GLTF,
         ".h5": SceneFormat(
-            read=_read_h5,
-            write=_write_h5,
+            read=lambda source, pictures: read_renderformer_h5(source.path, pictures=pictures),
+            write=write_renderformer_h5,
             carried=renderformer_h5.CARRIED,
             holds_pictures=True,
         ),
         ".safetensors": SceneFormat(
-            read=_read_scene_file, write=_write_scene_file, carried=scene_file.CARRIED
+            read=lambda source, _: LoadedScene(scene=read_scene_file(source.path), notes=()),
+            write=_write_scene_file,
+            carried=scene_file.CARRIED,
         ),
-        ".tar": SceneFormat(read=_read_sample, keys=_shard_keys, always_many=True),
+        ".tar": SceneFormat(
+            read=_read_sample,
+            keys=lambda source: [key for key, _ in iterate_samples(source.path)],
+            always_many=True,
+        ),
     },
 )
 """Formats by suffix, in lower case with the point."""
@@ -279,19 +238,16 @@ def list_lost_members(scene: Scene, carried: Collection[str]) -> tuple[str, ...]
 def _members_in_use(scene: Scene) -> Iterator[str]:
     """Yield the members of a scene that are not at their defaults."""
     for field in dataclasses.fields(Scene):
+        value = getattr(scene, field.name)
         if field.name == "materials":
-            yield from (f"materials.{name}" for name in columns_in_use(scene.materials))
+            yield from (f"materials.{name}" for name in columns_in_use(value))
         elif field.name == "objects":
-            for part_field in dataclasses.fields(SceneObject):
-                if any(
-                    getattr(entry, part_field.name) != part_field.default for entry in scene.objects
-                ):
-                    yield f"objects.{part_field.name}"
-        elif field.name == "environment":
-            yield from ("environment",) if scene.environment is not None else ()
-        elif field.name == "normal_textures":
-            yield from ("normal_textures",) if scene.normal_textures is not None else ()
-        elif field.name not in MAP_ARRAYS and len(getattr(scene, field.name)):
+            for part in dataclasses.fields(SceneObject):
+                if any(getattr(entry, part.name) != part.default for entry in value):
+                    yield f"objects.{part.name}"
+        elif field.name in ("environment", "normal_textures"):
+            yield from () if value is None else (field.name,)
+        elif field.name not in MAP_ARRAYS and len(value):
             yield field.name  # other MAP_ARRAYS belong to `textures`
 
 

@@ -1,4 +1,7 @@
-"""Builds a `Scene` from a scene description and its meshes.
+"""Records of a scene file (objects with mesh paths and materials, cameras), and their `Scene`.
+
+Values are as the file states them. Types, ranges and defaults are those of the file, which
+`pipeline.exchange.renderformer_json` reads.
 
 The transform of a mesh follows the order of the published converter: with `normalize`, the mesh is
 brought into a sphere of diameter 1 (the mean of the file's vertices becomes the origin, the
@@ -15,17 +18,11 @@ than 1 are scaled or refused (`limit_albedos`); the provenance names the scaled 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NoReturn
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.description import (
-    DescribedCamera,
-    DescribedMaterial,
-    DescribedObject,
-    SceneDescription,
-)
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded, smooth_shaded, without_slivers
 from scene_templates.rotations import rotate_points, rotation_xyz
@@ -33,6 +30,91 @@ from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.records.scene import ALBEDO_SUM_TOLERANCE, ObjectKind, Scene, SceneObject
+from storage.settings.ranges import Within
+
+Vector = tuple[float, float, float]
+
+_Length = Annotated[float, Within(-1e6, 1e6)]
+Lengths = tuple[_Length, _Length, _Length]
+"""Coordinates or factors; beyond 1e6 float32 positions are off by centimeters."""
+_Angle = Annotated[float, Within(-1e6, 1e6, unit="degrees")]
+Angles = tuple[_Angle, _Angle, _Angle]
+Fraction = Annotated[float, Within(0, 1)]
+Albedo = tuple[Fraction, Fraction, Fraction]
+_Radiance = Annotated[float, Within(0, 1e9)]
+Radiance = tuple[_Radiance, _Radiance, _Radiance]
+
+ColorGroups = Literal["per-triangle", "per-shading-group"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescribedTransform:
+    """Transform of a mesh into world space."""
+
+    translation: Lengths  # world units, the last step
+    rotation_deg: Angles  # angles about the world's X, then Y, then Z
+    scale: Lengths  # factors along the world's axes, after the rotation; a negative one mirrors
+    normalize: bool = True
+    """True brings the mesh into a sphere of diameter 1 around the origin first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescribedMaterial:
+    """Reflectance and emission of an object; colors are linear."""
+
+    diffuse: Albedo  # diffuse albedo, unless the object has random colors
+    specular: Albedo  # specular albedo
+    roughness: Fraction  # the GGX width is its square
+    emissive: Radiance
+    """Radiance of every triangle, to both sides; the object is an emitter where one is above 0."""
+    smooth_shading: bool
+    """True interpolates normals across edges of up to 30 degrees; False shades flat."""
+    random_diffuse_max: Fraction = 1.0  # upper bound of the random colors
+    random_diffuse_type: ColorGroups = "per-shading-group"  # triangles that share a random color
+    rand_tri_diffuse_seed: Annotated[int, Within(0, 2**32 - 1)] | None = None
+    """Seed of random colors that replace `diffuse`; None keeps `diffuse`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescribedObject:
+    """One entry of `objects`."""
+
+    name: str  # key of the entry
+    mesh_path: str  # relative to the scene file
+    transform: DescribedTransform  # from mesh to world space
+    material: DescribedMaterial  # reflectance and emission
+    remesh: bool = False  # True replaces the mesh by one of even triangles
+    remesh_target_face_num: Annotated[int, Within(4, 1_000_000, unit="triangles")] = 2048
+    """Maximum number of triangles of the remeshed mesh."""
+
+    @property
+    def remesh_faces(self) -> int | None:
+        """Maximum number of triangles after remeshing; None where the mesh stays as it is."""
+        return self.remesh_target_face_num if self.remesh else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescribedCamera:
+    """One entry of `cameras`."""
+
+    position: Lengths  # world units
+    look_at: Lengths  # the point in the middle of the picture
+    up: Lengths  # roughly upwards in the picture; neither unit nor orthogonal
+    fov_deg: Annotated[float, Within(0.001, 179, unit="degrees")]
+    """Full field of view, horizontal and vertical."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneDescription:
+    """One scene file."""
+
+    file: str  # name of the file, for messages and provenance
+    scene_name: str  # what its author calls it
+    objects: tuple[DescribedObject, ...]  # in the order of the file
+    cameras: tuple[DescribedCamera, ...]  # in the order of the file
+    unknown_fields: tuple[str, ...]
+    """Dotted names of unknown fields, which were left out."""
+
 
 AlbedoOverOne = Literal["scale", "refuse"]
 """Treatment of materials whose diffuse and specular albedos add up to more than 1."""
@@ -70,18 +152,10 @@ def scene_from_description(
     provenance: Mapping[str, Any],
     albedo_over_one: AlbedoOverOne = "scale",
 ) -> Scene:
-    """Build the scene that a file describes.
+    """Build the scene that a file describes, with its first `num_views` cameras.
 
-    Args:
-        description: the file.
-        meshes: one per object, in its order.
-        num_views: number of the file's cameras to take, from the first.
-        provenance: provenance of the scene; `albedo_scale` is added where materials were scaled.
-        albedo_over_one: treatment of albedos that add up to more than 1.
-
-    Returns:
-        A checked scene; objects in the order of the file, an emitting object as one object per
-        triangle.
+    Objects are in the order of the file, an emitting object as one object per triangle; `meshes`
+    has one per object. The provenance gets `albedo_scale` where materials were scaled.
 
     Raises:
         TrilightError: an object or camera, which is named, is unusable; or a count is too large.
@@ -97,7 +171,14 @@ def scene_from_description(
         except TrilightError as error:
             raise TrilightError(f"{description.file}: objects.{described.name}: {error}") from error
     try:
-        _check_counts(pieces)
+        emitters = sum(piece.entry.kind == "emitter" for piece in pieces)
+        require_at_most(
+            {
+                "triangles": (sum(len(piece.mesh.faces) for piece in pieces), MAX_TRIANGLES),
+                "emitting triangles": (emitters, MAX_EMITTERS),
+                "materials": (sum(len(piece.materials) for piece in pieces), MAX_MATERIALS),
+            }
+        )
         c2w, fov_deg = build_cameras(description.cameras[:num_views])
         scene = Scene(
             **concatenate_pieces(pieces),
@@ -110,17 +191,6 @@ def scene_from_description(
     except TrilightError as error:
         raise TrilightError(f"{description.file}: {error}") from error
     return scene
-
-
-def place_mesh(mesh: LoadedMesh, described: DescribedObject) -> NDArray[np.float32]:
-    """Return the vertices [V, 3] of a mesh in world space."""
-    transform = described.transform
-    points = mesh.positions
-    if transform.normalize:
-        points = (points - mesh.centre) / (2 * mesh.reach)
-    rotated = rotate_points(points, rotation_xyz(transform.rotation_deg))
-    world = rotated * np.array(transform.scale) + np.array(transform.translation)
-    return world.astype(np.float32)
 
 
 def scaled_albedo_notes(scene: Scene) -> tuple[str, ...]:
@@ -136,137 +206,95 @@ def _pieces(
     described: DescribedObject, mesh: LoadedMesh, over_one: AlbedoOverOne
 ) -> tuple[list[ScenePiece], float]:
     """Return the pieces of an object, and the least factor of its materials."""
-    positions = place_mesh(mesh, described)
-    mirrored = np.prod(described.transform.scale) < 0
+    material = described.material
+    transform = described.transform
+    points = mesh.positions
+    if transform.normalize:
+        points = (points - mesh.centre) / (2 * mesh.reach)
+    rotated = rotate_points(points, rotation_xyz(transform.rotation_deg))
+    world = rotated * np.array(transform.scale) + np.array(transform.translation)
+    positions = world.astype(np.float32)
+    mirrored = np.prod(transform.scale) < 0
     faces = (mesh.faces[:, ::-1] if mirrored else mesh.faces).astype(np.uint32)
     faces = without_slivers(positions, faces)
     if len(faces) == 0:
         raise TrilightError(
             f"no triangle of {mesh.uid} has an area after its transform; expected at least one."
         )
-    if described.material.emits:
-        return _emitters(described, mesh, positions, faces, over_one)
-    smooth = described.material.smooth_shading
-    shaded = (
-        smooth_shaded(positions, faces, SMOOTH_ANGLE_DEG)
-        if smooth
-        else flat_shaded(positions, faces)
-    )
-    piece, scale = _surface(described, mesh, shaded, over_one)
-    return [piece], scale
-
-
-def _surface(
-    described: DescribedObject, mesh: LoadedMesh, shaded: ShadedMesh, over_one: AlbedoOverOne
-) -> tuple[ScenePiece, float]:
-    material = described.material
-    rows = np.zeros(len(shaded.faces), np.int64)
+    names = [described.name]
     diffuse = np.array([material.diffuse])
-    if material.rand_tri_diffuse_seed is not None:
-        rows = color_groups(shaded, material)
-        count = int(rows.max()) + 1
-        diffuse = random_diffuse(material.rand_tri_diffuse_seed, material.random_diffuse_max, count)
-    materials, scale = _build_materials(diffuse, material, over_one)
     kind: ObjectKind = "shell" if mesh.uid.startswith(SHELL_FOLDER) else "object"
-    entry = _entry(described.name, kind, mesh)
-    return ScenePiece(entry=entry, mesh=shaded, materials=materials, material_index=rows), scale
-
-
-def _build_materials(
-    diffuse: NDArray[np.float64], material: DescribedMaterial, over_one: AlbedoOverOne
-) -> tuple[NDArray[np.float32], float]:
-    """Return non-emitting rows for diffuse albedos [M, 3], and the least albedo factor."""
+    if max(material.emissive) > 0:
+        require_at_most({"emitting triangles": (len(faces), MAX_EMITTERS)})
+        kind = "emitter"
+        parts = [flat_shaded(positions, faces[row : row + 1]) for row in range(len(faces))]
+        rows = np.zeros(1, np.int64)
+        if len(parts) > 1:
+            names = [f"{described.name}.{row}" for row in range(len(parts))]
+    else:
+        parts = [
+            smooth_shaded(positions, faces, SMOOTH_ANGLE_DEG)
+            if material.smooth_shading
+            else flat_shaded(positions, faces)
+        ]
+        rows = np.zeros(len(parts[0].faces), np.int64)
+        if (seed := material.rand_tri_diffuse_seed) is not None:
+            rows = color_groups(parts[0], material)
+            diffuse = random_diffuse(seed, material.random_diffuse_max, int(rows.max()) + 1)
     diffuse, specular, scale = limit_albedos(diffuse, np.array(material.specular), over_one)
     materials = default_rows(len(diffuse))
     materials[:, DIFFUSE] = diffuse
     materials[:, SPECULAR] = specular
     materials[:, ROUGHNESS] = material.roughness
-    return materials, scale
-
-
-def _emitters(
-    described: DescribedObject,
-    mesh: LoadedMesh,
-    positions: NDArray[np.float32],
-    faces: NDArray[np.uint32],
-    over_one: AlbedoOverOne,
-) -> tuple[list[ScenePiece], float]:
-    if len(faces) > MAX_EMITTERS:
-        _refuse_count("emitting triangles", len(faces), MAX_EMITTERS)
-    diffuse = np.array([described.material.diffuse])
-    materials, scale = _build_materials(diffuse, described.material, over_one)
-    materials[:, EMISSION] = described.material.emissive
-    single = len(faces) == 1
+    materials[:, EMISSION] = material.emissive
+    uid = mesh.uid if kind == "object" else ""
     pieces = [
         ScenePiece(
-            entry=_entry(described.name if single else f"{described.name}.{row}", "emitter", mesh),
-            mesh=flat_shaded(positions, faces[row : row + 1]),
+            entry=SceneObject(name=name, kind=kind, uid=uid, licence=mesh.licence),
+            mesh=part,
             materials=materials,
-            material_index=np.zeros(1, np.int64),
+            material_index=rows,
         )
-        for row in range(len(faces))
+        for name, part in zip(names, parts, strict=True)
     ]
     return pieces, scale
-
-
-def _entry(name: str, kind: ObjectKind, mesh: LoadedMesh) -> SceneObject:
-    uid = mesh.uid if kind == "object" else ""
-    return SceneObject(name=name, kind=kind, uid=uid, licence=mesh.licence)
 
 
 def build_cameras(
     cameras: Sequence[DescribedCamera],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return poses [C, 4, 4] and full angles [C] in degrees; raises TrilightError."""
-    poses = [_pose(camera, at) for at, camera in enumerate(cameras)]
+    poses = []
+    for row, camera in enumerate(cameras):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            c2w = look_at_c2w(eye=camera.position, target=camera.look_at, up=camera.up)
+        if not np.isfinite(c2w).all():
+            raise TrilightError(
+                f"cameras[{row}] looks from {camera.position} at {camera.look_at} with up "
+                f"{camera.up}; expected a distance, and an up that is not along the view."
+            )
+        poses.append(c2w)
     angles = np.array([camera.fov_deg for camera in cameras], np.float32)
     return np.array(poses, np.float32).reshape(-1, 4, 4), angles
 
 
-def _pose(camera: DescribedCamera, row: int) -> NDArray[np.float64]:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        c2w = look_at_c2w(eye=camera.position, target=camera.look_at, up=camera.up)
-    if not np.isfinite(c2w).all():
-        raise TrilightError(
-            f"cameras[{row}] looks from {camera.position} at {camera.look_at} with up "
-            f"{camera.up}; expected a distance, and an up that is not along the view."
-        )
-    return c2w
-
-
-def _check_counts(pieces: Sequence[ScenePiece]) -> None:
-    emitters = sum(piece.entry.kind == "emitter" for piece in pieces)
-    for what, count, most in (
-        ("triangles", sum(len(piece.mesh.faces) for piece in pieces), MAX_TRIANGLES),
-        ("emitting triangles", emitters, MAX_EMITTERS),
-        ("materials", sum(len(piece.materials) for piece in pieces), MAX_MATERIALS),
-    ):
+def require_at_most(counts: Mapping[str, tuple[int, int]]) -> None:
+    """Raise TrilightError where a count of a scene is larger than its maximum, by what it is of."""
+    for what, (count, most) in counts.items():
         if count > most:
-            _refuse_count(what, count, most)
-
-
-def _refuse_count(what: str, count: int, most: int) -> NoReturn:
-    raise TrilightError(f"{count} {what}; expected at most {most} in a scene.")
+            raise TrilightError(f"{count} {what}; expected at most {most} in a scene.")
 
 
 def limit_albedos(
     diffuse: NDArray[np.float64], specular: NDArray[np.float64], over_one: AlbedoOverOne
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return albedos that add up to at most 1, and the least factor that this took.
+    """Return albedos [M, 3] that add up to at most 1, and the least factor that this took.
 
     A surface beyond 1 reflects more light than it receives; published scene files have some (1.1).
     Both albedos of such a material are multiplied by 1 / their largest sum over the channels. One
     factor for all channels keeps both hues, and one for both albedos keeps their ratio; a factor
-    for each channel would bleach a red of 1.1 towards white.
-
-    Args:
-        diffuse: [M, 3] albedos of M materials.
-        specular: [3] albedo of all of them.
-        over_one: "scale" or "refuse" for materials beyond 1.
-
-    Returns:
-        Diffuse and specular albedos [M, 3], and the smallest factor of a material; 1.0 where none
-        was beyond 1, and then both are unchanged.
+    for each channel would bleach a red of 1.1 towards white. Where none of the diffuse albedos [M,
+    3] with the specular albedo [3] of all is beyond 1, they are unchanged and the factor is 1.0.
 
     Raises:
         TrilightError: a material is beyond 1, and `over_one` is "refuse".
@@ -299,20 +327,15 @@ def color_groups(mesh: ShadedMesh, material: DescribedMaterial) -> NDArray[np.in
 def random_diffuse(seed: int, bound: float, count: int) -> NDArray[np.float64]:
     """Return `count` diffuse albedos [count, 3]: integers below ceil(256 bound), over 255.
 
-    The published converter seeds numpy's legacy Mersenne Twister and draws one triple per group, in
-    the order in which trimesh splits the shaded mesh. On flat meshes that is the order of faces,
-    and colors are exactly the published ones. On smooth meshes trimesh has another order, and other
-    groups where an object has large flat regions; our groups are in the order of their first faces,
-    so that the same numbers may fall on other groups than published.
+    The published converter seeds numpy's legacy Mersenne Twister, also by 0, and draws one triple
+    per group, in the order in which trimesh splits the shaded mesh. On flat meshes that is the
+    order of faces, and colors are exactly the published ones. On smooth meshes trimesh has another
+    order, and other groups where an object has large flat regions; our groups are in the order of
+    their first faces, so that the same numbers may fall on other groups than published.
 
     The published tokens hold the numbers as linear albedos, and so does Trilight. Published renders
     passed them through vertex colors that Blender decodes as sRGB, so the same numbers meant darker
     surfaces there, which Trilight does not imitate.
-
-    Args:
-        seed: seed of the legacy generator, 0 to 2^32 - 1; 0 is an ordinary seed.
-        bound: `random_diffuse_max`; a channel may exceed it by at most 1/255.
-        count: number of colors.
     """
     generator = np.random.RandomState(seed)
     return generator.randint(0, max(1, math.ceil(256 * bound)), (count, 3)) / 255

@@ -16,7 +16,7 @@ from storage.records.texture import MapSource, Texture
 Map = NDArray[np.float32]
 
 _ROWS = 256  # rows of a map that are interpolated at a time
-_EXCESS = 1e-6
+EXCESS = 1e-6
 """Tolerance for the rounding of two float32 albedos that add up to 1."""
 
 
@@ -72,9 +72,11 @@ def color_textures(diffuse: Map, specular: Map, source: MapSource) -> tuple[Text
     The diffuse one is lowered where they would add up to more.
     """
     diffuse, specular = resample_to_largest(diffuse, specular)
-    glossy = _encode_color(specular, source)
+    glossy = Texture(texels=specular, source=source)
+    if not is_constant(specular):
+        glossy = Texture(texels=srgb8(specular), is_srgb=True, source=source)
     room = 1 - linear_map(glossy)
-    if is_constant(diffuse) and (diffuse <= room.min(axis=(0, 1)) + _EXCESS).all():
+    if is_constant(diffuse) and (diffuse <= room.min(axis=(0, 1)) + EXCESS).all():
         return Texture(texels=diffuse, source=source), glossy
     if is_constant(room) and is_constant(diffuse):
         return Texture(texels=np.minimum(diffuse, room), source=source), glossy
@@ -82,14 +84,3 @@ def color_textures(diffuse: Map, specular: Map, source: MapSource) -> tuple[Text
     codes = srgb8(limited)
     over = linear_from_srgb8()[codes] > room  # by rounding
     return Texture(texels=codes - over.astype(np.uint8), is_srgb=True, source=source), glossy
-
-
-def may_exceed_one(diffuse: Texture, specular: Texture) -> bool:
-    """Return whether two albedos may add up to more than 1 somewhere."""
-    return bool((diffuse.greatest + specular.greatest > 1 + _EXCESS).any())
-
-
-def _encode_color(values: Map, source: MapSource) -> Texture:
-    if is_constant(values):
-        return Texture(texels=values, source=source)
-    return Texture(texels=srgb8(values), is_srgb=True, source=source)

@@ -11,6 +11,7 @@
 Only this module splits `FILE::KEY`, so that no library that parses URLs ever sees it.
 """
 
+import dataclasses
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,12 +39,9 @@ def scene_source(
     usd_folder: Path | None = None,
     albedo_over_one: AlbedoOverOne = "scale",
 ) -> SceneSource:
-    """Return the source that `SRC` names, without opening the file.
+    """Return the source that the text of `SRC` names, without opening the file.
 
-    Args:
-        text: the text of `SRC`.
-        many: True accepts a shard without a key.
-        usd_folder, albedo_over_one: see `SceneSource`.
+    `many` accepts a shard without a key; the other options are those of `SceneSource`.
 
     Raises:
         TrilightError: a URL, a missing file, or a name in none of these forms.
@@ -96,14 +94,10 @@ def load_cameras(source: SceneSource) -> Cameras:
     return scene.c2w, scene.fov_deg
 
 
-def load_source(source: SceneSource, *, pictures: bool = False) -> LoadedScene:
-    """Read a scene with all of its cameras.
+def load_source(source: SceneSource, pictures: bool = False) -> LoadedScene:
+    """Read a scene with all of its cameras; only child processes call this.
 
-    Only child processes call this, since meshes may be read.
-
-    Args:
-        source: the scene.
-        pictures: True also reads the pictures of a shard's sample or an HDF5 file.
+    `pictures` also reads the pictures of a shard's sample or an HDF5 file.
 
     Raises:
         TrilightError: anything in the file is unusable, or the scene breaks a law (`Scene.check`).
@@ -113,7 +107,9 @@ def load_source(source: SceneSource, *, pictures: bool = False) -> LoadedScene:
     loaded = read(source, pictures)
     if not FORMATS.is_ours(source.path.suffix.lower()):
         loaded.scene.check()
-    return loaded
+        return loaded
+    notes = tuple(f"{source.name}: {text}" for text in loaded.notes)
+    return dataclasses.replace(loaded, notes=notes)
 
 
 def _form_of(source: SceneSource) -> SceneFormat:

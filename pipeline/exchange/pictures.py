@@ -30,11 +30,7 @@ def decode_pixels(data: bytes, name: str, lost: list[str] | None = None) -> NDAr
     """Return a picture [H, W, C], the top row first; None where the bytes are not one.
 
     OpenEXR and Radiance are linear float32 of 1 to 4 channels; others are as `decode_image`.
-
-    Args:
-        data: the file.
-        name: name for messages.
-        lost: receives a sentence for each unsupported feature.
+    Messages call it `name`; `lost` receives a sentence for each unsupported feature.
 
     Raises:
         TrilightError: the picture has more pixels than MAX_PIXELS.

@@ -1,5 +1,6 @@
 """Reads scenes of untrusted files in a child process with limits; returns checked scenes only."""
 
+import contextlib
 import dataclasses
 import logging
 from collections.abc import Callable, Iterable
@@ -10,6 +11,7 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.exchange.formats import Cameras, LoadedScene, SceneSource
 from pipeline.exchange.from_description import AlbedoOverOne, LoadedMesh
 from pipeline.exchange.open_scene import load_cameras, load_source, source_keys
+from pipeline.exchange.scene_budget import within_budget
 from pipeline.exchange.scene_files import load_mesh_file
 from pipeline.isolation import (
     NO_FILES,
@@ -27,14 +29,13 @@ from storage.records.scene import Scene
 log = logging.getLogger("trilight.exchange")
 
 
-class SceneReader:
+class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
     """A child process that reads any number of sources; close it, or use a `with` block."""
 
     def __init__(self, albedo_over_one: AlbedoOverOne = "scale") -> None:
-        """Create the reader; the child starts with the first call.
+        """Create the reader, with its treatment of albedos over 1 in RenderFormer's JSON.
 
-        Args:
-            albedo_over_one: treatment of albedos over 1 in RenderFormer's JSON.
+        The child starts with the first call.
         """
         self._child = file_child()
         self._over_one = albedo_over_one
@@ -45,7 +46,6 @@ class SceneReader:
         Raises:
             TrilightError: the file is unusable, or holds no scene.
         """
-        self._child.allow_files(reach_of(source))
         keys = self._read(source_keys, source)
         if not keys:
             raise TrilightError(f"{source.name}: holds no scene.")
@@ -54,12 +54,10 @@ class SceneReader:
     def load(self, source: SceneSource, *, pictures: bool = False) -> LoadedScene:
         """Read one scene; see `pipeline.exchange.open_scene.load_source`."""
         source = dataclasses.replace(source, albedo_over_one=self._over_one)
-        self._child.allow_files(reach_of(source))
-        return self._read(_load_with_pictures if pictures else load_source, source)
+        return self._read(load_source, source, pictures)
 
     def cameras(self, source: SceneSource) -> Cameras:
         """Read poses and angles; see `pipeline.exchange.open_scene.load_cameras`."""
-        self._child.allow_files(reach_of(source))
         return self._read(load_cameras, source)
 
     def mesh(self, path: Path, licence: str) -> LoadedMesh:
@@ -77,25 +75,24 @@ class SceneReader:
 
     def within_budget(self, scene: Scene, max_triangles: int) -> LoadedScene:
         """Reduce a scene in the child; see `pipeline.exchange.scene_budget.within_budget`."""
-        return self._call("scene", _within_budget, scene, max_triangles)
+        reduced, notes = self._call("scene", within_budget, scene, max_triangles)
+        return LoadedScene(scene=reduced, notes=notes)
 
     def close(self) -> None:
         """End the child."""
         self._child.close()
 
-    def __enter__(self) -> "SceneReader":
-        return self
-
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _read(self, function: Callable[[SceneSource], Result], source: SceneSource) -> Result:
+    def _read(self, function: Callable[..., Result], source: SceneSource, *args: bool) -> Result:
         """Call a function of a source; a complaint about its file names the path as it was given.
 
         Readers say the name alone, since others write what they say into datasets.
         """
+        self._child.allow_files(reach_of(source))
         try:
-            return self._call(source.name, function, source)
+            return self._call(source.name, function, source, *args)
         except TrilightError as error:
             name = source.path.name
             if not str(error).startswith(name):
@@ -107,17 +104,6 @@ class SceneReader:
             return call_with_retries(self._child, function, *args)
         except ChildFailed as failure:
             raise TrilightError(f"{name}: could not be read ({failure}).") from failure
-
-
-def _load_with_pictures(source: SceneSource) -> LoadedScene:
-    return load_source(source, pictures=True)
-
-
-def _within_budget(scene: Scene, max_triangles: int) -> LoadedScene:
-    from pipeline.exchange.scene_budget import within_budget  # loads mesh libraries
-
-    reduced, notes = within_budget(scene, max_triangles)
-    return LoadedScene(scene=reduced, notes=notes)
 
 
 _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)

@@ -8,8 +8,6 @@ the triangle continue the texture. When read, every triangle becomes a square of
 border of one cell so that no look-up touches a neighbor.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,12 +44,7 @@ def textured_triangles(scene: Scene) -> NDArray[np.bool_]:
 
 
 def compute_cells(scene: Scene, triangle: int) -> list[tuple[slice, NDArray[np.float32]]]:
-    """Return the channels and cells [C, 32, 32] of each textured column of a triangle.
-
-    Args:
-        scene: a scene with textures.
-        triangle: row of the triangle.
-    """
+    """Return the channels and cells [C, 32, 32] of each textured column of a triangle."""
     assert scene.material_textures is not None and scene.uv is not None
     index = scene.material_textures[scene.material_index[triangle]]
     uv = scene.uv.reshape(-1, 3, 2)[triangle].astype(np.float64)
@@ -87,18 +80,12 @@ def _compute_means(texture: Texture, uv: NDArray[np.float64]) -> NDArray[np.floa
     return means
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CellAtlas:
-    """Textures that hold the cells of many triangles, one square tile for each."""
+def build_atlas(
+    cells: NDArray[np.float32], source: MapSource
+) -> tuple[tuple[Texture, Texture, Texture], NDArray[np.float32]]:
+    """Return cells [N, 7, 32, 32] as textures of 8 bits: diffuse, specular and roughness.
 
-    textures: tuple[Texture, Texture, Texture]
-    """Diffuse, specular and roughness texture of all tiles."""
-    uv: NDArray[np.float32]
-    """[N, 3, 2] texture coordinates of the corners of each triangle."""
-
-
-def build_atlas(cells: NDArray[np.float32], source: MapSource) -> CellAtlas:
-    """Return cells [N, 7, 32, 32] as textures of 8 bits, in the order of their triangles.
+    The second value has the texture coordinates [N, 3, 2] of the corners of each triangle.
 
     The diffuse albedo is lowered where both add up to more than 1. Cells that no look-up reaches
     get the mean of the others, so that a texture's mean is that of its triangles.
@@ -119,4 +106,4 @@ def build_atlas(cells: NDArray[np.float32], source: MapSource) -> CellAtlas:
     corner = np.stack([column, row], axis=-1)[:, None] * _TILE + _BORDER
     offsets = np.array([[CELLS, 0], [0, CELLS], [0, 0]])
     uv = (corner + offsets) / [across * _TILE, up * _TILE]
-    return CellAtlas(textures=(*colors, roughness), uv=uv.astype(np.float32))
+    return (*colors, roughness), uv.astype(np.float32)

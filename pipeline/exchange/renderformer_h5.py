@@ -16,19 +16,24 @@
 - The normal channels are (.5, .5, 1): no bump, in the file's tangent space.
 - The texture of an emitter states diffuse (1, 1, 1) and roughness 1, as published, though emitters
   reflect nothing here (nor do the published ones when rendered).
-- Half floats end at 65504 and keep 11 bits: albedos change by up to 2^-11, and brighter lights are
-  refused.
+- The public converter writes textures as half floats, which end at 65504 and keep 11 bits. Ours are
+  float32, as those of the authors' later tools.
 - Every array is compressed by gzip at level 9, in chunks that h5py chooses.
 - Pictures have no alpha here: it is written as 1, and the empty background is radiance zero.
 - `mvp` is OpenGL's, for column vectors; the published training multiplies it by zero.
 
 The file has no place for objects (which triangles belong together), names and rights, provenance,
 or shared vertices. The reader does not trust the file (pipeline.exchange.safe_h5).
+
+A file of RenderFormer's successor holds [T, 16, 32, 32] cells, or their code by an image encoder.
+Nine of the 16 channels are a BRDF as a learned network encodes it, which no formula turns back into
+albedos; `light_strength` [T, 3] and `env_map` hold everything else. So its surfaces become grey,
+with a note.
 """
 
 import io
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,42 +41,36 @@ from numpy.typing import NDArray
 from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.renderformer_cells import (
     CELLS,
+    MAX_VARYING,
+    build_atlas,
     compute_cells,
     filled_cell_mask,
     textured_triangles,
 )
-from pipeline.exchange.renderformer_stored import (
-    CHANNELS,
-    FLAT_NORMAL,
-    MAX_TRIANGLES,
-    SECOND_VERSION,
-    TEXTURE_EMISSION,
-    TEXTURE_NORMAL,
-    is_second_version,
-    read_grey_textures,
-    read_sky,
-    read_textures,
-    with_cells,
-)
 from pipeline.exchange.safe_h5 import (
+    iterate_blocks,
     list_names,
     open_h5,
     plain_array,
     read_whole,
+    require_finite,
 )
+from pipeline.exchange.textured_triangles import index_corners
 from storage.atomic import write_atomically
-from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
+from storage.records.environment import Environment
 from storage.records.exr import MAX_RESOLUTION, to_half
 from storage.records.material import (
     DIFFUSE,
     EMISSION,
     PUBLISHED_COLUMNS,
     REFLECTING,
+    ROUGHNESS,
     SPECULAR,
     default_rows,
     distinct_rows,
 )
+from storage.records.retextured import with_textures, without_constant_textures
 from storage.records.scene import (
     ALBEDO_SUM_TOLERANCE,
     UNIT_NORMAL_TOLERANCE,
@@ -79,6 +78,7 @@ from storage.records.scene import (
     Scene,
     SceneObject,
 )
+from storage.records.texture import CONSTANT, TEXTURED, MapSource
 
 CARRIED = frozenset(
     {"vertex_positions", "vertex_normals", "faces", "material_index", "c2w", "fov_deg", "textures"}
@@ -86,38 +86,44 @@ CARRIED = frozenset(
 )
 """Members of a scene that the file holds (pipeline.exchange.formats)."""
 
+CHANNELS = 13
+"""A texture has CHANNELS channels of CELLS x CELLS cells."""
+_NORMAL = slice(7, 10)
+_EMISSION = slice(10, 13)
+"""Channels of a texture row; those before them are REFLECTING (storage.records.material)."""
+_FLAT_NORMAL = (0.5, 0.5, 1.0)
+_PUBLISHED_EMITTER = (1, 1, 1, 0, 0, 0, 1)
+"""What the reflecting channels of an emitter state."""
+
 NEAR = 0.05
 FAR = 5.0
 """Clip distances of `mvp`, in meters."""
 GZIP_LEVEL = 9
-
-TextureType = Literal["float16", "float32"]
 
 
 def write_renderformer_h5(
     path: Path,
     scene: Scene,
     radiance_rgb: NDArray[np.float32] | None = None,
-    *,
-    texture_type: TextureType = "float32",
-) -> None:
+) -> tuple[str, ...]:
     """Write a scene, and its pictures [V, R, R, 3] if given; equal scenes give equal bytes.
 
-    The public converter writes `float16`, the authors' later tools `float32`. The file appears
-    whole or not at all; memory is its compressed size and one block of textures.
+    The file appears whole or not at all; memory is its compressed size and one block of textures.
+
+    Returns:
+        Sentences about members in CARRIED that lose something.
 
     Raises:
-        TrilightError: a value exceeds half floats, or the file cannot be written.
+        TrilightError: a picture exceeds half floats, or the file cannot be written.
     """
     import h5py
 
-    texture = texture_rows(scene, texture_type)
     corners = scene.faces.astype(np.int64)
     stream = io.BytesIO()
     with h5py.File(stream, "w") as file:
         _write(file, "triangles", scene.vertex_positions[corners])
         _write(file, "vn", scene.vertex_normals[corners])
-        _write_texture(file, texture, scene)
+        _write_texture(file, _texture_rows(scene), scene)
         _write(file, "c2w", scene.c2w)
         _write(file, "fov", scene.fov_deg)
         if radiance_rgb is not None:
@@ -125,54 +131,32 @@ def write_renderformer_h5(
             _write(file, "img", np.concatenate([to_half(radiance_rgb), opaque], axis=3))
             _write(file, "mvp", _mvp(scene))
     write_atomically(path, stream.getvalue())
+    lost = []
+    reflects = (scene.materials[:, : SPECULAR.stop] > 0).any(axis=1)
+    reflects &= (scene.materials[:, EMISSION] > 0).any(axis=1)
+    if reflects.any():
+        lost.append(f"albedos of {int(reflects.sum())} emitting materials")
+    if count := int(textured_triangles(scene).sum()):
+        lost.append(f"more of {count} textured triangles than the means of 32 x 32 cells each")
+    return tuple(lost)
 
 
-def texture_rows(scene: Scene, texture_type: TextureType) -> NDArray[np.floating]:
-    """Return the value [T, 13] of each triangle's texture.
-
-    Where rounding to half floats would make albedos add up to more than 1, they are rounded down.
-
-    Raises:
-        TrilightError: an emission becomes infinite or zero as half floats.
-    """
+def _texture_rows(scene: Scene) -> NDArray[np.float32]:
+    """Return the value [T, 13] of each triangle's texture."""
     emits = np.any(scene.materials[:, EMISSION] > 0, axis=1)
     rows = np.zeros((len(scene.materials), CHANNELS), np.float32)
     rows[:, REFLECTING] = scene.materials[:, REFLECTING]
-    rows[emits, REFLECTING] = [1, 1, 1, 0, 0, 0, 1]
-    rows[:, TEXTURE_NORMAL] = FLAT_NORMAL
-    rows[:, TEXTURE_EMISSION] = scene.materials[:, EMISSION]
-    if texture_type == "float32":
-        return rows[scene.material_index]
-    with np.errstate(over="ignore"):
-        half = rows.astype(np.float16)
-    lit = half[:, TEXTURE_EMISSION]
-    if not np.isfinite(lit).all() or (lit.any(axis=1) != emits).any():
-        bad = rows[~np.isfinite(lit).all(axis=1) | (lit.any(axis=1) != emits)][0]
-        raise TrilightError(
-            f"emission is {bad[TEXTURE_EMISSION]}; half floats hold 6e-8 to {HALF_FLOAT_MAX:.0f}. "
-            "Write float32 textures."
-        )
-    total = half[:, DIFFUSE].astype(np.float32) + half[:, SPECULAR]
-    over = np.tile(total > 1, (1, 2))
-    albedos = slice(DIFFUSE.start, SPECULAR.stop)
-    lower = np.nextafter(half[:, albedos], np.float16(0))
-    rises = half[:, albedos] > rows[:, albedos]
-    half[:, albedos] = np.where(over & rises, lower, half[:, albedos])
-    return half[scene.material_index]
-
-
-def note_reflecting_emitters(scene: Scene) -> tuple[str, ...]:
-    """Return a note that a written file changes the albedos of emitters, where they reflect."""
-    emits = (scene.materials[:, EMISSION] > 0).any(axis=1)
-    reflects = (scene.materials[emits][:, : SPECULAR.stop] > 0).any(axis=1)
-    return (f"albedos of {int(reflects.sum())} emitting materials",) if reflects.any() else ()
+    rows[emits, REFLECTING] = _PUBLISHED_EMITTER
+    rows[:, _NORMAL] = _FLAT_NORMAL
+    rows[:, _EMISSION] = scene.materials[:, EMISSION]
+    return rows[scene.material_index]
 
 
 def _write(file: Any, name: str, values: NDArray) -> None:
     file.create_dataset(name, data=values, compression="gzip", compression_opts=GZIP_LEVEL)
 
 
-def _write_texture(file: Any, rows: NDArray[np.floating], scene: Scene) -> None:
+def _write_texture(file: Any, rows: NDArray[np.float32], scene: Scene) -> None:
     """Write textures in blocks of triangles; in memory each triangle takes 53 kB."""
     textured = textured_triangles(scene)
     shape = (len(rows), CHANNELS, CELLS, CELLS)
@@ -201,6 +185,7 @@ def _mvp(scene: Scene) -> NDArray[np.float32]:
     return np.einsum("vij,vjk->vik", clip, view).astype(np.float32)
 
 
+MAX_TRIANGLES = 1_000_000
 MAX_VIEWS = 1000
 MAX_PICTURE_BYTES = 1 << 30
 """Maximum bytes of all pictures of a file as float32."""
@@ -210,14 +195,16 @@ MAX_PALETTE = 1 << 16
 UNKNOWN_LICENCE = "LicenseRef-unknown"
 """Licence of everything that is read, since the file states no rights."""
 
+_GREY = 0.5
+_SECOND_VERSION = ("env_map", "env_map_rotation", "env_map_strength", "light_strength")
+"""Arrays of the successor, in addition to those of the first version."""
 _KNOWN = ("c2w", "fov", "img", "mvp", "texture", "triangles", "vn")
 _ROUNDING = 2.0**-10
 """Tolerance for the half-float rounding of albedos that add up to 1."""
-_PUBLISHED_EMITTER = np.array([1, 1, 1, 0, 0, 0, 1], np.float32)
 
 
-def read_renderformer_h5(path: Path) -> LoadedScene:
-    """Read a file of the published layout.
+def read_renderformer_h5(path: Path, *, pictures: bool = True) -> LoadedScene:
+    """Read a file of the published layout, and its pictures where that is asked.
 
     Corners with equal position and normal become one vertex, so that flat and smooth shading stay
     as they are. Equal materials become one row, but each emitting triangle has a separate row.
@@ -232,30 +219,33 @@ def read_renderformer_h5(path: Path) -> LoadedScene:
         triangles = read_whole(plain_array(file, "triangles", (None, 3, 3), MAX_TRIANGLES))
         count = len(triangles)
         normals = read_whole(plain_array(file, "vn", (count, 3, 3), MAX_TRIANGLES))
-        second = is_second_version(file)
-        stored = (read_grey_textures if second else read_textures)(file, count, lost)
-        sky = read_sky(file, UNKNOWN_LICENCE, lost) if second else None
+        second = _is_second_version(file)
+        rows, varies = (_read_grey_rows if second else _read_rows)(file, count, lost)
+        sky = _read_sky(file, lost) if second else None
         c2w = read_whole(plain_array(file, "c2w", (None, 4, 4), MAX_VIEWS))
         fov_deg = read_whole(plain_array(file, "fov", (len(c2w),), MAX_VIEWS))
-        pictures = _pictures(file, len(c2w), lost) if "img" in list_names(file) else None
-        positions, normals, faces = _index_vertices(triangles, _normalize(triangles, normals, lost))
+        radiance_rgb = _pictures(file, len(c2w), lost) if "img" in list_names(file) else None
+        positions, normals, faces = index_corners(triangles, _normalize(triangles, normals, lost))
         scene = Scene(
             vertex_positions=positions,
             vertex_normals=normals,
             faces=faces,
-            **_palette(stored.rows, stored.varies, lost),
+            **_palette(rows, varies, lost),
             c2w=c2w,
             fov_deg=fov_deg,
             provenance={"template": "renderformer-h5", "file": path.name},
             environment=sky,
         )
-        scene = with_cells(scene, stored, UNKNOWN_LICENCE)
+        if varies.any():
+            scene = _with_cells(scene, _read_cells(file, varies), varies)
         scene.check()
-    return LoadedScene(scene=scene, radiance_rgb=pictures, notes=tuple(lost))
+    return LoadedScene(
+        scene=scene, radiance_rgb=radiance_rgb if pictures else None, notes=tuple(lost)
+    )
 
 
 def _list_unknown(file: Any) -> list[str]:
-    known = (*_KNOWN, *SECOND_VERSION) if is_second_version(file) else _KNOWN
+    known = (*_KNOWN, *_SECOND_VERSION) if _is_second_version(file) else _KNOWN
     names = [f"array or group {name!r:.60}" for name in list_names(file) if name not in known]
     names += [f"attribute {name!r:.60}" for name in sorted(file.attrs)]
     return names if len(names) <= 10 else [*names[:10], f"and {len(names) - 10} more"]
@@ -288,24 +278,13 @@ def _normalize(
     return np.where(off, chosen / size, normals).astype(np.float32)
 
 
-def _index_vertices(
-    triangles: NDArray[np.float32], normals: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
-    """Return positions, normals and faces, with vertices in the order of first use."""
-    corners = np.concatenate([triangles, normals], axis=2).reshape(-1, 6)
-    first, rows = distinct_rows(corners)
-    vertices = corners[first]
-    faces = rows.astype(np.uint32).reshape(-1, 3)
-    return vertices[:, :3].copy(), vertices[:, 3:].copy(), faces
-
-
 def _palette(
     rows: NDArray[np.float32], varies: NDArray[np.bool_], lost: list[str]
 ) -> dict[str, Any]:
-    emits = (rows[:, TEXTURE_EMISSION] > 0).any(axis=1)
+    emits = (rows[:, _EMISSION] > 0).any(axis=1)
     materials = default_rows(len(rows))
     materials[:, REFLECTING] = rows[:, REFLECTING]
-    materials[:, EMISSION] = rows[:, TEXTURE_EMISSION]
+    materials[:, EMISSION] = rows[:, _EMISSION]
     if (materials[emits, REFLECTING] != _PUBLISHED_EMITTER).any():
         lost.append("albedos of emitters: emitters of a scene reflect nothing")
     materials[emits, REFLECTING] = [0, 0, 0, 0, 0, 0, 1]
@@ -341,3 +320,128 @@ def _limit_rounded_albedos(materials: NDArray[np.float32], lost: list[str]) -> N
         materials[:, SPECULAR] = np.where(
             rounded, np.maximum(1 - materials[:, DIFFUSE], 0), materials[:, SPECULAR]
         )
+
+
+def _read_rows(
+    file: Any, count: int, lost: list[str]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return the mean [T, 13] of each texture, and a mask [T] of those to read by cell.
+
+    One block of cells is in memory at a time.
+    """
+    texture = plain_array(file, "texture", (count, CHANNELS, CELLS, CELLS), MAX_TRIANGLES)
+    filled = filled_cell_mask()
+    low = np.full((count, CHANNELS), np.inf, np.float32)
+    high = -low
+    total = np.zeros((count, CHANNELS))
+    for where, block in iterate_blocks(texture):
+        rows = where[:2]
+        cells = filled[where[2:]]
+        if cells.any():
+            require_finite(texture, block[:, :, cells])
+            values = block[:, :, cells].astype(np.float32)
+            low[rows] = np.minimum(low[rows], values.min(axis=2))
+            high[rows] = np.maximum(high[rows], values.max(axis=2))
+            total[rows] += values.sum(axis=2, dtype=np.float64)
+    emits = (total[:, _EMISSION] > 0).any(axis=1)
+    differs = low != high
+    varies = differs[:, REFLECTING].any(axis=1) & ~emits
+    glows = differs[:, _EMISSION].any(axis=1)
+    if varies.sum() > MAX_VARYING:
+        lost.append(f"varying textures of {varies.sum()} triangles: replaced by their means")
+        varies[:] = False
+    if glows.any():
+        lost.append(f"varying emission of {glows.sum()} triangles: replaced by its mean")
+    bumpy = (low[:, _NORMAL] != np.array(_FLAT_NORMAL, np.float32)).any(axis=1)
+    if bumpy.any():
+        lost.append(f"normal textures of {bumpy.sum()} triangles")
+    mean = (total / filled.sum()).astype(np.float32)
+    return np.where(differs, mean, low), varies
+
+
+def _read_cells(file: Any, varies: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return the reflectance cells [N, 7, 32, 32] of the triangles with varying textures."""
+    texture = plain_array(file, "texture", (len(varies), CHANNELS, CELLS, CELLS), MAX_TRIANGLES)
+    cells = np.zeros((int(varies.sum()), CHANNELS, CELLS, CELLS), np.float32)
+    rank = np.cumsum(varies) - 1
+    for where, block in iterate_blocks(texture):
+        chosen = np.flatnonzero(varies[where[0]])
+        cells[rank[where[0]][chosen], where[1], where[2], where[3]] = block[chosen]
+    return cells[:, REFLECTING]
+
+
+def _with_cells(scene: Scene, cells: NDArray[np.float32], varies: NDArray[np.bool_]) -> Scene:
+    """Return a scene with the textures of its cells; varying triangles share a material."""
+    source = MapSource(name="cells of triangles", licence=UNKNOWN_LICENCE)
+    maps, corner_uv = build_atlas(cells, source)
+    uv = np.zeros((scene.num_triangles, 3, 2), np.float32)
+    uv[varies] = corner_uv
+    index = np.full((len(scene.materials), len(TEXTURED)), CONSTANT, np.int32)
+    textures = {texture.sha256: texture for texture in maps}
+    used = np.unique(scene.material_index[varies])
+    index[used] = [list(textures).index(texture.sha256) for texture in maps]
+    scene = with_textures(scene, uv.reshape(-1, 2), tuple(textures.values()), index)
+    return without_constant_textures(scene)
+
+
+def _is_second_version(file: Any) -> bool:
+    """Return whether an open file has the separate lights of the successor."""
+    return "light_strength" in list_names(file)
+
+
+def _read_grey_rows(
+    file: Any, count: int, lost: list[str]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return grey surfaces with the emission of a successor's file, as `_read_rows`."""
+    light = read_whole(plain_array(file, "light_strength", (count, 3), MAX_TRIANGLES))
+    rows = np.zeros((count, CHANNELS), np.float32)
+    rows[:, DIFFUSE] = _GREY
+    rows[:, ROUGHNESS] = 1
+    rows[light.any(axis=1), REFLECTING] = _PUBLISHED_EMITTER
+    rows[:, _NORMAL] = _FLAT_NORMAL
+    rows[:, _EMISSION] = light
+    lost.append(
+        f"materials: nine channels of a learned code for a BRDF, which no formula turns into "
+        f"albedos; all {count} triangles are a diffuse gray of {_GREY}"
+    )
+    return rows, np.zeros(count, np.bool_)
+
+
+def _read_sky(file: Any, lost: list[str]) -> Environment | None:
+    """Return the environment of a file, invisible to cameras; None where it has none.
+
+    The axes are those of `Environment`: the middle is +X, a quarter from the left +Y, the top +Z.
+
+    Raises:
+        TrilightError: the map is unusable (`plain_array`) or of another shape.
+    """
+    if "env_map" not in list_names(file):
+        return None
+    values = read_whole(plain_array(file, "env_map", (None, None, None), MAX_RESOLUTION))
+    if 3 not in (values.shape[0], values.shape[2]):
+        raise TrilightError(
+            f"env_map has shape {values.shape}; expected (3, H, 2 H) or (H, 2 H, 3)."
+        )
+    is_processed = values.shape[0] == 3  # a processed map is already rotated and scaled
+    radiance = np.moveaxis(values, 0, -1) if is_processed else values
+    if not is_processed:
+        strength = _read_small(file, "env_map_strength").ravel()
+        radiance = radiance * (strength[0] if strength.size == 1 else np.float32(1))
+        if np.any(_read_small(file, "env_map_rotation")):
+            lost.append("rotation of the environment: three angles whose order it does not state")
+    if not radiance.any():
+        return None  # a black map stands for no environment
+    return Environment(
+        radiance_rgb=np.ascontiguousarray(radiance, np.float32),
+        source=MapSource(name="env_map", licence=UNKNOWN_LICENCE),
+    )
+
+
+def _read_small(file: Any, name: str) -> NDArray[np.float32]:
+    """Read a small array of a file; empty where the file lacks it."""
+    if name not in list_names(file):
+        return np.zeros(0, np.float32)
+    try:
+        return read_whole(plain_array(file, name, (), 1))
+    except TrilightError:
+        return read_whole(plain_array(file, name, (None,), 16))

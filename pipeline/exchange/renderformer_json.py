@@ -23,14 +23,16 @@ from typing import Annotated, Any, NoReturn, get_args, get_origin, get_type_hint
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.description import (
+from pipeline.exchange.from_description import (
+    SHELL_FOLDER,
+    SMOOTH_ANGLE_DEG,
     ColorGroups,
     DescribedCamera,
     DescribedObject,
     SceneDescription,
+    require_at_most,
 )
-from pipeline.exchange.from_description import SHELL_FOLDER, SMOOTH_ANGLE_DEG
-from pipeline.exchange.textured_triangles import group_triangles
+from pipeline.exchange.textured_triangles import group_triangles, unique_name
 from pipeline.foreign.numbers import Malformed
 from pipeline.scenes.shading_normals import face_normals, smooth_shaded, without_slivers
 from storage.conventions import HALF_FLOAT_MAX
@@ -57,11 +59,7 @@ _OUR_NAMES = {"rotation": "rotation_deg", "fov": "fov_deg"}
 
 
 def read_description(data: bytes, name: str) -> SceneDescription:
-    """Parse a scene file.
-
-    Args:
-        data: the bytes of the file.
-        name: name of the file, for messages.
+    """Parse the bytes of a scene file; messages call it `name`.
 
     Raises:
         TrilightError: the file exceeds MAX_BYTES or is not JSON; a JSON object repeats a name; or a
@@ -299,11 +297,9 @@ class DescribedFiles:
 
 
 def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
-    """Return a scene as the files that the published tools read.
+    """Return a scene that passes `Scene.check` as the files that the published tools read.
 
-    Args:
-        scene: passes `Scene.check`.
-        stem: stem of the scene file and name of its mesh folders.
+    `stem` is the stem of the scene file and the name of its mesh folders.
 
     Raises:
         TrilightError: more objects or cameras than a file may have, a number out of range, or no
@@ -313,11 +309,12 @@ def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
     lost: list[str] = []
     meshes: dict[str, bytes] = {}
     objects: dict[str, Any] = {}
-    taken: set[str] = set()
+    taken: dict[str, int] = {}
     for row, material, faces in group_triangles(scene):
         if len(without_slivers(scene.vertex_positions, scene.faces[faces])) == 0:
             continue  # readers refuse a mesh without an area
-        name = _unique(_name(scene, row, material), taken)
+        # it becomes the name of a file, whose case some systems ignore
+        name = unique_name(_name(scene, row, material), taken, str.casefold)
         normals = scene.vertex_normals[scene.faces[faces]]
         path = _mesh_path(scene, row, material, stem)
         meshes[path] = _obj(scene, faces)
@@ -335,7 +332,13 @@ def describe_scene(scene: Scene, stem: str) -> DescribedFiles:
             "cameras": list(map(camera_entry, scene.c2w, scene.fov_deg)),
         }
     ).encode()
-    _require_size(scene, data, len(objects))
+    require_at_most(
+        {
+            "objects of one material": (len(objects), MAX_OBJECTS),
+            "cameras": (scene.num_views, MAX_CAMERAS),
+            "bytes of a scene file": (len(data), MAX_BYTES),
+        }
+    )
     read_description(data, f"{stem}.json")  # raises for anything that readers would refuse
     return DescribedFiles(json=data, meshes=meshes, lost=(*_losses(scene), *lost))
 
@@ -349,17 +352,6 @@ def _name(scene: Scene, row: int, material: int) -> str:
 def _printable(text: str) -> str:
     legal = (c if c.isprintable() and c not in _NO_FILE_LETTERS else "_" for c in text)
     return "".join(legal)[:_NAME_LETTERS]
-
-
-def _unique(name: str, taken: set[str]) -> str:
-    """Return an unused name, ignoring case, since it becomes the name of a file."""
-    candidate = name
-    count = 1
-    while candidate.casefold() in taken:
-        count += 1
-        candidate = f"{name}.{count}"
-    taken.add(candidate.casefold())
-    return candidate
 
 
 def _mesh_path(scene: Scene, row: int, material: int, stem: str) -> str:
@@ -445,13 +437,3 @@ def _losses(scene: Scene) -> list[str]:
     if (scene.materials[:, EMISSION] > HALF_FLOAT_MAX).any():
         losses.append(f"emission over {HALF_FLOAT_MAX:.0f}, which the published converter cuts off")
     return losses
-
-
-def _require_size(scene: Scene, data: bytes, objects: int) -> None:
-    for what, count, most in (
-        ("objects of one material", objects, MAX_OBJECTS),
-        ("cameras", scene.num_views, MAX_CAMERAS),
-        ("bytes", len(data), MAX_BYTES),
-    ):
-        if count > most:
-            raise TrilightError(f"scene: {count} {what}; a scene file holds at most {most}.")

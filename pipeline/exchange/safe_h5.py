@@ -12,7 +12,6 @@ import itertools
 import math
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,20 +27,9 @@ MAX_BLOCK_BYTES = 64 << 20
 MAX_CHUNKS = 1 << 22
 """Maximum number of chunks in an array; 4096 triangles with published textures take 22528."""
 
-_FLOATS = ("<f2", "<f4", "<f8")
 _DEFLATE = 1
 _SHUFFLE = 2
 """Numbers of the only supported filters."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class H5Array:
-    """A plain array of a file, not yet read."""
-
-    name: str  # for messages
-    shape: tuple[int, ...]  # claimed by the file; checked against the blocks
-    dtype: np.dtype  # type of its elements in the file
-    dataset: Any  # the h5py dataset
 
 
 @contextlib.contextmanager
@@ -71,19 +59,16 @@ def list_names(group: Any) -> list[str]:
     return sorted(group)
 
 
-def plain_array(group: Any, name: str, shape: Sequence[int | None], longest: int) -> H5Array:
-    """Return an unread array of little-endian floats that the file itself holds.
+def plain_array(group: Any, name: str, shape: Sequence[int | None], longest: int) -> Any:
+    """Return an h5py dataset, unread: little-endian floats that the file itself holds.
 
-    Args:
-        group: a group of an open file.
-        name: name of the array.
-        shape: required shape; None is any length from 1 to `longest`.
-        longest: maximum length of an axis.
+    In the required shape, None is any length from 1 to `longest`.
 
     Raises:
         TrilightError: the array is missing, a link, or of another type or shape.
     """
     import h5py
+    from h5py import h5t
 
     if name not in list_names(group):
         raise TrilightError(f"{name}: missing; expected an array {_format_shape(shape)}.")
@@ -102,11 +87,16 @@ def plain_array(group: Any, name: str, shape: Sequence[int | None], longest: int
             f"{name}: has shape {list(claimed)}; expected {_format_shape(shape)} with lengths of "
             f"at most {longest}."
         )
-    dtype = _float_type(dataset, name)
-    return H5Array(name=name, shape=claimed, dtype=dtype, dataset=dataset)
+    stored = dataset.id.get_type()
+    if not any(map(stored.equal, (h5t.IEEE_F16LE, h5t.IEEE_F32LE, h5t.IEEE_F64LE))):
+        raise TrilightError(
+            f"{name}: has another type of elements; expected little-endian floats of 16, 32 or 64 "
+            "bits."
+        )
+    return dataset
 
 
-def iterate_blocks(array: H5Array) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
+def iterate_blocks(array: Any) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
     """Yield (slices, values) of blocks that cover the array once; one block is in memory.
 
     Raises:
@@ -115,27 +105,27 @@ def iterate_blocks(array: H5Array) -> Iterator[tuple[tuple[slice, ...], NDArray]
     """
     from h5py import h5d
 
-    plan = array.dataset.id.get_create_plist()
+    plan = array.id.get_create_plist()
     if plan.get_external_count() or plan.get_layout() == h5d.VIRTUAL:
-        raise TrilightError(f"{array.name}: its bytes are elsewhere; expected them in the file.")
+        raise TrilightError(f"{_name(array)}: its bytes are elsewhere; expected them in the file.")
     if plan.get_layout() == h5d.CHUNKED:
         yield from _iterate_chunks(array, plan)
         return
     num_bytes = math.prod(array.shape) * array.dtype.itemsize
-    if array.dataset.id.get_storage_size() != num_bytes:
-        raise TrilightError(f"{array.name}: holds other bytes than its shape needs.")
+    if array.id.get_storage_size() != num_bytes:
+        raise TrilightError(f"{_name(array)}: holds other bytes than its shape needs.")
     if not array.shape:
-        yield (), np.asarray(array.dataset[()])
+        yield (), np.asarray(array[()])
         return
     row_bytes = num_bytes // array.shape[0]
     _require_memory(array, row_bytes, MAX_BLOCK_BYTES)
     rows = MAX_BLOCK_BYTES // row_bytes
     for start in range(0, array.shape[0], rows):
         where = (slice(start, min(start + rows, array.shape[0])),)
-        yield where, array.dataset[where]
+        yield where, array[where]
 
 
-def read_whole(array: H5Array, most_bytes: int = MAX_BLOCK_BYTES) -> NDArray[np.float32]:
+def read_whole(array: Any, most_bytes: int = MAX_BLOCK_BYTES) -> NDArray[np.float32]:
     """Read a whole array as float32.
 
     Raises:
@@ -150,33 +140,33 @@ def read_whole(array: H5Array, most_bytes: int = MAX_BLOCK_BYTES) -> NDArray[np.
     return values
 
 
-def require_finite(array: H5Array, values: NDArray) -> None:
+def require_finite(array: Any, values: NDArray) -> None:
     """Raise TrilightError where a value is NaN or infinite, or becomes so as float32."""
     with np.errstate(over="ignore"):
         finite = np.isfinite(values.astype(np.float32))
     if not finite.all():
-        raise TrilightError(f"{array.name}: holds {values[~finite][0]}; expected finite values.")
+        raise TrilightError(f"{_name(array)}: holds {values[~finite][0]}; expected finite values.")
 
 
-def _iterate_chunks(array: H5Array, plan: Any) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
-    size = array.dataset.chunks
+def _iterate_chunks(array: Any, plan: Any) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
+    size = array.chunks
     filters = [plan.get_filter(at)[0] for at in range(plan.get_nfilters())]
     if filters not in ([], [_DEFLATE], [_SHUFFLE], [_SHUFFLE, _DEFLATE]):
         raise TrilightError(
-            f"{array.name}: is packed with filters {filters}; expected deflate, shuffle or none."
+            f"{_name(array)}: is packed with filters {filters}; expected deflate, shuffle or none."
         )
     _require_memory(array, math.prod(size) * array.dtype.itemsize, MAX_BLOCK_BYTES)
     counts = [-(-length // chunk) for length, chunk in zip(array.shape, size, strict=True)]
     if math.prod(counts) > MAX_CHUNKS:
         raise TrilightError(
-            f"{array.name}: has {math.prod(counts)} chunks; expected up to {MAX_CHUNKS}."
+            f"{_name(array)}: has {math.prod(counts)} chunks; expected up to {MAX_CHUNKS}."
         )
     stored_offsets = _list_chunk_offsets(array)
     for at in itertools.product(*(range(count) for count in counts)):
         offset = tuple(i * chunk for i, chunk in zip(at, size, strict=True))
         if offset not in stored_offsets:
-            raise TrilightError(f"{array.name}: the chunk at {list(offset)} is missing.")
-        _, packed = array.dataset.id.read_direct_chunk(offset)
+            raise TrilightError(f"{_name(array)}: the chunk at {list(offset)} is missing.")
+        _, packed = array.id.read_direct_chunk(offset)
         values = np.frombuffer(_unpack(array, packed, filters), array.dtype).reshape(size)
         where = tuple(
             slice(start, min(start + chunk, length))
@@ -185,9 +175,9 @@ def _iterate_chunks(array: H5Array, plan: Any) -> Iterator[tuple[tuple[slice, ..
         yield where, values[tuple(slice(0, part.stop - part.start) for part in where)]
 
 
-def _list_chunk_offsets(array: H5Array) -> set[tuple[int, ...]]:
+def _list_chunk_offsets(array: Any) -> set[tuple[int, ...]]:
     """Return the offsets of the stored chunks; none is larger than a block or the file."""
-    most = min(MAX_BLOCK_BYTES, array.dataset.file.id.get_filesize())
+    most = min(MAX_BLOCK_BYTES, array.file.id.get_filesize())
     offsets: set[tuple[int, ...]] = set()
 
     def add_offset(chunk: Any) -> bool | None:
@@ -196,12 +186,12 @@ def _list_chunk_offsets(array: H5Array) -> set[tuple[int, ...]]:
         offsets.add(chunk.chunk_offset)
         return None
 
-    array.dataset.id.chunk_iter(add_offset)
+    array.id.chunk_iter(add_offset)
     return offsets
 
 
-def _unpack(array: H5Array, packed: bytes, filters: list[int]) -> bytes:
-    num_bytes = math.prod(array.dataset.chunks) * array.dtype.itemsize
+def _unpack(array: Any, packed: bytes, filters: list[int]) -> bytes:
+    num_bytes = math.prod(array.chunks) * array.dtype.itemsize
     if _DEFLATE in filters:
         inflater = zlib.decompressobj()
         try:
@@ -209,35 +199,26 @@ def _unpack(array: H5Array, packed: bytes, filters: list[int]) -> bytes:
                 packed, num_bytes + 1
             )  # one byte more than expected, whatever the data claims
         except zlib.error as error:
-            raise TrilightError(f"{array.name}: a chunk is damaged.") from error
+            raise TrilightError(f"{_name(array)}: a chunk is damaged.") from error
         if not inflater.eof:
-            raise TrilightError(f"{array.name}: a chunk ends too early or too late.")
+            raise TrilightError(f"{_name(array)}: a chunk ends too early or too late.")
     if len(packed) != num_bytes:
-        raise TrilightError(f"{array.name}: a chunk holds other bytes than its shape needs.")
+        raise TrilightError(f"{_name(array)}: a chunk holds other bytes than its shape needs.")
     if _SHUFFLE in filters:
         planes = np.frombuffer(packed, np.uint8).reshape(array.dtype.itemsize, -1)
         packed = planes.T.tobytes()
     return packed
 
 
-def _float_type(dataset: Any, name: str) -> np.dtype:
-    from h5py import h5t
-
-    stored = dataset.id.get_type()
-    known = (h5t.IEEE_F16LE, h5t.IEEE_F32LE, h5t.IEEE_F64LE)
-    for code, kind in zip(_FLOATS, known, strict=True):
-        if stored.equal(kind):
-            return np.dtype(code)
-    raise TrilightError(
-        f"{name}: has another type of elements; expected little-endian floats of 16, 32 or 64 bits."
-    )
-
-
-def _require_memory(array: H5Array, num_bytes: int, most: int) -> None:
+def _require_memory(array: Any, num_bytes: int, most: int) -> None:
     if num_bytes > most:
         raise TrilightError(
-            f"{array.name}: would take {num_bytes} bytes at once; expected at most {most}."
+            f"{_name(array)}: would take {num_bytes} bytes at once; expected at most {most}."
         )
+
+
+def _name(array: Any) -> str:
+    return str(array.name).removeprefix("/")
 
 
 def _format_shape(shape: Sequence[int | None]) -> str:

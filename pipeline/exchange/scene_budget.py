@@ -4,10 +4,11 @@ Emitters stay unchanged. The mesh stage's decimation reduces an object; each new
 material of the nearest old one, and smooth normals are computed again.
 """
 
+import dataclasses
+
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets.scene_mesh import remesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.shading_normals import (
@@ -55,13 +56,11 @@ def within_budget(scene: Scene, budget: int) -> tuple[Scene, tuple[str, ...]]:
             f"--budget is {budget}; expected at least {total}, the fewest triangles of this scene "
             f"(emitters take {counts[emits].sum()} of them)."
         )
-    reduced = Scene(
+    reduced = dataclasses.replace(
+        scene,
         **concatenate_pieces(pieces),
-        c2w=scene.c2w,
-        fov_deg=scene.fov_deg,
         objects=tuple(piece.entry for piece in pieces),
         provenance={**scene.provenance, "budget": budget},
-        environment=scene.environment,
     )
     reduced.check()
     return reduced, (f"{scene.num_triangles} triangles reduced to {total}", *lost)
@@ -102,15 +101,12 @@ def _reduce_piece(piece: ScenePiece, count: int) -> ScenePiece:
     )
     centers = old.positions[old.faces].mean(axis=1)
     _, nearest = cKDTree(centers).query(mesh.positions[mesh.faces].mean(axis=1))
-    return ScenePiece(
-        entry=piece.entry,
-        mesh=mesh,
-        materials=piece.materials,
-        material_index=piece.material_index[nearest],
-    )
+    return dataclasses.replace(piece, mesh=mesh, material_index=piece.material_index[nearest])
 
 
 def _decimate_mesh(piece: ScenePiece, count: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    from pipeline.assets.remesh import remesh  # loads mesh libraries
+
     faces = piece.mesh.faces.astype(np.int64)
     raw = TriangleMesh(positions=piece.mesh.positions.astype(np.float64), faces=faces)
     try:

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange.description import DescribedObject, SceneDescription
 from pipeline.exchange.from_description import (
     AlbedoOverOne,
     LoadedMesh,
+    SceneDescription,
     build_cameras,
     scene_from_description,
 )
@@ -46,13 +46,9 @@ class SceneFiles:
     notes: tuple[str, ...] = ()  # sentences about the built scenes
 
     def scene(self, scene_index: int, assets: AssetSettings, *, num_views: int, seed: int) -> Scene:
-        """Build a scene; only child processes call this, since it reads meshes.
+        """Build the scene of the file `names[scene_index]`; only child processes call this.
 
-        Args:
-            scene_index: index of the scene file in `names`.
-            assets: limits on meshes.
-            num_views: number of cameras to take from the file.
-            seed: seed of the dataset; recorded in the provenance only.
+        `num_views` cameras are taken; the provenance records the dataset's `seed`.
 
         Raises:
             Rejected: "unusable_scene_file", for a file of which no scene can be made.
@@ -112,19 +108,9 @@ def build_scene(
 ) -> tuple[Scene, Mapping[str, str]]:
     """Build the scene of one file; only child processes call this, since it reads meshes.
 
-    Args:
-        root: the folder, with links resolved.
-        name: name of the scene file in it.
-        settings: limits on meshes.
-        licence: licence of the objects.
-        num_views: number of cameras to take from the file; None for all.
-        scene_index: index of the scene in the dataset; recorded in the provenance only.
-        seed: seed of the dataset; recorded in the provenance only.
-        albedo_over_one: treatment of albedos that add up to more than 1.
-        notes: receives a sentence for each ignored part of a mesh file.
-
-    Returns:
-        The scene, and the sha256 of each of its files by path below `root`.
+    `num_views` cameras are taken, or all; index and seed stand in the provenance only. `notes`
+    receives a sentence for each ignored part of a mesh file. The scene comes with the sha256 of
+    each of its files by path below `root`, a folder whose links are resolved.
 
     Raises:
         TrilightError: the file or a mesh is unusable; the message names it.
@@ -137,10 +123,15 @@ def build_scene(
     for described in description.objects:
         key = (described.mesh_path, described.remesh_faces)
         if key not in meshes:
-            meshes[key], digest = _load_mesh(root, described, name, settings, licence)
-            digests[meshes[key].uid] = digest
+            where = f"{name}: objects.{described.name}.mesh_path"
+            path = _below(root, described.mesh_path, where)
+            uid = path.relative_to(root).as_posix()
+            display_name = f"{where} is {described.mesh_path}"
+            meshes[key], digests[uid] = load_mesh_file(
+                path, uid, display_name, settings, licence, described.remesh_faces
+            )
             if notes is not None:
-                notes += (f"{meshes[key].uid}: {text}" for text in meshes[key].unread)
+                notes += (f"{uid}: {text}" for text in meshes[key].unread)
     scene = scene_from_description(
         description,
         [meshes[described.mesh_path, described.remesh_faces] for described in description.objects],
@@ -152,32 +143,15 @@ def build_scene(
             "attempt": 0,
             "seed": seed,
             "camera_attempts": [0] * num_views,
-            "scene_file": _file_provenance(description, digests[name], num_views),
+            "scene_file": {
+                "name": description.file,
+                "sha256": digests[name],
+                "scene_name": description.scene_name,
+                "cameras": list(range(num_views)),
+            },
         },
     )
     return scene, digests
-
-
-def _file_provenance(
-    description: SceneDescription, sha256: str, num_views: int
-) -> Mapping[str, str | list[int]]:
-    return {
-        "name": description.file,
-        "sha256": sha256,
-        "scene_name": description.scene_name,
-        "cameras": list(range(num_views)),
-    }
-
-
-def _load_mesh(
-    root: Path, described: DescribedObject, name: str, settings: AssetSettings, licence: str
-) -> tuple[LoadedMesh, str]:
-    """Return the mesh of an object, and the digest of its file."""
-    where = f"{name}: objects.{described.name}.mesh_path"
-    path = _below(root, described.mesh_path, where)
-    uid = path.relative_to(root).as_posix()
-    display_name = f"{where} is {described.mesh_path}"
-    return load_mesh_file(path, uid, display_name, settings, licence, described.remesh_faces)
 
 
 def load_mesh_file(
@@ -188,18 +162,10 @@ def load_mesh_file(
     licence: str,
     remesh_faces: int | None = None,
 ) -> tuple[LoadedMesh, str]:
-    """Read the mesh of a scene; only child processes call this.
+    """Read the mesh of a scene, and the sha256 of its file; only child processes call this.
 
-    Args:
-        path: the file.
-        uid: identifier of the mesh in the scene.
-        display_name: name of the mesh for messages.
-        settings: limits on meshes.
-        licence: licence of the object.
-        remesh_faces: maximum number of triangles after remeshing; None keeps the mesh.
-
-    Returns:
-        The mesh, and the sha256 of its file.
+    The mesh gets the identifier `uid`; messages call it `display_name`. `remesh_faces` is the
+    maximum number of triangles after remeshing; None keeps the mesh.
 
     Raises:
         TrilightError: the file is not a usable mesh, or cannot be read.

@@ -1,6 +1,5 @@
 """Selects samples of a dataset by split and by key."""
 
-import os
 from collections.abc import Iterator
 
 from storage.conventions import SPLITS
@@ -9,20 +8,12 @@ from storage.errors import TrilightError
 from storage.records.sample import Sample, sample_key
 
 
-def is_dataset(source: str) -> bool:
-    """Return whether a source is a dataset (URL or folder) rather than a scene file."""
-    return "://" in source or os.path.isdir(source)
-
-
 def select_samples(
     dataset: Dataset, *, split: str | None = None, scene: str | None = None
 ) -> Iterator[tuple[str, Sample]]:
     """Yield (split, sample) of a dataset in its order, with pictures.
 
-    Args:
-        dataset: the dataset to read.
-        split: the only split; None for all.
-        scene: key of the only scene, with or without the zeros before it; None for all.
+    `split` and `scene` choose one; the key of a scene may lack the zeros before it.
 
     Raises:
         TrilightError: the split or scene does not exist, or the dataset is empty or damaged.

@@ -1,21 +1,22 @@
-"""Joins triangles with materials and textures into the objects of a Scene.
+"""Joins triangles with materials and textures, and cameras, of other programs to a Scene.
 
 Each triangle has three separate corners. Corners of equal position and normal become one vertex,
 and equal materials one row. Textures of one color become constants.
 """
 
 import dataclasses
+import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.cameras import fit_camera
 from pipeline.scenes.pieces import ScenePiece, concatenate_pieces
 from pipeline.scenes.shading_normals import ShadedMesh, flat_shaded
+from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import (
@@ -25,7 +26,7 @@ from storage.records.material import (
     distinct_rows,
     laid_out,
 )
-from storage.records.retextured import AnyScene, with_textures
+from storage.records.retextured import with_textures
 from storage.records.scene import ObjectKind, Scene, SceneObject
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
@@ -33,6 +34,9 @@ TextureSet = tuple[Texture | None, Texture | None, Texture | None]
 """Textures in the order of TEXTURED; None where the material column is the value."""
 
 NO_TEXTURES: TextureSet = (None, None, None)
+
+_FOV_DEG = 40.0
+"""Field of view of the camera that is added to a scene without cameras."""
 
 MAX_TRIANGLES = 1_500_000
 MAX_ROWS = 1 << 16
@@ -58,14 +62,11 @@ class TexturedTriangles:
 
     def select(self, mask: NDArray[np.bool_]) -> "TexturedTriangles":
         """Return the triangles that a mask [T] selects."""
-        return TexturedTriangles(
-            positions=self.positions[mask],
-            normals=self.normals[mask],
-            rows=self.rows[mask],
-            uv=self.uv[mask],
-            texture_set_index=self.texture_set_index[mask],
-            texture_sets=self.texture_sets,
-        )
+        arrays: dict[str, Any] = {name: getattr(self, name)[mask] for name in _PER_TRIANGLE}
+        return dataclasses.replace(self, **arrays)
+
+
+_PER_TRIANGLE = ("positions", "normals", "rows", "uv", "texture_set_index")
 
 
 def join_triangles(
@@ -74,24 +75,21 @@ def join_triangles(
     """Return the triangles of several parts, in the order of `places` [T], which they cover."""
     order = np.argsort(np.concatenate(places), kind="stable")
     starts = np.cumsum([0, *(len(part.texture_sets) for part in parts)])
-
-    def join(arrays: Iterable[NDArray]) -> NDArray:
-        return np.concatenate(list(arrays))[order]
-
+    shifted = [
+        dataclasses.replace(part, texture_set_index=part.texture_set_index + start)
+        for part, start in zip(parts, starts, strict=False)
+    ]
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in shifted])[order]
+        for name in _PER_TRIANGLE
+    }
     return TexturedTriangles(
-        positions=join(part.positions for part in parts),
-        normals=join(part.normals for part in parts),
-        rows=join(part.rows for part in parts),
-        uv=join(part.uv for part in parts),
-        texture_set_index=join(
-            part.texture_set_index + start for part, start in zip(parts, starts, strict=False)
-        ),
-        texture_sets=[each for part in parts for each in part.texture_sets],
+        **arrays, texture_sets=[each for part in parts for each in part.texture_sets]
     )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TexturedPiece:
+class _Piece:
     """An object of a scene with its textures."""
 
     piece: ScenePiece
@@ -102,22 +100,26 @@ class TexturedPiece:
     """Texture set of each material row of `piece`."""
 
 
-def build_piece(entry: SceneObject, triangles: TexturedTriangles) -> TexturedPiece:
-    """Build an object of a scene from its triangles."""
-    corners = np.concatenate([triangles.positions, triangles.normals], axis=2).reshape(-1, 6)
-    first, index = distinct_rows(corners)
+def index_corners(
+    positions: NDArray[np.float32], normals: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
+    """Return positions, normals and faces of corners [T, 3, 3], vertices in order of first use."""
+    corners = np.concatenate([positions, normals], axis=2).reshape(-1, 6)
+    first, rows = distinct_rows(corners)
     vertices = corners[first]
-    faces = index.reshape(-1, 3).astype(np.uint32)
+    faces = rows.astype(np.uint32).reshape(-1, 3)
+    return vertices[:, :3].copy(), vertices[:, 3:].copy(), faces
+
+
+def _build_piece(entry: SceneObject, triangles: TexturedTriangles) -> _Piece:
+    """Build an object of a scene from its triangles."""
+    positions, normals, faces = index_corners(triangles.positions, triangles.normals)
     rows = _with_means(triangles)
     appearance = np.column_stack([rows, triangles.texture_set_index.astype(np.float32)])
     palette, material_index = distinct_rows(appearance)
-    mesh = ShadedMesh(
-        positions=vertices[:, :3].copy(),
-        normals=vertices[:, 3:].copy(),
-        faces=faces,
-        groups=np.zeros(len(faces), np.int64),
-    )
-    return TexturedPiece(
+    groups = np.zeros(len(faces), np.int64)
+    mesh = ShadedMesh(positions=positions, normals=normals, faces=faces, groups=groups)
+    return _Piece(
         piece=ScenePiece(
             entry=entry, mesh=mesh, materials=rows[palette], material_index=material_index
         ),
@@ -149,21 +151,6 @@ def build_lamp(
     )
 
 
-def with_texture_sets(scene: AnyScene, pieces: Sequence[TexturedPiece]) -> AnyScene:
-    """Return the scene of these pieces, in their order, with their textures."""
-    textures: dict[str, Texture] = {}
-    sets = [texture_set for each in pieces for texture_set in each.texture_sets]
-    for texture in (texture for texture_set in sets for texture in texture_set if texture):
-        textures.setdefault(texture.sha256, texture)
-    order = {sha256: row for row, sha256 in enumerate(textures)}
-    index = [[order[each.sha256] if each else CONSTANT for each in row] for row in sets]
-    if not textures:
-        return scene
-    uv = np.concatenate([each.uv.reshape(-1, 2) for each in pieces]).astype(np.float32)
-    rows = np.array(index, np.int32).reshape(-1, len(TEXTURED))
-    return with_textures(scene, uv, tuple(textures.values()), rows)
-
-
 def _with_means(triangles: TexturedTriangles) -> NDArray[np.float32]:
     """Return the rows with the means of textures, so that equal materials have equal rows."""
     rows = triangles.rows.copy()
@@ -185,6 +172,31 @@ def _drop_constant_textures(textures: TextureSet) -> TextureSet:
     return one, two, three
 
 
+def _fit_camera(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
+    """Return the pose and angle of a camera that sees all points [N, 3], obliquely from above."""
+    low = points.min(axis=0).astype(np.float64)
+    high = points.max(axis=0).astype(np.float64)
+    center = (low + high) / 2
+    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    direction = np.array([0.6, -1.0, 0.6]) / np.linalg.norm([0.6, -1.0, 0.6])
+    eye = center + direction * radius / math.sin(math.radians(_FOV_DEG) / 2)
+    return look_at_c2w(eye=eye, target=center, up=[0, 0, 1]), _FOV_DEG
+
+
+def rigid_pose(matrix: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return a transform [4, 4] without its scale; None where it has no direction."""
+    backward = matrix[:3, 2]
+    right = matrix[:3, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        backward = backward / np.linalg.norm(backward)
+        right = right - backward * np.einsum("i,i->", right, backward)
+        right = right / np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(backward, right), backward], axis=1)
+    pose[:3, 3] = matrix[:3, 3]
+    return pose if np.isfinite(pose).all() else None
+
+
 def group_triangles(scene: Scene) -> list[tuple[int, int, NDArray[np.intp]]]:
     """Return (object, material, triangles), sorted by object and then by material."""
     keys = scene.object_index.astype(np.int64) * len(scene.materials) + scene.material_index
@@ -202,8 +214,8 @@ class SceneParts:
     def __init__(self, file: str) -> None:
         self._file = file
         self._names: dict[str, int] = {}
-        self._pieces: list[TexturedPiece] = []
-        self._surfaces: list[TexturedPiece] = []
+        self._pieces: list[_Piece] = []
+        self._surfaces: list[_Piece] = []
         self._counts = Counter[str]()
 
     def add(
@@ -220,8 +232,10 @@ class SceneParts:
         for kind, mask in kinds:
             if not mask.any():
                 continue
-            unique = dataclasses.replace(entry, name=self._make_unique(entry.name), kind=kind)
-            piece = build_piece(unique, triangles.select(mask))
+            unique = dataclasses.replace(
+                entry, name=unique_name(entry.name, self._names), kind=kind
+            )
+            piece = _build_piece(unique, triangles.select(mask))
             self._pieces.append(piece)
             self._surfaces += [] if is_lamp else [piece]
             self._counts["triangles"] += len(piece.piece.mesh.faces)
@@ -257,16 +271,13 @@ class SceneParts:
     ) -> Scene:
         """Build and check the scene; a camera that sees everything is added where there is none.
 
-        Args:
-            cameras: pose [4, 4] and full angle in degrees of each.
-            sky: its environment, if any.
-            provenance: template and file.
-            lost: receives a sentence for each loss.
+        `cameras` has the pose [4, 4] and full angle in degrees of each, `sky` the environment, if
+        any; `lost` receives a sentence for each loss.
         """
         points = self.surface_points()
         if not cameras:
             lost.append("no camera: one was added that sees everything")
-            cameras = [fit_camera(points)]
+            cameras = [_fit_camera(points)]
         scene = Scene(
             **concatenate_pieces([one.piece for one in self._pieces]),
             objects=tuple(one.piece.entry for one in self._pieces),
@@ -275,16 +286,31 @@ class SceneParts:
             provenance=provenance,
             environment=sky,
         )
-        scene = with_texture_sets(scene, self._pieces)
+        scene = self._with_textures(scene)
         scene.check()
         return scene
 
-    def _make_unique(self, base: str) -> str:
-        count = self._names.get(base, 0) + 1
-        name = base if count == 1 else f"{base}.{count}"
-        while count > 1 and name in self._names:
-            count += 1
-            name = f"{base}.{count}"
-        self._names[base] = count
-        self._names.setdefault(name, 1)
-        return name
+    def _with_textures(self, scene: Scene) -> Scene:
+        textures: dict[str, Texture] = {}
+        sets = [texture_set for each in self._pieces for texture_set in each.texture_sets]
+        for texture in (texture for texture_set in sets for texture in texture_set if texture):
+            textures.setdefault(texture.sha256, texture)
+        if not textures:
+            return scene
+        order = {sha256: row for row, sha256 in enumerate(textures)}
+        index = [[order[each.sha256] if each else CONSTANT for each in row] for row in sets]
+        uv = np.concatenate([each.uv.reshape(-1, 2) for each in self._pieces]).astype(np.float32)
+        rows = np.array(index, np.int32).reshape(-1, len(TEXTURED))
+        return with_textures(scene, uv, tuple(textures.values()), rows)
+
+
+def unique_name(base: str, counts: dict[str, int], key: Callable[[str], str] = str) -> str:
+    """Return an unused name: the base, or with `.2` and so on; `counts` holds keys of all names."""
+    count = counts.get(key(base), 0) + 1
+    name = base if count == 1 else f"{base}.{count}"
+    while count > 1 and key(name) in counts:
+        count += 1
+        name = f"{base}.{count}"
+    counts[key(base)] = count
+    counts.setdefault(key(name), 1)
+    return name

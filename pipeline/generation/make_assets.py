@@ -17,8 +17,8 @@ from pipeline.assets.preview import preview_source_and_level
 from pipeline.assets.recipe import RECIPE, library_versions
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedObject
-from pipeline.documents.attribution import encode_attribution
 from pipeline.documents.quality_page import Pair, encode_quality_page
+from pipeline.documents.rights import encode_attribution
 from pipeline.exchange.gltf.write_gltf import encode_mesh_glb
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.generation.prepare_isolated import (

@@ -270,7 +270,7 @@ def test_the_ends_of_half_floats_go_through_hdf5(tmp_path: Path, emission: float
     scene = tiny_scene()
     scene.materials[LIGHT, EMISSION] = emission
     pictures = np.stack([_spike(8), _halfs(8)])
-    write_renderformer_h5(tmp_path / "a.h5", scene, pictures, texture_type="float16")
+    write_renderformer_h5(tmp_path / "a.h5", scene, pictures)
     read = read_renderformer_h5(tmp_path / "a.h5")
     assert read.radiance_rgb is not None
     assert np.array_equal(read.radiance_rgb, pictures)

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from infra.planning import measure_scenes
-from pipeline.exchange.renderformer_h5 import TextureType, write_renderformer_h5
+from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.presets.registry import preset_settings
 from storage.dataset.layout import DatasetFolder
@@ -116,18 +116,14 @@ def time_reading(
         return seconds / count, (time.process_time() - core_began) / count
 
 
-TEXTURES: Mapping[str, TextureType] = {"HDF5 float16": "float16", "HDF5 float32": "float32"}
+TEXTURES = {"HDF5 float16": "float16", "HDF5 float32": "float32"}
 LAYOUTS = (*PROFILES, *TEXTURES)
 
 Packed = TypeVar("Packed")
 
 
 def unpacking_figures(samples: Sequence[Sample], layout: str, work: Path) -> Mapping[str, float]:
-    """Unpack samples of one of LAYOUTS in memory, in one thread.
-
-    Returns:
-        Mean bytes of a sample before and after, and mean CPU milliseconds.
-    """
+    """Return mean bytes before and after, and CPU milliseconds, of unpacking samples in memory."""
     if layout in TEXTURES:
         files = [_h5_bytes(sample, work, TEXTURES[layout]) for sample in samples]
         return _time_unpacking(files, _unpacked_h5, len)
@@ -142,10 +138,14 @@ def _unpacked_sample(members: Mapping[str, bytes]) -> int:
     return int(arrays + sample.radiance_rgb.nbytes)
 
 
-def _h5_bytes(sample: Sample, work: Path, texture_type: TextureType) -> bytes:
-    path = work / "scene.h5"
-    write_renderformer_h5(path, sample.scene, sample.radiance_rgb, texture_type=texture_type)
-    return path.read_bytes()
+def _h5_bytes(sample: Sample, work: Path, texture_type: str) -> bytes:
+    write_renderformer_h5(work / "scene.h5", sample.scene, sample.radiance_rgb)
+    stream = io.BytesIO()
+    with h5py.File(work / "scene.h5") as source, h5py.File(stream, "w") as file:
+        for name, array in source.items():
+            data = array[()].astype(texture_type if name == "texture" else array.dtype)
+            file.create_dataset(name, data=data, compression="gzip", compression_opts=9)
+    return stream.getvalue()
 
 
 def _unpacked_h5(data: bytes) -> int:

@@ -51,19 +51,14 @@ def _annotations(
     for row in np.unique(ids[ids >= 0]).tolist():
         entry = objects[row]
         mask = ids == row
-        rows, columns = np.nonzero(mask)
-        min_column = int(columns.min())
-        min_row = int(rows.min())
+        corners = np.argwhere(mask)[:, ::-1]
+        low = corners.min(axis=0)
+        size = corners.max(axis=0) - low + 1
         yield {
             "category_id": _CATEGORIES[entry.kind],
             "segmentation": {"size": list(mask.shape), "counts": _runs(mask)},
-            "area": len(rows),
-            "bbox": [
-                min_column,
-                min_row,
-                int(columns.max()) - min_column + 1,
-                int(rows.max()) - min_row + 1,
-            ],
+            "area": len(corners),
+            "bbox": [*low.tolist(), *size.tolist()],
             "iscrowd": 0,
             "object_name": entry.name,
             "uid": entry.uid,

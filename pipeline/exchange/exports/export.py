@@ -7,10 +7,9 @@ from typing import Literal
 
 from pipeline.exchange.exports.coco import write_coco
 from pipeline.exchange.exports.energon import write_energon
-from pipeline.exchange.exports.huggingface import write_huggingface
 from pipeline.exchange.exports.hypersim import write_hypersim
-from pipeline.exchange.exports.nerfstudio import write_nerfstudio
-from pipeline.exchange.exports.scenes import WRITERS, write_benchmark, write_scenes
+from pipeline.exchange.exports.pictures import write_huggingface, write_nerfstudio
+from pipeline.exchange.exports.scenes import SCENE_FORMS, write_benchmark, write_scenes
 from pipeline.exchange.select_samples import select_samples
 from storage.atomic import write_atomically
 from storage.dataset.dataset import open_dataset
@@ -30,22 +29,16 @@ ExportForm = Literal[
     "benchmark",
 ]
 
-Samples = Iterator[tuple[str, Sample]]
-"""Samples, each with its split."""
-
-FORMS: dict[str, Callable[[Samples, Path], Sequence[str] | None]] = {
+FORMS: dict[str, Callable[[Iterator[tuple[str, Sample]], Path], Sequence[str] | None]] = {
     "nerfstudio": write_nerfstudio,
     "coco": write_coco,
     "huggingface": write_huggingface,
     "hypersim": write_hypersim,
-    **{form: functools.partial(write_scenes, form=form) for form in WRITERS},
+    **{form: functools.partial(write_scenes, form=form) for form in SCENE_FORMS},
     "benchmark": write_benchmark,
 }
 """Writers by format. Each writes into a folder, index files last, and may return sentences about
 losses."""
-
-WHOLE_SHARDS = "energon"
-"""The format that takes the shards as they are."""
 
 _RIGHTS = ("LICENSE.md", "attribution.csv")
 """Files of a dataset on rights, which every export contains."""
@@ -60,17 +53,11 @@ def export_dataset(
     scene: str | None,
     done: Callable[[int], None],
 ) -> Sequence[str]:
-    """Write samples of a dataset in the format of another library, with the rights of its objects.
+    """Write samples of a dataset in a format of FORMS, with the rights of its objects.
 
-    Args:
-        source: folder or URL of a dataset.
-        form: a name of FORMS.
-        out: a folder that is empty, or does not exist.
-        split, scene: as `select_samples`.
-        done: called after each sample with its number of views.
-
-    Returns:
-        Sentences about what the format cannot hold.
+    `out` is empty or does not exist; `split` and `scene` are those of `select_samples`. `done` is
+    called after each sample with its number of views. The returned sentences tell what the format
+    cannot hold.
 
     Raises:
         TrilightError: the dataset is unusable, there is no such split or scene, or the folder is
@@ -80,13 +67,13 @@ def export_dataset(
         raise TrilightError(f"--out is {out}, which is not empty; expected a new folder.")
     dataset = open_dataset(source)
 
-    def samples() -> Samples:
+    def samples() -> Iterator[tuple[str, Sample]]:
         for split_sample in select_samples(dataset, split=split, scene=scene):
             yield split_sample
             done(split_sample[1].scene.num_views)
 
     lost: Sequence[str] | None = None
-    if form == WHOLE_SHARDS:
+    if form == "energon":  # takes the shards as they are
         if scene is not None:
             raise TrilightError(
                 "--form energon copies whole shards, and --scene names a sample; leave it out, or "

@@ -1,11 +1,32 @@
-"""Writers of PNG, TIFF and JSON files for the exports.
+"""Exports as folders of pictures, for nerfstudio and for `datasets`; writers of PNG, TIFF and JSON.
 
 A scene stands alone where nothing is behind its objects: no floor, no wall, no sky that cameras
 see. Its pictures get alpha, and pictures of normals and albedo beside them.
+
+nerfstudio: one folder for each scene, with `transforms.json`, pictures and depths.
+
+    KEY/transforms.json, KEY/images/VIEW.png, KEY/depths/VIEW.npy
+    KEY/{normals,albedos}/VIEW.png    of a scene that stands alone, whose images are RGBA
+
+Poses are camera to world, looking along -Z with +Y up, world +Z up. Depths are along the axis of
+the camera, in millimeters, since nerfstudio multiplies them by 0.001; 0 is unknown.
+https://docs.nerf.studio/quickstart/data_conventions.html
+
+Hugging Face `datasets`: an image folder for `load_dataset(FOLDER)`.
+
+    SPLIT/metadata.jsonl, SPLIT/KEY.VIEW.{png,depth.tiff,object.tiff,triangle.tiff}
+
+Columns: `image` (8-bit sRGB), `depth` (float32, meters along the axis of the camera, infinite where
+nothing is met), `object` and `triangle` (int32 rows of the scene's objects and triangles, -1 where
+nothing is met), all as pictures; the camera, the picture's stated error, and the objects' names.
+Scenes that stand alone have an RGBA `image`, the columns `normal` and `albedo`, and the stated
+error over the object.
+https://huggingface.co/docs/datasets/image_dataset
 """
 
 import io
 import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +36,100 @@ from PIL import Image
 
 from pipeline.documents.png import encode_png
 from storage.atomic import write_atomically
-from storage.conventions import preview_srgb8, srgb8
+from storage.conventions import focal_px, preview_srgb8, srgb8
 from storage.records.passes.pictures import view_passes
 from storage.records.sample import Sample
 from storage.records.scene import Scene
 
 _ALPHA_RAYS = 4
 """Rays along each side of a pixel that tell its alpha."""
+
+_MM = np.float32(1000)
+
+_PASSES = {"depth": "depth_axis_m", "object": "object", "triangle": "triangle"}
+"""Pass of each column of a table for `datasets`."""
+
+
+def write_nerfstudio(samples: Iterator[tuple[str, Sample]], out: Path) -> None:
+    """Write one folder for each sample, in the layout of this module."""
+    for _, sample in samples:
+        folder = out / sample.key
+        frames = [_frame(folder, sample, view) for view in range(sample.scene.num_views)]
+        write_json(folder / "transforms.json", {"camera_model": "OPENCV", "frames": frames})
+
+
+def write_huggingface(samples: Iterator[tuple[str, Sample]], out: Path) -> None:
+    """Write pictures and one table for each split, in the layout of this module."""
+    lines: dict[str, list[str]] = {}
+    for split, sample in samples:
+        for view in range(sample.scene.num_views):
+            row = _row(out / split, sample, view)
+            lines.setdefault(split, []).append(json.dumps(row, allow_nan=False))
+    for split, split_lines in lines.items():
+        text = "".join(f"{line}\n" for line in split_lines)
+        write_atomically(out / split / "metadata.jsonl", text.encode())
+
+
+def _frame(folder: Path, sample: Sample, view: int) -> dict[str, Any]:
+    scene = sample.scene
+    resolution = sample.radiance_rgb.shape[2]
+    depth = sample.view_passes(["depth_axis_m"], view=view)["depth_axis_m"]
+    stream = io.BytesIO()
+    np.save(stream, np.where(np.isfinite(depth), depth * _MM, np.float32(0)))
+    write_atomically(folder / f"depths/{view}.npy", stream.getvalue())
+    picture = folder / f"images/{view}.png"
+    surfaces = _write_view(sample, view, picture, lambda name: folder / f"{name}s/{view}.png")
+    focal = float(focal_px(float(scene.fov_deg[view]), resolution))
+    return {
+        "file_path": f"images/{view}.png",
+        "depth_file_path": f"depths/{view}.npy",
+        "transform_matrix": scene.c2w[view].tolist(),
+        "fl_x": focal,
+        "fl_y": focal,
+        "cx": resolution / 2,
+        "cy": resolution / 2,
+        "w": resolution,
+        "h": resolution,
+        **{f"{name}_file_path": f"{name}s/{view}.png" for name in surfaces},
+    }
+
+
+def _row(folder: Path, sample: Sample, view: int) -> dict[str, Any]:
+    scene = sample.scene
+    record = sample.views[view]
+    name = f"{sample.key}.{view}"
+    picture = folder / f"{name}.png"
+    surfaces = _write_view(sample, view, picture, lambda column: folder / f"{name}.{column}.png")
+    passes = sample.view_passes(list(_PASSES.values()), view=view)
+    for column, pass_name in _PASSES.items():
+        stream = io.BytesIO()
+        Image.fromarray(passes[pass_name]).save(stream, "TIFF")  # lossless, 32 bits
+        write_atomically(folder / f"{name}.{column}.tiff", stream.getvalue())
+    return {
+        "file_name": f"{name}.png",
+        **{f"{column}_file_name": f"{name}.{column}.tiff" for column in _PASSES},
+        **{f"{column}_file_name": f"{name}.{column}.png" for column in surfaces},
+        "scene": sample.key,
+        "view": view,
+        "c2w": scene.c2w[view].tolist(),
+        "fov_deg": float(scene.fov_deg[view]),
+        "noise_floor_db": record.noise_floor_db,
+        **({"object_noise_floor_db": record.object_noise_floor_db} if surfaces else {}),
+        "objects": [entry.name for entry in scene.objects],
+        "licences": [entry.licence for entry in scene.objects],
+    }
+
+
+def _write_view(
+    sample: Sample, view: int, picture: Path, surface: Callable[[str], Path]
+) -> list[str]:
+    """Write the picture of a view, and of its surfaces by name if its scene stands alone."""
+    alone = stands_alone(sample.scene)
+    write_png(picture, sample, view, alpha=alone)
+    surfaces = _surface_pictures(sample, view) if alone else {}
+    for name, pixels in surfaces.items():
+        write_atomically(surface(name), encode_png(pixels))
+    return list(surfaces)
 
 
 def stands_alone(scene: Scene) -> bool:
@@ -34,12 +142,8 @@ def stands_alone(scene: Scene) -> bool:
 def write_png(path: Path, sample: Sample, view: int, *, alpha: bool = False) -> None:
     """Write the picture of a view as 8-bit sRGB; radiance above 1 is clipped.
 
-    Args:
-        path: the file.
-        sample: whose picture.
-        view: row of the cameras.
-        alpha: write RGBA, of a scene that stands alone. Colors are straight: those of the surface
-            alone, without the black around it. Alpha is the share of 16 rays that meet a surface.
+    `alpha` writes RGBA, of a scene that stands alone. Colors are straight: those of the surface
+    alone, without the black around it. Alpha is the share of 16 rays that meet a surface.
     """
     radiance_rgb = sample.radiance_rgb[view]
     if not alpha:
@@ -55,7 +159,7 @@ def write_png(path: Path, sample: Sample, view: int, *, alpha: bool = False) -> 
     write_atomically(path, encode_png(np.where(alpha8 > 0, rgba, 0).astype(np.uint8)))
 
 
-def surface_pictures(sample: Sample, view: int) -> dict[str, NDArray[np.uint8]]:
+def _surface_pictures(sample: Sample, view: int) -> dict[str, NDArray[np.uint8]]:
     """Return 8-bit pictures [R, R, 3] of what a view's surfaces are, black where there is none.
 
     `normal`: the shading normal in world axes, -1 to 1 as 0 to 255. `albedo`: diffuse and specular
@@ -65,13 +169,6 @@ def surface_pictures(sample: Sample, view: int) -> dict[str, NDArray[np.uint8]]:
     normal, diffuse, specular = sample.view_passes(names, view=view).values()
     rgb8 = np.nan_to_num(np.round((normal + 1) * 127.5)).astype(np.uint8)
     return {"normal": rgb8, "albedo": srgb8(np.nan_to_num(diffuse + specular))}
-
-
-def write_tiff(path: Path, values: NDArray[np.float32] | NDArray[np.int32]) -> None:
-    """Write one value for each pixel [R, R] as a lossless 32-bit TIFF."""
-    stream = io.BytesIO()
-    Image.fromarray(values).save(stream, "TIFF")
-    write_atomically(path, stream.getvalue())
 
 
 def write_json(path: Path, value: Any) -> None:

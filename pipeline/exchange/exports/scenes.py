@@ -12,7 +12,7 @@ that the leaderboard reads those pictures unrenamed (`trilight leaderboard SET -
 
 import csv
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from pipeline.exchange.convert import write_scene
@@ -24,15 +24,14 @@ SCENE_SUFFIXES = {"h5": ".h5", "json": ".json", "usd": ".usdc"}
 """Suffix of the scene file of each format."""
 
 TARGETS = "exr"
-"""Format name of the target pictures."""
+"""Format name of the target pictures, which have exactly the dataset's values."""
+
+SCENE_FORMS = (*SCENE_SUFFIXES, TARGETS)
 
 MOST_NOTES = 6
 """Maximum number of losses listed for each format; further ones are counted."""
 
 _COLUMNS = ("scene", "view", "split", "h5", "json", "usd", "target", "noise_floor_db")
-
-WriteSample = Callable[[Sample, Path], Sequence[str]]
-"""Writes a sample's files into a folder, and returns sentences about losses."""
 
 
 def picture_name(key: str, view: int) -> str:
@@ -40,48 +39,34 @@ def picture_name(key: str, view: int) -> str:
     return f"{key}_view_{view}.exr"
 
 
-def write_targets(sample: Sample, folder: Path) -> Sequence[str]:
-    """Write the picture of every view with exactly the dataset's values."""
-    for view, radiance_rgb in enumerate(sample.radiance_rgb):
-        write_atomically(folder / picture_name(sample.key, view), encode_exr(radiance_rgb))
-    return ()
-
-
-def make_scene_writer(form: str) -> WriteSample:
-    """Return the writer of scenes in a format of SCENE_SUFFIXES."""
-
-    def write(sample: Sample, folder: Path) -> Sequence[str]:
-        target = folder / f"{sample.key}{SCENE_SUFFIXES[form]}"
-        folder.mkdir(parents=True, exist_ok=True)
-        return write_scene(target, sample.scene, sample.radiance_rgb)
-
-    return write
-
-
-WRITERS: dict[str, WriteSample] = {
-    **{form: make_scene_writer(form) for form in SCENE_SUFFIXES},
-    TARGETS: write_targets,
-}
-"""Writer of each format."""
+def _write_sample(form: str, sample: Sample, folder: Path) -> Sequence[str]:
+    """Write a sample in a form into a folder; return sentences about losses."""
+    if form == TARGETS:
+        for view, radiance_rgb in enumerate(sample.radiance_rgb):
+            write_atomically(folder / picture_name(sample.key, view), encode_exr(radiance_rgb))
+        return ()
+    folder.mkdir(parents=True, exist_ok=True)
+    target = folder / f"{sample.key}{SCENE_SUFFIXES[form]}"
+    return write_scene(target, sample.scene, sample.radiance_rgb)
 
 
 def write_scenes(samples: Iterator[tuple[str, Sample]], out: Path, form: str) -> Sequence[str]:
     """Write every sample in one format into a folder; return sentences about losses."""
     lost: dict[str, None] = {}
     for _, sample in samples:
-        lost |= dict.fromkeys(WRITERS[form](sample, out))
+        lost |= dict.fromkeys(_write_sample(form, sample, out))
     return _limit_notes(form, list(lost))
 
 
 def write_benchmark(samples: Iterator[tuple[str, Sample]], out: Path) -> Sequence[str]:
     """Write all formats and the table of views, in the layout of this module."""
-    lost: dict[str, dict[str, None]] = {form: {} for form in WRITERS}
+    lost: dict[str, dict[str, None]] = {form: {} for form in SCENE_FORMS}
     stream = io.StringIO(newline="")
     table = csv.writer(stream, lineterminator="\n")
     table.writerow(_COLUMNS)
     for split, sample in samples:
-        for form, write in WRITERS.items():
-            lost[form] |= dict.fromkeys(write(sample, out / form))
+        for form in SCENE_FORMS:
+            lost[form] |= dict.fromkeys(_write_sample(form, sample, out / form))
         scenes = [f"{form}/{sample.key}{suffix}" for form, suffix in SCENE_SUFFIXES.items()]
         for view, record in enumerate(sample.views):
             target = f"{TARGETS}/{picture_name(sample.key, view)}"

@@ -7,7 +7,6 @@ at every angle, as in Trilight; the tint gives the other channels. The base colo
 diffuse / (1 - F). Lamps are surfaces that emit (KHR_materials_emissive_strength).
 """
 
-import io
 import json
 import struct
 from collections.abc import Mapping
@@ -16,8 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
+from pipeline.documents.png import encode_png
 from pipeline.exchange.linear_maps import (
     Map,
     constant_map,
@@ -78,7 +77,7 @@ def encode_scene_glb(scene: Scene) -> bytes:
     nodes: list[dict[str, Any]] = [{"rotation": list(_TO_Y_UP), "children": []}]
     meshes = list[dict[str, Any]]()
     for row, entry in enumerate(scene.objects):
-        primitives = [_primitive(file, scene, *part[1:]) for part in parts if part[0] == row]
+        primitives = [_scene_primitive(file, scene, *part[1:]) for part in parts if part[0] == row]
         if primitives:
             nodes.append({"name": entry.name, "mesh": len(meshes)})
             meshes.append({"name": entry.name, "primitives": primitives})
@@ -113,17 +112,13 @@ def encode_mesh_glb(
 ) -> bytes:
     """Return a textured mesh as the bytes of a GLB file.
 
-    Args:
-        positions: [V, 3], +Z up.
-        faces: [F, 3] rows of `positions`.
-        uv: [F, 3, 2] texture coordinates of the corners, v up.
-        textures: diffuse, specular and roughness.
+    Vertices [V, 3] are +Z up, faces [F, 3] rows of them, and coordinates [F, 3, 2] of corners v up.
+    The textures are diffuse, specular and roughness.
     """
     file = GlbFile()
     maps = {name: linear_map(texture) for name, texture in zip(TEXTURED, textures, strict=True)}
-    attributes = _attributes(file, positions[faces].reshape(-1, 3), None, uv.reshape(-1, 2))
-    indices = file.accessor(np.arange(faces.size, dtype="<u4"), "SCALAR", UNSIGNED)
-    primitive = {"attributes": attributes, "indices": indices, "material": 0}
+    corners = positions[faces].reshape(-1, 3)
+    primitive = _primitive(file, 0, np.arange(faces.size), corners, None, uv.reshape(-1, 2))
     file.tree |= {
         "nodes": [{"mesh": 0, "rotation": list(_TO_Y_UP)}],
         "meshes": [{"primitives": [primitive]}],
@@ -133,33 +128,30 @@ def encode_mesh_glb(
     return file.encode()
 
 
-def _primitive(
+def _scene_primitive(
     file: "GlbFile", scene: Scene, material: int, triangles: NDArray[np.intp]
 ) -> dict[str, Any]:
     corners = scene.faces[triangles].reshape(-1)
     if scene.uv is None:
         vertices, indices = np.unique(corners, return_inverse=True)
+        uv = None
     else:
         vertices = corners
         indices = np.arange(len(corners))
-    uv = None if scene.uv is None else scene.uv.reshape(-1, 3, 2)[triangles].reshape(-1, 2)
-    attributes = _attributes(
-        file, scene.vertex_positions[vertices], scene.vertex_normals[vertices], uv
-    )
-    return {
-        "attributes": attributes,
-        "indices": file.accessor(indices.astype("<u4"), "SCALAR", UNSIGNED),
-        "material": material,
-    }
+        uv = scene.uv.reshape(-1, 3, 2)[triangles].reshape(-1, 2)
+    points = scene.vertex_positions[vertices]
+    return _primitive(file, material, indices, points, scene.vertex_normals[vertices], uv)
 
 
-def _attributes(
+def _primitive(
     file: "GlbFile",
+    material: int,
+    indices: NDArray[np.integer],
     points: NDArray[np.floating],
     normals: NDArray[np.floating] | None,
     uv: NDArray[np.floating] | None,
-) -> dict[str, int]:
-    """Add positions and normals [V, 3] and coordinates [V, 2], v up; return their accessors."""
+) -> dict[str, Any]:
+    """Return the JSON of positions and normals [V, 3], and coordinates [V, 2] with v up."""
     points = points.astype("<f4")
     bounds = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
     attributes = {"POSITION": file.accessor(points, "VEC3", FLOAT, bounds)}
@@ -168,7 +160,8 @@ def _attributes(
     if uv is not None:
         from_top = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype("<f4")
         attributes["TEXCOORD_0"] = file.accessor(from_top, "VEC2", FLOAT)
-    return attributes
+    index = file.accessor(indices.astype("<u4"), "SCALAR", UNSIGNED)
+    return {"attributes": attributes, "indices": index, "material": material}
 
 
 def _material(
@@ -246,10 +239,8 @@ class GlbFile:
 
     def picture(self, values: NDArray[np.uint8]) -> int:
         """Add a picture [H, W, 3], bottom row first; return the index of its texture."""
-        stream = io.BytesIO()
-        Image.fromarray(values[::-1]).save(stream, "PNG")
         images, textures = (self.tree.setdefault(name, []) for name in ("images", "textures"))
-        images.append({"bufferView": self._view(stream.getvalue()), "mimeType": "image/png"})
+        images.append({"bufferView": self._view(encode_png(values[::-1])), "mimeType": "image/png"})
         textures.append({"source": len(images) - 1})
         return len(textures) - 1
 

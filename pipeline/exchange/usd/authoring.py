@@ -1,7 +1,7 @@
 """Writes prims and attributes straight into a layer, with a hundredth of the calls of schemas.
 
-An attribute is a pair (USD type name, value). The writer and the exact reader use the same tables
-of attributes by name: one writes the values, the other compares them.
+The writer and the exact reader use the same tables of attributes by name: one writes the values,
+the other compares them.
 """
 
 import functools
@@ -9,14 +9,22 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.exchange.usd.prim_names import NAMESPACE
 
-Attributes = Mapping[str, tuple[str, Any]]
-"""Type name and value of each attribute by name; the prefix "uniform " sets its variability."""
+Attributes = Mapping[str, tuple[str, Any] | tuple[str, Any, str]]
+"""Type name, value and connected output, if any, of each attribute by name.
+
+The prefix "uniform " of a type sets its variability. Inputs and outputs may have the value None. An
+output is named by its path below the material.
+"""
 
 UNIFORM = "uniform "
+
+
+def text_attributes(fields: Mapping[str, str], record: Any) -> dict[str, tuple[str, Any]]:
+    """Return attributes of a record's fields that are texts; `fields` has their names."""
+    return {name: ("string", getattr(record, field)) for field, name in fields.items()}
 
 
 def add_prim(layer: Any, path: str, type_name: str, schemas: Sequence[str] = ()) -> Any:
@@ -31,11 +39,11 @@ def add_prim(layer: Any, path: str, type_name: str, schemas: Sequence[str] = ())
     return prim
 
 
-def add_attributes(prim: Any, attributes: Attributes) -> None:
-    """Write attributes with their default values."""
+def add_attributes(prim: Any, attributes: Attributes, material: str = "") -> None:
+    """Write attributes with default values, and connections to outputs below `material`."""
     from pxr import Sdf
 
-    for name, (kind, value) in attributes.items():
+    for name, (kind, value, *sources) in attributes.items():
         uniform = kind.startswith(UNIFORM)
         attribute = Sdf.AttributeSpec(
             prim,
@@ -44,7 +52,11 @@ def add_attributes(prim: Any, attributes: Attributes) -> None:
             Sdf.VariabilityUniform if uniform else Sdf.VariabilityVarying,
             name.startswith(NAMESPACE),
         )
-        attribute.default = usd_value(kind, value)
+        if value is not None:
+            attribute.default = usd_value(kind, value)
+        if sources:
+            paths = [_target(f"{material}/{source}") for source in sources]
+            attribute.connectionPathList.explicitItems = paths
 
 
 def add_relationship(prim: Any, name: str, target: str) -> None:
@@ -53,18 +65,6 @@ def add_relationship(prim: Any, name: str, target: str) -> None:
 
     relationship = Sdf.RelationshipSpec(prim, name, False)
     relationship.targetPathList.explicitItems = [_target(target)]
-
-
-def add_link(prim: Any, name: str, kind: str, source: str | None = None) -> None:
-    """Write an input or output, connected to the output `source` where that is given.
-
-    An existing attribute keeps its value.
-    """
-    from pxr import Sdf
-
-    link = prim.attributes.get(name) or Sdf.AttributeSpec(prim, name, _value_type(kind))
-    if source is not None:
-        link.connectionPathList.explicitItems = [_target(source)]
 
 
 def _target(path: str) -> Any:
@@ -89,26 +89,9 @@ def usd_value(kind: str, value: Any) -> Any:
 @functools.cache
 def _converter(kind: str) -> Callable[[Any], Any]:
     """Return the converter to a USD type; cached, since scenes have 10^5 values."""
-    from pxr import Gf, Sdf, Vt
+    from pxr import Sdf
 
-    known: dict[str, Callable[[Any], Any]] = {
-        "token[]": Vt.TokenArray,
-        "int[]": Vt.IntArray.FromNumpy,
-        "float[]": Vt.FloatArray.FromNumpy,
-        "texCoord2f[]": Vt.Vec2fArray.FromNumpy,
-        "color3f": Gf.Vec3f,
-        "float4": lambda value: Gf.Vec4f(*value),
-        "asset": Sdf.AssetPath,
-        "float2": Gf.Vec2f,
-        "float3": lambda value: Gf.Vec3f(*value),
-        "matrix4d": Gf.Matrix4d,
-        "double3": lambda value: Gf.Vec3d(*value),
-    }
-    plain = kind.removeprefix(UNIFORM)
-    return known.get(plain, _vectors if plain.endswith("[]") else lambda value: value)
-
-
-def _vectors(values: NDArray[np.float32]) -> Any:
-    from pxr import Vt
-
-    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values))
+    python_class = Sdf.AssetPath if kind == "asset" else _value_type(kind).type.pythonClass
+    if hasattr(python_class, "FromNumpy"):
+        return lambda values: python_class.FromNumpy(np.ascontiguousarray(values))
+    return python_class or (lambda value: value)  # numbers and texts have no class

@@ -1,4 +1,4 @@
-"""Converts USD lights to emissive triangles: rectangles, disks, spheres, cylinders and meshes.
+"""Converts USD lights: domes to environments, others to emissive triangles.
 
 Radiance is intensity x 2^exposure x color, divided by the area where the light is normalized. The
 area is in the units of the stage, as UsdLux defines it, even where these are not meters. Polygons
@@ -6,6 +6,7 @@ approximate round lights and have exactly their area. Triangles emit to both sid
 disks of USD emit to one, so a note is added.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -13,9 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.pictures import MAX_BYTES, decode_pixels, linear_rgb
+from pipeline.exchange.usd import prim_names as names
 from pipeline.foreign.numbers import FINITE, read_number, read_numbers
 from pipeline.foreign.usd.placed import PlacedPrim
-from pipeline.foreign.usd.texture_nodes import convert_to_rec709
+from pipeline.foreign.usd.stage import OpenedStage
+from pipeline.foreign.usd.texture_nodes import asset_bytes, convert_to_rec709
+from storage.errors import TrilightError
+from storage.records.environment import Environment
+from storage.records.texture import MapSource
 from storage.settings.ranges import Within
 
 _DISK_CORNERS = 24
@@ -66,13 +73,10 @@ def compute_radiance(
 ) -> NDArray[np.float32]:
     """Return the radiance [3] that the light API of a prim states.
 
-    Args:
-        placed: a light, or a mesh with the light API.
-        triangles: [T, 3, 3] in meters, for the area.
-        time: time code of the values.
-        lost: receives a sentence for each loss.
+    The prim is a light, or a mesh with the light API; its triangles [T, 3, 3] in meters have the
+    area.
     """
-    emitted = read_light_color(placed.prim, time, lost)
+    emitted = _read_light_color(placed.prim, time, lost)
     if placed.prim.GetAttribute("inputs:normalize").Get(time):
         area = sum_area(triangles) / placed.meters_per_unit**2
         emitted = emitted / max(area, 1e-30)
@@ -82,7 +86,7 @@ def compute_radiance(
     return np.where(np.isfinite(emitted), emitted, 0).astype(np.float32)
 
 
-def read_light_color(prim: Any, time: Any, lost: list[str]) -> NDArray[np.float64]:
+def _read_light_color(prim: Any, time: Any, lost: list[str]) -> NDArray[np.float64]:
     """Return intensity x 2^exposure x color [3] of a light, tinted by its temperature."""
     from pxr import UsdLux
 
@@ -184,3 +188,102 @@ def _sphere() -> NDArray[np.float64]:
         corner = [np.stack([faces[:, i], middle[:, i], middle[:, i - 1]], axis=1) for i in range(3)]
         faces = np.concatenate([*corner, middle])
     return faces * math.sqrt(4 * math.pi / sum_area(faces))
+
+
+_SAME_ROTATION = 1e-5
+"""Tolerance for a rotation that Trilight wrote: other programs keep angles in float32."""
+
+
+def read_foreign_dome(
+    prim: Any, to_world: NDArray[np.float64], time: Any, opened: OpenedStage, licence: str
+) -> Environment | None:
+    """Read the environment of any DomeLight; return None, with a note, where it is unusable.
+
+    `to_world` [4, 4] is its transform; a map that states no licence gets `licence`.
+
+    Raises:
+        TrilightError: the map file is outside the folder or on the network.
+    """
+    prim_path = str(prim.GetPath())
+    radiance = _read_map(prim, time, opened)
+    if radiance is None:
+        return None
+    tinted = radiance * _read_light_color(prim, time, opened.lost)
+    left_basis, _, right_basis = np.linalg.svd(to_world[:3, :3] @ _pole_rotation(prim))
+    rotation = left_basis @ right_basis
+    if np.linalg.det(rotation) < 0:
+        opened.lost.append(f"{prim_path}: a mirrored dome; its light was left out")
+        return None
+    visibility = prim.GetAttribute(names.VISIBLE_TO_CAMERA)
+    sky = Environment(
+        radiance_rgb=tinted.astype(np.float32),
+        rotation=(rotation @ names.TO_OUR_AXES.T).astype(np.float32),
+        is_seen=bool(visibility and visibility.Get(time)),
+        source=MapSource(name=prim.GetName(), licence=licence),
+    )
+    try:
+        sky.check()
+    except TrilightError as error:
+        opened.lost.append(f"{prim_path}: {error}; its light was left out")
+        return None
+    return _take_held(sky, prim, time)
+
+
+def _take_held(sky: Environment, dome: Any, time: Any) -> Environment:
+    """Return an environment with the values that Trilight wrote on the prim of the scene."""
+    stage = dome.GetStage()
+    holder = next((prim for prim in stage.Traverse() if prim.HasAttribute(names.SKY_SOURCE)), None)
+    if holder is None:
+        return sky
+
+    def read_value(name: str) -> Any:
+        return holder.GetAttribute(name).Get(time)
+
+    held = names.parse_map_text(read_value(names.SKY_SOURCE))
+    if held is None or held[0] != sky.sha256:
+        return sky
+    sky = dataclasses.replace(sky, source=held[1])
+    if not dome.HasAttribute(names.VISIBLE_TO_CAMERA):
+        sky = dataclasses.replace(sky, is_seen=bool(read_value(names.SKY_VISIBLE)))
+    rows = list(map(read_value, names.SKY_ROWS))
+    if None in rows or not np.allclose(rows, sky.rotation, atol=_SAME_ROTATION):
+        return sky
+    return dataclasses.replace(sky, rotation=np.array(rows, np.float32))
+
+
+def _pole_rotation(prim: Any) -> NDArray[np.float64]:
+    """Return the rotation of a dome from its pole +Y to the axis that a DomeLight_1 states."""
+    from pxr import UsdGeom
+
+    stated = prim.GetAttribute("poleAxis")
+    axis = stated.Get() if stated else UsdGeom.Tokens.y
+    if axis == "scene":
+        axis = UsdGeom.GetStageUpAxis(prim.GetStage())
+    is_turned = axis == UsdGeom.Tokens.z
+    return np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) if is_turned else np.eye(3)
+
+
+def _read_map(prim: Any, time: Any, opened: OpenedStage) -> NDArray[np.float64] | None:
+    """Return the map [H, 2 H, 3] of a dome; uniform radiance 1 where it names no file."""
+    prim_path = str(prim.GetPath())
+    attribute = prim.GetAttribute(names.MAP_PATH)
+    asset = attribute.Get(time) if attribute else None
+    if asset is None or not asset.path:
+        return np.ones((1, 2, 3))
+    layout = prim.GetAttribute("inputs:texture:format").Get(time)
+    if layout not in (None, "automatic", "latlong"):
+        opened.lost.append(f"{prim_path}: a picture of format {layout}; expected latlong")
+        return None
+    specs = attribute.GetPropertyStack(time)
+    resolved = opened.resolve(specs[0].layer if specs else opened.root, asset.path)
+    data = None if resolved is None else asset_bytes(resolved, MAX_BYTES)
+    if data is None:
+        opened.lost.append(f"{prim_path}: map {asset.path!r:.100} is missing")
+        return None
+    pixels = decode_pixels(data, asset.path, opened.lost)
+    if pixels is None:
+        opened.lost.append(
+            f"{prim_path}: map {asset.path!r:.100} is not read; its light was left out"
+        )
+        return None
+    return linear_rgb(pixels).astype(np.float64)

@@ -15,17 +15,13 @@ from pipeline.exchange.part_materials import PartConverter
 from pipeline.exchange.pictures import decode_values
 from pipeline.exchange.textured_triangles import TexturedTriangles, join_triangles
 from pipeline.exchange.usd.held_materials import (
-    HeldMaterial,
-    as_stated,
-    find_exact,
     keep_exact,
     name_lost_columns,
-    parse_numbers,
+    read_column,
     read_held_material,
-    restore_stated,
+    restore_exact,
 )
 from pipeline.exchange.usd.prim_names import added_column
-from pipeline.exchange.usd.read_exact_scene import read_written_rows
 from pipeline.foreign.part import Part, drop_empty, unit_normals
 from pipeline.foreign.usd.materials import MeshMaterials
 from pipeline.foreign.usd.object_source import UsdStage, read_stage_materials
@@ -150,12 +146,13 @@ class _Extras:
 class StageSurfaces:
     """Converts the meshes of a stage to triangles with materials and textures."""
 
-    def __init__(self, stage: UsdStage, licence: str) -> None:
+    def __init__(
+        self, stage: UsdStage, licence: str, written: Mapping[str, NDArray[np.float32]]
+    ) -> None:
         """Read all materials; the stage's notes receive their losses.
 
-        Args:
-            stage: the open stage with its meshes.
-            licence: licence of textures.
+        Textures get the licence; `written` has material rows as Trilight wrote them, by the paths
+        of their prims.
 
         Raises:
             Rejected: a picture is outside of the folder, or too large.
@@ -165,7 +162,7 @@ class StageSurfaces:
         self._lost = stage.opened.lost
         self._opened = stage.opened
         self._licence = licence
-        self._written = read_written_rows(self._opened)
+        self._written = written
         self._converter = PartConverter(self._lost)
         self._extras: list[_Extras] = []
         self._looks = MeshMaterials(
@@ -224,7 +221,7 @@ class StageSurfaces:
         exact = None
         if held is not None:
             self._lost += [_HELD, *name_lost_columns(material)]
-            stated, exact = self._read_held(held, stated, material)
+            stated, exact = restore_exact(held, stated, material, self._time, self._opened)
         if stated is None:
             self._lost.append(
                 f"{material.GetPath()}: no supported shader; its display color is used"
@@ -233,24 +230,6 @@ class StageSurfaces:
         added = _read_added_columns(material, self._time, self._lost)
         self._extras.append(_Extras(name=stated.name, added=added, exact=exact))
         return stated
-
-    def _read_held(
-        self, held: HeldMaterial, stated: StatedMaterial | None, material: Any
-    ) -> tuple[StatedMaterial, dict[str, Texture] | None]:
-        """Return the inputs of a material that Trilight wrote, and its exact columns."""
-        if stated is None:
-            self._lost.append(f"{held.where}: no shader; the values that Trilight wrote are used")
-            stated = as_stated(held)
-        elif stated.is_specular or not (
-            "metallic" in stated.textures or stated.constants["metallic"].any()
-        ):
-            stated = restore_stated(held, stated, material, self._time, self._opened)
-        else:
-            self._lost.append(
-                f"{held.where}: became a metal since Trilight wrote it; read as any other material"
-            )
-            return stated, None
-        return find_exact(held, stated, self._lost)
 
 
 def _read_added_columns(
@@ -267,8 +246,8 @@ def _read_added_columns(
             lost.append(f"{attribute.GetPath()}: this material column is not declared here")
             continue
         column = declared[name]
-        value = parse_numbers(attribute.Get(time))
-        if len(value) == column.width and np.all(column.within.holds(value)):
+        value = read_column(attribute, column, time)
+        if value is not None:
             values[name] = value
         else:
             lost.append(

@@ -2,16 +2,23 @@
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.cameras import rigid_pose
-from pipeline.exchange.textured_triangles import SceneParts, TexturedTriangles, build_lamp
-from pipeline.exchange.usd.dome import read_foreign_dome
-from pipeline.exchange.usd.foreign_lights import compute_radiance, light_triangles
+from pipeline.exchange.textured_triangles import (
+    SceneParts,
+    TexturedTriangles,
+    build_lamp,
+    rigid_pose,
+)
+from pipeline.exchange.usd.foreign_lights import (
+    compute_radiance,
+    light_triangles,
+    read_foreign_dome,
+)
 from pipeline.exchange.usd.foreign_materials import StageSurfaces, read_mesh
 from pipeline.exchange.usd.prim_names import FOV_DEG, INDEX, OBJECT_TEXTS, parse_camera_row
 from pipeline.foreign.numbers import read_number
@@ -28,8 +35,16 @@ _MOST_NOTED = 200
 """Maximum characters of all notes in the message on a stage without light."""
 
 
-def build_stage_scene(stage: Any, time: Any, opened: OpenedStage, licence: str) -> Scene:
+def build_stage_scene(
+    stage: Any,
+    time: Any,
+    opened: OpenedStage,
+    licence: str,
+    written: Mapping[str, NDArray[np.float32]],
+) -> Scene:
     """Build the scene of a stage at a time; `opened.lost` receives notes on losses.
+
+    `written` has material rows as Trilight wrote them, by the paths of their prims, where known.
 
     Raises:
         TrilightError: a count exceeds its maximum, arrays contradict each other, or the stage lacks
@@ -37,9 +52,8 @@ def build_stage_scene(stage: Any, time: Any, opened: OpenedStage, licence: str) 
     """
     placed = sorted(placed_prims(stage, time, opened.lost), key=_read_row)
     meshes = tuple(each for each in placed if each.prim.GetTypeName() in ("Mesh", *SOLIDS))
-    surfaces = StageSurfaces(
-        UsdStage(opened=opened, composed=stage, meshes=meshes, time=time), licence
-    )
+    usd_stage = UsdStage(opened=opened, composed=stage, meshes=meshes, time=time)
+    surfaces = StageSurfaces(usd_stage, licence, written)
     numbers = iter(range(len(meshes)))
     parts = SceneParts(opened.path.name)
     cameras = []

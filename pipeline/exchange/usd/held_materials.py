@@ -8,7 +8,6 @@ edit it there. Blender writes no specular albedo, so that the exact one stays.
 """
 
 import dataclasses
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -17,23 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.linear_maps import (
+    EXCESS,
     color_textures,
     constant_map,
     linear_map,
-    may_exceed_one,
 )
 from pipeline.exchange.pictures import MAX_BYTES, MAX_PIXELS
 from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles
-from pipeline.exchange.usd.openpbr import read_openpbr, written_columns
-from pipeline.exchange.usd.prim_names import (
-    ADDED_COLUMNS,
-    DIGEST,
-    MATERIAL_ATTRIBUTES,
-    column_attribute,
-    texture_attribute,
+from pipeline.exchange.usd import prim_names as names
+from pipeline.exchange.usd.write_materials import (
+    COAT_ROUGHNESS,
+    OPENPBR,
+    PREVIEW_INPUTS,
+    decode_texture,
+    read_openpbr,
+    written_columns,
 )
-from pipeline.exchange.usd.write_materials import PREVIEW_INPUTS
-from pipeline.exchange.usd.write_textures import COAT_ROUGHNESS, OPENPBR, decode_texture
 from pipeline.foreign.picture import decode_image
 from pipeline.foreign.usd.shaders import (
     DEFAULTS,
@@ -57,6 +55,7 @@ from storage.records.material import (
     EMISSION,
     ROUGHNESS,
     SPECULAR,
+    MaterialColumn,
     declared_column,
     laid_out,
 )
@@ -64,9 +63,6 @@ from storage.records.texture import TEXTURED, MapSource, Texture
 
 _OPENPBR = f"its shader {OPENPBR}"
 """Words for the shader, for notes."""
-
-_EXCESS = 1e-6
-"""Tolerance for the rounding of two float32 albedos that add up to 1."""
 
 ROUGHNESS_PART = slice(ROUGHNESS, ROUGHNESS + 1)
 
@@ -98,21 +94,17 @@ def read_held_material(
     opened: OpenedStage,
     rows: Mapping[str, NDArray[np.float32]],
 ) -> HeldMaterial | None:
-    """Read the exact values of a material; return None where one is missing.
+    """Read the exact values of a UsdShade.Material; return None where one is missing.
 
-    Args:
-        material: the UsdShade.Material.
-        time: time of the values.
-        opened: the file, which receives notes.
-        rows: material rows as Trilight wrote them, by the paths of their prims, where known.
+    `rows` are material rows as Trilight wrote them, by the paths of their prims, where known.
     """
     prim = material.GetPrim()
     columns = dict[str, NDArray[np.float32]]()
-    for name, attribute in MATERIAL_ATTRIBUTES.items():
+    for name, attribute in names.MATERIAL_ATTRIBUTES.items():
         value = prim.GetAttribute(attribute)
         column = declared_column(name)
-        stated = parse_numbers(value.Get(time) if value else None)
-        if len(stated) != column.width or not np.all(column.within.holds(stated)):
+        stated = read_column(value, column, time)
+        if stated is None:
             if value and value.HasAuthoredValue():
                 opened.lost.append(
                     f"{value.GetPath()}: expected {column.width} numbers {column.within}; the "
@@ -122,13 +114,13 @@ def read_held_material(
         columns[name] = stated.astype(np.float32)
     maps = {}
     for name in TEXTURED:
-        text = prim.GetAttribute(texture_attribute(name))
-        held = parse_map_text(text.Get(time) if text else None)
+        text = prim.GetAttribute(names.texture_attribute(name))
+        held = names.parse_map_text(text.Get(time) if text else None)
         if held is not None:
             maps[name] = held
     where = str(prim.GetPath())
     root = prim.GetParent().GetParent()
-    is_marked = bool(root) and root.HasAttribute(DIGEST)
+    is_marked = bool(root) and root.HasAttribute(names.DIGEST)
     parts = {column.name: part for column, part in laid_out()}
     return HeldMaterial(
         where=where,
@@ -140,19 +132,30 @@ def read_held_material(
     )
 
 
-def parse_map_text(text: Any) -> tuple[str, MapSource] | None:
-    """Parse a line of `names.format_map` to digest and source; return None for other text."""
-    try:
-        fields = json.loads(text)
-        sha256 = fields.pop("sha256")
-        source = MapSource(**fields)
-    except (TypeError, ValueError, KeyError, AttributeError):
-        return None
-    texts = (sha256, *dataclasses.astuple(source))
-    return (sha256, source) if all(isinstance(each, str) for each in texts) else None
+def restore_exact(
+    held: HeldMaterial,
+    stated: StatedMaterial | None,
+    material: Any,
+    time: Any,
+    opened: OpenedStage,
+) -> tuple[StatedMaterial, dict[str, Texture] | None]:
+    """Return the inputs of a material that Trilight wrote, and its exact columns."""
+    if stated is None:
+        opened.lost.append(f"{held.where}: no shader; the values that Trilight wrote are used")
+        stated = _as_stated(held)
+    elif not stated.is_specular and (
+        "metallic" in stated.textures or stated.constants["metallic"].any()
+    ):
+        opened.lost.append(
+            f"{held.where}: became a metal since Trilight wrote it; read as any other material"
+        )
+        return stated, None
+    else:
+        stated = _restore_stated(held, stated, material, time, opened)
+    return _find_exact(held, stated, opened.lost)
 
 
-def restore_stated(
+def _restore_stated(
     held: HeldMaterial, stated: StatedMaterial, material: Any, time: Any, opened: OpenedStage
 ) -> StatedMaterial:
     """Return the inputs of a shader in the workflow that Trilight writes.
@@ -199,7 +202,7 @@ def _note_unused(
             lost.append(f"{stated.where}.{name}: has no place here")
 
 
-def as_stated(held: HeldMaterial) -> StatedMaterial:
+def _as_stated(held: HeldMaterial) -> StatedMaterial:
     """Return a material of the values that Trilight wrote, for one that has lost its shader."""
     values = {name: _fill(held.columns[column]) for column, name in PREVIEW_INPUTS.items()}
     return StatedMaterial(
@@ -218,7 +221,7 @@ def as_stated(held: HeldMaterial) -> StatedMaterial:
     )
 
 
-def find_exact(
+def _find_exact(
     held: HeldMaterial, stated: StatedMaterial, lost: list[str]
 ) -> tuple[StatedMaterial, dict[str, Texture]]:
     """Return the inputs with the values that count, and the columns as Trilight wrote them.
@@ -261,7 +264,7 @@ def _find_changed(
     """
     of_preview = {each: stated.constants[name] for each, name in PREVIEW_INPUTS.items()}
     places: dict[str, NDArray[Any]] = {
-        column_attribute(column): held.columns[column],
+        names.column_attribute(column): held.columns[column],
         _name_shader(stated): of_preview[column],
     }
     if column in held.openpbr:
@@ -329,7 +332,7 @@ def keep_exact(
         for column, part in zip(TEXTURED, (DIFFUSE, SPECULAR, ROUGHNESS_PART), strict=True):
             if column in exact:
                 rows[:, part] = exact[column].mean
-        excess = (rows[:, DIFFUSE] + rows[:, SPECULAR]).max(axis=1, initial=0) > 1 + _EXCESS
+        excess = (rows[:, DIFFUSE] + rows[:, SPECULAR]).max(axis=1, initial=0) > 1 + EXCESS
         if excess.any():
             lost.append(note)
             rows[excess, DIFFUSE] = np.minimum(rows[excess, DIFFUSE], 1 - rows[excess, SPECULAR])
@@ -341,7 +344,8 @@ def keep_exact(
             for column, texture in zip(TEXTURED, texture_set, strict=True)
         )
         assert diffuse is not None and specular is not None
-        if not {"diffuse", "specular"} <= exact.keys() and may_exceed_one(diffuse, specular):
+        exceeds = (diffuse.greatest + specular.greatest > 1 + EXCESS).any()
+        if exceeds and not {"diffuse", "specular"} <= exact.keys():
             lost.append(note)
             source = diffuse.source
             diffuse, specular = color_textures(linear_map(diffuse), linear_map(specular), source)
@@ -362,14 +366,15 @@ def name_lost_columns(material: Any) -> list[str]:
     prim = material.GetPrim()
     return [
         f"{prim.GetPath()}: material column {name!r} is not in the file any more; default used"
-        for name in str(prim.GetAttribute(ADDED_COLUMNS).Get() or "").split()
-        if not prim.HasAttribute(column_attribute(name))
+        for name in str(prim.GetAttribute(names.ADDED_COLUMNS).Get() or "").split()
+        if not prim.HasAttribute(names.column_attribute(name))
     ]
 
 
-def parse_numbers(value: Any) -> NDArray[np.float64]:
-    """Return an attribute's value as a row of numbers; empty for other values."""
+def read_column(attribute: Any, column: MaterialColumn, time: Any) -> NDArray[np.float64] | None:
+    """Return the lawful value of a column's attribute as a row of numbers; else None."""
     try:
-        return np.array(value, np.float64).reshape(-1)
+        value = np.array(attribute.Get(time) if attribute else None, np.float64).reshape(-1)
     except (TypeError, ValueError):
-        return np.zeros(0)
+        return None
+    return value if len(value) == column.width and np.all(column.within.holds(value)) else None

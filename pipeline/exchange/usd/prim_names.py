@@ -15,6 +15,10 @@ prim states the same as closely as USD can.
 """
 
 import dataclasses
+import json
+from typing import Any
+
+import numpy as np
 
 from storage.digests import canonical_json
 from storage.records.texture import MapSource
@@ -54,6 +58,17 @@ SKY_VISIBLE = NAMESPACE + "skyVisibleToCamera"
 SKY_SOURCE = NAMESPACE + "skySource"
 """Attributes of `/Scene` where there is an environment: rotation rows, visibility, and map
 (format_map). Blender converts a dome to a world and drops the attributes of its prim."""
+
+TO_OUR_AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Rotation from the axes of a dome to those of a map: X to Y, Y to Z, Z to X.
+
+A dome has the middle of its picture towards +Z, a quarter from the left towards +X and the top
+towards +Y, whatever the axis of the stage. Writing and reading both apply the rotation, so that a
+scene round-trips bit for bit and other programs show the same sky.
+"""
+
+MAP_PATH = "inputs:texture:file"
+"""Attribute of a dome: its map file."""
 
 TEXTURE_ROW = NAMESPACE + "textureRow"
 """Attribute of a texture's shader: its row among the textures of the scene."""
@@ -103,6 +118,18 @@ def texture_attribute(column: str) -> str:
 def format_map(sha256: str, source: MapSource) -> str:
     """Return one line of JSON for a texture or map: content digest, name and rights."""
     return canonical_json({"sha256": sha256, **dataclasses.asdict(source)}).decode()
+
+
+def parse_map_text(text: Any) -> tuple[str, MapSource] | None:
+    """Parse a line of `format_map` to digest and source; return None for other text."""
+    try:
+        fields = json.loads(text)
+        sha256 = fields.pop("sha256")
+        source = MapSource(**fields)
+    except (TypeError, ValueError, KeyError, AttributeError):
+        return None
+    texts = (sha256, *dataclasses.astuple(source))
+    return (sha256, source) if all(isinstance(each, str) for each in texts) else None
 
 
 def material_name(row: int) -> str:

@@ -1,45 +1,53 @@
-"""Writes material rows to USD: exact attributes, UsdPreviewSurface, and OpenPBR for MaterialX.
+"""Writes material rows to USD: exact attributes, UsdPreviewSurface, and OpenPBR or textures.
 
 The BRDF of a scene is Lambert + specular x GGX without a Fresnel term. UsdPreviewSurface in its
 specular workflow has the same albedos and roughness, but its specular albedo rises to 1 at grazing
 angles. Blender multiplies that albedo by the head-on reflectance of the index of refraction, which
-other programs ignore; so the written index reflects almost everything. OpenPBR
-(pipeline.exchange.usd.openpbr) looks similar too. Neither is equal; the attributes hold the exact
-values. Textures are connected to the preview (pipeline.exchange.usd.write_textures).
+other programs ignore; so the written index reflects almost everything. OpenPBR's base has one index
+of refraction: it is set so that the strongest channel reflects the specular albedo head-on, and the
+tint gives the other channels. Neither is equal; the attributes hold the exact values. Both count
+emission otherwise (as a plain color, in nits) and get the radiance.
 
-UsdPreviewSurface counts emission as a plain color: it gets the radiance.
+A textured column is an input of the preview that is connected to a texture, which reads the
+coordinates `st` of the meshes. Coordinates need no conversion: v is up, and the bottom row of a
+picture is at v = 0. A textured material has no OpenPBR shader, so that MaterialX renderers use the
+preview with its textures instead of one color. A specular texture is also connected to the
+roughness of an absent coat: Blender drops specular textures, but keeps this one.
+
+The file of a texture is lossless: PNG for 8 bits, OpenEXR for float32, with one channel or three.
+Picture files begin with the top row, textures of a scene with the bottom row. Equal textures share
+a file.
 """
 
+import io
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.documents.png import encode_png
+from pipeline.exchange.usd import prim_names as names
 from pipeline.exchange.usd.authoring import (
     Attributes,
     add_attributes,
-    add_link,
     add_prim,
+    text_attributes,
     usd_value,
 )
-from pipeline.exchange.usd.openpbr import Color, openpbr_inputs
-from pipeline.exchange.usd.prim_names import (
-    ADDED_COLUMNS,
-    MATERIAL_ATTRIBUTES,
-    column_attribute,
-    material_name,
+from pipeline.foreign.usd.colors import convert_to_rec709
+from pipeline.foreign.usd.shaders import (
+    IOR_OF_CONSTANT_ALBEDOS,
+    note_unsupported,
+    parse_color,
+    reflect_head_on,
+    surface_shader,
 )
-from pipeline.exchange.usd.write_textures import (
-    OPENPBR,
-    PREVIEW,
-    Used,
-    build_source_table,
-    material_links,
-    texture_tables,
-    used_textures,
-)
-from pipeline.foreign.usd.shaders import IOR_OF_CONSTANT_ALBEDOS
+from pipeline.foreign.usd.stage import OpenedStage
+from pipeline.foreign.usd.texture_nodes import find_sources, is_output
+from storage.errors import TrilightError
+from storage.records.exr import MAX_RESOLUTION, channel_names, decode_channels, encode_channels
 from storage.records.material import (
     DIFFUSE,
     EMISSION,
@@ -49,6 +57,11 @@ from storage.records.material import (
     stored_columns,
 )
 from storage.records.scene import Scene
+from storage.records.texture import CONSTANT, NORMAL, TEXTURED, MapSource, Texture
+
+PREVIEW = "Preview"
+OPENPBR = "OpenPBR"
+"""Names of the two shaders of a material."""
 
 PREVIEW_INPUTS = {
     "diffuse": "diffuseColor",
@@ -57,6 +70,61 @@ PREVIEW_INPUTS = {
     "emission": "emissiveColor",
 }
 """Input of the preview for each published column."""
+
+SHADERS = {
+    "diffuse": "DiffuseTexture",
+    "specular": "SpecularTexture",
+    "roughness": "RoughnessTexture",
+    NORMAL: "NormalTexture",
+}
+"""Name of the texture shader of each column, and of the normal map."""
+
+ST = "primvars:st"
+"""Attribute of the meshes of a textured scene."""
+
+COAT_ROUGHNESS = "inputs:clearcoatRoughness"
+"""Input of a preview without a coat; it preserves the specular texture in Blender."""
+
+_COORDINATES = "Coordinates"
+"""Name of the shader that reads texture coordinates."""
+
+_LINKS = {
+    "diffuse": ("color3f", "inputs:diffuseColor", "outputs:rgb", "float3"),
+    "specular": ("color3f", "inputs:specularColor", "outputs:rgb", "float3"),
+    "roughness": ("float", "inputs:roughness", "outputs:r", "float"),
+    NORMAL: ("normal3f", "inputs:normal", "outputs:rgb", "float3"),
+}
+"""Type and name of the input, and name and type of its output, by column."""
+
+_TO_VECTORS: Attributes = {
+    "inputs:scale": ("float4", (2.0, 2.0, 2.0, 1.0)),
+    "inputs:bias": ("float4", (-1.0, -1.0, -1.0, 0.0)),
+    "inputs:fallback": ("float4", (0.0, 0.0, 1.0, 1.0)),
+}
+"""Inputs that make vectors of the texels of a normal map."""
+
+_CHANNELS = {1: "Y", 3: "RGB"}
+"""OpenEXR channel names by channel count: a number or a color."""
+
+Color = tuple[float, float, float]
+
+Used = Mapping[str, tuple[int, Texture]]
+"""Row and texture of each textured column of a material, and of its normal map."""
+
+_Table = dict[str, tuple[str, Any] | tuple[str, Any, str]]
+
+_OPENPBR_SHADER = "ND_open_pbr_surface_surfaceshader"
+
+_MOST_REFLECTING = 0.98
+"""Maximum head-on reflectance that sets the index of refraction: 0.98 needs 199."""
+
+_INPUTS = {
+    "diffuse": ("base_weight", "base_color"),
+    "specular": ("specular_weight", "specular_color", "specular_ior"),
+    "roughness": ("specular_roughness",),
+    "emission": ("emission_luminance", "emission_color"),
+}
+"""OpenPBR's inputs whose product is a column; an index of refraction counts as its reflectance."""
 
 
 def add_materials(layer: Any, folder: str, scene: Scene) -> None:
@@ -69,79 +137,265 @@ def add_materials(layer: Any, folder: str, scene: Scene) -> None:
 
     add_prim(layer, folder, "Scope")
     first = None
-    names = stored_columns(scene.materials)
+    columns = stored_columns(scene.materials)
     for row, values in enumerate(scene.materials):
-        path = f"{folder}/{material_name(row)}"
-        used = used_textures(scene, row)
-        if used or first is None:
-            _add_material(layer, path, material_tables(values, names, used), list(used))
-            first = first if used else path
-            continue
-        Sdf.CopySpec(layer, first, layer, path)
-        for relative_path, attributes in material_tables(values, names).items():
-            prim = layer.GetPrimAtPath(path + relative_path)
-            for name, (kind, value) in attributes.items():
+        path = f"{folder}/{names.material_name(row)}"
+        used = _used_textures(scene, row)
+        copied = first is not None and not used
+        if copied:
+            Sdf.CopySpec(layer, first, layer, path)
+        for below, attributes in material_tables(values, columns, used).items():
+            if not copied:
+                prim = add_prim(layer, path + below, "Shader" if below else "Material")
+                add_attributes(prim, attributes, path)
+                continue
+            prim = layer.GetPrimAtPath(path + below)
+            for name, (kind, value, *_) in attributes.items():
                 if kind in ("color3f", "float", "float[]"):
                     prim.attributes[name].default = usd_value(kind, value)
+        first = first if used else first or path
+
+
+def _used_textures(scene: Scene, row: int) -> Used:
+    """Return the textures of a material row."""
+    if scene.material_textures is None:
+        return {}
+    normal = CONSTANT if scene.normal_textures is None else int(scene.normal_textures[row])
+    index = [*scene.material_textures[row].tolist(), normal]
+    return {
+        name: (texture, scene.textures[texture])
+        for name, texture in zip((*TEXTURED, NORMAL), index, strict=True)
+        if texture != CONSTANT
+    }
 
 
 def material_tables(
-    values: NDArray[np.float32], columns: Sequence[str], used: Used | None = None
+    values: NDArray[np.float32], columns: Sequence[str], used: Used
 ) -> dict[str, Attributes]:
     """Return the attributes of a material row's prims, by their path below the material.
 
-    Args:
-        values: the row, with all declared columns.
-        columns: names of the stored columns (storage.records.material.stored_columns).
-        used: textures of the row; none by default.
+    The row has all declared columns; `columns` names the stored ones, and `used` its textures.
     """
     diffuse, specular, emission = (_rgb(values[part]) for part in (DIFFUSE, SPECULAR, EMISSION))
     roughness = float(values[ROUGHNESS])
-    tables: dict[str, Attributes] = {
-        "": _exact_attributes(values, columns),
-        f"/{PREVIEW}": {
-            "info:id": ("uniform token", "UsdPreviewSurface"),
-            "inputs:useSpecularWorkflow": ("int", 1),
-            "inputs:diffuseColor": ("color3f", diffuse),
-            "inputs:specularColor": ("color3f", specular),
-            "inputs:roughness": ("float", roughness),
-            "inputs:emissiveColor": ("color3f", emission),
-            "inputs:ior": ("float", IOR_OF_CONSTANT_ALBEDOS),
-        },
+    material = _exact_attributes(values, columns)
+    for name, (_, texture) in used.items():
+        source = names.format_map(texture.sha256, texture.source)
+        material[names.texture_attribute(name)] = ("string", source)
+    material["outputs:surface"] = ("token", None, f"{PREVIEW}.outputs:surface")
+    preview: _Table = {
+        "info:id": ("uniform token", "UsdPreviewSurface"),
+        "inputs:useSpecularWorkflow": ("int", 1),
+        "inputs:diffuseColor": ("color3f", diffuse),
+        "inputs:specularColor": ("color3f", specular),
+        "inputs:roughness": ("float", roughness),
+        "inputs:emissiveColor": ("color3f", emission),
+        "inputs:ior": ("float", IOR_OF_CONSTANT_ALBEDOS),
+        "outputs:surface": ("token", None),
     }
-    if used:
-        tables[""] = {**tables[""], **build_source_table(used)}
-        return {**tables, **texture_tables(used)}
-    return {**tables, f"/{OPENPBR}": openpbr_inputs(diffuse, specular, roughness, emission)}
+    tables: dict[str, Attributes] = {"": material, f"/{PREVIEW}": preview}
+    if not used:
+        material["outputs:mtlx:surface"] = ("token", None, f"{OPENPBR}.outputs:out")
+        inputs = openpbr_inputs(diffuse, specular, roughness, emission)
+        return {**tables, f"/{OPENPBR}": {**inputs, "outputs:out": ("token", None)}}
+    for name, (row, texture) in used.items():
+        kind, socket, output, output_kind = _LINKS[name]
+        value = preview[socket][1] if socket in preview else None
+        preview[socket] = (kind, value, f"{SHADERS[name]}.{output}")
+        shader = {
+            **_texture_table(row, texture),
+            **(_TO_VECTORS if name == NORMAL else {}),
+            output: (output_kind, None),
+            "inputs:st": ("float2", None, f"{_COORDINATES}.outputs:result"),
+        }
+        if name == "specular":
+            preview[COAT_ROUGHNESS] = ("float", None, f"{SHADERS[name]}.outputs:r")
+            shader["outputs:r"] = ("float", None)
+        tables[f"/{SHADERS[name]}"] = shader
+    tables[f"/{_COORDINATES}"] = {
+        "info:id": ("uniform token", "UsdPrimvarReader_float2"),
+        "inputs:varname": ("string", ST.removeprefix("primvars:")),
+        "outputs:result": ("float2", None),
+    }
+    return tables
 
 
-def _exact_attributes(values: NDArray[np.float32], columns: Sequence[str]) -> Attributes:
+def _exact_attributes(values: NDArray[np.float32], columns: Sequence[str]) -> _Table:
     """Return the attributes that hold the columns exactly."""
-    attributes: dict[str, tuple[str, Any]] = {}
+    attributes: _Table = {}
     for column, part in laid_out():
         if column.name in columns:
             kind = "color3f" if column.is_colour else "float" if column.width == 1 else "float[]"
             value = _rgb(values[part]) if column.is_colour else values[part]
-            attributes[column_attribute(column.name)] = (
+            attributes[names.column_attribute(column.name)] = (
                 kind,
                 float(value[0]) if kind == "float" else value,
             )
-    if added := [name for name in columns if name not in MATERIAL_ATTRIBUTES]:
-        attributes[ADDED_COLUMNS] = ("string", " ".join(added))
+    if added := [name for name in columns if name not in names.MATERIAL_ATTRIBUTES]:
+        attributes[names.ADDED_COLUMNS] = ("string", " ".join(added))
     return attributes
-
-
-def _add_material(
-    layer: Any, path: str, tables: Mapping[str, Attributes], textured: Sequence[str]
-) -> None:
-    links = material_links(textured)
-    for relative_path, attributes in tables.items():
-        prim = add_prim(layer, path + relative_path, "Shader" if relative_path else "Material")
-        add_attributes(prim, attributes)
-        for name, (kind, source) in links[relative_path].items():
-            add_link(prim, name, kind, None if source is None else f"{path}/{source}")
 
 
 def _rgb(values: NDArray[np.float32]) -> Color:
     red, green, blue = (float(value) for value in values)
     return red, green, blue
+
+
+def _texture_table(row: int, texture: Texture) -> _Table:
+    mean = tuple(float(value) for value in np.broadcast_to(texture.mean, 3))
+    return {
+        "info:id": ("uniform token", "UsdUVTexture"),
+        "inputs:file": ("asset", f"./{texture_file(texture)}"),
+        "inputs:sourceColorSpace": ("token", "sRGB" if texture.is_srgb else "raw"),
+        "inputs:wrapS": ("token", "repeat"),
+        "inputs:wrapT": ("token", "repeat"),
+        "inputs:fallback": ("float4", (*mean, 1.0)),
+        names.TEXTURE_ROW: ("int", row),
+        **text_attributes(names.MAP_TEXTS, texture.source),
+    }
+
+
+def texture_files(scene: Scene) -> dict[str, bytes]:
+    """Return the texture files of a scene by name; raises TrilightError."""
+    return {texture_file(texture): encode_texture(texture) for texture in scene.textures}
+
+
+def texture_file(texture: Texture) -> str:
+    """Return the file name of a texture."""
+    suffix = "png" if texture.texels.dtype == np.uint8 else "exr"
+    return f"texture-{texture.sha256[:16]}.{suffix}"
+
+
+def encode_texture(texture: Texture) -> bytes:
+    """Return the bytes of a texture's file; they contain no time stamp.
+
+    Raises:
+        TrilightError: the texture is larger than the USD reader accepts.
+    """
+    height, width, channels = texture.texels.shape
+    if max(height, width) > MAX_RESOLUTION:
+        raise TrilightError(
+            f"texture: {width} x {height} texels; expected at most {MAX_RESOLUTION} each way in "
+            "USD. Write it as .safetensors, or make it smaller."
+        )
+    picture: NDArray[Any] = np.ascontiguousarray(texture.texels[::-1])
+    if picture.dtype == np.float32:
+        values = picture if channels == 3 else picture[..., 0]
+        return encode_channels({_CHANNELS[channels]: np.ascontiguousarray(values)})
+    return encode_png(picture if channels == 3 else picture[..., 0])
+
+
+def decode_texture(data: bytes, *, is_exr: bool, is_srgb: bool, source: MapSource) -> Texture:
+    """Decode a file of `encode_texture`.
+
+    Raises:
+        LookupError: `encode_texture` did not write the file.
+    """
+    try:
+        texels: NDArray[Any] = _exr_texels(data) if is_exr else _png_texels(data)
+        texture = Texture(texels=np.ascontiguousarray(texels), is_srgb=is_srgb, source=source)
+        texture.check("texture")
+    except (TrilightError, OSError, SyntaxError, ValueError) as error:
+        raise LookupError("it is no texture that was written here") from error
+    return texture
+
+
+def _exr_texels(data: bytes) -> NDArray[np.float32]:
+    name = "Y" if channel_names(data) == ["Y"] else "RGB"
+    pixels = decode_channels(data, name, lambda header: None)[name]
+    texels: NDArray[np.float32] = pixels.reshape(*pixels.shape[:2], -1)[::-1]
+    return texels
+
+
+def _png_texels(data: bytes) -> NDArray[np.uint8]:
+    from PIL import Image
+
+    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        if max(image.size) > MAX_RESOLUTION or image.mode not in ("L", "RGB"):
+            raise ValueError(f"{image.size} in mode {image.mode}")
+        pixels: NDArray[np.uint8] = np.asarray(image, np.uint8)
+    return pixels.reshape(*pixels.shape[:2], -1)[::-1]
+
+
+def openpbr_inputs(
+    diffuse: Color, specular: Color, roughness: float, emission: Color
+) -> Attributes:
+    """Return the attributes of the shader of a material's columns."""
+    max_specular = max(specular)
+    max_emission = max(emission)
+    root = math.sqrt(min(max_specular, _MOST_REFLECTING))
+    return {
+        "info:id": ("uniform token", _OPENPBR_SHADER),
+        "inputs:base_color": ("color3f", diffuse),
+        "inputs:base_weight": ("float", 1.0),
+        "inputs:base_diffuse_roughness": ("float", 0.0),
+        "inputs:specular_weight": ("float", 1.0 if max_specular > 0 else 0.0),
+        "inputs:specular_color": ("color3f", _divide_by_largest(specular, max_specular)),
+        "inputs:specular_roughness": ("float", roughness),
+        "inputs:specular_ior": ("float", _round_to_float32((1 + root) / (1 - root))),
+        "inputs:emission_luminance": ("float", max_emission),
+        "inputs:emission_color": ("color3f", _divide_by_largest(emission, max_emission)),
+    }
+
+
+def written_columns(columns: Mapping[str, NDArray]) -> dict[str, NDArray[np.float64]]:
+    """Return the columns [3] that the shader written for a material's columns states."""
+    diffuse, specular, roughness, emission = (
+        tuple(np.maximum(columns[name], 0).tolist()) for name in _INPUTS
+    )
+    table = openpbr_inputs(diffuse, specular, roughness[0], emission)
+    constants = {name.removeprefix("inputs:"): value for name, (_, value, *_) in table.items()}
+    return _multiply(constants)
+
+
+def read_openpbr(material: Any, time: Any, opened: OpenedStage) -> dict[str, NDArray[np.float64]]:
+    """Return the columns [3] that the OpenPBR shader beside a preview states; none without both.
+
+    Columns with an input that is missing, or no constant, are left out; notes name the latter.
+    """
+    shader = material.ComputeSurfaceSource("mtlx")[0]
+    preview = surface_shader(material)
+    if (
+        not shader
+        or shader.GetShaderId() != _OPENPBR_SHADER
+        or shader.GetPath() == preview.GetPath()
+    ):
+        return {}
+    values = dict[str, NDArray[Any]]()
+    for name in (each for inputs in _INPUTS.values() for each in inputs):
+        sources = find_sources(shader, name)
+        if not sources:
+            continue
+        stated = None if is_output(sources[0]) else sources[0].Get(time)
+        value = parse_color(
+            None if stated is None else convert_to_rec709(sources[0], np.array(stated))
+        )
+        if value is None:
+            opened.lost.append(f"{shader.GetPath()}.{name}: no finite constant; it is not read")
+        else:
+            values[name] = value
+    note_unsupported(shader, time, opened, ("specular_weight", "specular_color"))
+    return _multiply(values)
+
+
+def _multiply(values: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
+    columns = {}
+    for column, inputs in _INPUTS.items():
+        if all(name in values for name in inputs):
+            factors = [np.broadcast_to(values[name], 3).astype(float) for name in inputs]
+            if column == "specular":
+                factors[-1] = reflect_head_on(factors[-1])
+            columns[column] = np.prod(factors, axis=0)
+    return columns
+
+
+def _divide_by_largest(rgb: Color, largest: float) -> Color:
+    """Return a color divided by its largest channel; white for black."""
+    if largest <= 0:
+        return 1.0, 1.0, 1.0
+    red, green, blue = (_round_to_float32(value / largest) for value in rgb)
+    return red, green, blue
+
+
+def _round_to_float32(value: float) -> float:
+    return float(np.float32(value))

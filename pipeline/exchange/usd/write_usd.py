@@ -2,9 +2,17 @@
 
 Stages are Z up, in meters, with a default prim; textures and an environment map are files next to
 the stage, or in the archive. Equal scenes give equal bytes.
-`prim_names` lists the paths; `read_exact_scene` reads them.
+`prim_names` lists the paths; `read_usd` reads them.
 A camera has a pose and a lens, in tenths of a meter, on a square film of 36 mm. A `.usdz` file is a
 zip archive of uncompressed members that begin at multiples of 64 bytes.
+
+The origin of a mesh is the center of its bounding box, since other programs rotate and scale an
+object about its origin; points are relative to it. Where center plus point in float32 differs from
+the position, an attribute holds the exact position.
+
+An emitter is emissive geometry and a light: its material emits, and `MeshLightAPI` with its default
+`materialGlowTintsLight` and a white intensity of 1 emits the radiance of the material. The map of
+an environment is an OpenEXR of float32, because half floats end below the radiance of suns.
 """
 
 import io
@@ -18,29 +26,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
-from pipeline.exchange.usd.dome import add_dome, map_files, sky_attributes
-from pipeline.exchange.usd.prim_names import (
-    DIGEST,
-    FOV_DEG,
-    OBJECT_TEXTS,
-    PROVENANCE,
-    ROOT,
-    SHARD_ROOT,
-    UNUSED_NORMALS,
-    UNUSED_POSITIONS,
-    UNUSED_ROWS,
-    VARIANT_SET,
-    VERSION,
-    camera_name,
+from pipeline.exchange.usd import prim_names as names
+from pipeline.exchange.usd.authoring import (
+    Attributes,
+    add_attributes,
+    add_prim,
+    add_relationship,
+    text_attributes,
 )
-from pipeline.exchange.usd.write_materials import add_materials
-from pipeline.exchange.usd.write_meshes import add_objects
-from pipeline.exchange.usd.write_textures import texture_files
+from pipeline.exchange.usd.write_materials import ST, add_materials, texture_files
 from storage.atomic import write_atomically
 from storage.conventions import SCHEMA_VERSION
 from storage.digests import canonical_json
 from storage.errors import TrilightError
+from storage.records.environment import Environment
+from storage.records.exr import MAX_RESOLUTION, encode_channels
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import ARRAY_FIELDS, Scene
 from storage.records.scene_file import scene_digest
@@ -52,20 +52,21 @@ ENVIRONMENT = "Environment"
 
 CARRIED = frozenset(
     {*ARRAY_FIELDS, "provenance", "textures", "normal_textures", "environment"}
-    | {f"objects.{field}" for field in OBJECT_TEXTS}
+    | {f"objects.{field}" for field in names.OBJECT_TEXTS}
 )
 """Members of a scene that the file holds (pipeline.exchange.formats)."""
 
 
-def write_usd(path: Path, scene: Scene) -> None:
-    """Write one scene; the file appears whole or not at all.
+def write_usd(path: Path, scene: Scene) -> tuple[()]:
+    """Write one scene; the file appears whole or not at all. Nothing in CARRIED loses anything.
 
     Raises:
         TrilightError: the suffix is not USD's, the scene breaks a law or holds text that USD cannot
             store, or the file cannot be written.
     """
-    layer = _new_layer(path, ROOT)
-    _save(path, layer, _add_scene(layer, ROOT, scene))
+    layer = _new_layer(path, names.ROOT)
+    _save(path, layer, _add_scene(layer, names.ROOT, scene))
+    return ()
 
 
 def write_usd_shard(path: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
@@ -76,19 +77,19 @@ def write_usd_shard(path: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
     """
     from pxr import Sdf
 
-    layer = _new_layer(path, SHARD_ROOT)
-    root = add_prim(layer, SHARD_ROOT, "Xform")
-    root.variantSetNameList.Prepend(VARIANT_SET)
+    layer = _new_layer(path, names.SHARD_ROOT)
+    root = add_prim(layer, names.SHARD_ROOT, "Xform")
+    root.variantSetNameList.Prepend(names.VARIANT_SET)
     keys = []
     files = dict[str, bytes]()
     for key, scene in scenes:
-        variant = f"{SHARD_ROOT}{{{VARIANT_SET}={key}}}"
+        variant = f"{names.SHARD_ROOT}{{{names.VARIANT_SET}={key}}}"
         Sdf.CreatePrimInLayer(layer, variant)
-        files |= _add_scene(layer, variant + ROOT.removeprefix("/"), scene)
+        files |= _add_scene(layer, variant + names.ROOT.removeprefix("/"), scene)
         keys.append(key)
     if not keys:
         raise TrilightError(f"{path.name}: no scenes to write; expected at least one.")
-    root.variantSelections[VARIANT_SET] = keys[0]
+    root.variantSelections[names.VARIANT_SET] = keys[0]
     _save(path, layer, files)
 
 
@@ -98,13 +99,13 @@ def root_attributes(scene: Scene) -> Attributes:
     unused[scene.faces] = False
     rows = np.flatnonzero(unused)
     return {
-        VERSION: ("int", SCHEMA_VERSION),
-        DIGEST: ("string", scene_digest(scene)),
-        PROVENANCE: ("string", canonical_json(dict(scene.provenance)).decode()),
-        UNUSED_ROWS: ("int[]", rows.astype(np.int32)),
-        UNUSED_POSITIONS: ("point3f[]", scene.vertex_positions[rows]),
-        UNUSED_NORMALS: ("normal3f[]", scene.vertex_normals[rows]),
-        **sky_attributes(scene.environment),
+        names.VERSION: ("int", SCHEMA_VERSION),
+        names.DIGEST: ("string", scene_digest(scene)),
+        names.PROVENANCE: ("string", canonical_json(dict(scene.provenance)).decode()),
+        names.UNUSED_ROWS: ("int[]", rows.astype(np.int32)),
+        names.UNUSED_POSITIONS: ("point3f[]", scene.vertex_positions[rows]),
+        names.UNUSED_NORMALS: ("normal3f[]", scene.vertex_normals[rows]),
+        **_sky_attributes(scene.environment),
     }
 
 
@@ -112,13 +113,15 @@ def _add_scene(layer: Any, path: str, scene: Scene) -> dict[str, bytes]:
     """Write a scene into a layer; return its texture and map files by name."""
     scene.check()
     scene = without_constant_textures(scene)
-    for entry in scene.objects:
-        _require_text(entry.name, entry.uid, entry.licence, entry.attribution, entry.source_url)
-    for texture in scene.textures:
-        source = texture.source
-        _require_text(source.name, source.licence, source.attribution, source.source_url)
+    records: list[tuple[Any, dict[str, str]]] = [
+        (entry, names.OBJECT_TEXTS) for entry in scene.objects
+    ]
+    records += [(texture.source, names.MAP_TEXTS) for texture in scene.textures]
+    for text in (getattr(record, field) for record, fields in records for field in fields):
+        if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
+            raise TrilightError(f"names: {text!r:.80} has a character that USD cannot store.")
     author_scene(layer, path, scene)
-    return texture_files(scene) | map_files(scene.environment)
+    return texture_files(scene) | _map_files(scene.environment)
 
 
 def author_scene(layer: Any, path: str, scene: Scene) -> Any:
@@ -129,17 +132,12 @@ def author_scene(layer: Any, path: str, scene: Scene) -> Any:
         root = add_prim(layer, path, "Xform")
         add_attributes(root, root_attributes(scene))
         add_materials(layer, f"{path}/Materials", scene)
-        add_objects(layer, f"{path}/Objects", scene, f"{path}/Materials")
-        add_cameras(layer, f"{path}/Cameras", scene)
+        _add_objects(layer, f"{path}/Objects", scene, f"{path}/Materials")
+        _add_cameras(layer, f"{path}/Cameras", scene)
         if scene.environment is not None:
-            add_dome(layer, f"{path}/{ENVIRONMENT}", scene.environment)
+            dome = add_prim(layer, f"{path}/{ENVIRONMENT}", "DomeLight")
+            add_attributes(dome, _dome_attributes(scene.environment))
     return root
-
-
-def _require_text(*texts: str) -> None:
-    for text in texts:
-        if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
-            raise TrilightError(f"names: {text!r:.80} has a character that USD cannot store.")
 
 
 def _new_layer(path: Path, root: str) -> Any:
@@ -178,38 +176,196 @@ def _save(path: Path, layer: Any, files: Mapping[str, bytes]) -> None:
     write_atomically(path, data)  # last, so that the files that it names exist
 
 
-APERTURE = 0.36
-"""Width and height of the film in tenths of a meter."""
+_BINDING = "material:binding"
+_LIGHT: Attributes = {
+    "inputs:intensity": ("float", 1.0),
+    "inputs:exposure": ("float", 0.0),
+    "inputs:color": ("color3f", (1.0, 1.0, 1.0)),
+    "inputs:normalize": ("bool", False),
+    "light:materialSyncMode": ("uniform token", "materialGlowTintsLight"),
+}
+_MESH: Attributes = {
+    "doubleSided": ("uniform bool", True),
+    "orientation": ("uniform token", "rightHanded"),
+    "subdivisionScheme": ("uniform token", "none"),
+    "subsetFamily:materialBind:familyType": ("uniform token", "partition"),
+}
+CENTER = "xformOp:translate"
+"""Name of the transform to the center, which USD's common API sets."""
 
-CLIP_METRES = (1e-3, 1e4)
+_SUBSET: Attributes = {
+    "elementType": ("uniform token", "face"),
+    "familyName": ("uniform token", "materialBind"),
+}
 
 
-def add_cameras(layer: Any, folder: str, scene: Scene) -> None:
-    """Write a prim for each camera below `folder`."""
+def _add_objects(layer: Any, folder: str, scene: Scene, materials: str) -> None:
+    """Write a prim for each object below `folder`; the materials are below `materials`."""
     add_prim(layer, folder, "Scope")
-    for row in range(scene.num_views):
-        camera = add_prim(layer, f"{folder}/{camera_name(row)}", "Camera")
-        add_attributes(camera, camera_attributes(scene.c2w[row], float(scene.fov_deg[row])))
+    order = np.argsort(scene.object_index, kind="stable")
+    counts = np.bincount(scene.object_index, minlength=len(scene.objects))
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    for row, name in enumerate(prim_names(scene)):
+        faces = order[starts[row] : starts[row + 1]]
+        _add_object(layer, f"{folder}/{name}", scene, row, faces, materials)
 
 
-def camera_attributes(c2w: NDArray[np.float32], fov_deg: float) -> Attributes:
-    """Return the attributes of a camera from its pose [4, 4] and full field of view in degrees."""
-    focal = APERTURE / (2 * math.tan(math.radians(fov_deg) / 2))
-    rows = c2w.astype(np.float64).T.tolist()  # USD multiplies rows from the left
+def prim_names(scene: Scene) -> list[str]:
+    """Return a unique and valid USD name for each object."""
+    from pxr import Tf
+
+    taken: set[str] = set()
+    unique = []
+    for row, entry in enumerate(scene.objects):
+        name = Tf.MakeValidIdentifier(entry.name or "object")
+        while name in taken:
+            name = f"{name}_{row}"
+        taken.add(name)
+        unique.append(name)
+    return unique
+
+
+def _add_object(
+    layer: Any, path: str, scene: Scene, row: int, faces: NDArray[np.intp], materials: str
+) -> None:
+    entry = scene.objects[row]
+    emits = entry.kind == "emitter"
+    attributes = {
+        names.INDEX: ("int", row),
+        **text_attributes(names.OBJECT_TEXTS, entry),
+        names.VISIBLE_TO_CAMERA: ("bool", not emits),
+        **(_LIGHT if emits else {}),
+    }
+    if len(faces) == 0:
+        add_attributes(add_prim(layer, path, "Xform"), attributes)
+        return
+    schemas = ["MaterialBindingAPI", *(["MeshLightAPI"] if emits else [])]
+    prim = add_prim(layer, path, "Mesh", schemas)
+    add_attributes(prim, {**attributes, **_MESH, **_mesh_arrays(scene, faces)})
+    prim.attributes["normals"].SetInfo("interpolation", "vertex")
+    if scene.uv is not None:
+        prim.attributes[ST].SetInfo("interpolation", "faceVarying")
+    index = scene.material_index[faces]
+    used = np.unique(index)
+    add_relationship(prim, _BINDING, f"{materials}/{names.material_name(used[0])}")
+    for material in used:
+        name = names.material_name(material)
+        subset = add_prim(layer, f"{path}/{name}", "GeomSubset", ["MaterialBindingAPI"])
+        chosen = np.flatnonzero(index == material).astype(np.int32)
+        add_attributes(subset, {**_SUBSET, "indices": ("int[]", chosen)})
+        add_relationship(subset, _BINDING, f"{materials}/{name}")
+
+
+def sum_positions(center: NDArray[np.float64], points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the float32 positions of points [V, 3] about a center."""
+    return (points.astype(np.float64) + center).astype(np.float32)
+
+
+def _mesh_arrays(scene: Scene, faces: NDArray[np.intp]) -> Attributes:
+    """Return the arrays of a mesh, with exact positions where center plus point differs."""
+    rows, corners = np.unique(scene.faces[faces], return_inverse=True)
+    positions = scene.vertex_positions[rows]
+    wide = positions.astype(np.float64)
+    middle = (wide.min(axis=0) + wide.max(axis=0)) / 2
+    center = middle.astype(np.float32).astype(np.float64)
+    points = (wide - center).astype(np.float32)
+    same = sum_positions(center, points).view(np.uint32) == positions.view(np.uint32)
+    exact = np.flatnonzero(~same.all(axis=1))
+    uv = None if scene.uv is None else scene.uv.reshape(-1, 3, 2)[faces].reshape(-1, 2)
     return {
-        "xformOp:transform": ("matrix4d", rows),
-        "xformOpOrder": ("uniform token[]", ("xformOp:transform",)),
-        "projection": ("token", "perspective"),
-        "focalLength": ("float", float(np.float32(focal))),
-        "horizontalAperture": ("float", float(np.float32(APERTURE))),
-        "verticalAperture": ("float", float(np.float32(APERTURE))),
-        "clippingRange": ("float2", CLIP_METRES),
-        FOV_DEG: ("float", fov_deg),
+        CENTER: ("double3", center.tolist()),
+        "xformOpOrder": ("uniform token[]", (CENTER,)),
+        names.EXACT_ROWS: ("int[]", exact.astype(np.int32)),
+        names.EXACT_POSITIONS: ("point3f[]", positions[exact]),
+        "faceVertexCounts": ("int[]", np.full(len(faces), 3, np.int32)),
+        "faceVertexIndices": ("int[]", corners.ravel().astype(np.int32)),
+        "points": ("point3f[]", points),
+        "normals": ("normal3f[]", scene.vertex_normals[rows]),
+        "extent": ("float3[]", np.stack([points.min(axis=0), points.max(axis=0)])),
+        names.VERTEX_ROWS: ("int[]", rows.astype(np.int32)),
+        names.FACE_ROWS: ("int[]", faces.astype(np.int32)),
+        **({} if uv is None else {ST: ("texCoord2f[]", uv)}),
     }
 
 
-ALIGNMENT = 64
-LAYER_NAME = "scene.usdc"
+def _map_files(sky: Environment | None) -> dict[str, bytes]:
+    """Return the map file of an environment by name.
+
+    Raises:
+        TrilightError: the map is larger than the OpenEXR reader accepts.
+    """
+    if sky is None:
+        return {}
+    if max(sky.radiance_rgb.shape) > MAX_RESOLUTION:
+        raise TrilightError(
+            f"environment: {sky.radiance_rgb.shape[1]} texels wide; expected at most "
+            f"{MAX_RESOLUTION} in USD. Write it as .safetensors, or make it smaller."
+        )
+    return {_map_file(sky): encode_channels({"RGB": sky.radiance_rgb})}
+
+
+def _map_file(sky: Environment) -> str:
+    """Return the file name of a map; equal maps share a file."""
+    return f"sky-{sky.sha256[:16]}.exr"
+
+
+def _dome_attributes(sky: Environment) -> Attributes:
+    """Return the attributes of the prim of an environment."""
+    to_world = np.eye(4)
+    to_world[:3, :3] = sky.rotation.astype(np.float64) @ names.TO_OUR_AXES
+    return {
+        "xformOp:transform": ("matrix4d", to_world.T.tolist()),  # USD multiplies from the left
+        "xformOpOrder": ("uniform token[]", ("xformOp:transform",)),
+        names.MAP_PATH: ("asset", f"./{_map_file(sky)}"),
+        "inputs:texture:format": ("token", "latlong"),
+        "inputs:intensity": ("float", 1.0),
+        names.VISIBLE_TO_CAMERA: ("bool", sky.is_seen),
+        **text_attributes(names.MAP_TEXTS, sky.source),
+    }
+
+
+def _sky_attributes(sky: Environment | None) -> Attributes:
+    """Return the attributes of a scene's prim about its environment; empty without one."""
+    if sky is None:
+        return {}
+    return {
+        **{
+            name: ("float3", tuple(map(float, row)))
+            for name, row in zip(names.SKY_ROWS, sky.rotation, strict=True)
+        },
+        names.SKY_VISIBLE: ("bool", sky.is_seen),
+        names.SKY_SOURCE: ("string", names.format_map(sky.sha256, sky.source)),
+    }
+
+
+_APERTURE = 0.36
+"""Width and height of the film in tenths of a meter."""
+
+_CLIP_METERS = (1e-3, 1e4)
+
+
+def _add_cameras(layer: Any, folder: str, scene: Scene) -> None:
+    """Write a prim for each camera below `folder`."""
+    add_prim(layer, folder, "Scope")
+    for row, (c2w, fov_deg) in enumerate(zip(scene.c2w, scene.fov_deg.tolist(), strict=True)):
+        focal = _APERTURE / (2 * math.tan(math.radians(fov_deg) / 2))
+        camera = add_prim(layer, f"{folder}/{names.camera_name(row)}", "Camera")
+        attributes: Attributes = {
+            # USD multiplies rows from the left
+            "xformOp:transform": ("matrix4d", c2w.astype(np.float64).T.tolist()),
+            "xformOpOrder": ("uniform token[]", ("xformOp:transform",)),
+            "projection": ("token", "perspective"),
+            "focalLength": ("float", float(np.float32(focal))),
+            "horizontalAperture": ("float", float(np.float32(_APERTURE))),
+            "verticalAperture": ("float", float(np.float32(_APERTURE))),
+            "clippingRange": ("float2", _CLIP_METERS),
+            names.FOV_DEG: ("float", fov_deg),
+        }
+        add_attributes(camera, attributes)
+
+
+_ALIGNMENT = 64
+_LAYER_NAME = "scene.usdc"
 
 _HEADER_BYTES = 30
 _PADDING_ID = 0x1986
@@ -220,10 +376,10 @@ def encode_usdz(layer: bytes, files: Mapping[str, bytes] | None = None) -> bytes
     """Return the `.usdz` archive of a `.usdc` layer and its files, without time stamps."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
-        for name, data in {LAYER_NAME: layer, **(files or {})}.items():
+        for name, data in {_LAYER_NAME: layer, **(files or {})}.items():
             entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
             begin = stream.tell() + _HEADER_BYTES + len(name)
-            padding = -(begin + 4) % ALIGNMENT
+            padding = -(begin + 4) % _ALIGNMENT
             entry.extra = _PADDING_ID.to_bytes(2, "little") + padding.to_bytes(2, "little")
             entry.extra += bytes(padding)
             entry.external_attr = 0o644 << 16

@@ -243,7 +243,7 @@ def test_a_network_clips_what_half_floats_lack_and_groups_lights(
     np.testing.assert_array_equal(
         shown(out.with_suffix(".png"))[::16, ::16], preview_srgb8(decode_exr(out.read_bytes()))
     )
-    write_renderformer_h5(tmp_path / "many.h5", many_lights(9), texture_type="float32")
+    write_renderformer_h5(tmp_path / "many.h5", many_lights(9))
     first = decode_exr(out.read_bytes())
     render(tmp_path / "many.h5", *drawn[1:], "--lights-per-pass", "9")
     # it orders the triangles anew, and half floats are exact to 2^-11 of their value

@@ -13,7 +13,6 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from pipeline.documents.card import encode_card
 from pipeline.documents.distributions import dataset_distributions
 from pipeline.documents.figures import (
     Panel,
@@ -23,9 +22,7 @@ from pipeline.documents.figures import (
     short_label,
 )
 from pipeline.documents.gallery import write_gallery
-from pipeline.documents.report import write_report
-from pipeline.documents.report_sections import _rejections
-from pipeline.documents.rights import rights_of
+from pipeline.documents.report import _rejections, write_report
 from pipeline.documents.scene_page import Neighbours, encode_scene_page, shown_maps
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
@@ -42,6 +39,7 @@ from tests.pipeline.documents.dataset_by_hand import (
     write_dataset,
 )
 from tests.pipeline.documents.pages_read import HARM, Tags, read, text_of
+from tests.pipeline.documents.test_card import card_of
 from tests.scenes_by_hand import tiny_scene
 from tests.textured_by_hand import sky, textured_scene
 
@@ -234,12 +232,6 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return dataset
 
 
-def card_of(dataset: Dataset) -> str:
-    found = dataset_distributions(dataset)
-    rights = rights_of(found.objects)
-    return encode_card(dataset.folder, dataset.manifest, found, rights).decode()
-
-
 def test_the_report_and_the_card_count_maps_and_scenes_show_them(
     mapped: Dataset, dataset: Dataset, five: dict[str, Tags]
 ) -> None:
@@ -250,7 +242,7 @@ def test_the_report_and_the_card_count_maps_and_scenes_show_them(
     assert "texture colours 0 2 texture roughness 2" in text and "sky sky 0 1" in text
     assert "mean radiance of a sky 1 0.250 0.250 0.250 0.250 0.250 0.250" in text
     assert "#textures-and-skies" in page.links
-    card = card_of(mapped)
+    card = card_of(mapped)[1]
     assert "2 of 3 scenes, 4 maps of 2 families, 2 to 6 texels wide" in card
     assert "1 of 3 scenes, 1 families, mean radiance 0.25; half of the light" in card
     text = text_of(read((mapped.folder.report_pages / "000000000.html").read_bytes()))
@@ -258,7 +250,8 @@ def test_the_report_and_the_card_count_maps_and_scenes_show_them(
     assert "sky 0 (environment, seen): mean radiance 0.25, brightest texel 1 times that" in text
     plain = text_of(read((mapped.folder.report_pages / "000000002.html").read_bytes()))
     assert "Textures and environment" not in plain
-    assert "textures" not in card_of(dataset) and "skies" not in card_of(dataset)
+    bare = card_of(dataset)[1]
+    assert "textures" not in bare and "skies" not in bare
     assert "#textures-and-skies" not in five["report"].links
 
 

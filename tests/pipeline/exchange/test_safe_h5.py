@@ -112,17 +112,14 @@ HOSTILE: dict[str, tuple[Callable[[Any], None], str]] = {
 def test_hostile_arrays_are_refused(path: Path) -> None:
     """`other.h5` and `secret.bin` are there, and would be read if they were not refused."""
     for folder, (change, message) in with_folders(path.parent, HOSTILE.values()):
-        _check_hostile_array(Path(shutil.copy(path, folder)), change, message)
-
-
-def _check_hostile_array(path: Path, change: Callable[[Any], None], message: str) -> None:
-    shutil.copy(path, path.with_name("other.h5"))
-    path.with_name("secret.bin").write_bytes(np.ones(27, "<f4").tobytes())
-    with h5py.File(path, "r+") as file:
-        del file["triangles"]
-        change(file)
-    with pytest.raises(TrilightError, match=rf"a\.h5: triangles: .*{message}"):
-        read_renderformer_h5(path)
+        hostile = Path(shutil.copy(path, folder))
+        shutil.copy(path, folder / "other.h5")
+        (folder / "secret.bin").write_bytes(np.ones(27, "<f4").tobytes())
+        with h5py.File(hostile, "r+") as file:
+            del file["triangles"]
+            change(file)
+        with pytest.raises(TrilightError, match=rf"a\.h5: triangles: .*{message}"):
+            read_renderformer_h5(hostile)
 
 
 def _ones_without_light() -> Any:
@@ -144,19 +141,16 @@ OTHERS: dict[str, tuple[str, Any, str]] = {
 
 
 def test_other_arrays_are_checked_too(path: Path) -> None:
-    for folder, case in with_folders(path.parent, OTHERS.values()):
-        _check_other_array(Path(shutil.copy(path, folder)), *case)
-
-
-def _check_other_array(path: Path, name: str, values: Any, message: str) -> None:
-    with h5py.File(path, "r+") as file:
-        del file[name]
-        if values is None:
-            file.create_dataset(name, (2, 8192, 8192, 4), "<f2", chunks=(1, 64, 64, 4))
-        else:
-            file[name] = values
-    with pytest.raises(TrilightError, match=message):
-        read_renderformer_h5(path)
+    for folder, (name, values, message) in with_folders(path.parent, OTHERS.values()):
+        other = Path(shutil.copy(path, folder))
+        with h5py.File(other, "r+") as file:
+            del file[name]
+            if values is None:
+                file.create_dataset(name, (2, 8192, 8192, 4), "<f2", chunks=(1, 64, 64, 4))
+            else:
+                file[name] = values
+        with pytest.raises(TrilightError, match=message):
+            read_renderformer_h5(other)
 
 
 def test_a_normal_of_a_face_without_area_cannot_be_made(path: Path) -> None:

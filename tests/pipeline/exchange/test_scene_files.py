@@ -79,17 +79,24 @@ def _settings(folder: Path, views: int | None = None) -> DatasetSettings:
     return settings_for_files(preset_settings("smoke"), find_scene_files(str(folder)), views)
 
 
+def _files(folder: Path, *names: str, **unusable: str) -> SceneFiles:
+    sha256 = {uid: digest for name in names for uid, digest in _digests(folder, name).items()}
+    return SceneFiles(
+        root=folder.resolve(), names=names, sha256=sha256, unusable=unusable, licence="MIT"
+    )
+
+
 def _scene(files: SceneFiles, scene_index: int, settings: DatasetSettings) -> Scene:
     views = settings.scenes.num_views
     return files.scene(scene_index, settings.assets, num_views=views, seed=settings.seed)
 
 
-def _accept(folder: Path, out: Path, licence: str | None = None) -> None:
+def _accept(folder: Path, out: Path, licence: str | None = None) -> object:
     found, settings = find_scene_files(str(folder)), _settings(folder)
     publication = begin_or_resume_dataset(
         DatasetFolder(out), settings, {}, 1, accept_environment=False
     )
-    accept_scene_files(found, licence, settings, publication)
+    return accept_scene_files(found, licence, settings, publication).origin
 
 
 def test_a_scene_says_where_it_comes_from(folder: Path) -> None:
@@ -201,13 +208,7 @@ def test_files_are_frozen_by_digest(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_file_that_changes_during_a_run_stops_it(folder: Path) -> None:
-    files = SceneFiles(
-        root=folder.resolve(),
-        names=("a.json", "b.json"),
-        sha256=_digests(folder, "a.json") | _digests(folder, "b.json"),
-        unusable={},
-        licence="MIT",
-    )
+    files = _files(folder, "a.json", "b.json")
     settings = _settings(folder)
     assert _scene(files, 1, settings).provenance["scene_file"]["name"] == "b.json"
     with (folder / "meshes/tri.obj").open("a") as stream:
@@ -222,14 +223,7 @@ def test_a_run_reads_files_in_a_confined_child(
     """What it may read is the folder; what it returns is what is read here."""
     settings = _settings(folder)
     (folder / "c.json").write_text((folder / "a.json").read_text())
-    names = ("a.json", "c.json")
-    files = SceneFiles(
-        root=folder.resolve(),
-        names=names,
-        sha256=_digests(folder, "a.json") | _digests(folder, "c.json"),
-        unusable={"c.json": "it is not wanted"},
-        licence="MIT",
-    )
+    files = _files(folder, "a.json", "c.json", **{"c.json": "it is not wanted"})
     job = cast(Any, SimpleNamespace(
         folder=DatasetFolder(tmp_path / "set"), settings=settings, lock_sha256="",
         accepted=SimpleNamespace(origin=files), num_at_once=1, device="",
@@ -274,10 +268,7 @@ def test_a_bad_file_keeps_its_number_and_stops_nobody(folder: Path, tmp_path: Pa
     found, settings = find_scene_files(str(folder)), _settings(folder)
     assert found.names == ("a.json", "aa.json", "b.json", "c.json")
     assert settings.splits.listed_scenes == 4
-    publication = begin_or_resume_dataset(
-        DatasetFolder(tmp_path / "set"), settings, {}, 1, accept_environment=False
-    )
-    files = accept_scene_files(found, None, settings, publication).origin
+    files = _accept(folder, tmp_path / "set")
     assert isinstance(files, SceneFiles)
     assert sorted(files.unusable) == ["aa.json", "c.json"]
     for scene_index in (1, 3):

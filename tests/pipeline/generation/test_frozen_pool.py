@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.documents.attribution import encode_attribution
+from pipeline.documents.rights import encode_attribution
 from pipeline.generation import accept_maps as accepting
 from pipeline.generation import freeze_objects, frozen_pool, pipeline, render_workers
 from pipeline.generation.accept_maps import AcceptedMaps, MapFolders, accept_maps, map_folders

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.exchange.convert import _convert_one
+from pipeline.exchange.convert import convert_sources
 from pipeline.exchange.formats import SceneSource
 from pipeline.exchange.open_scene import load_cameras, load_source, source_keys
 from pipeline.generation.inspect_scene import _facts
@@ -72,7 +72,7 @@ def test_a_real_answer_is_as_declared(tmp_path: Path) -> None:
     calls: list[tuple[Callable[..., Any], Any]] = [
         (each, each(source)) for each in (load_source, load_cameras, source_keys, _facts)
     ]
-    calls.append((_convert_one, _convert_one(source, tmp_path / "out.glb", None)))
+    calls.append((convert_sources, convert_sources([source], tmp_path / "out.glb", None)))
     for function, value in calls:
         sent = encode_result(value)
         answer = decode_answer([np.frombuffer(part, np.uint8).copy() for part in sent], function)

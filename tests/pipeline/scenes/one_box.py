@@ -7,8 +7,12 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from pipeline.exchange.description import SceneDescription
-from pipeline.exchange.from_description import AlbedoOverOne, LoadedMesh, scene_from_description
+from pipeline.exchange.from_description import (
+    AlbedoOverOne,
+    LoadedMesh,
+    SceneDescription,
+    scene_from_description,
+)
 from pipeline.exchange.renderformer_json import read_description
 from storage.records.scene import Scene
 

@@ -14,17 +14,21 @@ from PIL import Image
 
 from model.scene_tensors import scene_tensors
 from pipeline.exchange.exports.export import FORMS
-from pipeline.exchange.exports.scenes import MOST_NOTES, WRITERS, _limit_notes, picture_name
+from pipeline.exchange.exports.pictures import stands_alone
+from pipeline.exchange.exports.scenes import MOST_NOTES, SCENE_FORMS, _limit_notes, picture_name
 from pipeline.exchange.open_scene import load_source, scene_source
-from storage.conventions import in_camera, preview_srgb8
+from storage.conventions import in_camera, preview_srgb8, srgb8
 from storage.dataset.dataset import open_dataset
 from storage.records.exr import decode_exr
-from storage.records.material import EMISSION
+from storage.records.material import DIFFUSE, EMISSION, SPECULAR
+from storage.records.passes.pictures import view_passes
 from storage.records.sample import PartFloor, Sample
+from storage.records.scene import Scene
 from tests.command_line import trilight
 from tests.for_each import for_each
 from tests.foreign_packages import nerfstudio_pictures
 from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample, write_dataset
+from tests.sky_maps import constant
 from tests.train.toy import VIEWS, toy_sample, write_toy_dataset
 
 PX = 16
@@ -154,7 +158,7 @@ def test_many_losses_are_counted_once_each_is_told() -> None:
     assert _limit_notes("h5", ["a", "b"]) == ["h5 cannot hold a", "h5 cannot hold b"]
     told = _limit_notes("json", [str(number) for number in range(MOST_NOTES + 3)])
     assert len(told) == MOST_NOTES + 1 and told[-1] == "json loses 3 more things of this kind"
-    assert set(WRITERS) == {"h5", "json", "usd", "exr"}
+    assert set(SCENE_FORMS) == {"h5", "json", "usd", "exr"}
 
 
 SIZE = 16
@@ -361,3 +365,87 @@ def test_mistakes(dataset: Path, tmp_path: Path) -> None:
     )
     other = trilight(["export", str(tmp_path / "full"), "--form", "coco", *new])
     assert "no manifest.json" in str(other.exception)
+
+
+def _alone(*, seen_sky: bool | None = None) -> Scene:
+    """Return a scene of an object alone, below a sky that cameras see or not; None for no sky."""
+    scene = furnished(["a"], "alone")
+    objects = [
+        dataclasses.replace(entry, kind="object") if entry.kind == "shell" else entry
+        for entry in scene.objects
+    ]
+    sky = None if seen_sky is None else dataclasses.replace(constant(0.5), is_seen=seen_sky)
+    return dataclasses.replace(scene, objects=tuple(objects), environment=sky)
+
+
+@pytest.fixture
+def lone(tmp_path: Path) -> Path:
+    shards = {"train-000000.tar": [_covered(sample(0, _alone(seen_sky=False)))]}
+    write_dataset(tmp_path / "data", shards, objects=[locked("a", "CC-BY-4.0")])
+    (tmp_path / "data/attribution.csv").write_text("uid\na\n")
+    return tmp_path / "data"
+
+
+def _covered(made: Sample) -> Sample:
+    """Return a sample whose pictures are 0.6 times the share of each pixel that is covered."""
+    pictures = [np.repeat(0.6 * _coverage(made, view)[..., None], 3, axis=-1) for view in (0, 1)]
+    return dataclasses.replace(made, radiance_rgb=np.stack(pictures).astype(np.float32))
+
+
+def _coverage(made: Sample, view: int) -> NDArray[np.float64]:
+    found: NDArray[np.float64] = view_passes(
+        made.scene, ["coverage"], view=view, resolution=16, rays_a_side=4
+    )["coverage"]
+    return found
+
+
+@for_each(
+    ("scene", "expected"),
+    [
+        (_alone(), True),
+        (_alone(seen_sky=False), True),
+        (_alone(seen_sky=True), False),
+        (furnished(["a"]), False),
+    ],
+)
+def test_a_floor_and_a_seen_sky_are_behind_objects(scene: Scene, expected: bool) -> None:
+    assert stands_alone(scene) == expected
+
+
+def test_nerfstudio_pictures_have_straight_alpha(lone: Path) -> None:
+    folder = exported(lone, "nerfstudio") / "000000000"
+    (made,) = open_dataset(str(lone)).samples("train")
+    for view, frame in enumerate(json.loads((folder / "transforms.json").read_text())["frames"]):
+        rgba = np.asarray(Image.open(folder / frame["file_path"]))
+        covered = _coverage(made, view)
+        assert {0.0, 1.0} < set(np.unique(covered)), "edges are met"
+        np.testing.assert_array_equal(rgba[..., 3], np.round(255 * covered))
+        assert not rgba[covered == 0].any()
+        # the same color up to the edge: half floats of radiance are right to 2^-11
+        color = rgba[covered > 0][:, :3].astype(int)
+        assert np.abs(color - preview_srgb8(np.full(3, 0.6))).max() <= 1
+        seen = made.view_passes(["shading_normal", "hit"], view=view)
+        normal = np.asarray(Image.open(folder / frame["normal_file_path"])) / 127.5 - 1
+        np.testing.assert_allclose(
+            normal[seen["hit"]], seen["shading_normal"][seen["hit"]], atol=1 / 255 + 1e-6
+        )
+        albedo = np.asarray(Image.open(folder / frame["albedo_file_path"]))
+        rows = made.scene.materials[made.scene.material_index]
+        triangle = made.view_passes(["triangle"], view=view)["triangle"][seen["hit"]]
+        expected = srgb8(rows[triangle][:, DIFFUSE] + rows[triangle][:, SPECULAR])
+        np.testing.assert_array_equal(albedo[seen["hit"]], expected)
+        assert not albedo[~seen["hit"]].any()
+
+
+def test_huggingface_has_columns_of_surfaces_and_the_error_over_the_object(
+    lone: Path, tmp_path: Path
+) -> None:
+    from datasets import load_dataset
+
+    out = exported(lone, "huggingface")
+    loaded = load_dataset(str(out), cache_dir=str(tmp_path / "cache"))["train"]
+    (made,) = open_dataset(str(lone)).samples("train")
+    assert len(loaded) == 2
+    for row in loaded:
+        assert (row["image"].mode, row["normal"].mode, row["albedo"].mode) == ("RGBA", "RGB", "RGB")
+        assert row["object_noise_floor_db"] == made.views[row["view"]].object_noise_floor_db

@@ -10,8 +10,7 @@ from pxr import Sdf, Usd, UsdGeom
 
 from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.usd.read_usd import read_usd
-from pipeline.exchange.usd.write_meshes import CENTER
-from pipeline.exchange.usd.write_usd import write_usd
+from pipeline.exchange.usd.write_usd import CENTER, write_usd
 from storage.records.material import PUBLISHED_COLUMNS
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +10,28 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
+from PIL import Image
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
+from pipeline.exchange.formats import FORMATS, drop_uncarried_maps, list_lost_members
+from pipeline.exchange.loaded_scene import LoadedScene
 from pipeline.exchange.usd.read_usd import read_usd, usd_keys
 from pipeline.exchange.usd.write_usd import SUFFIXES, write_usd, write_usd_shard
-from storage.conventions import look_at_c2w
+from scene_templates.rotations import uniform_rotation
+from storage.conventions import linear_from_srgb8, look_at_c2w
 from storage.errors import TrilightError
+from storage.records.environment import Environment
+from storage.records.exr import encode_channels
+from storage.records.lookup import environment_values
 from storage.records.scene import Scene, SceneObject
-from storage.records.scene_file import encode_scene
-from tests.for_each import for_each
-from tests.pipeline.exchange.exchange_kit import errors_of
-from tests.scenes_by_hand import LIGHT, tiny_scene
+from storage.records.scene_file import encode_scene, scene_digest
+from storage.records.texture import MapSource, Texture
+from tests.for_each import for_each, with_folders
+from tests.pipeline.exchange.exchange_kit import assert_usd_keeps_all, errors_of
+from tests.pipeline.foreign.test_light_pictures import radiance_hdr
+from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
+from tests.sky_maps import COLOURS, POLES, one_sun, six_poles, smooth
+from tests.textured_by_hand import bumpy_scene, number_texture, sky, textured_scene
 
 OPENPBR_INPUTS = {
     "base_color": "color3f",
@@ -73,14 +84,12 @@ def test_validators_would_see_a_mistake(tmp_path: Path) -> None:
 
 @for_each("suffix", SUFFIXES)
 def test_there_and_back_is_exact_and_valid(tmp_path: Path, suffix: str) -> None:
-    scene = odd_scene()
-    path = tmp_path / f"a{suffix}"
-    assert errors_of(written(tmp_path, scene, path.name)) == []
-    back = read_usd(path, None, None, "")
-    assert back.notes == () and encode_scene(back.scene) == encode_scene(scene)
+    assert_usd_keeps_all(odd_scene(), tmp_path, suffix)
+    path = tmp_path / f"again{suffix}"
+    before = path.read_bytes()
     assert usd_keys(path) == [""]
-    write_usd(tmp_path / f"b{suffix}", back.scene)
-    assert (tmp_path / f"b{suffix}").read_bytes() == path.read_bytes()
+    assert_usd_keeps_all(read_usd(path, None, None, "").scene, tmp_path, suffix)
+    assert path.read_bytes() == before
 
 
 @st.composite
@@ -215,7 +224,10 @@ def test_an_emitter_is_a_light_and_glows_on_both_sides(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_shard_shows_one_scene_at_a_time(tmp_path: Path, suffix: str) -> None:
-    kept = {"000000001": tiny_scene(), "000000007": odd_scene()}
+    scenes = [tiny_scene(), odd_scene(), bumpy_scene()]
+    scenes += [tiny_scene(environment=sky) for sky in (smooth(), None, smooth(is_seen=True))]
+    scenes += [textured_scene(seed) for seed in (0, 1, 0)]
+    kept = {f"{row:09d}": scene for row, scene in enumerate(scenes, 1)}
     write_usd_shard(tmp_path / f"s{suffix}", kept.items())
     stage = Usd.Stage.Open(str(tmp_path / f"s{suffix}"))
     assert errors_of(stage) == []
@@ -226,40 +238,42 @@ def test_a_shard_shows_one_scene_at_a_time(tmp_path: Path, suffix: str) -> None:
         found = read_usd(tmp_path / f"s{suffix}", key, None, "")
         assert encode_scene(found.scene) == encode_scene(scene)
     assert usd_keys(tmp_path / f"s{suffix}") == list(kept)
-    with pytest.raises(TrilightError, match="no scene 000000003; expected one of 000000001"):
-        read_usd(tmp_path / f"s{suffix}", "000000003", None, "")
+    if suffix != ".usdz":  # one content, one file
+        assert len(list(tmp_path.glob("sky-*.exr"))) == 1
+        assert len(list(tmp_path.glob("texture-*.png"))) == 3
+    with pytest.raises(TrilightError, match="no scene 000000033; expected one of 000000001"):
+        read_usd(tmp_path / f"s{suffix}", "000000033", None, "")
 
 
-def edits() -> Iterable[tuple[str, str, Any]]:
-    yield "/Scene/Objects/floor.points", "default", [(0, 0, 0)] * 4
-    yield "/Scene/Materials/material_0/Preview.inputs:diffuseColor", "default", (0.1, 0.1, 0.1)
-    yield "/Scene/Materials/material_0/OpenPBR.inputs:base_color", "default", (0.1, 0.1, 0.1)
-    yield "/Scene/Objects/light.inputs:intensity", "default", 3.0
-    yield "/Scene/Cameras/camera_0.focalLength", "default", 3.0
-    yield "/Scene/Objects/floor", "active", False
-    yield "/Scene/Objects/floor", "instanceable", True
+def set_default(path: str, value: Any) -> Callable[[Any], None]:
+    return lambda layer: setattr(layer.GetObjectAtPath(path), "default", value)
 
 
-@for_each("path, field, value", edits())
-def test_what_was_changed_is_no_longer_ours(
-    tmp_path: Path, path: str, field: str, value: Any
+def add_light(layer: Any) -> None:
+    UsdLux.SphereLight.Define(Usd.Stage.Open(layer), "/Scene/Objects/more")
+
+
+@for_each(
+    "edit",
+    [
+        set_default("/Scene/Objects/floor.points", [(0, 0, 0)] * 4),
+        set_default("/Scene/Materials/material_0/Preview.inputs:diffuseColor", (0.1, 0.1, 0.1)),
+        set_default("/Scene/Materials/material_0/OpenPBR.inputs:base_color", (0.1, 0.1, 0.1)),
+        set_default("/Scene/Objects/light.inputs:intensity", 3.0),
+        set_default("/Scene/Cameras/camera_0.focalLength", 3.0),
+        lambda layer: layer.GetObjectAtPath("/Scene/Objects/floor").SetInfo("active", False),
+        lambda layer: layer.GetObjectAtPath("/Scene/Objects/floor").SetInfo("instanceable", True),
+        add_light,
+    ],
+)
+def test_what_was_changed_or_added_is_no_longer_ours(
+    tmp_path: Path, edit: Callable[[Any], None]
 ) -> None:
     write_usd(tmp_path / "a.usda", tiny_scene())
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "a.usda"))
-    spec = layer.GetObjectAtPath(path)
-    if field == "default":
-        spec.default = value
-    else:
-        spec.SetInfo(field, value)
+    edit(layer)
     layer.Export(str(tmp_path / "b.usda"))
     assert read_usd(tmp_path / "b.usda", None, None, "").notes
-
-
-def test_what_was_added_is_no_longer_ours(tmp_path: Path) -> None:
-    stage = written(tmp_path, tiny_scene())
-    UsdLux.SphereLight.Define(stage, "/Scene/Objects/more")
-    stage.Save()
-    assert read_usd(tmp_path / "a.usdc", None, None, "").notes
 
 
 @pytest.mark.parametrize(
@@ -281,3 +295,226 @@ def test_what_is_not_written(tmp_path: Path, scene: Scene, name: str, message: s
     with pytest.raises(TrilightError, match=message):
         write_usd(tmp_path / name, scene)
     assert not list(tmp_path.iterdir())
+
+
+def _read(path: Path) -> LoadedScene:
+    return read_usd(path, None, None, "CC0-1.0")
+
+
+def _sky(scene: Scene) -> Environment:
+    assert scene.environment is not None
+    return scene.environment
+
+
+def test_a_normal_map_is_an_input_that_usd_defines(tmp_path: Path) -> None:
+    scene = bumpy_scene()
+    write_usd(tmp_path / "a.usda", scene)
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    shader = UsdShade.Shader(stage.GetPrimAtPath(f"/Scene/Materials/material_{FLOOR}/Preview"))
+    (source,) = UsdShade.Utils.GetValueProducingAttributes(shader.GetInput("normal"))
+    node = UsdShade.Shader(source.GetPrim())
+    stated = {name: node.GetInput(name).Get() for name in ("scale", "bias", "sourceColorSpace")}
+    assert stated == {"scale": (2, 2, 2, 1), "bias": (-1, -1, -1, 0), "sourceColorSpace": "raw"}
+    picture = np.asarray(Image.open(tmp_path / node.GetInput("file").Get().path))
+    assert np.array_equal(picture[::-1], scene.textures[2].texels)
+    assert not list_lost_members(scene, FORMATS[".usda"].carried)
+    assert "normal_textures" in " ".join(list_lost_members(scene, FORMATS[".h5"].carried))
+    dropped = drop_uncarried_maps(scene, FORMATS[".h5"].carried)
+    assert scene_digest(dropped) == scene_digest(textured_scene())
+
+
+def test_other_programs_find_each_pole_where_we_have_it(tmp_path: Path) -> None:
+    """By the convention of USD alone: the middle is +Z of the dome, a quarter +X, the top +Y."""
+    turn = uniform_rotation(np.random.default_rng(2)).astype(np.float32)
+    turned = six_poles(rotation=turn)
+    path = tmp_path / "a.usda"
+    write_usd(path, tiny_scene(environment=turned))
+    stage = Usd.Stage.Open(str(path))
+    dome = UsdLux.DomeLight(stage.GetPrimAtPath("/Scene/Environment"))
+    matrix = dome.ComputeLocalToWorldTransform(Usd.TimeCode.Default())
+    places = {
+        "+Z": (0.5, 0.5),
+        "+X": (0.25, 0.5),
+        "-X": (0.75, 0.5),
+        "+Y": (0.5, 1),
+        "-Y": (0.5, 0),
+    }
+    radiance = turned.radiance_rgb
+    for name, (u, v) in places.items():
+        world = np.array(matrix.TransformDir(Gf.Vec3d(*map(float, POLES[name]))))
+        row = min(int((1 - v) * len(radiance)), len(radiance) - 1)
+        column = int(u * 2 * len(radiance))
+        assert environment_values(turned, world) == pytest.approx(radiance[row, column])
+
+
+def edited(path: Path, edit: Callable[[Usd.Stage, UsdLux.DomeLight], object]) -> LoadedScene:
+    """Return our six poles, with their dome edited."""
+    write_usd(path, tiny_scene(environment=six_poles()))
+    stage = Usd.Stage.Open(str(path))
+    edit(stage, UsdLux.DomeLight(stage.GetPrimAtPath("/Scene/Environment")))
+    stage.Save()
+    return _read(path)
+
+
+@pytest.mark.parametrize("up", ["Y", "Z"])
+def test_a_foreign_dome_stands_by_the_axes_of_usd(tmp_path: Path, up: str) -> None:
+    """Unturned: the top of the picture is +Y of the stage, whichever axis is up there."""
+
+    def turn(stage: Usd.Stage, light: UsdLux.DomeLight) -> None:
+        light.GetPrim().GetAttribute("xformOp:transform").Set(Gf.Matrix4d(1))
+        stage.SetMetadata("upAxis", up)
+        light.GetIntensityAttr().Set(2.0)
+        light.CreateExposureAttr(1.0)
+
+    found = edited(tmp_path / "a.usda", turn)
+    assert found.notes
+    of_picture = {"top": "+Z", "middle": "+X", "quarter": "+Y"}  # its colours, by our own axes
+    world = {"Z": {"top": (0, 1, 0), "middle": (0, 0, 1), "quarter": (1, 0, 0)},
+             "Y": {"top": (0, 0, 1), "middle": (0, -1, 0), "quarter": (1, 0, 0)}}[up]  # fmt: skip
+    for part, pole in of_picture.items():
+        value = environment_values(_sky(found.scene), world[part])
+        assert value == pytest.approx(4 * np.array(COLOURS[pole]), rel=1e-5), part
+
+
+def test_a_dome_without_a_file_is_even_and_may_be_the_only_light(tmp_path: Path) -> None:
+    def clear(stage: Usd.Stage, light: UsdLux.DomeLight) -> None:
+        light.GetTextureFileAttr().Clear()
+        light.CreateColorAttr(Gf.Vec3f(1.0, 0.5, 0.25))
+        stage.GetPrimAtPath("/Scene/Objects/light").SetActive(False)
+
+    found = edited(tmp_path / "a.usda", clear).scene
+    assert not found.triangle_emits.any()
+    np.testing.assert_allclose(_sky(found).radiance_rgb, [[[1, 0.5, 0.25]] * 2])
+
+
+@for_each(
+    "asset, expected",
+    [
+        ("./missing.exr", "is missing"),
+        ("./text.exr", "is not read"),
+        ("./wide.exr", "shape"),
+        ("./a.hdr", [0.5, 1, 0.25]),
+        ("./a.png", linear_from_srgb8()[[188] * 3]),
+    ],
+)
+def test_a_map_is_read_or_named(tmp_path: Path, asset: str, expected: Any) -> None:
+    texels = np.full((2, 4, 4), (64, 128, 32, 130), np.uint8)
+    (tmp_path / "a.hdr").write_bytes(radiance_hdr(texels, header="EXPOSURE=2\n"))
+    Image.fromarray(np.full((2, 4, 3), 188, np.uint8)).save(tmp_path / "a.png")
+    (tmp_path / "text.exr").write_bytes(b"no picture")
+    wide = encode_channels({"RGB": np.ones((4, 4, 3), np.float32)})
+    (tmp_path / "wide.exr").write_bytes(wide)
+    found = edited(
+        tmp_path / "a.usda",
+        lambda stage, light: light.GetTextureFileAttr().Set(Sdf.AssetPath(asset)),
+    )
+    if isinstance(expected, str):
+        assert found.scene.environment is None
+        assert any(expected in text for text in found.notes)
+    else:
+        radiance = _sky(found.scene).radiance_rgb
+        np.testing.assert_allclose(radiance, np.broadcast_to(expected, (2, 4, 3)), rtol=1e-6)
+
+
+def test_a_map_that_was_changed_is_read_as_it_is_now(tmp_path: Path) -> None:
+    """The scene is no longer the one that was written, and the digest says so."""
+    write_usd(tmp_path / "a.usda", tiny_scene(environment=six_poles()))
+    (file,) = tmp_path.glob("sky-*.exr")
+    file.write_bytes(encode_channels({"RGB": np.full((2, 4, 3), 7, np.float32)}))
+    found = _read(tmp_path / "a.usda")
+    assert found.notes
+    assert (_sky(found.scene).radiance_rgb == 7).all()
+
+
+def _all_textured() -> Scene:
+    """Every column textured, of 8 bits and of float32, and two materials that share textures."""
+    rng = np.random.default_rng(5)
+    diffuse = Texture(texels=rng.uniform(0, 0.5, (5, 3, 3)).astype(np.float32))
+    specular = Texture(texels=rng.integers(0, 127, (2, 7, 3), np.uint8))
+    number = Texture(texels=rng.integers(0, 256, (4, 4, 1), np.uint8), is_srgb=True,
+                     source=MapSource(name='a "b" ü', licence="MIT", attribution="Ö"))  # fmt: skip
+    base = textured_scene()
+    index = np.array([[0, 1, 2], [-1, -1, -1], [-1, -1, 2]], np.int32)
+    rows = np.concatenate([base.materials, base.materials[:1]])
+    material_index = np.array([FLOOR, 2, LIGHT], np.uint16)
+    return dataclasses.replace(
+        base,
+        materials=rows,
+        material_index=material_index,
+        textures=(diffuse, specular, number),
+        material_textures=index,
+    )
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_textures_and_skies_come_back_bit_for_bit(tmp_path: Path, suffix: str) -> None:
+    """Bytes as bytes and floats as floats; a sun above what half floats hold, turned anyhow."""
+    scenes = [textured_scene(), textured_scene(environment=sky()), _all_textured()]
+    turn = uniform_rotation(np.random.default_rng(1)).astype(np.float32)
+    skies = (one_sun(1e6, rotation=turn), six_poles(is_seen=True))
+    scenes += [tiny_scene(environment=each) for each in skies]
+    for folder, scene in with_folders(tmp_path, scenes):
+        assert_usd_keeps_all(scene, folder, suffix)
+        before = (folder / f"again{suffix}").read_bytes()
+        write_usd(folder / f"again{suffix}", scene)
+        assert (folder / f"again{suffix}").read_bytes() == before
+        assert (suffix == ".usdz") == (len(list(folder.iterdir())) == 1)
+
+
+def test_one_colour_is_no_texture(tmp_path: Path) -> None:
+    one = Texture(texels=np.full((3, 3, 3), 128, np.uint8), is_srgb=True)
+    scene = textured_scene(0, one, number_texture())
+    assert_usd_keeps_all(scene, tmp_path, ".usda")
+    assert not list(tmp_path.glob("*.png"))
+
+
+def test_other_programs_find_every_corner_where_we_have_it(tmp_path: Path) -> None:
+    """By the words of USD alone: `st` of a corner, v up, the top row of a picture at v = 1."""
+    texels = np.array([[[200, 0, 0], [0, 200, 0]], [[0, 0, 200], [90, 90, 0]]], np.uint8)
+    scene = textured_scene(0, Texture(texels=texels, is_srgb=True), number_texture())
+    path = tmp_path / "a.usda"
+    write_usd(path, scene)
+    stage = Usd.Stage.Open(str(path))
+    shader = UsdShade.Shader(stage.GetPrimAtPath("/Scene/Materials/material_0/DiffuseTexture"))
+    assert shader.GetInput("sourceColorSpace").Get() == "sRGB"
+    assert [shader.GetInput(f"wrap{axis}").Get() for axis in "ST"] == ["repeat", "repeat"]
+    picture = np.asarray(Image.open(tmp_path / shader.GetInput("file").Get().path))
+    for u, v, column, row in ((0.25, 0.25, 0, 0), (0.75, 0.25, 1, 0), (0.25, 0.75, 0, 1)):
+        assert (picture[int((1 - v) * 2), int(u * 2)] == texels[row, column]).all()
+    primvar = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/Scene/Objects/floor")).GetPrimvar("st")
+    assert primvar.GetInterpolation() == "faceVarying"
+    assert np.array_equal(np.array(primvar.Get()), scene.uv[:6])  # type: ignore[index]
+
+
+def test_renderers_of_materialx_get_the_textures_too(tmp_path: Path) -> None:
+    """A textured material has no constant OpenPBR that they would prefer; others keep it."""
+    write_usd(tmp_path / "a.usda", textured_scene())
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    for row, expected in (
+        (FLOOR, "UsdPreviewSurface"),
+        (LIGHT, "ND_open_pbr_surface_surfaceshader"),
+    ):
+        material = UsdShade.Material(stage.GetPrimAtPath(f"/Scene/Materials/material_{row}"))
+        assert material.ComputeSurfaceSource("mtlx")[0].GetShaderId() == expected
+
+
+def test_a_texture_that_was_changed_is_read_as_it_is_now(tmp_path: Path) -> None:
+    path = tmp_path / "a.usda"
+    write_usd(path, textured_scene())
+    layer = Sdf.Layer.FindOrOpen(str(path))
+    shader = layer.GetPrimAtPath("/Scene/Materials/material_0/Preview")
+    shader.attributes["inputs:diffuseColor"].connectionPathList.ClearEdits()
+    layer.Export(str(tmp_path / "b.usda"))
+    assert _read(tmp_path / "b.usda").notes, "a connection was edited"
+    (file,) = tmp_path.glob("texture-*.png")
+    Image.fromarray(np.full((4, 6, 3), 255, np.uint8)).save(file)
+    found = _read(path)
+    assert any("changed since" in text for text in found.notes)
+
+
+def test_a_texture_too_large_for_usd_is_refused(tmp_path: Path) -> None:
+    long = np.zeros((1, 8193, 3), np.uint8)
+    long[0, 0] = 1
+    scene = textured_scene(0, Texture(texels=long), number_texture())
+    with pytest.raises(TrilightError, match="texture: 8193 x 1 texels; expected at most 8192"):
+        write_usd(tmp_path / "a.usda", scene)
