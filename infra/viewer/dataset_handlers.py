@@ -14,7 +14,7 @@ from infra.viewer.scene_handlers import (
     handlers_of_scene,
     thumbnail_png,
 )
-from infra.viewer.server import NotFound, Request, Response, Route, json_response
+from infra.viewer.server import NotFound, Request, Response, Routes, json_response
 from pipeline.exchange.formats import LoadedScene
 from storage.dataset.dataset import Dataset, LocalFiles, reading
 from storage.dataset.shard import read_member, scan_samples
@@ -51,18 +51,15 @@ class DatasetHandlers:
         self.index = DatasetIndex(dataset)
         self.index.begin()
 
-    def gets(self) -> dict[str, Route]:
-        """Return the routes of GET requests."""
+    def routes(self) -> Routes:
+        """Return the routes of the page's requests."""
         return {
-            "api/dataset": self._facts,
-            "api/rows": self._rows,
-            "api/thumbnail/": self._thumbnail,
-            "scene/": self._scenes.get,
+            "GET api/dataset": self._facts,
+            "GET api/rows": self._rows,
+            "GET api/thumbnail/": self._thumbnail,
+            "GET scene/": self._scenes.respond,
+            "POST scene/": self._scenes.respond,
         }
-
-    def posts(self) -> dict[str, Route]:
-        """Return the routes of POST requests."""
-        return {"scene/": self._scenes.post}
 
     def close(self) -> None:
         """Stop reading and rendering."""

@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from infra.render.path_tracer import RenderChild
 from infra.render.tone_mapping import ToneMap, tone_mapped
 from infra.viewer.page_renderers import PageRenderer, PassImage, StoredPictures, page_renderers
-from infra.viewer.picture_options import parse_edits, parse_picture_options, short_digest
+from infra.viewer.picture_options import parse_picture_options, short_digest
 from infra.viewer.render_queue import RenderJob, RenderQueue, agreement_db
 from infra.viewer.scene_bytes import scene_bytes, sky_bytes, texture_png
 from infra.viewer.server import (
     NotFound,
     Request,
     Response,
-    Route,
+    Routes,
     dispatch,
     json_response,
     static_routes,
@@ -88,23 +88,18 @@ class SceneHandlers:
         self.queue = RenderQueue(self.scene, self.renderers)
         self._writing = threading.Lock()
 
-    def gets(self) -> dict[str, Route]:
-        """Return the routes of GET requests."""
+    def routes(self) -> Routes:
+        """Return the routes of the page's requests."""
         return {
-            "api/scene": self._facts,
-            "api/scene.bin": lambda _: Response(body=scene_bytes(self.scene), kind=_OCTETS),
-            "api/texture/": self._texture,
-            "api/sky.bin": self._sky,
-            "api/picture/": self._progress,
-            "api/shown/": self._image_png,
-        }
-
-    def posts(self) -> dict[str, Route]:
-        """Return the routes of POST requests."""
-        return {
-            "api/picture": self._submit,
-            "api/rest": self._cancel_all,
-            "api/export": self._export,
+            "GET api/scene": self._facts,
+            "GET api/scene.bin": lambda _: Response(body=scene_bytes(self.scene), kind=_OCTETS),
+            "GET api/texture/": self._texture,
+            "GET api/sky.bin": self._sky,
+            "GET api/picture/": self._progress,
+            "GET api/shown/": self._image_png,
+            "POST api/picture": self._submit,
+            "POST api/rest": self._cancel_all,
+            "POST api/export": self._export,
         }
 
     def close(self) -> None:
@@ -206,9 +201,9 @@ class SceneHandlers:
     def _export(self, request: Request) -> Response:
         body = request.body if isinstance(request.body, dict) else {}
         suffix = str(body.get("form"))
-        edits = parse_edits(body)
         if suffix not in EXPORTS or not self._is_offered(suffix):
             raise TrilightError(f"form {suffix:.20}: expected one of {' '.join(EXPORTS)}.")
+        edits = body.get("edits") or {}
         key = short_digest(edits)
         with self._writing, tempfile.TemporaryDirectory(prefix="trilight-view-") as folder:
             path = Path(folder) / f"scene{suffix}"
@@ -304,22 +299,13 @@ class OpenScenes:
         self._opening = threading.Lock()
         self._open = OrderedDict[str, SceneHandlers]()
 
-    def get(self, request: Request) -> Response:
-        """Respond to a GET request."""
-        room, below = self._scene_handlers(request)
-        return dispatch({**static_routes("scene.html"), **room.gets()}, below)
-
-    def post(self, request: Request) -> Response:
-        """Respond to a POST request."""
-        room, below = self._scene_handlers(request)
-        return dispatch(room.posts(), below)
-
     def close(self) -> None:
         """Stop rendering, and wait for its end."""
         for room in self._open.values():
             room.close()
 
-    def _scene_handlers(self, request: Request) -> tuple[SceneHandlers, Request]:
+    def respond(self, request: Request) -> Response:
+        """Respond to a request below a scene's page."""
         match = _BELOW.fullmatch(request.path)
         if match is None or not self._key.fullmatch(match[1]):
             raise NotFound("there is no such scene.")
@@ -329,4 +315,5 @@ class OpenScenes:
             self._open[key] = room
             while len(self._open) > MOST_OPEN:
                 self._open.popitem(last=False)[1].queue.close()
-        return room, dataclasses.replace(request, path=match[2])
+        below = dataclasses.replace(request, path=match[2])
+        return dispatch({**static_routes("scene.html"), **room.routes()}, below)

@@ -12,11 +12,11 @@ import pytest
 from PIL import Image
 
 from infra.render.path_tracer import RenderChild
-from infra.viewer import scene_list as list_module
+from infra.viewer import open_source
 from infra.viewer.dataset_handlers import DatasetHandlers
 from infra.viewer.dataset_index import filter_of
 from infra.viewer.folder_handlers import THUMBNAIL_PX, FolderHandlers
-from infra.viewer.scene_list import scene_list
+from infra.viewer.open_source import scene_list
 from pipeline.exchange.convert import write_scene
 from pipeline.renders.mitsuba_variant import Variant, choose_variant
 from pipeline.shards.finished_dataset import FinishedDataset
@@ -186,7 +186,7 @@ def test_the_list_is_of_files_that_may_be_scenes(
         scene_list(tmp_path)
     os.symlink(root / NAMES[1], tmp_path / "linked.json")
     assert scene_list(tmp_path).names == ("linked.json",)
-    monkeypatch.setattr(list_module, "MOST_FILES", 2)
+    monkeypatch.setattr(open_source, "MOST_FILES", 2)
     cut = scene_list(root)
     assert cut.names == tuple(NAMES[:2]) and cut.is_cut
 

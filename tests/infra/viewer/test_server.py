@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from infra.viewer import server as viewer_server
-from infra.viewer.deferred_handlers import DeferredHandlers, page_of
+from infra.viewer.open_source import DeferredHandlers, page_of
 from infra.viewer.server import (
     MAX_BODY_BYTES,
     MAX_PATH,
@@ -20,7 +20,7 @@ from infra.viewer.server import (
     PageServer,
     Request,
     Response,
-    Route,
+    Routes,
     json_response,
     refusal,
 )
@@ -36,11 +36,9 @@ HERE = f"127.0.0.1:{PORT}"
 class EchoRoom:
     """Answers what it was asked, and makes mistakes when told to."""
 
-    def gets(self) -> dict[str, Route]:
-        return {"api/echo": self._echo, "api/below/": self._echo}
-
-    def posts(self) -> dict[str, Route]:
-        return {"api/echo": self._echo}
+    def routes(self) -> Routes:
+        names = ("GET api/echo", "GET api/below/", "POST api/echo")
+        return dict.fromkeys(names, self._echo)
 
     def close(self) -> None:
         pass
@@ -199,13 +197,13 @@ def _count_open(lines: list[socket.socket]) -> int:
 
 
 def test_it_listens_on_this_machine_alone_and_says_which_port_is_taken() -> None:
-    server = PageServer({}, {})
+    server = PageServer({})
     try:
         assert server.server_address[0] == "127.0.0.1"
         assert len(server.token) >= 32
         assert server.address == f"http://127.0.0.1:{server.server_port}/{server.token}/"
         with pytest.raises(TrilightError, match=f"--port is {server.server_port}"):
-            PageServer({}, {}, port=server.server_port)
+            PageServer({}, port=server.server_port)
     finally:
         server.server_close()
 
@@ -261,9 +259,11 @@ def test_the_page_of_a_source(tmp_path: Path) -> None:
 
 def test_questions_wait_until_the_source_is_open() -> None:
     later, answers = DeferredHandlers("scene.html"), list[bytes]()
-    assert later.gets[""](Request(path="", query={})).kind.startswith("text/html")
+    assert later.routes["GET "](Request(path="", query={})).kind.startswith("text/html")
     asked = threading.Thread(
-        target=lambda: answers.append(later.gets["api/"](Request(path="api/echo", query={})).body)
+        target=lambda: answers.append(
+            later.routes["GET api/"](Request(path="api/echo", query={})).body
+        )
     )
     asked.start()
     asked.join(0.05)
@@ -272,4 +272,4 @@ def test_questions_wait_until_the_source_is_open() -> None:
     asked.join(10)
     assert b"api/echo" in answers[0]
     with pytest.raises(NotFound):
-        later.posts["api/"](Request(path="api/none", query={}))
+        later.routes["POST api/"](Request(method="POST", path="api/none", query={}))
