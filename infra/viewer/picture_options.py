@@ -38,9 +38,7 @@ class LampEdit:
     """Changes to a lamp."""
 
     move: Annotated[Vector, Within(-MAX_POSITION_M, MAX_POSITION_M, unit="meters")] = (0, 0, 0)
-    """Offset of the lamp."""
     gain: Annotated[float, Within(0.001, MOST_GAIN)] = 1.0
-    """Factor of the radiance."""
 
 
 @checked()
@@ -48,11 +46,8 @@ class MaterialEdit:
     """Changes to a material; a stated color or number replaces a texture."""
 
     diffuse: Annotated[Vector | None, Within(0, 1)] = None
-    """Diffuse albedo; by default unchanged, as the others."""
     specular: Annotated[Vector | None, Within(0, 1)] = None
-    """Specular albedo."""
     roughness: Annotated[float | None, Within(0, 1)] = None
-    """Roughness."""
 
 
 @checked()
@@ -73,11 +68,9 @@ class PictureRequest:
     """Body of a request for a picture."""
 
     engine: str
-    """Name of the renderer."""
     c2w: Annotated[tuple[float, ...], Within(-_FAR_M, _FAR_M)]
     """Pose of the camera, 16 numbers, row by row."""
     fov: Annotated[float, Within(1, 170, unit="degrees")]
-    """Full angle of view."""
     resolution: Annotated[int, Within(16, MOST_PX, unit="pixels")]
     """Width of the picture, a multiple of 8."""
     view: int | None = None
@@ -119,20 +112,20 @@ def parse_picture_options(body: Any, engines: Mapping[str, Any], views: int) -> 
     Raises:
         TrilightError: an option is missing or invalid.
     """
-    asked = from_record(PictureRequest, body)
-    if asked.engine not in engines:
-        expected = expected_one_of(asked.engine, list(engines))
-        raise TrilightError(f"engine {asked.engine:.40}: {expected}.")
-    if asked.resolution % 8:
-        raise TrilightError(f"resolution is {asked.resolution}; expected a multiple of 8.")
-    if asked.view is not None and not 0 <= asked.view < views:
-        raise TrilightError(f"view is {asked.view}; expected 0 to {views - 1}, or none.")
+    request = from_record(PictureRequest, body)
+    if request.engine not in engines:
+        expected = expected_one_of(request.engine, list(engines))
+        raise TrilightError(f"engine {request.engine:.40}: {expected}.")
+    if request.resolution % 8:
+        raise TrilightError(f"resolution is {request.resolution}; expected a multiple of 8.")
+    if request.view is not None and not 0 <= request.view < views:
+        raise TrilightError(f"view is {request.view}; expected 0 to {views - 1}, or none.")
     return PictureOptions(
-        engine=asked.engine,
-        camera=Camera(c2w=_pose(asked.c2w), fov_deg=asked.fov, view=asked.view),
-        resolution=asked.resolution,
-        edits=asked.edits or {},
-        error_db=asked.error_db,
+        engine=request.engine,
+        camera=Camera(c2w=_pose(request.c2w), fov_deg=request.fov, view=request.view),
+        resolution=request.resolution,
+        edits=request.edits or {},
+        error_db=request.error_db,
     )
 
 

@@ -116,9 +116,9 @@ Routes = Mapping[str, Route]
 
 def dispatch(routes: Routes, request: Request) -> Response:
     """Return the response of the route of a request; raises TrilightError as a `Route` does."""
-    asked = f"{request.method} {request.path}"
+    name = f"{request.method} {request.path}"
     for prefix, route in routes.items():
-        if asked == prefix or (prefix.endswith("/") and asked.startswith(prefix)):
+        if name == prefix or (prefix.endswith("/") and name.startswith(prefix)):
             return route(request)
     raise NotFound(f"{request.path or 'the page'}: nothing is there.")
 
