@@ -103,7 +103,7 @@ def _copy(kind: str, context: BenchContext, device: "torch.device") -> Figures:
 def _picture(
     network: str, precision: str, context: BenchContext, device: "torch.device"
 ) -> Figures:
-    from infra.bench.gpu.twin import twin_figures
+    from infra.bench.gpu.steps import twin_figures
 
     return twin_figures(network, precision, device)
 
@@ -111,13 +111,9 @@ def _picture(
 def _step(run: str, context: BenchContext, device: "torch.device") -> Figures:
     from infra.bench.gpu.steps import step_figures
 
-    figures, parts = step_figures(run, _STEPS[context.scale.name], device)
+    figures = step_figures(run, _STEPS[context.scale.name], device)
     if not figures:
         context.note(f"{run}: too little memory, even for one scene a pass")
-    total = sum(parts.values()) or 1.0
-    words = [f"{name} {100 * ms / total:.0f} %" for name, ms in list(parts.items())[:3]]
-    if words:
-        context.note(f"{run}: {', '.join(words)} of a step")
     return figures
 
 

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from infra.bench import stated_errors
-from infra.bench.experiments.calibration import KINDS, LOOKS, has_wide, use_of
-from infra.bench.stated_errors import main, read_looks
-from infra.bench.store import Store
-from infra.bench.workloads.fitted_statement import (
+from infra.bench.experiments.calibration import FIGURES, KINDS, LOOKS, has_wide, use_of
+from infra.bench.stated_errors import (
     ALLOWED,
     Look,
     cross_fitted,
@@ -19,11 +17,13 @@ from infra.bench.workloads.fitted_statement import (
     fit_weights,
     judge,
     largest_shift,
+    main,
+    read_looks,
     stated_by,
     stops,
     true_db,
 )
-from infra.bench.workloads.recorded_looks import FIGURES
+from infra.bench.store import Store
 from pipeline.renders.calibrated_error import load_statement, versions_of_pictures
 from storage.errors import TrilightError
 

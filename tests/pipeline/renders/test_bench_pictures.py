@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from infra.bench.workloads.coarser_meshes import picture_db
+from infra.bench.experiments.calibration import FIGURES, record_looks, unreachable
+from infra.bench.experiments.meshes import picture_db
 from infra.bench.workloads.judged_pictures import shrink_reference
-from infra.bench.workloads.recorded_looks import FIGURES, record_looks, unreachable
 from infra.bench.workloads.traced_pictures import fixed_samples, render_levels, render_shot
 from infra.render.raw_references import raw_reference
 from pipeline.foreign.mesh import TriangleMesh
