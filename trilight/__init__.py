@@ -45,10 +45,10 @@ if TYPE_CHECKING:
     from train.presets import training_preset as training_preset
     from train.result import TrainResult as TrainResult
     from train.settings import TrainSettings as TrainSettings
+    from trilight.compose import Material as Material
     from trilight.compose import SceneBuilder as SceneBuilder
     from trilight.datasets import generate as generate
     from trilight.learning import train_network as train_network
-    from trilight.parts import Material as Material
     from trilight.pictures import open_network as open_network
     from trilight.pictures import render as render
     from trilight.pictures import render_views as render_views

@@ -18,8 +18,7 @@ from infra.cli.commands import COMMANDS, SECTIONS
 from infra.cli.everyday import EVERYDAY
 from infra.cli.options import choices_of, is_repeated, takes_names, value_of
 from infra.cli.options import kind_of as kind_of_field
-from infra.setup.command_line_page import every_command
-from infra.setup.generated_pages import PAGES
+from infra.setup.generated_pages import PAGES, every_command
 from model.config import SIZES
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
 from pipeline.shards.expression import TEXTS, condition, kind_of

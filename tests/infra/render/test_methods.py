@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 
 from infra.bench.workloads.judged_pictures import difference_db
-from infra.render.comparison import Frame, flicker
 from infra.render.networks import (
     DirectLightRenderer,
     NetworkRenderer,
@@ -19,6 +18,7 @@ from infra.render.networks import (
 from infra.render.path_tracer import MOST_SCENES, PathTracer, RenderChild, RenderWorker
 from infra.render.quality import FixedSamples, ToStatedError
 from infra.render.raw_references import RawReference, true_error, true_error_db
+from infra.render.run_render import Frame, flicker
 from model.config import hits_smoke
 from model.inference import NeuralRenderer
 from pipeline.exchange.open_scene import SceneSource
