@@ -13,8 +13,7 @@ from PIL import Image
 
 from infra.render.path_tracer import RenderChild
 from infra.viewer import open_source
-from infra.viewer.dataset_handlers import DatasetHandlers
-from infra.viewer.dataset_index import filter_of
+from infra.viewer.dataset_handlers import DatasetHandlers, filter_of
 from infra.viewer.folder_handlers import THUMBNAIL_PX, FolderHandlers
 from infra.viewer.open_source import scene_list
 from pipeline.exchange.convert import write_scene
