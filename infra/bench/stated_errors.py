@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from infra.bench.experiment import Store
 from infra.bench.experiments.calibration import use_of
 from infra.bench.run_benchmark import ROOT
-from infra.bench.store import Store
 from pipeline.renders.calibrated_error import (
     FILE,
     LEAST_ERROR,

@@ -1,4 +1,4 @@
-"""Python: scenes, pictures, and the names that `import trilight` offers to programs and documents."""
+"""Python: scenes, pictures, and the names that `import trilight` offers to programs and pages."""
 
 import ast
 import json

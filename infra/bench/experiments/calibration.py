@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
-from infra.bench.workloads.judged_pictures import load_or_render_reference, shrink_reference
+from infra.bench.workloads.traced_pictures import load_or_render_reference, shrink_reference
 from infra.bench_options import BenchOptions
 from infra.render.held_out_scenes import first_composed
 from infra.render.raw_references import RawReference, first_camera, true_error
@@ -380,11 +380,11 @@ EXPERIMENT = Experiment(
     title="How far true errors are from what the halves of a picture say",
     about="Pictures of layouts of their own at three widths, with what their halves say at every "
     "look and their true error, held against raw samples in two halves.",
-    cost=Column(name="samples", figure="spp"),
+    cost=Column("samples", "spp"),
     columns=(
-        Column(name="true, median millionths", figure="log_true"),
-        Column(name="reference's uncertainty, median millionths", figure="log_open"),
-        Column(name="bound, median dB", figure="bound_log"),
+        Column("true, median millionths", "log_true"),
+        Column("reference's uncertainty, median millionths", "log_open"),
+        Column("bound, median dB", "bound_log"),
     ),
     because="Squared errors are of log10(1 + radiance). The page of stated errors is made of the "
     "rows.",

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, rounds
-from infra.bench.workloads.cost_scene import cost_scene
+from infra.bench.workloads.named_scenes import cost_scene
 from infra.bench.workloads.reading import write_copies
 from infra.bench.workloads.traced_pictures import fixed_samples, render_shot
 from infra.bench_options import BenchOptions
@@ -212,8 +212,8 @@ EXPERIMENT = Experiment(
     title="Time and memory against the size of the work",
     about="Datasets of more scenes at 16 pixels, meshes of more objects, views of more triangles "
     "at 64 pixels, and more shards of one scene: each in a fresh process that did a small one.",
-    cost=Column(name="seconds", figure="seconds"),
-    columns=(Column(name="MB at most", figure="peak_bytes", then=lambda size: size / 1e6),),
+    cost=Column("seconds", "seconds"),
+    columns=(Column("MB at most", "peak_bytes", then=lambda size: size / 1e6),),
     also_cost=("MB at most",),
     because="Seconds are on the clock; memory is that of the process and its children.",
     points=_points,

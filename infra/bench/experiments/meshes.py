@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, percent
-from infra.bench.workloads.cost_scene import plain_surface, quad, scene_of_pieces
+from infra.bench.workloads.named_scenes import plain_surface, quad, scene_of_pieces
 from infra.bench.workloads.traced_pictures import fixed_samples
 from infra.bench_options import BenchOptions
 from pipeline.assets.cleaning.clean import clean, normalize
@@ -256,17 +256,15 @@ EXPERIMENT = Experiment(
     "reference recipe (isotropic remeshing at 0.5 %, then quadric collapse), and by `faithful` to "
     "several budgets. The largest few are also path traced beside their source, on a floor under "
     "a lamp.",
-    cost=Column(name="core-seconds an object", figure="cpu_s"),
-    error=Column(
-        name="distance to the source, p99, % of the diagonal", figure="error_p99", then=percent
-    ),
+    cost=Column("core-seconds an object", "cpu_s"),
+    error=Column("distance to the source, p99, % of the diagonal", "error_p99", then=percent),
     columns=(
-        Column(name="triangles", figure="faces"),
-        Column(name="mean distance, %", figure="error_mean", then=percent),
-        Column(name="area variation", figure="area_variation"),
-        Column(name="smallest angles, degrees", figure="min_angle_p5_deg"),
-        Column(name="picture, psnr_log_db", figure="picture_db"),
-        Column(name="the source with other samples, psnr_log_db", figure="again_db"),
+        Column("triangles", "faces"),
+        Column("mean distance, %", "error_mean", then=percent),
+        Column("area variation", "area_variation"),
+        Column("smallest angles, degrees", "min_angle_p5_deg"),
+        Column("picture, psnr_log_db", "picture_db"),
+        Column("the source with other samples, psnr_log_db", "again_db"),
     ),
     because="Distances are two-way, to the cleaned source; medians over the objects. `uniform` is "
     "for uses that need even triangles, at more error and more time.",

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from infra.bench.workloads.cost_scene import cost_scene
+from infra.bench.workloads.named_scenes import cost_scene
 from model.config import ModelConfig, hits_smoke, smoke, tiny
 from model.costs import Workload, training_flops
 from model.inference import NeuralRenderer

@@ -24,8 +24,8 @@ from infra.bench.gpu import steps
 from infra.bench.gpu.steps import NETWORKS, step_figures, step_settings, twin_figures
 from infra.bench.workloads import cycles as environment
 from infra.bench.workloads.cycles import installed_python
-from infra.bench.workloads.judged_pictures import load_or_render_reference
 from infra.bench.workloads.reading import LAYOUTS, unpacking_figures, write_copies
+from infra.bench.workloads.traced_pictures import load_or_render_reference
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera
 from pipeline.isolation import IsolatedChild

@@ -24,6 +24,8 @@ from infra.bench.experiment import (
     Experiment,
     Figures,
     Point,
+    Run,
+    Store,
     columns_of,
     every_experiment,
     experiment_of,
@@ -46,7 +48,6 @@ from infra.bench.stated_errors import (
     stops,
     true_db,
 )
-from infra.bench.store import Run, Store
 from infra.bench_options import BenchOptions
 from pipeline.renders.calibrated_error import load_statement, versions_of_pictures
 from storage.errors import Rejected, TrilightError

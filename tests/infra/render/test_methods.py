@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from infra.bench.workloads.judged_pictures import difference_db
+from infra.bench.workloads.traced_pictures import difference_db
 from infra.render import plan
 from infra.render.networks import (
     DirectLightRenderer,
