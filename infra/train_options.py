@@ -86,9 +86,9 @@ class TrainOptions:
 
     def start(self) -> StartOptions:
         """Return the start options of the run."""
-        stated = {each.name: getattr(self, each.name) for each in fields(StartOptions)}
+        values = {each.name: getattr(self, each.name) for each in fields(StartOptions)}
         restarts = int(os.environ.get(RESTARTS, "0")) > 0
-        return StartOptions(**stated | {"restartable": self.restartable or restarts})
+        return StartOptions(**values | {"restartable": self.restartable or restarts})
 
     def command(self) -> list[str]:
         """Return the command line that trains."""
