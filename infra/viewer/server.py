@@ -337,8 +337,8 @@ def static_routes(page: str) -> dict[str, Route]:
         return Response(body=files[name].read_bytes(), kind=_KINDS[files[name].suffix])
 
     def index(request: Request) -> Response:
-        whole = files["page.html"].read_bytes().replace(b"PAGE", Path(page).stem.encode())
-        body = whole.replace(b"BODY", files[page].read_bytes())
+        head = files["page.html"].read_bytes().replace(b"PAGE", Path(page).stem.encode())
+        body = head.replace(b"BODY", files[page].read_bytes())
         return Response(body=body, kind=_KINDS[".html"])
 
     return {"GET ": index, "GET static/": file}
