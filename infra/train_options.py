@@ -3,7 +3,7 @@
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import field, fields
 from typing import Annotated, Any, Literal
 
 from storage.errors import TrilightError
@@ -86,14 +86,9 @@ class TrainOptions:
 
     def start(self) -> StartOptions:
         """Return the start options of the run."""
-        return StartOptions(
-            resume=self.resume,
-            restartable=self.restartable or int(os.environ.get(RESTARTS, "0")) > 0,
-            branch=self.branch,
-            decisions=self.decisions,
-            begin_with=self.begin_with,
-            lpips=self.lpips,
-        )
+        values = {each.name: getattr(self, each.name) for each in fields(StartOptions)}
+        restarts = int(os.environ.get(RESTARTS, "0")) > 0
+        return StartOptions(**values | {"restartable": self.restartable or restarts})
 
     def command(self) -> list[str]:
         """Return the command line that trains."""

@@ -45,14 +45,14 @@ if TYPE_CHECKING:
     from train.run_training import TrainResult as TrainResult
     from train.settings import TrainSettings as TrainSettings
     from train.settings import WatchSettings as WatchSettings
+    from trilight.compose import Material as Material
     from trilight.compose import SceneBuilder as SceneBuilder
-    from trilight.datasets import generate as generate
     from trilight.learning import train_network as train_network
-    from trilight.parts import Material as Material
     from trilight.pictures import open_network as open_network
     from trilight.pictures import render as render
     from trilight.pictures import render_views as render_views
     from trilight.pictures import write_picture as write_picture
+    from trilight.scenes import generate as generate
     from trilight.scenes import read_scene as read_scene
     from trilight.scenes import read_scenes as read_scenes
     from trilight.scenes import within_budget as within_budget

@@ -1,9 +1,10 @@
-"""Scene files: read, write, and reduce them to a network's number of triangles."""
+"""Scene files, read, written and reduced to a network's number of triangles; and datasets."""
 
 import os
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from infra.render.sources import scene_sources
 from pipeline.exchange.convert import write_scene as write_in_form
 from pipeline.exchange.open_scene import LoadedScene, scene_source
 from pipeline.exchange.reader import SceneReader
+from pipeline.generation.generate_options import GenerateOptions
 from storage.records.scene import Scene
 
 
@@ -84,3 +86,24 @@ def _warn_notes(loaded: LoadedScene) -> Scene:
     for note in loaded.notes:
         warnings.warn(note, stacklevel=3)
     return loaded.scene
+
+
+if TYPE_CHECKING:
+    from pipeline.generation.generation_run import Outcome
+
+
+def generate(options: GenerateOptions) -> "Outcome":
+    """Generate a dataset, or its missing scenes, as `trilight generate` does.
+
+    The call may be stopped at any time; the same options resume and give the same dataset digest.
+
+    Args:
+        options: preset, folder, number of scenes: the options of the command line.
+
+    Raises:
+        TrilightError: an error that the user can fix; finished scenes are safe.
+    """
+    from pipeline.executors.threads import ThreadRunner
+    from pipeline.generation.pipeline import make_dataset
+
+    return make_dataset(options, ThreadRunner())

@@ -13,20 +13,16 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from infra.bench.experiment import BenchScale, Figures
-from infra.bench.workloads.coarser_meshes import count_faces
 from infra.bench.workloads.named_scenes import given_scenes, read_given, sampled_scene
 from infra.bench.workloads.reading import Members, render_scenes, write_copies
 from infra.bench_options import BenchOptions
 from infra.render.held_out_scenes import composing_child
 from infra.render.path_tracer import RenderChild
 from pipeline.generation.prepare_isolated import preload_mesh_libraries
-from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
-from pipeline.objects.sources import find_objects
+from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.presets.settings import DatasetSettings
 from pipeline.presets.training import smoke
-from storage.cache import cache_folder
 from storage.dataset.training_data import TrainingData, open_training_data
-from storage.errors import Rejected
 from storage.records.scene import Scene
 
 Result = TypeVar("Result")
@@ -88,24 +84,6 @@ class BenchContext:
         """A child for mesh libraries, one thread, with a limit on its processor time."""
         limits = ChildLimits(memory_bytes=8 << 30, wall_s=600, cpu_s=240, calls_per_child=10_000)
         return self.until_closed(IsolatedChild(limits=limits))
-
-    @functools.cached_property
-    def mesh_files(self) -> tuple[tuple[Path, int], ...]:
-        """Files of usable objects with their number of triangles after cleaning, largest first.
-
-        Raises:
-            TrilightError: as `find_objects`.
-        """
-        objects = find_objects(
-            self.options.objects,
-            work_dir=cache_folder("objects"),
-            allowed_licences=self.options.allowed_licences,
-        )
-        sizes = {}
-        for record in objects.records:
-            with contextlib.suppress(Rejected, ChildFailed):
-                sizes[Path(record.path)] = self.mesh_child.call(count_faces, Path(record.path))
-        return tuple(sorted(sizes.items(), key=lambda item: (-item[1], str(item[0]))))
 
     def scene(self, trial: str) -> Scene:
         """Return the scene of the trial `sampled N`, or the user's scene of that name."""

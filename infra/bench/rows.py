@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from infra.bench.experiment import Column, Experiment, Point, columns_of
-from infra.bench.store import Run
+from infra.bench.experiment import Column, Experiment, Point, Run, columns_of
 from pipeline.documents.figures import drawing
 from storage.errors import TrilightError
 from storage.intervals import mean_interval

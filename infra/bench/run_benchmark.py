@@ -22,12 +22,13 @@ from infra.bench.experiment import (
     BenchScale,
     Experiment,
     Point,
+    Run,
+    Store,
     device_of,
     missing_need,
     public_options,
 )
 from infra.bench.rows import plot
-from infra.bench.store import Run, Store
 from infra.bench_options import BenchOptions
 from infra.processor import processor
 from pipeline.isolation import ChildFailed

@@ -14,8 +14,7 @@ from storage.errors import TrilightError
 from storage.settings.described import checked
 
 if TYPE_CHECKING:
-    from infra.bench.experiment import Experiment
-    from infra.bench.store import Run
+    from infra.bench.experiment import Experiment, Run
 
 
 @checked()
@@ -40,9 +39,8 @@ _COLUMNS = 8
 @command("names")
 def bench(run_options: BenchRunOptions, options: BenchOptions) -> None:
     try:
-        from infra.bench.experiment import FULL, QUICK, experiment_of
+        from infra.bench.experiment import FULL, QUICK, Store, experiment_of
         from infra.bench.run_benchmark import results_path, run
-        from infra.bench.store import Store
     except ModuleNotFoundError as error:
         if ".bench" not in (error.name or ""):
             raise

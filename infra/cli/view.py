@@ -38,13 +38,13 @@ class ViewOptions:
 @command("source")
 def view(options: ViewOptions) -> None:
     first_words(f"Opening {safe_url(options.source)}")
-    from infra.viewer.deferred_handlers import DeferredHandlers, page_of
+    from infra.viewer.open_source import DeferredHandlers, open_handlers, page_of
     from infra.viewer.server import PageServer
 
     if options.checkpoint is not None:
         require_torch("--checkpoint")
     later = DeferredHandlers(page_of(options.source))
-    server = PageServer(later.gets, later.posts, port=options.port)
+    server = PageServer(later.routes, port=options.port)
     stops: list[int] = []
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -52,8 +52,6 @@ def view(options: ViewOptions) -> None:
     console.print("Only this machine reaches it, with this address. Ctrl-C ends it.", style="dim")
     if not options.no_browser and _has_screen():
         webbrowser.open(server.address)
-    from infra.viewer.open_source import open_handlers  # slow: formats, renderers
-
     room = open_handlers(options.source, checkpoint=options.checkpoint, threads=options.threads)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: stops.append(number))

@@ -6,12 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from infra.render.budget import Choice, choose, price_all
 from infra.render.networks import NetworkRenderer
 from infra.render.options import EngineChoice, RenderOptions
 from infra.render.output_paths import OutputPaths, output_paths
 from infra.render.path_tracer import PathTracer, RenderChild
-from infra.render.preview_table import known_costs, shipped_table
+from infra.render.preview_table import Choice, choose, known_costs, price_all, shipped_table
 from infra.render.quality import Budget, FixedSamples, Traced
 from infra.render.sources import camera_path, orbit, own_camera, pair_cameras, scene_sources
 from infra.render.tone_mapping import Look

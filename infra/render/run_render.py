@@ -1,35 +1,212 @@
-"""One call of `trilight render`: renders every picture of a plan, or keeps an equal one."""
+"""One call of `trilight render`: renders every picture of a plan, or keeps an equal one.
+
+An equal picture is known by the header of its EXR file. Two engines' pictures of one view are
+compared side by side, and by the flicker of their error: in motion an error that stays at its
+pixels is hardly seen; one that jumps is (storage.metrics.flicker_log_db).
+"""
 
 import itertools
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
-from infra.render.budget import Choice
-from infra.render.comparison import Flicker, Frame, comparison_sheet, flicker, log_error
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as Picture
+from PIL import ImageDraw, ImageFont
+
 from infra.render.output_paths import write_video
-from infra.render.picture_file import (
-    PictureFile,
-    Radiance,
-    header_of,
-    load_matching_picture,
-    write_picture,
-)
 from infra.render.plan import RenderPlan, Shot
+from infra.render.preview_table import Choice
 from infra.render.sources import own_camera
-from infra.render.tone_mapping import Look, display_pixels
+from infra.render.tone_mapping import Look, display_pixels, enlarge
 from pipeline.documents.png import encode_png
-from pipeline.exchange.formats import SceneSource
+from pipeline.exchange.formats import FORMATS, SceneSource
 from pipeline.exchange.reader import SceneReader
 from pipeline.renders.settings import FIRST_SPP
 from storage.atomic import write_atomically
-from storage.metrics import psnr_log_db
-from storage.records.lights import num_lights
+from storage.conventions import log10_radiance
+from storage.digests import canonical_json, sha256_hex
+from storage.errors import TrilightError
+from storage.metrics import flicker_log_db, psnr_log_db
+from storage.records.exr import read_header
+from storage.records.exr_layers import decode_picture, encode_picture
+from storage.records.lights import num_lights, rounded_to_half
+from storage.records.safe_read import read_plain
 from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
-from storage.renderer import Facts, Image, OnProgress, ReadyScene, Renderer, Sampling
+from storage.renderer import Camera, Fact, Facts, Image, OnProgress, ReadyScene, Renderer, Sampling
+from train.evaluation.error_colors import ERROR_WHITE, error_picture
+
+_CAPTION_PX = 24
+_GAP_PX = 8
+_FONT_PX = 14
+_INK = (30, 30, 30)
+_PAPER = (250, 250, 248)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """Data of one view by both engines, with which the next frame is compared."""
+
+    source: SceneSource
+    error_RR3: NDArray
+    """[R, R, 3] the network's error of log10(1 + radiance) against the traced picture."""
+    noise_floor_db: float
+    """Stated error of the traced picture as psnr_log_db."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flicker:
+    """Change of the network's error between two consecutive frames; at most 100 dB."""
+
+    db: float
+    """Flicker in dB; a higher value is calmer."""
+    noise_db: float
+    """Flicker in dB of the traced pictures' noise alone, an upper bound for any network."""
+
+
+def log_error(neural_rgb: NDArray[np.float32], traced_rgb: NDArray[np.float32]) -> NDArray:
+    """Return the error [R, R, 3] of log10(1 + radiance)."""
+    error: NDArray = log10_radiance(neural_rgb) - log10_radiance(traced_rgb)
+    return error
+
+
+def flicker(before: Frame | None, now: Frame) -> Flicker | None:
+    """Return the flicker from one frame to the next; None where their scenes do not belong."""
+    if before is None:
+        return None
+    # one scene or frames of one stage, unlike the scenes of a shard
+    is_stage = not FORMATS[now.source.path.suffix.lower()].always_many
+    if before.source != now.source and not (is_stage and before.source.path == now.source.path):
+        return None
+    noise = 10 ** (-before.noise_floor_db / 10) + 10 ** (-now.noise_floor_db / 10)
+    noise_db = float(-10 * np.log10(max(noise, 1e-10)))
+    return Flicker(db=flicker_log_db(before.error_RR3, now.error_RR3), noise_db=noise_db)
+
+
+def comparison_sheet(
+    traced_rgb: NDArray[np.float32], neural_rgb: NDArray[np.float32], look: Look
+) -> NDArray[np.uint8]:
+    """Return [H, W, 3]: path traced, neural, and the error of the second against the first.
+
+    Both [R, R, 3] linear radiance. Height and width are even, as videos need them. Exposure changes
+    the first two, and no error.
+    """
+    agreement = psnr_log_db(neural_rgb, traced_rgb)
+    stops = f", {look.exposure_ev:+g} EV" if look.exposure_ev else ""
+    tiles = (
+        (f"mitsuba{stops}", display_pixels(traced_rgb, look)),
+        (f"neural, {agreement:.1f} dB (log){stops}", display_pixels(neural_rgb, look)),
+        (f"error (white: {ERROR_WHITE} log10)", enlarge(error_picture(neural_rgb, traced_rgb))),
+    )
+    width = len(tiles[0][1])
+    sheet = Picture.new("RGB", (3 * width + 2 * _GAP_PX, width + _CAPTION_PX), _PAPER)
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=_FONT_PX)
+    for column, (caption, pixels) in enumerate(tiles):
+        column_px = column * (width + _GAP_PX)
+        sheet.paste(Picture.fromarray(pixels), (column_px, _CAPTION_PX))
+        draw.text((column_px + 2, 3), caption, fill=_INK, font=font)
+    return np.asarray(sheet)
+
+
+Radiance = NDArray[np.float32]
+"""[R, R, 3] linear radiance."""
+
+_PREFIX = "trilight."
+_REQUEST = "request_sha256"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureFile:
+    """Picture on disk, without its pixels, since a video may have thousands."""
+
+    path: Path
+    facts: Facts
+    was_kept: bool
+    """True where an equal file existed already."""
+    is_black: bool
+    seconds: float | None
+    """Wall-clock seconds of rendering, those of loading the scene included for its first picture;
+    None where the file was kept."""
+
+
+def header_of(
+    renderer: Renderer, source: str, scene_sha256: str, camera: Camera
+) -> Mapping[str, Fact]:
+    """Return the header of a picture, without times and folders: everything that decides it.
+
+    Args:
+        source: name of the scene's file, without its folders.
+        scene_sha256: digest of the scene by storage.records.scene_file.scene_digest.
+    """
+    pose: dict[str, Any] = {"c2w": camera.c2w.tolist(), "fov_deg": camera.fov_deg}
+    values = {
+        "engine": renderer.name,
+        "source": source,
+        "scene_sha256": scene_sha256,
+        "camera": pose if camera.view is None else {**pose, "view": camera.view},
+        **renderer.identity,
+    }
+    plain = {
+        name: value if isinstance(value, Fact) else canonical_json(value).decode()
+        for name, value in values.items()
+    }
+    return {**plain, _REQUEST: sha256_hex(canonical_json(values))}
+
+
+def load_matching_picture(
+    path: Path, header: Mapping[str, Fact]
+) -> tuple[PictureFile, Radiance] | None:
+    """Return the picture in a file if its header matches; else, or if it is unreadable, None."""
+    try:
+        data = read_plain(path)
+        stored = read_header(data)
+        if stored.get(_PREFIX + _REQUEST) != header[_REQUEST]:
+            return None
+        names = {channel.name.rpartition(".")[0] for channel in stored["channels"]}
+        radiance_rgb = decode_picture(data, names - {""})
+    except (OSError, RuntimeError, ValueError, TrilightError):
+        return None
+    described = {_PREFIX + name for name in header}
+    facts = {
+        name.removeprefix(_PREFIX): value
+        for name, value in stored.items()
+        if name.startswith(_PREFIX) and name not in described
+    }
+    return _picture_file(path, facts, radiance_rgb, None), radiance_rgb
+
+
+def write_picture(
+    path: Path, header: Mapping[str, Fact], image: Image, facts: Facts, seconds: float
+) -> tuple[PictureFile, Radiance]:
+    """Write a picture with its facts, and return it as the file holds it.
+
+    Equal headers and pictures give equal bytes.
+
+    Raises:
+        TrilightError: a value is not finite, or the file cannot be written.
+    """
+    named = {_PREFIX + name: value for name, value in (dict(header) | dict(facts)).items()}
+    write_atomically(path, encode_picture(image.radiance_rgb, image.layers_rgb, named))
+    radiance_rgb = rounded_to_half(image.radiance_rgb)
+    return _picture_file(path, facts, radiance_rgb, seconds), radiance_rgb
+
+
+def _picture_file(
+    path: Path, facts: Facts, radiance_rgb: Radiance, seconds: float | None
+) -> PictureFile:
+    return PictureFile(
+        path=path,
+        facts=dict(facts),
+        was_kept=seconds is None,
+        is_black=not radiance_rgb.any(),
+        seconds=seconds,
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

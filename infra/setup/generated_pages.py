@@ -1,10 +1,22 @@
 """Reference pages that each build of the site generates from the program's declarations."""
 
+import dataclasses
 import inspect
+import re
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
 
-from infra.setup.command_line_page import command_line_page
-from infra.setup.settings_page import settings_page
+from cyclopts import App
+
+from infra.cli.commands import COMMANDS, app
+from infra.cli.options import PRESETS
+from infra.render.options import RenderOptions
+from infra.serving.train_model import TrainOptions
+from pipeline.flows.forms import DatasetInRuns
+from pipeline.generation.price import CorePrice
+from pipeline.generation.revisit_options import RevisitOptions
+from pipeline.presets.settings import DatasetSettings
 from pipeline.shards.expression import TEXTS
 from scene_templates.recorded_sampler import RecordedDraw
 from scene_templates.skies.procedural_skies import (
@@ -19,9 +31,197 @@ from scene_templates.surfaces.maps import LEAST_TINT, SurfaceDraws
 from scene_templates.surfaces.procedural_textures import OUR_SURFACES, SURFACES, SurfaceMapSettings
 from scene_templates.surfaces.texels import Texels
 from storage.markdown import table
+from storage.records.material import PUBLISHED_COLUMNS, laid_out
 from storage.records.passes.declared import MOTION, Pass, declared_passes
 from storage.records.quantities import QUANTITIES
+from storage.records.scene import Scene
 from storage.seeds import rng_for
+from storage.settings.fields import (
+    default_text,
+    describe_fields,
+    group_of,
+    parts_of,
+)
+from train.evaluation.options import EvaluationOptions, LeaderboardOptions
+from train.monitoring.settings import WatchSettings
+from train.settings import TrainSettings
+
+_COMMANDS = """# Command line
+
+Every command and option. `trilight COMMAND -h` shows the everyday options and examples, and
+`--help-all` what is here. Where two names are given, both work. An option that may be repeated is
+written once for each value: `--data A --data B`. `--set` changes the [settings](settings.md).
+"""
+
+_ORDER = "generate"
+"""Command whose options others take too."""
+_MANY = 10
+"""Number of options that two commands share before they are printed once."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """Option or positional argument of a command."""
+
+    field: str
+    """Name of the settings field that it fills."""
+    names: tuple[str, ...]
+    """Names of the option, or the argument's name in capitals."""
+    takes: str
+    """Name of the value, such as INT; empty for a switch."""
+    help: str
+    """Sentence, with choices, range and default in brackets."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """Command with its options."""
+
+    name: str
+    """Words after `trilight`, such as `shards merge`."""
+    help: str
+    """Help text of the command."""
+    options: tuple[Option, ...]
+    """Arguments and options in the order of the help."""
+
+
+def every_command() -> list[Command]:
+    """Return every command, those within groups included."""
+    return [command for name in COMMANDS for command in _commands(app[name], name)]
+
+
+def _commands(group: App, name: str) -> Iterator[Command]:
+    if group.default_command is not None:
+        options = tuple(map(_option, group.assemble_argument_collection()))
+        yield Command(name=name, help=group.help, options=options)
+    for inner in group:
+        if not inner.startswith("-"):
+            yield from _commands(group[inner], f"{name} {inner}")
+
+
+def _option(argument: Any) -> Option:
+    by_place = argument.index is not None
+    name: str = argument.field_info.name
+    return Option(
+        field=name,
+        names=(PRESETS.get(name, name.upper()),) if by_place else tuple(argument.names),
+        takes=argument.parameter.metavar or "",
+        help=argument.parameter.help,
+    )
+
+
+def command_line_page() -> str:
+    """Return every command with its options, as --help shows them."""
+    parts = [_COMMANDS]
+    commands = every_command()
+    shared = next(set(command.options) for command in commands if command.name == _ORDER)
+    for command in commands:
+        parts.append(f"## `trilight {command.name}`\n\n{command.help}\n")
+        options = command.options
+        if command.name != _ORDER and len(shared.intersection(options)) > _MANY:
+            parts.append(f"It takes these options of [generate](#trilight-{_ORDER}) too:\n")
+            names = [option.names[0] for option in options if option in shared]
+            parts.append(", ".join(f"`{name}`" for name in names) + "\n")
+            options = tuple(option for option in options if option not in shared)
+        rows = [
+            (f"`{', '.join(option.names)}`", option.takes, option.help.replace("|", "\\|"))
+            for option in options
+        ]
+        parts.append(table(("option", "takes", "meaning"), rows) + "\n")
+    return "\n".join(parts)
+
+
+ROOTS: dict[str, tuple[type, ...]] = {
+    "Scene": (Scene,),
+    "Generate": (DatasetInRuns, DatasetSettings),
+    "Revisit": (RevisitOptions,),
+    "Render": (RenderOptions,),
+    "Plan": (CorePrice,),
+    "Train": (TrainOptions, TrainSettings, WatchSettings),
+    "Evaluate": (EvaluationOptions,),
+    "Leaderboard": (LeaderboardOptions,),
+}
+"""Settings classes by command; `reachable` finds the classes within them."""
+
+_HEAD = """# Settings
+
+Made from the descriptions at the fields (`storage/settings/described.py`), which
+are also what is checked and what the command line and Prefect's forms show: a value outside is
+refused in one line that names the field. Tests go to both ends of every range and one step outside
+(`tests/extremes/test_ranges.py`), and run what both ends make where that is cheap. Laws between
+fields, such as `min_spp` of at most `max_spp`, are not here: the complaint about one says what it
+expects. Every setting of a preset can be changed with `--set NAME=VALUE`, by its dotted
+name, such as `--set scenes.lights.count=[2,4]`, `--set scenes.families.0.weight=2` or `--set
+model=large`. Settings of a run that say *free* are how it is executed: the weights do not depend on
+them, or by rounding alone. All others are what the run means, and change by `--change`, which the
+run records ([Carry on a run](../how-to/carry-on-a-run.md)).
+"""
+
+
+def settings_page() -> str:
+    """Return every setting with its meaning, range and default."""
+    parts = [_HEAD]
+    for command, roots in ROOTS.items():
+        parts.append(f"## {command}\n")
+        for settings in reachable(*roots):
+            if rows := list(_rows(settings)):
+                first = _first_sentence(inspect.getdoc(settings) or "")
+                parts.append(f"### `{settings.__name__}`\n\n{first}\n")
+                head = ("field", "meaning", "expected", "default", "when a run goes on")
+                parts.append(table(head[: len(rows[0])], rows) + "\n")
+    return "\n".join(parts)
+
+
+def reachable(*roots: type) -> list[type]:
+    """Return dataclasses and those in their fields, each once, outer ones first."""
+    kinds: dict[type, None] = {}
+    for root in roots:
+        kinds[root] = None
+        for field in describe_fields(root):
+            kinds |= dict.fromkeys(reachable(*filter(group_of, parts_of(field.hint))))
+    return list(kinds)
+
+
+def _rows(kind: type) -> Iterator[tuple[str, ...]]:
+    if kind is Scene:  # its fields are arrays, and no settings
+        for field in describe_fields(Scene):
+            ranges = {"": field.within}
+            if field.name == "materials":
+                columns = laid_out(PUBLISHED_COLUMNS)
+                ranges = {f", {column.name}": column.within for column, _ in columns}
+            for part, within in ranges.items():
+                if within is not None:
+                    yield f"`{field.name}`{part}", _first_sentence(field.sentence), str(within), ""
+        return
+    fields = describe_fields(kind) if hasattr(kind, "__pydantic_fields__") else ()
+    is_marked = any(field.is_execution for field in fields)
+    for field in fields:
+        named = [name for kind in parts_of(field.hint) for name in getattr(kind, "PRESETS", ())]
+        presets = f", or one of {', '.join(named)}" if named else ""
+        yield (
+            f"`{field.name}`",
+            _first_sentence(field.sentence).replace("|", "\\|"),
+            (field.expected + presets).replace("|", "\\|"),
+            _default_text(field.default),
+            *(["free" if field.is_execution else ""] if is_marked else []),
+        )
+
+
+def _default_text(default: Any) -> str:
+    if default is dataclasses.MISSING or dataclasses.is_dataclass(default):
+        return ""
+    if default is None or default in ((), {}):
+        return "none"
+    if isinstance(default, bool):
+        return str(default).lower()
+    return default_text(default, quote="`")
+
+
+def _first_sentence(doc: str) -> str:
+    """Return a text up to its first full stop before a space, as one line."""
+    match = re.match(r".*?(?<! al)\.(?=\s|$)", " ".join(doc.split()))
+    return match[0] if match else doc
+
 
 _PASSES = """# Passes: what a pixel sees
 

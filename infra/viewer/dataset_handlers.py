@@ -2,11 +2,23 @@
 
 import dataclasses
 import functools
+import json
+import math
 import re
+import shlex
+import struct
+import threading
+import time
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
 
 from infra.render.path_tracer import RenderChild
-from infra.viewer.dataset_index import DatasetIndex, SceneFilter, SceneRow, filter_of
 from infra.viewer.scene_handlers import (
     MOST_THUMBNAILS,
     OpenScenes,
@@ -14,13 +26,243 @@ from infra.viewer.scene_handlers import (
     handlers_of_scene,
     thumbnail_png,
 )
-from infra.viewer.server import NotFound, Request, Response, Route, json_response
+from infra.viewer.server import NotFound, Request, Response, Routes, json_response
 from pipeline.exchange.formats import LoadedScene
 from storage.dataset.dataset import Dataset, LocalFiles, reading
-from storage.dataset.shard import read_member, scan_samples
-from storage.errors import TrilightError
+from storage.dataset.manifest import ShardEntry
+from storage.dataset.shard import Member, contents_of, read_member, scan_samples
+from storage.errors import TrilightError, expected_one_of
 from storage.records.exr import decode_exr
+from storage.records.profiles import PACKED, PLAIN
 from storage.remote.safe_url import safe_url
+
+MOST_SCENES = 500_000
+"""Maximum number of rows; a larger dataset is cut."""
+
+_MOST_HEADER = 1 << 20
+
+_PATIENCE_S = 20.0
+"""Seconds to wait for a scene that is not read yet."""
+
+_WHERE = {
+    "triangles": "triangles_per_scene",
+    "lights": "lights_per_scene",
+    "coverage": "min(coverage)",
+    "floor": "min(noise_floor_db)",
+}
+"""Columns with limits, by their quantity in `trilight shards select --where`."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SceneRow:
+    """Facts of one scene."""
+
+    key: str
+    shard: int
+    """Index of the shard in the manifest."""
+    split: str
+    template: str
+    views: int
+    triangles: int
+    lights: int
+    """Number of emitter objects, not of their triangles."""
+    floor: float
+    """Stated error of the worst view as psnr_log_db."""
+    coverage: float
+    """Least fraction over the views of pixels on objects."""
+    spp: int
+    """Greatest number of samples per pixel over the views."""
+
+
+SORTED_BY: Mapping[str, Callable[[SceneRow], Any]] = {
+    name: attrgetter(name, "key")
+    for name in ("key", "split", "template", "triangles", "lights", "floor", "coverage", "spp")
+}
+"""Sort key of rows by column."""
+
+
+class DatasetIndex:
+    """Growing index of a dataset's scenes."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        self._dataset = dataset
+        self._rows: list[SceneRow] = []
+        self._by_key: dict[str, SceneRow] = {}
+        self._closed = False
+        self.shards_read = 0
+        self.problems: list[str] = []
+        """Messages on shards that could not be read."""
+        self._thread = threading.Thread(target=self._read_all, daemon=True)
+
+    def begin(self) -> None:
+        """Start the reading thread."""
+        self._thread.start()
+
+    def wait(self) -> None:
+        """Wait until all shards are read."""
+        self._thread.join()
+
+    def close(self) -> None:
+        """Stop reading."""
+        self._closed = True
+
+    @property
+    def rows(self) -> list[SceneRow]:
+        """All rows so far, in the order of the shards."""
+        return self._rows[:]
+
+    def row(self, key: str) -> SceneRow:
+        """Wait for the row of a scene, and return it; raises TrilightError without one."""
+        deadline = time.monotonic() + _PATIENCE_S
+        while key not in self._by_key:
+            if not self._thread.is_alive():
+                raise TrilightError(f"scene {key:.40}: not in the dataset.")
+            if time.monotonic() > deadline:
+                raise TrilightError(f"scene {key:.40}: not read yet; ask for it again.")
+            self._thread.join(0.05)
+        return self._by_key[key]
+
+    def _read_all(self) -> None:
+        for number, shard in enumerate(self._dataset.manifest.shards):
+            if self._closed or len(self._rows) >= MOST_SCENES:
+                break
+            try:
+                self._read_shard(number, shard)
+            except (TrilightError, OSError) as error:
+                self.problems.append(str(error))
+            self.shards_read += 1
+
+    def _read_shard(self, number: int, shard: ShardEntry) -> None:
+        dataset = self._dataset
+        with dataset.files.open(shard, checked=False) as stream:
+            with reading(dataset.display_name, shard.name):
+                samples = contents_of(stream, shard.name).samples
+            for key, members in samples.items():
+                if self._closed:
+                    return
+                with reading(dataset.display_name, shard.name):
+                    row = _row(stream, key, members, number, shard.split)
+                self._rows.append(row)
+                self._by_key[key] = row
+
+
+def _row(
+    stream: BinaryIO, key: str, members: Mapping[str, Member], shard: int, split: str
+) -> SceneRow:
+    record = json.loads(read_member(stream, members["json"]))
+    views = record["views"]
+    return SceneRow(
+        key=key,
+        shard=shard,
+        split=split,
+        template=str(record["provenance"].get("template", "unknown")),
+        views=len(views),
+        triangles=_num_triangles(stream, members),
+        lights=sum(entry["kind"] == "emitter" for entry in record["objects"]),
+        floor=min(_single(view["noise_floor_db"]) for view in views),
+        coverage=min(_single(view["coverage"]) for view in views),
+        spp=max(int(view["spp"]) for view in views),
+    )
+
+
+def _num_triangles(stream: BinaryIO, members: Mapping[str, Member]) -> int:
+    suffix = PLAIN if PLAIN in members else PACKED
+    stream.seek(members[suffix].offset)
+    head = stream.read(min(members[suffix].num_bytes, _MOST_HEADER))
+    if suffix == PACKED:
+        head = zlib.decompressobj(31).decompress(head, _MOST_HEADER)
+    (length,) = struct.unpack("<Q", head[:8])
+    shapes = json.loads(head[8 : 8 + length])
+    return int(shapes["faces"]["shape"][0])
+
+
+def _single(value: Any) -> float:
+    """Return a number as `trilight shards select` compares it."""
+    return float(np.float32(value))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFilter:
+    """Conditions and order of a dataset's page."""
+
+    split: str = ""
+    """Split of the scenes; empty for all splits."""
+    template: str = ""
+    """Layout of the scenes; empty for all layouts."""
+    least: Mapping[str, float]
+    """Lower limits, inclusive, by column."""
+    most: Mapping[str, float]
+    """Upper limits, inclusive, by column."""
+    sort: str = "key"
+    descending: bool = False
+
+    def rows(self, rows: Sequence[SceneRow]) -> list[SceneRow]:
+        """Return the rows that meet the conditions, sorted."""
+        matching = [row for row in rows if self._matches(row)]
+        return sorted(matching, key=SORTED_BY[self.sort], reverse=self.descending)
+
+    def command(self, dataset: Path, out: Path) -> str:
+        """Return the command that selects the matching scenes; empty without conditions."""
+        words = ["trilight", "shards", "select", str(dataset)]
+        conditions = [
+            f"{_WHERE[name]} {sign} {value:g}"
+            for limits, sign in ((self.least, ">="), (self.most, "<="))
+            for name, value in limits.items()
+        ]
+        options = {"--split": self.split, "--template": self.template}
+        options["--where"] = " and ".join(conditions)
+        chosen = [word for option, value in options.items() if value for word in (option, value)]
+        return shlex.join([*words, *chosen, "--out", str(out)]) if chosen else ""
+
+    def _matches(self, row: SceneRow) -> bool:
+        return (
+            self.split in ("", row.split)
+            and self.template in ("", row.template)
+            and all(getattr(row, name) >= value for name, value in self.least.items())
+            and all(getattr(row, name) <= value for name, value in self.most.items())
+        )
+
+
+def filter_of(query: Mapping[str, str]) -> SceneFilter:
+    """Return the filter of a query.
+
+    Args:
+        query: `split`, `template`, `sort`, `descending`, and `COLUMN_min` and `COLUMN_max`.
+
+    Raises:
+        TrilightError: a limit is no number, or the sort column is unknown.
+    """
+    sort = query.get("sort", "key")
+    if sort not in SORTED_BY:
+        raise TrilightError(f"sort is {sort:.40}; {expected_one_of(sort, list(SORTED_BY))}.")
+    ends = {
+        end: {
+            name: _number(query[f"{name}_{end}"], name)
+            for name in _WHERE
+            if query.get(f"{name}_{end}")
+        }
+        for end in ("min", "max")
+    }
+    return SceneFilter(
+        split=query.get("split", ""),
+        template=query.get("template", ""),
+        least=ends["min"],
+        most=ends["max"],
+        sort=sort,
+        descending=query.get("descending") == "1",
+    )
+
+
+def _number(text: str, name: str) -> float:
+    try:
+        # rounded as in the command, so that both select the same scenes
+        value = float(f"{float(text):g}")
+    except ValueError as error:
+        raise TrilightError(f"{name}: {text:.20} is no number.") from error
+    if not math.isfinite(value):
+        raise TrilightError(f"{name}: {text:.20} is no finite number.")
+    return value
+
 
 MOST_ROWS = 200
 """Maximum number of scenes in one response."""
@@ -51,18 +293,15 @@ class DatasetHandlers:
         self.index = DatasetIndex(dataset)
         self.index.begin()
 
-    def gets(self) -> dict[str, Route]:
-        """Return the routes of GET requests."""
+    def routes(self) -> Routes:
+        """Return the routes of the page's requests."""
         return {
-            "api/dataset": self._facts,
-            "api/rows": self._rows,
-            "api/thumbnail/": self._thumbnail,
-            "scene/": self._scenes.get,
+            "GET api/dataset": self._facts,
+            "GET api/rows": self._rows,
+            "GET api/thumbnail/": self._thumbnail,
+            "GET scene/": self._scenes.respond,
+            "POST scene/": self._scenes.respond,
         }
-
-    def posts(self) -> dict[str, Route]:
-        """Return the routes of POST requests."""
-        return {"scene/": self._scenes.post}
 
     def close(self) -> None:
         """Stop reading and rendering."""

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from infra.render.path_tracer import PathTracer, RenderChild
 from infra.render.quality import FixedSamples
+from infra.viewer.open_source import SceneList
 from infra.viewer.scene_handlers import (
     MOST_THUMBNAILS,
     OpenScenes,
@@ -17,8 +18,7 @@ from infra.viewer.scene_handlers import (
     handlers_of_scene,
     thumbnail_png,
 )
-from infra.viewer.scene_list import SceneList
-from infra.viewer.server import NotFound, Request, Response, Route, json_response
+from infra.viewer.server import NotFound, Request, Response, Routes, json_response
 from pipeline.exchange.formats import LoadedScene
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
@@ -47,18 +47,15 @@ class FolderHandlers:
         self._png = functools.lru_cache(MOST_THUMBNAILS)(self._small_png)
         self._scenes = OpenScenes(_NUMBER, self._open_scene)
 
-    def gets(self) -> dict[str, Route]:
-        """Return the routes of GET requests."""
+    def routes(self) -> Routes:
+        """Return the routes of the page's requests."""
         return {
-            "api/folder": self._facts,
-            "api/about/": self._about,
-            "api/thumbnail/": self._thumbnail,
-            "scene/": self._scenes.get,
+            "GET api/folder": self._facts,
+            "GET api/about/": self._about,
+            "GET api/thumbnail/": self._thumbnail,
+            "GET scene/": self._scenes.respond,
+            "POST scene/": self._scenes.respond,
         }
-
-    def posts(self) -> dict[str, Route]:
-        """Return the routes of POST requests."""
-        return {"scene/": self._scenes.post}
 
     def close(self) -> None:
         """Stop reading and rendering."""

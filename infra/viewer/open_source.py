@@ -1,21 +1,115 @@
-"""Opens the source of `trilight view`: a scene, a folder of scenes, or a dataset."""
+"""Opens the source of `trilight view`; its page is served before, and its requests wait."""
 
+import os
+from collections.abc import Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
-from infra.render.path_tracer import RenderChild
-from infra.viewer.dataset_handlers import DatasetHandlers
-from infra.viewer.deferred_handlers import PageHandlers, page_of
-from infra.viewer.folder_handlers import FolderHandlers
-from infra.viewer.scene_handlers import handlers_of_scene
-from infra.viewer.scene_list import scene_list
-from pipeline.exchange.open_scene import scene_source
-from pipeline.exchange.reader import SceneReader
-from pipeline.renders.mitsuba_variant import choose_variant
-from storage.dataset.dataset import open_dataset
+from infra.run_record import is_run, tensorboard_command
+from infra.viewer.server import Request, Response, Routes, dispatch, static_routes
+from storage.dataset.layout import DatasetFolder
+from storage.errors import TrilightError
+
+_KEY = "::"
+"""Separator between the file of many scenes and the key of one."""
+
+MOST_FILES = 5000
+"""Maximum number of listed files; a larger folder is cut."""
+
+
+class PageHandlers(Protocol):
+    """Request handlers of a page."""
+
+    def routes(self) -> Routes:
+        """Return the routes of the page's requests."""
+
+    def close(self) -> None:
+        """Stop reading and rendering."""
+
+
+class DeferredHandlers:
+    """Routes that wait for the handlers of a source that is being opened."""
+
+    def __init__(self, page: str) -> None:
+        """Serve a page; its other requests wait for the result of `opened`."""
+        self.opened = Future[PageHandlers]()
+        waiting = ("GET api/", "GET scene/", "POST api/", "POST scene/")
+        self.routes: Routes = {**static_routes(page), **dict.fromkeys(waiting, self._respond)}
+
+    def _respond(self, request: Request) -> Response:
+        return dispatch(self.opened.result().routes(), request)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneList:
+    """Sorted files that may be scenes."""
+
+    root: Path
+    names: tuple[str, ...]
+    """Paths relative to the folder, with slashes."""
+    is_cut: bool
+    """True where the folder has more files than are listed."""
+
+
+def page_of(source: str) -> str:
+    """Return the name of the page of a source; raises TrilightError without such a source."""
+    if "://" in source:
+        return "dataset.html"
+    path = Path(source)
+    if path.is_dir():
+        if is_run(path):
+            raise TrilightError(
+                f"{source}: the folder of a training run; expected scenes or a dataset. Its curves "
+                f"and pictures: `{tensorboard_command(path)}`."
+            )
+        if DatasetFolder(path).manifest.exists():
+            return "dataset.html"
+        scene_list(path)
+        return "folder.html"
+    if not Path(source.rpartition(_KEY)[0] or source).exists():
+        raise TrilightError(
+            f"{source}: no such file; expected a scene, a folder of scenes, or a dataset."
+        )
+    return "scene.html"
+
+
+def scene_list(root: Path) -> SceneList:
+    """Return the files with a scene's suffix in a folder and its subfolders.
+
+    Hidden folders and links to folders are left out.
+
+    Raises:
+        TrilightError: there is no such file.
+    """
+    from pipeline.exchange.formats import readable_suffixes  # slow
+
+    suffixes = frozenset(readable_suffixes())
+    names = list[str]()
+    for name in _files(root):
+        if Path(name).suffix.lower() in suffixes:
+            names.append(name)
+        if len(names) > MOST_FILES:
+            break
+    if not names:
+        raise TrilightError(
+            f"{root}: no dataset, and holds no scene; expected a folder that `trilight generate` "
+            f"wrote, or files {' '.join(readable_suffixes())} in it."
+        )
+    return SceneList(root=root, names=tuple(names[:MOST_FILES]), is_cut=len(names) > MOST_FILES)
+
+
+def _files(root: Path) -> Iterator[str]:
+    for folder, below, files in os.walk(root):
+        below[:] = sorted(name for name in below if not name.startswith("."))
+        for name in sorted(files):
+            if not name.startswith("."):
+                yield Path(folder, name).relative_to(root).as_posix()
 
 
 def open_handlers(source: str, *, checkpoint: str | None, threads: int | None) -> PageHandlers:
-    """Open a source, and return the handlers of its page.
+    """Open a source, and return the handlers of its page; imports formats and renderers.
 
     Args:
         source: a scene as `trilight render` takes it, a folder of such files, or a dataset
@@ -26,19 +120,24 @@ def open_handlers(source: str, *, checkpoint: str | None, threads: int | None) -
     Raises:
         TrilightError: the source is unusable.
     """
+    from infra.render.path_tracer import RenderChild
+    from infra.viewer.dataset_handlers import DatasetHandlers
+    from infra.viewer.folder_handlers import FolderHandlers
+    from infra.viewer.scene_handlers import handlers_of_scene
+    from pipeline.exchange.open_scene import scene_source
+    from pipeline.exchange.reader import SceneReader
+    from pipeline.renders.mitsuba_variant import choose_variant
+    from storage.dataset.dataset import open_dataset
+
     page = page_of(source)
+    child = RenderChild(choose_variant("auto"), threads)
     if page == "folder.html":
-        return FolderHandlers(scene_list(Path(source)), _child(threads), checkpoint)
+        return FolderHandlers(scene_list(Path(source)), child, checkpoint)
     if page == "dataset.html":
-        return DatasetHandlers(open_dataset(source), source, _child(threads), checkpoint)
+        return DatasetHandlers(open_dataset(source), source, child, checkpoint)
     file = scene_source(source)
     with SceneReader() as reader:
         loaded = reader.load(file, pictures=True)
-    child = _child(threads)
     room = handlers_of_scene(file.name, loaded, source, child, checkpoint)
     room.child = child
     return room
-
-
-def _child(threads: int | None) -> RenderChild:
-    return RenderChild(choose_variant("auto"), threads)

@@ -5,10 +5,9 @@ so that nothing has to be undone.
 """
 
 import dataclasses
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +19,66 @@ from storage.records.retextured import chosen_maps
 from storage.records.scene import MAX_POSITION_M, Scene
 from storage.records.texture import CONSTANT, TEXTURED
 from storage.renderer import Camera
+from storage.settings.described import checked, from_record
+from storage.settings.ranges import Within
 
 MOST_PX = 1024
 """Maximum width in pixels of a requested picture."""
 
-_POSE_LENGTH = 16
 MOST_GAIN = 1000.0
 """Maximum factor by which a lamp may become brighter."""
 
-_COLUMNS = {"diffuse": DIFFUSE, "specular": SPECULAR}
+_COLUMNS = {"diffuse": DIFFUSE, "specular": SPECULAR, "roughness": ROUGHNESS}
+
+Vector = tuple[float, float, float]
+
+
+@checked()
+class LampEdit:
+    """Changes to a lamp."""
+
+    move: Annotated[Vector, Within(-MAX_POSITION_M, MAX_POSITION_M, unit="meters")] = (0, 0, 0)
+    gain: Annotated[float, Within(0.001, MOST_GAIN)] = 1.0
+
+
+@checked()
+class MaterialEdit:
+    """Changes to a material; a stated color or number replaces a texture."""
+
+    diffuse: Annotated[Vector | None, Within(0, 1)] = None
+    specular: Annotated[Vector | None, Within(0, 1)] = None
+    roughness: Annotated[float | None, Within(0, 1)] = None
+
+
+@checked()
+class SceneEdits:
+    """Changes to a scene."""
+
+    lamps: Mapping[int, LampEdit] = field(default_factory=dict)
+    """Changes by row of the emitter."""
+    materials: Mapping[int, MaterialEdit] = field(default_factory=dict)
+    """Changes by row of the material."""
+
+
+_FAR_M = 10 * MAX_POSITION_M
+
+
+@checked()
+class PictureRequest:
+    """Body of a request for a picture."""
+
+    engine: str
+    c2w: Annotated[tuple[float, ...], Within(-_FAR_M, _FAR_M)]
+    """Pose of the camera, 16 numbers, row by row."""
+    fov: Annotated[float, Within(1, 170, unit="degrees")]
+    resolution: Annotated[int, Within(16, MOST_PX, unit="pixels")]
+    """Width of the picture, a multiple of 8."""
+    view: int | None = None
+    """Camera of the scene; none for a free one."""
+    edits: Mapping[str, Any] | None = None
+    """Changes in the form of SceneEdits; none by default."""
+    error_db: Annotated[float, Within(10, 60, unit="dB")] = 45.0
+    """Stated error as psnr_log_db at which a path tracer stops."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,7 +90,7 @@ class PictureOptions:
     resolution: int
     """Width of the picture in pixels, a multiple of 8."""
     edits: Mapping[str, Any]
-    """Edits of the scene in the form of infra.viewer.picture_options."""
+    """Edits of the scene in the form of SceneEdits."""
     error_db: float
     """Stated error as psnr_log_db at which a path tracer stops."""
 
@@ -62,59 +112,35 @@ def parse_picture_options(body: Any, engines: Mapping[str, Any], views: int) -> 
     Raises:
         TrilightError: an option is missing or invalid.
     """
-    if not isinstance(body, Mapping):
-        raise TrilightError("the request is no JSON object.")
-    engine = str(body.get("engine"))
-    if engine not in engines:
-        raise TrilightError(f"engine {engine:.40}: {expected_one_of(engine, list(engines))}.")
-    width = body.get("resolution")
-    view = body.get("view")
-    if not (isinstance(width, int) and 16 <= width <= MOST_PX and width % 8 == 0):
-        raise TrilightError(
-            f"resolution is {width!r:.20}; expected a multiple of 8 from 16 to {MOST_PX}."
-        )
-    if view is not None and not (isinstance(view, int) and 0 <= view < views):
-        raise TrilightError(f"view is {view!r:.20}; expected 0 to {views - 1}, or none.")
+    request = from_record(PictureRequest, body)
+    if request.engine not in engines:
+        expected = expected_one_of(request.engine, list(engines))
+        raise TrilightError(f"engine {request.engine:.40}: {expected}.")
+    if request.resolution % 8:
+        raise TrilightError(f"resolution is {request.resolution}; expected a multiple of 8.")
+    if request.view is not None and not 0 <= request.view < views:
+        raise TrilightError(f"view is {request.view}; expected 0 to {views - 1}, or none.")
     return PictureOptions(
-        engine=engine,
-        camera=_camera(body, view),
-        resolution=int(width),
-        edits=parse_edits(body),
-        error_db=_number(body.get("error_db", 45), "error_db", 10, 60),
+        engine=request.engine,
+        camera=Camera(c2w=_pose(request.c2w), fov_deg=request.fov, view=request.view),
+        resolution=request.resolution,
+        edits=request.edits or {},
+        error_db=request.error_db,
     )
 
 
-def parse_edits(body: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the edits in the body of a request; raises TrilightError if they are no object."""
-    edits = body.get("edits")
-    if edits is not None and not isinstance(edits, Mapping):
-        raise TrilightError(f"edits: {edits!r:.20} is no JSON object; expected one, or null.")
-    return edits or {}
-
-
-def _camera(body: Mapping[str, Any], view: int | None) -> Camera:
-    pose = body.get("c2w")
-    if not isinstance(pose, list) or len(pose) != _POSE_LENGTH:
+def _pose(numbers: tuple[float, ...]) -> NDArray[np.float32]:
+    """Return the nearest pose with an orthonormal rotation, since a browser rounds."""
+    if len(numbers) != 16:
         raise TrilightError("c2w: expected 16 numbers, row by row.")
-    far = 10 * MAX_POSITION_M
-    numbers = np.array([_number(value, "c2w", -far, far) for value in pose])
-    c2w = numbers.reshape(4, 4)
+    c2w = np.array(numbers).reshape(4, 4)
     rotation = c2w[:3, :3]
     if abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
         raise TrilightError("c2w: expected the pose of a camera, a rotation without mirroring.")
-    # a browser rounds, and scenes need an orthonormal rotation: the nearest one, by the SVD
     u, _, vt = np.linalg.svd(rotation)
     c2w[:3, :3] = u @ vt
     c2w[3] = (0, 0, 0, 1)
-    fov_deg = _number(body.get("fov"), "fov", 1, 170)
-    return Camera(c2w=c2w.astype(np.float32), fov_deg=fov_deg, view=view)
-
-
-def _number(value: Any, name: str, low: float, high: float) -> float:
-    real = isinstance(value, int | float) and not isinstance(value, bool)
-    if not real or not math.isfinite(value) or not low <= value <= high:
-        raise TrilightError(f"{name} is {value!r:.20}; expected a number from {low:g} to {high:g}.")
-    return float(value)
+    return c2w.astype(np.float32)
 
 
 def short_digest(value: Any) -> str:
@@ -122,29 +148,28 @@ def short_digest(value: Any) -> str:
     return sha256_hex(canonical_json(value))[:24]
 
 
-def apply_edits(scene: Scene, edits: Mapping[str, Any]) -> Scene:
-    """Return the scene with edits.
-
-    Args:
-        scene: scene as it was loaded.
-        edits: `lamps`: by row of the emitter, `move` [3] in meters and `gain`; `materials`: by row,
-            `diffuse` and `specular` [3] and `roughness`. Values that are left out stay. A stated
-            color or number replaces a texture.
+def apply_edits(scene: Scene, record: Mapping[str, Any]) -> Scene:
+    """Return a scene as it was loaded with the edits of a record (SceneEdits).
 
     Raises:
         TrilightError: an edit is malformed, or breaks a rule of scenes.
     """
-    lamps = _group(edits, "lamps")
-    materials = _group(edits, "materials")
-    if not lamps and not materials:
+    edits = from_record(SceneEdits, record)
+    if not edits.lamps and not edits.materials:
         return scene
     positions = scene.vertex_positions.copy()
     rows = scene.materials.copy()
     worn = None if scene.material_textures is None else scene.material_textures.copy()
-    for row, change in lamps.items():
-        _move_lamp(scene, row, change, positions, rows)
-    for row, change in materials.items():
-        _change_material(scene, row, change, rows, worn)
+    for row, lamp in edits.lamps.items():
+        _move_lamp(scene, row, lamp, positions, rows)
+    for row, material in edits.materials.items():
+        if not 0 <= row < len(rows):
+            raise TrilightError(f"edits: the scene has no material {row}.")
+        for name, value in vars(material).items():
+            if value is not None:
+                rows[row, _COLUMNS[name]] = value
+                if worn is not None:
+                    worn[row, TEXTURED.index(name)] = CONSTANT
     worn_scene = dataclasses.replace(scene, material_textures=worn)
     every = (np.arange(scene.num_triangles), np.arange(len(rows)))
     changed = dataclasses.replace(
@@ -154,57 +179,16 @@ def apply_edits(scene: Scene, edits: Mapping[str, Any]) -> Scene:
     return changed
 
 
-def _group(edits: Mapping[str, Any], name: str) -> dict[int, Mapping[str, Any]]:
-    changes = edits.get(name, {})
-    try:
-        group = {int(row): dict(change) for row, change in changes.items()}
-    except (AttributeError, TypeError, ValueError) as error:
-        raise TrilightError(f"edits: {name} is no table of changes by row.") from error
-    return dict(group)
-
-
 def _move_lamp(
     scene: Scene,
     row: int,
-    change: Mapping[str, Any],
+    change: LampEdit,
     positions: NDArray[np.float32],
     rows: NDArray[np.float32],
 ) -> None:
     if not 0 <= row < len(scene.objects) or scene.objects[row].kind != "emitter":
         raise TrilightError(f"edits: object {row} is no light of the scene.")
     mine = scene.object_index == row
-    move = _numbers(change.get("move", (0, 0, 0)), "move", 3, -MAX_POSITION_M, MAX_POSITION_M)
-    positions[np.unique(scene.faces[mine])] += move.astype(np.float32)
-    gain = float(_numbers([change.get("gain", 1)], "gain", 1, 0.001, MOST_GAIN)[0])
+    positions[np.unique(scene.faces[mine])] += np.array(change.move, np.float32)
     for material in np.unique(scene.material_index[mine]):
-        rows[material, EMISSION] = scene.materials[material, EMISSION] * gain
-
-
-def _change_material(
-    scene: Scene,
-    row: int,
-    change: Mapping[str, Any],
-    rows: NDArray[np.float32],
-    worn: NDArray[np.int32] | None,
-) -> None:
-    if not 0 <= row < len(rows):
-        raise TrilightError(f"edits: the scene has no material {row}.")
-    for name, part in _COLUMNS.items():
-        if name in change:
-            rows[row, part] = _numbers(change[name], name, 3, 0, 1)
-    if "roughness" in change:
-        rows[row, ROUGHNESS] = _numbers([change["roughness"]], "roughness", 1, 0, 1)[0]
-    if worn is not None:
-        worn[row, [at for at, name in enumerate(TEXTURED) if name in change]] = CONSTANT
-
-
-def _numbers(values: Any, name: str, count: int, low: float, high: float) -> NDArray[np.float64]:
-    try:
-        numbers = [float(value) for value in values]
-    except (TypeError, ValueError) as error:
-        raise TrilightError(f"edits: {name} is no list of numbers.") from error
-    if len(numbers) != count or not all(math.isfinite(v) and low <= v <= high for v in numbers):
-        raise TrilightError(
-            f"edits: {name} is {numbers}; expected {count} from {low:g} to {high:g}."
-        )
-    return np.array(numbers)
+        rows[material, EMISSION] = scene.materials[material, EMISSION] * change.gain

@@ -93,6 +93,7 @@ def json_response(value: Any) -> Response:
 class Request:
     """Request that passed the guard."""
 
+    method: str = "GET"
     path: str
     """Decoded path below the token, without the first slash."""
     query: Mapping[str, str]
@@ -109,14 +110,17 @@ Route = Callable[[Request], Response]
 """Handler of one path, or of all paths below a prefix that ends in a slash; raises TrilightError
 with a sentence for the page, NotFound where there is no resource."""
 
+Routes = Mapping[str, Route]
+"""Routes by method and path, such as `GET api/scene`."""
 
-def dispatch(routes: Mapping[str, Route], request: Request) -> Response:
+
+def dispatch(routes: Routes, request: Request) -> Response:
     """Return the response of the route of a request; raises TrilightError as a `Route` does."""
-    path = request.path
+    name = f"{request.method} {request.path}"
     for prefix, route in routes.items():
-        if path == prefix or (prefix.endswith("/") and path.startswith(prefix)):
+        if name == prefix or (prefix.endswith("/") and name.startswith(prefix)):
             return route(request)
-    raise NotFound(f"{path or 'the page'}: nothing is there.")
+    raise NotFound(f"{request.path or 'the page'}: nothing is there.")
 
 
 class PageServer(ThreadingHTTPServer):
@@ -125,16 +129,13 @@ class PageServer(ThreadingHTTPServer):
     daemon_threads = True
     request_queue_size = 64
 
-    def __init__(
-        self, gets: Mapping[str, Route], posts: Mapping[str, Route], *, port: int = 0
-    ) -> None:
+    def __init__(self, routes: Routes, *, port: int = 0) -> None:
         """Listen on a port; 0 stands for any free one.
 
         Raises:
             TrilightError: the port cannot be used.
         """
-        self.gets = gets
-        self.posts = posts
+        self.routes = routes
         self.token = new_token()
         self.slots = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self._awaited: dict[socket.socket, float] = {}
@@ -242,8 +243,8 @@ class _Handler(BaseHTTPRequestHandler):
         path, _, query = self.path.partition("?")
         below = unquote(path.removeprefix(f"/{self.server.token}")).removeprefix("/")
         body = _parse_body(data) if method == "POST" else None
-        request = Request(path=below, query=dict(parse_qsl(query)), body=body)
-        return dispatch(self.server.posts if method == "POST" else self.server.gets, request)
+        request = Request(method=method, path=below, query=dict(parse_qsl(query)), body=body)
+        return dispatch(self.server.routes, request)
 
     def _send_sentence(self, status: HTTPStatus, sentence: str) -> None:
         """Send a sentence: as text where HTML is accepted, else as JSON."""
@@ -336,6 +337,8 @@ def static_routes(page: str) -> dict[str, Route]:
         return Response(body=files[name].read_bytes(), kind=_KINDS[files[name].suffix])
 
     def index(request: Request) -> Response:
-        return Response(body=files[page].read_bytes(), kind=_KINDS[".html"])
+        head = files["page.html"].read_bytes().replace(b"PAGE", Path(page).stem.encode())
+        body = head.replace(b"BODY", files[page].read_bytes())
+        return Response(body=body, kind=_KINDS[".html"])
 
-    return {"": index, "static/": file}
+    return {"GET ": index, "GET static/": file}

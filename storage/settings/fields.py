@@ -100,7 +100,8 @@ class FieldDescription:
         if self.within is None:
             return expected_of(self.hint)
         numbers = _NUMBERS[self.kind]
-        shapes = {"one": _KINDS[self.kind], "pair": f"two {numbers}", "many": numbers}
+        several = "three" if len(get_args(self.bare)) == 3 else "two"
+        shapes = {"one": _KINDS[self.kind], "pair": f"{several} {numbers}", "many": numbers}
         order = ", the lower one first" if LowFirst() in self.notes else ""
         return f"{shapes[self.shape]} {self.within}{order}"
 

@@ -11,7 +11,7 @@ import sys
 import tokenize
 from collections import Counter
 
-from infra.setup.command_line_page import every_command
+from infra.setup.generated_pages import every_command
 from tests.conftest import BUDGET, ROOT
 
 PROGRAMS = (".py", ".js", ".html", ".jinja", ".css", ".sh", ".sbatch")

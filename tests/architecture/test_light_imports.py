@@ -16,7 +16,7 @@ STEPS = (
     ("import io; shard.write_tar(io.BytesIO(), [])", HEAVY),
     ("import scene_templates.templates, scene_templates.settings", HEAVY),
     (
-        "import trilight.compose, trilight.datasets, trilight.extend, trilight.learning, "
+        "import trilight.compose, trilight.extend, trilight.learning, "
         "trilight.pictures, trilight.scenes",
         HEAVY,
     ),

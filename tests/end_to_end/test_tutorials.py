@@ -15,8 +15,7 @@ from typing import Any
 
 import pytest
 
-from infra.viewer.deferred_handlers import page_of
-from infra.viewer.open_source import open_handlers
+from infra.viewer.open_source import open_handlers, page_of
 from pipeline.presets.registry import preset_settings
 from storage.digests import sha256_of_file
 from storage.records.objects import write_objects_lock

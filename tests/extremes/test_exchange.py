@@ -16,7 +16,7 @@ import OpenEXR
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from infra.bench.workloads.cost_scene import cost_scene
+from infra.bench.workloads.named_scenes import cost_scene
 from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from pipeline.exchange.renderformer_json import describe_scene
 from pipeline.presets.registry import preset_settings

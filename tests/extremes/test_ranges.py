@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from infra.render.options import RenderOptions
 from infra.serving.train_model import TrainOptions
-from infra.setup.settings_page import ROOTS, reachable
+from infra.setup.generated_pages import ROOTS, reachable
 from model.config import BaseWidths, ModelConfig, smoke, tiny
 from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSettings
 from pipeline.flows.forms import DatasetInRuns

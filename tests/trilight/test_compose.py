@@ -1,16 +1,40 @@
-"""Scenes from Python: lawful, the same as from a scene file, and mistakes named."""
+"""Python: scenes, pictures, and the names that `import trilight` offers to programs and pages."""
 
+import ast
 import json
+import re
+import sys
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
+from PIL import Image
 
+import trilight
+from infra.setup.wheel_tree import PACKAGES
 from pipeline.objects.generated import encode_ply
+from pipeline.renders.mitsuba_variant import Variant
+from storage.errors import TrilightError
+from storage.records.exr import decode_exr
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.renderer import Camera
+from tests.command_line import run_program
+from tests.conftest import ROOT
 from tests.for_each import for_each
-from trilight import Material, SceneBuilder, TrilightError, read_scene
+from tests.scenes_by_hand import tiny_scene
+from trilight import (
+    Material,
+    SceneBuilder,
+    extend,
+    preview_srgb8,
+    read_scene,
+    render_views,
+    write_picture,
+)
+from trilight.lazy import offered_names
 
 TETRAHEDRON = (
     [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -136,3 +160,154 @@ def test_a_file_is_the_mesh_that_its_arrays_are(tmp_path: Path) -> None:
     assert here.mean(axis=(0, 1)) == pytest.approx(np.zeros(3), abs=1e-6), "at the origin"
     assert (read.objects[1].name, read.objects[1].uid) == ("it", "it.ply")
     assert read.objects[1].licence == "CC-BY-4.0"
+
+
+@for_each(("module", "missing"), [(trilight, "rendr"), (extend, "TEMPLATE")])
+def test_every_name_is_there(module: ModuleType, missing: str) -> None:
+    for name in module.__all__:
+        assert getattr(module, name) is not None, name
+    assert trilight.__version__ == metadata.version("trilight")
+    with pytest.raises(AttributeError, match=f"no attribute '{missing}'"):
+        getattr(module, missing)
+
+
+def test_no_name_is_one_that_a_wheel_needs() -> None:
+    """There `trilight.train` is a package: importing it would replace a function of that name."""
+    modules = {path.stem for path in (ROOT / "trilight").glob("*.py")}
+    assert not {*trilight.__all__, *modules} & {*PACKAGES, "tests"}
+
+
+@for_each("example", sorted((ROOT / "examples").glob("*.py")))
+def test_examples_import_from_the_face_alone(example: Path) -> None:
+    ours = {
+        node.module
+        for node in ast.walk(ast.parse(example.read_text()))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES
+    }
+    assert not ours
+
+
+@for_each("page", ["docs/reference/python.md", "README.md"])
+def test_documents_name_what_is_there(page: str) -> None:
+    text = (ROOT / page).read_text()
+    named = set(re.findall(r"\btrilight\.([A-Za-z_]+)", "\n".join(_code(text))))
+    assert named <= {*trilight.__all__, "extend"}
+
+
+def _code(text: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+
+
+def _require_runs(folder: Path, *words: str) -> None:
+    """Run a program as a user does, in a separate folder."""
+    run_program([sys.executable, *words], folder, PYTHONPATH=str(ROOT), MPLBACKEND="Agg")
+
+
+NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
+
+FEW_SAMPLES = (
+    "noise_floor_db=20",
+    'noise_floor_db=20, changes={"renders.min_spp": 16, "renders.max_spp": 16}',
+)
+"""What an order's pictures have in the documents, and here."""
+RUN_CELLS = f"""
+import json, sys
+cells = [cell for cell in json.load(open(sys.argv[1]))["cells"] if cell["cell_type"] == "code"]
+for number, cell in enumerate(cells):
+    text = "".join(cell["source"]).replace(*{FEW_SAMPLES})
+    exec(compile(text, f"code cell {{number}}", "exec"), globals())
+"""
+
+
+@for_each("notebook", NOTEBOOKS)
+def test_it_holds_code_and_no_outputs(notebook: Path) -> None:
+    assert len(NOTEBOOKS) >= 2
+    cells = [
+        cell for cell in json.loads(notebook.read_text())["cells"] if cell["cell_type"] == "code"
+    ]
+    assert len(cells) >= 5
+    for cell in cells:
+        assert (cell["outputs"], cell["execution_count"]) == ([], None)
+        code = "".join(cell["source"])
+        compile(code, notebook.name, "exec")
+        assert set(re.findall(r"\btrilight\.(\w+)", code)) <= set(trilight.__all__)
+
+
+@pytest.mark.slow("commands")
+@for_each("notebook", NOTEBOOKS)
+def test_it_runs(notebook: Path, tmp_path: Path) -> None:
+    _require_runs(tmp_path, "-c", RUN_CELLS, str(notebook))
+
+
+CODE = _code((ROOT / "docs/reference/python.md").read_text())
+
+
+def test_the_page_is_a_program() -> None:
+    assert len(CODE) == 6
+    assert all(len(block.strip().splitlines()) <= 12 for block in CODE)
+    compile("\n".join(CODE), "python.md", "exec")
+
+
+@pytest.mark.slow("commands")
+def test_the_page_runs(tmp_path: Path) -> None:
+    """As one program without `if __name__ == "__main__"`, in a folder of its own."""
+    program = tmp_path / "program.py"
+    program.write_text("\n".join(CODE).replace(*FEW_SAMPLES))
+    _require_runs(tmp_path, str(program))
+    made = {path.name for path in tmp_path.iterdir()}
+    assert {"still.usdz", "still.exr", "network.png", "set", "run", "evaluation"} <= made
+
+
+@pytest.mark.slow("commands")
+def test_the_lines_of_the_readme_run(tmp_path: Path) -> None:
+    (code,) = _code((ROOT / "README.md").read_text())
+    assert len(code.strip().splitlines()) <= 10
+    (tmp_path / "program.py").write_text(code)
+    _require_runs(tmp_path, str(tmp_path / "program.py"))
+    assert (tmp_path / "knot.png").stat().st_size > 500
+
+
+def test_a_name_is_exported_as_its_import_calls_it(tmp_path: Path) -> None:
+    module = tmp_path / "package.py"
+    module.write_text(
+        "from typing import TYPE_CHECKING\n"
+        "if TYPE_CHECKING:\n"
+        "    from json import dumps as dumps\n"
+        "    from os.path import join as joined, split as split\n"
+    )
+    assert offered_names(str(module)) == {
+        "dumps": ("json", "dumps"),
+        "joined": ("os.path", "join"),
+        "split": ("os.path", "split"),
+    }
+
+
+def test_every_camera_is_rendered_but_where_some_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Scene:
+        """Returns the field of view in place of a picture."""
+
+        def __init__(self, *_: object) -> None: ...
+
+        def render_view(self, camera: Camera) -> tuple[float, int | None]:
+            return camera.fov_deg, camera.view
+
+    monkeypatch.setattr("infra.render.path_tracer.SceneInChild", Scene)
+    variant = Variant(name="llvm_ad_rgb", libllvm="", note="")  # nothing is traced here
+    monkeypatch.setattr("pipeline.renders.mitsuba_variant.choose_variant", lambda default: variant)
+    scene = tiny_scene(fov_deg=np.array([45, 50], np.float32))
+    first, second = (45, 0), (50, 1)
+    found: list[object] = [*render_views(scene)]
+    assert found == [first, second]
+    assert [*render_views(scene, views=[1, 0])] == [second, first]
+
+
+def test_a_picture_is_written_as_its_name_says(tmp_path: Path) -> None:
+    picture = np.linspace(0, 2, 8 * 8 * 3, dtype=np.float32).reshape(8, 8, 3)
+    write_picture(tmp_path / "a.exr", picture)
+    back = decode_exr((tmp_path / "a.exr").read_bytes())
+    np.testing.assert_array_equal(back, picture.astype(np.float16).astype(np.float32))
+    write_picture(tmp_path / "a.PNG", picture)
+    shown = np.asarray(Image.open(tmp_path / "a.PNG"))
+    np.testing.assert_array_equal(shown, preview_srgb8(picture))
+    with pytest.raises(TrilightError, match=r"a\.jpg: .*expected \.exr or \.png"):
+        write_picture(tmp_path / "a.jpg", picture)

@@ -10,9 +10,13 @@ from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, percent
 from infra.bench.experiments.frontier import adaptive
 from infra.bench.workloads.cycles import render_with_cycles
-from infra.bench.workloads.judged_pictures import difference_db, shrink_reference
 from infra.bench.workloads.named_scenes import SKIES, given_scenes, mapped_scene, object_alone
-from infra.bench.workloads.traced_pictures import render_shot, render_shots
+from infra.bench.workloads.traced_pictures import (
+    difference_db,
+    render_shot,
+    render_shots,
+    shrink_reference,
+)
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera, raw_reference, true_error_db
 from pipeline.presets.training import object_views
@@ -170,31 +174,26 @@ EXPERIMENT = Experiment(
     about="Raw samples of ours and a denoised picture against raw samples of Cycles, of sampled "
     "scenes, of scenes with procedural surfaces, of scenes below skies, of objects alone, and "
     "of those in `--scenes`; the first run installs Blender (GPL-3, 380 MB) in an environment.",
-    cost=Column(name="core-seconds of Cycles", figure="core_s"),
-    error=Column(name="agreement without noise, linear dB", figure="noiseless_db"),
+    cost=Column("core-seconds of Cycles", "core_s"),
+    error=Column("agreement without noise, linear dB", "noiseless_db"),
     better="higher",
     columns=(
-        Column(name="by pixel, linear dB", figure="pixels_db"),
-        Column(name="at least, dB", figure="pixels_db", over="least"),
-        Column(name="Cycles with itself, dB", figure="seeds_db"),
-        Column(name="over the aim, least dB", figure="margin_db", over="least"),
-        Column(name="means of 8 x 8, dB", figure="blocks_db"),
-        Column(name="ours brighter by, median %", figure="brightness"),
-        Column(name="at most, %", figure="brightness", over="most"),
-        Column(name="at least, %", figure="brightness", over="least"),
-        Column(name="stated psnr_log_db", figure="stated_db"),
-        Column(name="to our samples, dB", figure="to_ours_db"),
-        Column(name="to Cycles' samples, dB", figure="to_theirs_db"),
-        Column(name="objects: core-seconds of ours a view", figure="our_core_s"),
-        Column(name="objects: stated over them, dB", figure="stated_objects_db"),
-        Column(name="objects: true error of ours, dB", figure="ours_db"),
-        Column(
-            name="objects: views over 1 dB worse than stated, %",
-            figure="missed",
-            over="mean",
-            then=percent,
-        ),
-        Column(name="objects: that of Cycles denoised, dB", figure="theirs_db"),
+        Column("by pixel, linear dB", "pixels_db"),
+        Column("at least, dB", "pixels_db", over="least"),
+        Column("Cycles with itself, dB", "seeds_db"),
+        Column("over the aim, least dB", "margin_db", over="least"),
+        Column("means of 8 x 8, dB", "blocks_db"),
+        Column("ours brighter by, median %", "brightness"),
+        Column("at most, %", "brightness", over="most"),
+        Column("at least, %", "brightness", over="least"),
+        Column("stated psnr_log_db", "stated_db"),
+        Column("to our samples, dB", "to_ours_db"),
+        Column("to Cycles' samples, dB", "to_theirs_db"),
+        Column("objects: core-seconds of ours a view", "our_core_s"),
+        Column("objects: stated over them, dB", "stated_objects_db"),
+        Column("objects: true error of ours, dB", "ours_db"),
+        Column("objects: views over 1 dB worse than stated, %", "missed", "mean", percent),
+        Column("objects: that of Cycles denoised, dB", "theirs_db"),
     ),
     because="A sky a quarter turn off, a mirrored texture or colors decoded twice would each cost "
     "ten decibels and more. Where a picture is as far from Cycles' samples as from our own, its "

@@ -23,13 +23,14 @@ from infra.bench.experiment import (
     Point,
     percent,
 )
-from infra.bench.workloads.judged_pictures import (
+from infra.bench.workloads.named_scenes import given_scenes
+from infra.bench.workloads.traced_pictures import (
     figures,
     load_or_render_reference,
+    render_levels,
+    render_shot,
     shrink_reference,
 )
-from infra.bench.workloads.named_scenes import given_scenes
-from infra.bench.workloads.traced_pictures import render_levels, render_shot
 from infra.bench_options import BenchOptions
 from infra.render.methods import SAMPLE_SEED
 from infra.render.raw_references import (
@@ -247,7 +248,7 @@ _STATED: tuple[tuple[str, str, Over, Callable[[float], float] | None], ...] = (
 )
 
 _WRONG = tuple(
-    Column(name=f"{metric}: {words}", figure=f"{name}_{figure}", over=over, then=then)
+    Column(f"{metric}: {words}", f"{name}_{figure}", over=over, then=then)
     for name, metric in (("log", "log"), ("linear", "linear"), ("object", "objects"))
     for words, figure, over, then in (_STATED if name == "log" else _STATED[:1])
 )
@@ -257,22 +258,22 @@ EXPERIMENT = Experiment(
     title="Cost at equal error compared with plain Mitsuba, and stated errors",
     about="Our stated errors and Mitsuba's `path` integrator, raw or with one OIDN and our guide "
     "pictures, whichever is better, scene by scene, held against raw samples in two halves.",
-    cost=Column(name="core-seconds a view", figure="core_s", over="mean"),
-    error=Column(name="psnr_log_db, dB", figure="db"),
+    cost=Column("core-seconds a view", "core_s", over="mean"),
+    error=Column("psnr_log_db, dB", "db"),
     better="higher",
     columns=(
-        Column(name="samples", figure="spp", over="mean"),
-        Column(name="5th percentile, dB", figure="db", over="p5"),
-        Column(name="linear, dB", figure="linear_true_db"),
-        Column(name="Mitsuba's cost at equal error, times", figure="times"),
-        Column(name="least times", figure="times", over="least"),
-        *(Column(name=f"{sampler}, times", figure=f"times_{sampler}") for sampler in PLAIN),
-        Column(name="lower bounds, %", figure="at_least", over="mean", then=percent),
-        Column(name="upper bounds, %", figure="at_most", over="mean", then=percent),
-        Column(name="one pixel decides, %", figure="single_pixel", over="mean", then=percent),
+        Column("samples", "spp", over="mean"),
+        Column("5th percentile, dB", "db", over="p5"),
+        Column("linear, dB", "linear_true_db"),
+        Column("Mitsuba's cost at equal error, times", "times"),
+        Column("least times", "times", over="least"),
+        *(Column(f"{sampler}, times", f"times_{sampler}") for sampler in PLAIN),
+        Column("lower bounds, %", "at_least", over="mean", then=percent),
+        Column("upper bounds, %", "at_most", over="mean", then=percent),
+        Column("one pixel decides, %", "single_pixel", over="mean", then=percent),
         *_WRONG,
-        Column(name="hit the sample limit, %", figure="at_cap", over="mean", then=percent),
-        Column(name="what the reference leaves open, median dB", figure="log_open_db"),
+        Column("hit the sample limit, %", "at_cap", over="mean", then=percent),
+        Column("what the reference leaves open, median dB", "log_open_db"),
     ),
     because="Mitsuba's cost at equal error is the median over the scenes of its core-seconds, "
     "interpolated between its numbers of samples, divided by ours; the better of its samplers "

@@ -103,7 +103,7 @@ def _copy(kind: str, context: BenchContext, device: "torch.device") -> Figures:
 def _picture(
     network: str, precision: str, context: BenchContext, device: "torch.device"
 ) -> Figures:
-    from infra.bench.gpu.twin import twin_figures
+    from infra.bench.gpu.steps import twin_figures
 
     return twin_figures(network, precision, device)
 
@@ -111,13 +111,9 @@ def _picture(
 def _step(run: str, context: BenchContext, device: "torch.device") -> Figures:
     from infra.bench.gpu.steps import step_figures
 
-    figures, parts = step_figures(run, _STEPS[context.scale.name], device)
+    figures = step_figures(run, _STEPS[context.scale.name], device)
     if not figures:
         context.note(f"{run}: too little memory, even for one scene a pass")
-    total = sum(parts.values()) or 1.0
-    words = [f"{name} {100 * ms / total:.0f} %" for name, ms in list(parts.items())[:3]]
-    if words:
-        context.note(f"{run}: {', '.join(words)} of a step")
     return figures
 
 
@@ -147,17 +143,17 @@ EXPERIMENT = Experiment(
     about="Large products and copies, pictures of the built-in networks against stored ones, "
     "steps of the training presets at their own sizes, rendering, and reading; without a GPU the "
     "same at toy sizes, which shows that it works.",
-    cost=Column(name="ms", figure="ms"),
+    cost=Column("ms", "ms"),
     columns=(
-        Column(name="TFLOP/s", figure="teraflop_per_s"),
-        Column(name="GB/s", figure="gigabyte_per_s"),
-        Column(name="to the stored picture, dB", figure="db"),
-        Column(name="views/s", figure="views_per_s"),
-        Column(name="scenes a pass", figure="scenes"),
-        Column(name="not compiled, ms", figure="plain_ms"),
-        Column(name="GiB", figure="peak_gib"),
-        Column(name="kernels", figure="kernels"),
-        Column(name="core-s", figure="core_s"),
+        Column("TFLOP/s", "teraflop_per_s"),
+        Column("GB/s", "gigabyte_per_s"),
+        Column("to the stored picture, dB", "db"),
+        Column("views/s", "views_per_s"),
+        Column("scenes a pass", "scenes"),
+        Column("not compiled, ms", "plain_ms"),
+        Column("GiB", "peak_gib"),
+        Column("kernels", "kernels"),
+        Column("core-s", "core_s"),
     ),
     because="Pictures below 40 dB of the stored ones are wrong: believe no time then. The file "
     "names no host, user or folder; to send it, attach it to an issue.",

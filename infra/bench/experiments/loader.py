@@ -77,12 +77,12 @@ EXPERIMENT = Experiment(
     title="Samples a second and bytes a sample",
     about="Whole samples of `smoke`, four views each, unpacked from our profiles and from the "
     "published HDF5 layout, and shards that become batches of 64 pixels by threads.",
-    cost=Column(name="ms a sample", figure="sample_ms"),
+    cost=Column("ms a sample", "sample_ms"),
     columns=(
-        Column(name="samples a second", figure="sample_ms", then=lambda ms: 1000 / ms),
-        Column(name="kB a sample", figure="bytes", then=lambda size: size / 1000),
-        Column(name="in memory, kB", figure="memory_bytes", then=lambda size: size / 1000),
-        Column(name="core-ms a sample", figure="core_ms"),
+        Column("samples a second", "sample_ms", then=lambda ms: 1000 / ms),
+        Column("kB a sample", "bytes", then=lambda size: size / 1000),
+        Column("in memory, kB", "memory_bytes", then=lambda size: size / 1000),
+        Column("core-ms a sample", "core_ms"),
     ),
     because="Unpacking is timed by the processor in memory, batches by the clock; HDF5 files are "
     "those of our exporter, read without any check.",

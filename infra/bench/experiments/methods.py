@@ -7,7 +7,7 @@ import numpy as np
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point
-from infra.bench.workloads.judged_pictures import load_or_render_reference
+from infra.bench.workloads.traced_pictures import load_or_render_reference
 from infra.bench_options import BenchOptions
 from infra.render.held_out_scenes import TRIANGLES, held_out_scene, held_out_settings
 from infra.render.methods import (
@@ -121,16 +121,16 @@ EXPERIMENT = Experiment(
     title="Methods to a picture: what is traced and what is learned",
     about=f"One view each of scenes of `{BENCHMARK}`, which no network was trained on, of at most "
     f"{TRIANGLES} triangles, at 64 and 256 pixels; one thread, everything warm.",
-    cost=Column(name="a scene's first view, core-s", figure="core_s"),
-    error=Column(name="psnr_log_db, dB", figure="db"),
+    cost=Column("a scene's first view, core-s", "core_s"),
+    error=Column("psnr_log_db, dB", "db"),
     better="higher",
     columns=(
-        Column(name="a further view, core-s", figure="view_s"),
-        Column(name="5th percentile, dB", figure="db", over="p5"),
-        Column(name="more than the first network, dB", figure="db", over="pair"),
-        Column(name="object, dB", figure="object_db"),
-        Column(name="linear, dB", figure="linear_db"),
-        Column(name="SSIM", figure="ssim"),
+        Column("a further view, core-s", "view_s"),
+        Column("5th percentile, dB", "db", over="p5"),
+        Column("more than the first network, dB", "db", over="pair"),
+        Column("object, dB", "object_db"),
+        Column("linear, dB", "linear_db"),
+        Column("SSIM", "ssim"),
     ),
     also_cost=("a further view, core-s",),
     because="Errors are to raw samples in two halves: neither their noise nor a denoiser is in "

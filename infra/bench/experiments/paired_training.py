@@ -98,15 +98,13 @@ EXPERIMENT = Experiment(
     title="Two trainings, side by side",
     about="A training preset with the changes of --set-a and with those of --set-b, from the same "
     "seeds, judged on scenes of the validation split of `--data`.",
-    cost=Column(name="seconds of a training", figure="seconds", over="mean"),
-    error=Column(
-        name="held-out log L1, thousandths", figure="log_l1", over="mean", then=lambda l1: 1000 * l1
-    ),
+    cost=Column("seconds of a training", "seconds", over="mean"),
+    error=Column("held-out log L1, thousandths", "log_l1", over="mean", then=lambda l1: 1000 * l1),
     columns=(
-        Column(name="a step, s", figure="step_s", over="mean"),
-        Column(name="psnr_log_db, dB", figure="db", over="mean"),
-        Column(name="more error than a, %", figure="percent", over="pair"),
-        Column(name="more than a, dB", figure="db", over="pair"),
+        Column("a step, s", "step_s", over="mean"),
+        Column("psnr_log_db, dB", "db", over="mean"),
+        Column("more error than a, %", "percent", over="pair"),
+        Column("more than a, dB", "db", over="pair"),
     ),
     because="Differences are of pairs of one seed and scene, with the 95 % interval of their mean, "
     "bootstrapped over scenes: it says nothing of other seeds where there are few.",

@@ -1,7 +1,11 @@
-"""Throughput of a device, and the steps of a training preset with their time by part.
+"""Throughput of a device, pictures by the built-in networks, and the steps of a training preset.
+
+Pictures are compared with stored ones of a processor, which finds a GPU with wrong results before
+any time is trusted. The stored ones belong to certain weights, named by their digest: after another
+training of a built-in network, `python -m infra.bench.gpu.steps` renders them again.
 
 Batches are synthetic, since the content does not change the time. Where memory is too small, a step
-has fewer scenes. Times of parts are from PyTorch's profiler.
+has fewer scenes. `trilight train --profile` says where the time of a step goes.
 """
 
 import dataclasses
@@ -9,22 +13,27 @@ import gc
 import math
 import statistics
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from numpy.typing import NDArray
 
-from infra.bench.workloads.cost_scene import cost_scene
+from infra.bench.workloads.named_scenes import cost_scene
 from model.config import ModelConfig, hits_smoke, smoke, tiny
 from model.costs import Workload, training_flops
+from model.inference import NeuralRenderer
+from model.open import BUILTIN_NETWORKS
 from model.precision import fast_float32_products
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from pipeline.renders.mitsuba_variant import query_gpus
-from storage.conventions import look_at_c2w
+from storage.conventions import log10_radiance, look_at_c2w, radiance_from_log10
+from storage.digests import sha256_hex
+from storage.errors import TrilightError
+from storage.installation import module_name
+from storage.metrics import psnr_log_db
 from train.data.buckets import TrainingBatch
 from train.loop.distributed import DistributedContext
 from train.loop.step import Stepper
@@ -34,12 +43,78 @@ from train.loss.training_loss import TrainingLoss
 from train.presets import training_preset
 from train.settings import TrainSettings
 
-if TYPE_CHECKING:
-    from model.config import ModelConfig
+NETWORKS = ("builtin:tokens", "builtin:hits")
+STORED = Path(__file__).with_name("twin.npz")
+"""float16 log10(1 + radiance) [64, 64, 3] by network, and the digest of its weights."""
+TRIANGLES = 400
+LIGHTS = 4
+PX = 64
+MORE_VIEWS = 5
 
-MARK = "trilight: "
-"""Prefix of the names of parts in a trace."""
-REST = "backward and rest"
+
+def twin_figures(network: str, precision: str, device: torch.device) -> dict[str, float]:
+    """Return psnr_log_db of a network's picture to the stored one, and milliseconds of a view.
+
+    Raises:
+        TrilightError: the stored picture belongs to other weights than the built-in network's.
+    """
+    twin = stored_twin(network)
+    picture, seconds = _render(network, device, precision)
+    return {"ms": 1e3 * seconds, "db": psnr_log_db(picture, twin)}
+
+
+def stored_twin(network: str) -> NDArray[np.float64]:
+    """Return the stored picture [64, 64, 3] of a network, linear radiance.
+
+    Raises:
+        TrilightError: the picture belongs to other weights.
+    """
+    with np.load(STORED, allow_pickle=False) as stored:
+        digest = str(stored[f"{network} sha256"])
+        picture = stored[network]
+    if digest != (now := _digest(network)):
+        raise TrilightError(
+            f"bench gpu: the stored picture of {network} is by weights of sha256 {digest[:8]}, "
+            f"and {now[:8]} is what this Trilight has; make it again: python -m "
+            f"{module_name('infra.bench.gpu.steps')}."
+        )
+    return radiance_from_log10(picture.astype(np.float64))
+
+
+def _digest(network: str) -> str:
+    return sha256_hex(BUILTIN_NETWORKS[network].read_bytes())
+
+
+def _render(
+    network: str, device: torch.device, precision: str
+) -> tuple[NDArray[np.float64], float]:
+    """Return the first view of the scene, and the seconds of one more after the warm-up."""
+    renderer = NeuralRenderer.load(network, device=str(device), precision=precision)
+    scene = cost_scene(TRIANGLES, LIGHTS)
+    prepared = renderer.prepare(scene)
+    pose = scene.c2w[0]
+    fov = float(scene.fov_deg[0])
+    picture = renderer.view(prepared, pose, fov, PX)
+    times = time_calls(
+        lambda: renderer.view(prepared, pose, fov, PX), device, MORE_VIEWS, warm_up=0
+    )
+    return np.asarray(picture, np.float64), float(np.median(times))
+
+
+def store(path: Path = STORED) -> None:
+    """Render the scene by each network on the processor, and write the pictures."""
+    stored_values: dict[str, Any] = {}
+    for network in NETWORKS:
+        picture, _ = _render(network, torch.device("cpu"), "float32")
+        stored_values[network] = log10_radiance(picture).astype(np.float16)
+        stored_values[f"{network} sha256"] = _digest(network)
+    np.savez_compressed(path, **stored_values)
+
+
+if __name__ == "__main__":
+    store()
+
+
 SHRUNK_PX = 32
 SHRUNK_TRIANGLES = 64
 SHRUNK_SCENES = 2
@@ -61,57 +136,8 @@ VGG16_WIDTHS = (64, 128, 256, 512, 512)
 REPEATS = 5
 
 
-@contextmanager
-def marked_parts(model: nn.Module, objective: TrainingLoss, updater: Any) -> Iterator[None]:
-    """Mark the parts of a step in a trace; the optimizer is the call of `updater.step`."""
-    with ExitStack() as stack:
-        for name, module in _parts(model, objective):
-            stack.enter_context(_mark_calls(name, module))
-        step = updater.step
-
-        def marked_step(*args: Any) -> Any:
-            with torch.profiler.record_function(f"{MARK}optimiser"):
-                return step(*args)
-
-        updater.step = marked_step
-        stack.callback(vars(updater).pop, "step")
-        yield
-
-
-def _parts(model: Any, objective: TrainingLoss) -> Iterator[tuple[str, nn.Module]]:
-    if model.encoder is not None:
-        yield "encoder", model.encoder
-    for layer in model.decoder.layers:
-        yield "decoder layers", layer
-    yield "head", model.decoder.head
-    yield "loss", objective
-    for module in objective.modules():
-        if isinstance(module, Lpips):
-            yield "LPIPS", module
-
-
-@contextmanager
-def _mark_calls(name: str, module: Any) -> Iterator[None]:
-    """Mark every call of a module from outside, because hooks would be compiled with it."""
-    before = module._compiled_call_impl  # what a call of a compiled module calls
-    call = before or module._call_impl
-
-    def marked_call(*args: Any, **named: Any) -> Any:
-        with torch.profiler.record_function(MARK + name):
-            return call(*args, **named)
-
-    module._compiled_call_impl = marked_call
-    try:
-        yield
-    finally:
-        module._compiled_call_impl = before
-
-
-def profile_call(work: Callable[[], object], device: torch.device) -> tuple[int, dict[str, float]]:
-    """Return the number of kernels of a call, and its milliseconds by part.
-
-    On a processor operators are counted instead of kernels.
-    """
+def count_kernels(work: Callable[[], object], device: torch.device) -> int:
+    """Return the number of kernels of a call; on a processor, of its operators."""
     from torch.profiler import ProfilerActivity, profile
 
     on_gpu = device.type == "cuda"
@@ -120,43 +146,15 @@ def profile_call(work: Callable[[], object], device: torch.device) -> tuple[int,
         work()
         if on_gpu:
             torch.cuda.synchronize(device)
-    events = trace.events() or []
-    kernels_us = [_kernel_us(event) for event in events if _is_kernel(event, on_gpu=on_gpu)]
-    parts = Counter[str]()
-    for event in events:
-        if event.name.startswith(MARK) and not _is_on_gpu(event):
-            part = event.name.removeprefix(MARK)
-            parts[part] += event.device_time_total if on_gpu else event.cpu_time_total
-    return len(kernels_us), parts_ms(sum(kernels_us), parts)
-
-
-def parts_ms(total_us: float, parts: Mapping[str, float]) -> dict[str, float]:
-    """Return milliseconds by part, largest first, with the REST; LPIPS is part of the loss."""
-    microseconds = dict(parts)
-    if "LPIPS" in microseconds:
-        microseconds["loss"] -= microseconds["LPIPS"]
-    microseconds[REST] = max(total_us - sum(microseconds.values()), 0)
-    return {
-        name: microseconds[name] / 1e3
-        for name in sorted(microseconds, key=lambda name: -microseconds[name])
-    }
-
-
-def _is_on_gpu(event: Any) -> bool:
-    return str(event.device_type).endswith("CUDA")
+    return sum(_is_kernel(event, on_gpu=on_gpu) for event in trace.events() or [])
 
 
 def _is_kernel(event: Any, *, on_gpu: bool) -> bool:
-    if event.name.startswith(MARK) or getattr(event, "is_user_annotation", False):
+    if getattr(event, "is_user_annotation", False):
         return False
     if on_gpu:
-        return _is_on_gpu(event)
+        return str(event.device_type).endswith("CUDA")
     return event.name.startswith("aten::") and event.self_cpu_time_total > 0
-
-
-def _kernel_us(event: Any) -> float:
-    on_gpu = _is_on_gpu(event)
-    return float(event.self_device_time_total if on_gpu else event.self_cpu_time_total)
 
 
 def step_settings(run: str, device: torch.device) -> TrainSettings:
@@ -181,10 +179,8 @@ def _small(model: ModelConfig) -> ModelConfig:
     return tiny() if model.head == "dpt" else smoke()
 
 
-def step_figures(
-    run: str, steps: int, device: torch.device
-) -> tuple[dict[str, float], Mapping[str, float]]:
-    """Return figures of a step of one pass, and its milliseconds by part of the network.
+def step_figures(run: str, steps: int, device: torch.device) -> dict[str, float]:
+    """Return figures of a step of one pass.
 
     A pass has as many scenes as in the preset, or as fit into memory. A preset that fails has no
     `ms`, so that the others are still measured.
@@ -193,19 +189,17 @@ def step_figures(
     scenes = min(settings.scenes_per_pass, settings.scenes_per_step)
     while scenes:
         try:
-            figures, parts = _measure_steps(settings, scenes, steps, device)
+            figures = _measure_steps(settings, scenes, steps, device)
             if device.type == "cuda" and settings.compile == "auto":
                 _free_memory(device)
-                plain, _ = _measure_steps(
-                    dataclasses.replace(settings, compile="no"), scenes, steps, device
-                )
-                figures["plain_ms"] = plain["ms"]
-            return figures, parts
+                plain = dataclasses.replace(settings, compile="no")
+                figures["plain_ms"] = _measure_steps(plain, scenes, steps, device)["ms"]
+            return figures
         except torch.OutOfMemoryError:
             scenes //= 2
         finally:
             _free_memory(device)
-    return {}, {}
+    return {}
 
 
 def _free_memory(device: torch.device) -> None:
@@ -216,7 +210,7 @@ def _free_memory(device: torch.device) -> None:
 
 def _measure_steps(
     settings: TrainSettings, scenes: int, steps: int, device: torch.device
-) -> tuple[dict[str, float], Mapping[str, float]]:
+) -> dict[str, float]:
     state = new_state(settings, device)
     lpips = drawn_lpips(settings) if device.type == "cuda" else drawn_lpips(settings, THIN)
     objective = TrainingLoss(settings.loss, lpips).to(device)
@@ -242,9 +236,7 @@ def _measure_steps(
     }
     if device.type == "cuda":
         figures["peak_gib"] = torch.cuda.max_memory_allocated(device) / 2**30
-    with marked_parts(state.model, objective, state.updater):
-        kernels, parts = profile_call(step, device)
-    return {**figures, "kernels": float(kernels)}, parts
+    return {**figures, "kernels": float(count_kernels(step, device))}
 
 
 def workloads(settings: TrainSettings, scenes: int) -> list[Workload]:
@@ -301,7 +293,7 @@ def drawn_batch(settings: TrainSettings, scenes: int) -> TrainingBatch:
     )
 
 
-def _prepare(tensors: SceneTensors, model: "ModelConfig", px: int) -> SceneTensors:
+def _prepare(tensors: SceneTensors, model: ModelConfig, px: int) -> SceneTensors:
     """Return a scene with the inputs of its network, as the stream does."""
     if not model.hit_rays:
         return tensors

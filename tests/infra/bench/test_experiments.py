@@ -16,18 +16,16 @@ from infra.bench.experiments import methods
 from infra.bench.experiments.calibration import LOOKS
 from infra.bench.experiments.cycles import agreement_figures
 from infra.bench.experiments.frontier import cost_at_error
+from infra.bench.experiments.growth import WORK, measure_work, session_bytes, sizes_of
 from infra.bench.experiments.loader import read_figures
 from infra.bench.experiments.meshes import BUDGET_GROUP, CURVE, METHOD_GROUP
 from infra.bench.experiments.paired_training import SIDE_A, SIDE_B, scene_of, settings_of
 from infra.bench.gpu import steps
-from infra.bench.gpu.steps import REST, parts_ms, step_figures, step_settings
-from infra.bench.gpu.twin import NETWORKS, twin_figures
+from infra.bench.gpu.steps import NETWORKS, step_figures, step_settings, twin_figures
 from infra.bench.workloads import cycles as environment
-from infra.bench.workloads import sized_work
 from infra.bench.workloads.cycles import installed_python
-from infra.bench.workloads.judged_pictures import load_or_render_reference
 from infra.bench.workloads.reading import LAYOUTS, unpacking_figures, write_copies
-from infra.bench.workloads.sized_work import WORK, measure_work, session_bytes, sizes_of
+from infra.bench.workloads.traced_pictures import load_or_render_reference
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import RawReference, first_camera
 from pipeline.isolation import IsolatedChild
@@ -125,11 +123,6 @@ def test_every_preset_has_its_own_size_on_a_gpu_and_a_small_one_here() -> None:
             assert (small.loss, small.precision) == (settings.loss, settings.precision)
 
 
-def test_lpips_is_no_part_of_the_loss_in_the_sum() -> None:
-    found = parts_ms(120.0, {"loss": 50.0, "LPIPS": 30.0})
-    assert found == {REST: 0.07, "LPIPS": 0.03, "loss": 0.02}
-
-
 def test_too_little_memory_has_no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
@@ -138,7 +131,7 @@ def test_too_little_memory_has_no_figures(monkeypatch: pytest.MonkeyPatch) -> No
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(steps, "drawn_batch", drawn)
-    assert step_figures("smoke", 1, CPU) == ({}, {})
+    assert step_figures("smoke", 1, CPU) == {}
     assert asked[-1] == 1, "fewer scenes were tried, down to one"
 
 
@@ -151,12 +144,11 @@ def test_a_built_in_network_shows_its_stored_picture_here() -> None:
 
 
 @pytest.mark.slow("benchmarks")
-def test_steps_are_timed_with_their_parts() -> None:
+def test_steps_are_timed() -> None:
     for run in ("smoke", "finetune", "hits"):
         with case(run):
-            figures, parts = step_figures(run, 1, CPU)
+            figures = step_figures(run, 1, CPU)
             assert figures["ms"] > 0 and figures["kernels"] > 100
-            assert {"loss", "optimiser", REST} <= set(parts)
 
 
 def test_sizes_grow_fourfold_up_to_the_most() -> None:
@@ -191,7 +183,7 @@ def test_every_kind_of_work_is_done_at_its_smallest_size(
     sample.mkdir()
     for name, data in encode_sample(toy_sample(0, resolution=32), "compact").items():
         (sample / name).write_bytes(data)
-    for row, (name, work) in enumerate(sized_work.WORK.items()):
+    for row, (name, work) in enumerate(WORK.items()):
         with case(name):
             folder = tmp_path / str(row)
             folder.mkdir()

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from infra.render.budget import Priced, choose, choose_reaching, choose_within, price_all
 from infra.render.machine_costs import PROBED_PX, PROBES, PartSeconds, costs_of
 from infra.render.preview_table import (
     MEASURE,
@@ -23,10 +22,15 @@ from infra.render.preview_table import (
     PictureCosts,
     PreviewError,
     PreviewTable,
+    Priced,
+    choose,
+    choose_reaching,
+    choose_within,
     keep_machine_costs,
     known_costs,
     machine_costs_path,
     machine_name,
+    price_all,
     shipped_table,
 )
 from infra.render.quality import FixedSamples, TimeBudget

@@ -23,7 +23,7 @@ from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
 from storage.renderer import Camera, Image, ReadyScene
 from tests.for_each import case
-from tests.infra.render.test_plan import HereReader
+from tests.infra.render.test_methods import HereReader
 from tests.scenes_by_hand import tiny_scene
 
 

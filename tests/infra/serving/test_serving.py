@@ -20,10 +20,18 @@ from typing import Any, cast
 import pytest
 from prefect.exceptions import ParameterTypeError
 
-from infra.serving import access, local
-from infra.serving.access import grant, next_command, revoke, settings_file, state_folder
+from infra.serving import local
 from infra.serving.deployments import limits
-from infra.serving.local import running, start, stop
+from infra.serving.local import (
+    grant,
+    next_command,
+    revoke,
+    running,
+    settings_file,
+    start,
+    state_folder,
+    stop,
+)
 from infra.serving.train_model import RunChanges, TrainOptions, train_model, train_options
 from pipeline.flows import prefect_server
 from pipeline.flows.prefect_server import (
@@ -194,7 +202,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
     (tmp_path / "checkout").mkdir()
-    monkeypatch.setattr(access, "LINK", tmp_path / "checkout" / "prefect.toml")
+    monkeypatch.setattr(local, "LINK", tmp_path / "checkout" / "prefect.toml")
     return tmp_path / "checkout"
 
 

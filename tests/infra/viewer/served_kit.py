@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
-from infra.viewer.deferred_handlers import DeferredHandlers, PageHandlers
+from infra.viewer.open_source import DeferredHandlers, PageHandlers
 from infra.viewer.server import PageServer
 
 
@@ -42,7 +42,7 @@ def served(room: PageHandlers, page: str = "scene.html") -> Iterator[Asker]:
     """Serve a room for the block."""
     later = DeferredHandlers(page)
     later.opened.set_result(room)
-    server = PageServer(later.gets, later.posts)
+    server = PageServer(later.routes)
     thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)
     thread.start()
     try:

@@ -21,9 +21,8 @@ from infra.viewer.page_renderers import (
     samples_on_page,
 )
 from infra.viewer.picture_options import PictureOptions, apply_edits, parse_picture_options
-from infra.viewer.render_queue import RenderJob, RenderQueue, agreement_db
 from infra.viewer.scene_bytes import scene_bytes, sky_bytes, texture_png
-from infra.viewer.scene_handlers import SceneHandlers
+from infra.viewer.scene_handlers import RenderJob, RenderQueue, SceneHandlers, agreement_db
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from infra.bench.workloads.cost_scene import cost_scene
+from infra.bench.workloads.named_scenes import cost_scene
 from pipeline.exchange import formats
 from pipeline.exchange.convert import convert_scene, write_scene
 from pipeline.exchange.formats import list_lost_members

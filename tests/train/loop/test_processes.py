@@ -19,7 +19,7 @@ from model.checkpoint_format import saved_steps
 from storage.dataset.dataset import Dataset
 from storage.seeds import rng_for
 from tests.conftest import ROOT
-from tests.infra.slurm.fake_slurm import commands_in
+from tests.infra.slurm.test_jobs import commands_in
 from tests.train.toy import write_toy_dataset
 from train.monitoring.rows import read_rows
 
