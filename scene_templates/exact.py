@@ -41,7 +41,11 @@ def smoothstep(share: ArrayLike) -> Numbers:
 
 
 def ramp(distance_px: ArrayLike) -> Numbers:
-    """Return how much of a texel is inside an edge, by how far inside its centre is, in texels."""
+    """Return how much of a texel is inside an edge, from the distance of its centre to the edge.
+
+    Args:
+        distance_px: in texels, positive inside.
+    """
     return np.clip(np.asarray(distance_px, np.float64) + 0.5, 0, 1)
 
 

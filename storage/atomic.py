@@ -22,9 +22,14 @@ def atomic_writer(path: Path, *, replace: bool = True) -> Iterator[BinaryIO]:
 
     A process that is killed inside the block leaves at most a `.part` file, which
     `remove_leftovers` clears away. Two writers of the same name do no harm, on one machine or on
-    two: each has a temporary name of its own. With `replace` the last one wins; otherwise the
-    first, and the others' bytes are dropped. It raises TrilightError where the disk is full (an
-    EnvironmentFailure), or the place cannot be written.
+    two: each has a temporary name of its own.
+
+    Args:
+        path: the final name.
+        replace: the last writer wins; otherwise the first, and the others' bytes are dropped.
+
+    Raises:
+        TrilightError: the disk is full (an EnvironmentFailure), or the place cannot be written.
     """
     unique_suffix = (
         f"{os.getpid()}-{os.urandom(4).hex()}"  # containers give all their processes number 1

@@ -96,8 +96,14 @@ def camera_rays(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the rays through the pixel centres of one camera, in world space.
 
-    The camera has a pose [4, 4] and a square picture, of which all rows are meant by default. The
-    rays are an origin [3] and unit directions [rows, resolution, 3] (row 0 on top), float64.
+    Args:
+        c2w: [4, 4].
+        fov_deg: full field of view in degrees.
+        resolution: width and height in pixels.
+        rows: of the picture; all by default.
+
+    Returns:
+        origin [3] and unit directions [rows, resolution, 3] (row 0 on top), float64.
     """
     pose = np.asarray(c2w, np.float64)
     offset = np.arange(resolution) + 0.5 - 0.5 * resolution
@@ -118,7 +124,13 @@ def in_camera(positions: ArrayLike, c2w: ArrayLike) -> NDArray[np.float64]:
 def pixel_places(
     positions: ArrayLike, c2w: ArrayLike, fov_deg: float, resolution: int
 ) -> NDArray[np.float64]:
-    """Return where a camera's picture shows world positions [..., 3]: the inverse of `camera_rays`.
+    """Return where a camera's picture shows world positions: the inverse of `camera_rays`.
+
+    Args:
+        positions: [..., 3] in metres.
+        c2w: [4, 4].
+        fov_deg: full field of view in degrees.
+        resolution: width and height in pixels.
 
     Places are x from the left and y from the top [..., 2] in pixels, float64; the centre of pixel
     (i, j) is (j + 0.5, i + 0.5). They may lie outside the picture; what is not before the camera
@@ -134,9 +146,12 @@ def pixel_places(
 def latlong_uv(directions: ArrayLike) -> NDArray[np.float64]:
     """Return where an environment map holds directions: the inverse of `latlong_direction`.
 
-    Directions [..., 3] are in the axes of the map, of any length but 0. The result is u and v [...,
-    2] in [0, 1], float64; v is up, as everywhere: 1 at +Z, in the top row. At the poles u is 0.5,
-    or what rounding makes of it.
+    Args:
+        directions: [..., 3] in the axes of the map, of any length but 0.
+
+    Returns:
+        u and v [..., 2] in [0, 1], float64; v is up, as everywhere: 1 at +Z, in the top row. At
+        the poles u is 0.5, or what rounding makes of it.
     """
     x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
     u = 0.5 - np.arctan2(y, x) / (2 * np.pi)

@@ -75,9 +75,13 @@ def denoise(
 ) -> NDArray[np.float32]:
     """Return the picture without noise, exactly black where no ray hit anything.
 
-    The picture and its features are [R, R, 3] each, the features free of noise themselves. Radiance
-    is finite and at least 0: other values vanish in the filter without a trace. Threads and device
-    are by default what `set_denoiser_threads` and `set_denoiser_device` say.
+    Args:
+        radiance_rgb: [R, R, 3] finite and at least 0. Values that are not finite vanish in the
+            filter without a trace: look for them before.
+        features: albedo and normal, [R, R, 3] each, free of noise themselves.
+        quality: of the network.
+        threads: of the processor; None is what `set_denoiser_threads` says.
+        device: of the filter; None is what `set_denoiser_device` says.
     """
     if not radiance_rgb.any():
         return np.zeros_like(radiance_rgb)  # the filter would paint the albedo, up to 0.003 bright

@@ -55,9 +55,13 @@ _loading: list[Extension] = []
 def load_extension(file: str | Path, *, sha256: str | None = None) -> Extension:
     """Load a file, once in this process, and name it to the processes that start from here.
 
-    `sha256` is what its bytes must be, where another process has loaded it before. It raises
-    TrilightError where there is no such file, it is not Python or raises something, it registers a
-    name that is taken, another one has its name, or it is not what was loaded before.
+    Args:
+        file: its path.
+        sha256: what its bytes must be, where another process has loaded it before.
+
+    Raises:
+        TrilightError: there is no such file, it is not Python or raises something, it registers a
+            name that is taken, another one has its name, or it is not what was loaded before.
     """
     path = Path(os.path.abspath(os.path.expanduser(file)))
     known = _loaded.get(path.name)

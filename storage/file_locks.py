@@ -72,8 +72,12 @@ def open_lock(path: Path) -> int:
 def take_lock(descriptor: int, *, shared: bool = False, wait: bool = False) -> bool:
     """Take the lock of an open file; return whether it is ours.
 
-    A file system that carries no locks grants every lock; the first time is a warning. A shared
-    lock is held together with other shared ones. With `wait`, it always becomes ours.
+    A file system that carries no locks grants every lock; the first time is a warning.
+
+    Args:
+        descriptor: of the file.
+        shared: together with other shared locks; otherwise it excludes every other lock.
+        wait: until it is free, so that it always becomes ours.
     """
     operation = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     try:

@@ -6,9 +6,13 @@ import numpy as np
 
 
 def mean_interval(figures: Sequence[float], clusters: Sequence[str]) -> tuple[float, float]:
-    """Return the 95 % interval of a mean whose figures are alike within clusters, given by name.
+    """Return the 95 % interval of a mean whose figures are alike within clusters.
 
     It is bootstrapped over whole clusters (2000 times, of a fixed seed).
+
+    Args:
+        figures: one for each turn.
+        clusters: the name of each turn's cluster.
     """
     names = sorted(set(clusters))
     rows = np.array([names.index(name) for name in clusters])

@@ -39,9 +39,14 @@ def psnr_linear_db(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def object_psnr_log_db(a: ArrayLike, b: ArrayLike, hits: NDArray[np.bool_]) -> float:
-    """Return psnr_log_db of [R, R, 3] over the pixels [R, R] whose camera ray hits geometry.
+    """Return psnr_log_db over the pixels whose camera ray hits geometry.
 
     Empty background earns nothing here. A picture without any hit scores MAX_DB.
+
+    Args:
+        a: [R, R, 3] linear radiance.
+        b: the same shape.
+        hits: [R, R] whether the pixel's ray hits geometry.
     """
     return _db(_squared_log_error(a, b)[hits])
 

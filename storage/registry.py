@@ -30,11 +30,15 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         decides: tuple[Decided, ...] = (),
         aliases: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        """Begin a table of our own entries, of which one is called `what` in messages.
+        """Begin a table.
 
-        Every entry is a `kind`, as isinstance takes it. Extensions that add to a table that decides
-        nothing are not recorded: they change how something is done, not what it means. Aliases are
-        further names of our own entries; no list shows them.
+        Args:
+            what: one entry is called in messages, such as `template`.
+            kind: type of every entry, as isinstance takes it.
+            entries: our own.
+            decides: what depends on its entries. Extensions that add to a table that decides
+                nothing are not recorded: they change how something is done, not what it means.
+            aliases: further names of our own entries; no list shows them.
         """
         self.what = what
         self._kind = kind

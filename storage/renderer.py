@@ -123,7 +123,11 @@ class Renderer(Protocol):
         """Everything but scene and camera that decides a picture, as JSON values."""
 
     def load(self, scene: Scene, name: str) -> ReadyScene:
-        """Load a scene that passes `Scene.check`, which messages call `name`.
+        """Load a scene, which messages call `name`.
+
+        Args:
+            scene: a scene that passes `Scene.check`.
+            name: name of the scene.
 
         It raises Unrenderable where the scene cannot be rendered, and TrilightError where the
         renderer is unusable, or cannot make pictures of its width.

@@ -59,10 +59,16 @@ ShortText = Annotated[str, Spelled(".{0,1000}", "a text of at most 1000 characte
 
 
 def read_json(data: bytes | str, kind: type[T], source: str) -> T:
-    """Return the value of a JSON text, checked strictly; bytes are UTF-8.
+    """Return the value of a JSON text, checked strictly.
 
-    It raises TrilightError for other JSON than the type says; this names `source`, such as the path
-    of the file, the field, the value and what was expected.
+    Args:
+        data: the text; bytes are UTF-8.
+        kind: its type.
+        source: begins the complaint, such as the path of the file.
+
+    Raises:
+        TrilightError: other JSON than the type says; names source, field, value and what was
+            expected.
     """
     from storage.settings.described import parse_strictly  # pydantic takes time to import
 

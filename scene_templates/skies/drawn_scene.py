@@ -45,10 +45,14 @@ def scene_sky(
 ) -> SceneSky | None:
     """Return the sky of a scene, or None where it has none.
 
-    The emitting triangles are [N, 3, 3] corners around the middle of the room, of radiance [N, 3];
-    if there are none, the drawn strength is the mean radiance of the sky. The attempt of the key
-    decides which sky, not whether there is one. The licences are those of what is in the scene
-    already.
+    Args:
+        settings: the ranges to draw from.
+        emitters: [N, 3, 3] corners of the emitting triangles, around the middle of the room; if
+            there are none, the drawn strength is the mean radiance of the sky.
+        radiance_rgb: [N, 3] their radiance.
+        scene_key: its attempt decides which sky, not whether there is one.
+        user_skies: the user's own maps.
+        licences: of what is in the scene already.
     """
     if not settings.share:
         return None

@@ -188,10 +188,13 @@ class Dataset:
         num_listed: int | None = None,
         noted: Sequence[Failure] = (),
     ) -> None:
-        """Name what is read, with every shard that may be read in the manifest.
+        """Name what is read.
 
-        Of these the manifest on the disk lists `num_listed`, all by default; `noted` is what was
-        rejected on the way to the others.
+        Args:
+            files: where it is.
+            manifest: what it is, with every shard that may be read.
+            num_listed: how many of the shards the manifest on the disk lists; all by default.
+            noted: what was rejected on the way to the others.
         """
         self.files = files
         self.manifest = manifest

@@ -162,7 +162,11 @@ def index_shard(path: Path) -> ShardEntry:
 
 
 def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
-    """Return the manifest entry of an open shard; raises TrilightError where it is not whole."""
+    """Return the manifest entry of an open shard.
+
+    Raises:
+        TrilightError: the name is not a shard's, or the file is not a whole shard.
+    """
     match = SHARD_NAME.fullmatch(name)
     if match is None:
         raise TrilightError(f"{name}: not a shard; expected a name like train-000003.tar.")
@@ -215,7 +219,8 @@ def shard_row(shard: ShardEntry) -> dict[str, Any]:
 def read_manifest(path: Path) -> Manifest:
     """Return the manifest of a file, as far as it is listed.
 
-    It raises TrilightError where it is missing, no JSON, or of another schema version or form.
+    Raises:
+        TrilightError: missing, not JSON, another schema version, or a shard name that is none.
     """
     return _read(path, decode_manifest)
 

@@ -232,10 +232,13 @@ def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
 def missing_shards(url: str, num_scenes: int = 0) -> list[int]:
     """Return the indices of the shards that a dataset of any folder or URL lacks.
 
-    Of more scenes than were planned so far, also what those need. Where all are there and the
-    dataset is still not finished, its first shard counts as missing: the worker that makes it
-    finishes the dataset. It raises TrilightError without a readable manifest, or for a URL that is
-    refused.
+    Of more scenes than were planned so far, also what those need.
+
+    Where all are there and the dataset is still not finished, its first shard counts as missing:
+    the worker that makes it finishes the dataset.
+
+    Raises:
+        TrilightError: there is no readable manifest, or the URL is refused.
     """
     dataset = open_listed(url)
     manifest = dataset.manifest

@@ -119,8 +119,10 @@ def fetch_notes(
 ) -> list[ShardNote]:
     """Return notes that are on a server, by the names of their files, many at a time.
 
-    `read` returns a file of the dataset by its relative name, and is called in threads. It raises
-    TrilightError where one of them is no note, or as `read`.
+    `read` returns a file of the dataset by its relative name, and is called in threads.
+
+    Raises:
+        TrilightError: one of them is no note, or as `read`.
     """
 
     def fetch_note(name: str) -> ShardNote:

@@ -74,11 +74,15 @@ class TrainingData:
 
 
 def open_training_data(data: Sequence[str]) -> TrainingData:
-    """Open what `--data` names: one root of a dataset, or any number of shards that end in `.tar`.
+    """Open what `--data` names.
 
-    Shards are paths, URLs and brace patterns. It raises TrilightError where nothing is named, roots
-    and shards are mixed, a URL is refused, or there is no readable manifest. That no key is in two
-    shards of a dataset, `trilight verify` says.
+    Args:
+        data: one root of a dataset, or any number of paths, URLs and brace patterns that end in
+            `.tar`.
+
+    Raises:
+        TrilightError: nothing is named, roots and shards are mixed, a URL is refused, or there is
+            no readable manifest. That no key is in two shards of a dataset, `trilight verify` says.
     """
     shards = [text for text in data if is_shards(text)]
     if shards and len(shards) == len(data):

@@ -43,11 +43,19 @@ _SMALLEST_ALPHA = 1e-6
 def directional_albedo(
     stretched_cos: ArrayLike, alpha: ArrayLike, smith: Smith
 ) -> NDArray[np.float64]:
-    """Return E of GGX, of the shape that both arguments broadcast to.
+    """Return E of GGX.
 
     E = integral of D G2 (i.h) / (c_i c_h) over D-weighted facets h, of which those count that
     reflect to above the surface: for each azimuth the slopes up to a known bound, so that the
-    integrand is smooth where quadrature needs it. Both x and the GGX width are in (0, 1].
+    integrand is smooth where quadrature needs it.
+
+    Args:
+        stretched_cos: x, in (0, 1].
+        alpha: GGX width, in (0, 1]; broadcast against x.
+        smith: how the masking of both directions comes together.
+
+    Returns:
+        E, of the shape that both broadcast to.
     """
     x, width = (np.asarray(a, np.float64)[..., None, None] for a in (stretched_cos, alpha))
     length = np.sqrt(1 - x**2 + np.square(width * x))

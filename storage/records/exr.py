@@ -188,11 +188,19 @@ def decode_channels(
     """Return the channels of an OpenEXR file by name, R, G and B as one unless `separate`.
 
     The library takes memory for all that a file's headers speak of, and small files can speak of
-    much: no pixel is read before the headers are what is expected. `check` is called with the
-    header before that. Height and width are any, or of `size`; messages about it say `what`. It
-    raises TrilightError for another file, or one that is truncated, of several parts, with other
-    channels, larger than MAX_RESOLUTION, of more than 3 GiB, of another size, or refused by
-    `check`.
+    much: no pixel is read before the headers are what is expected.
+
+    Args:
+        data: the file.
+        names: of the channels that it must have.
+        check: called with the header before any pixel is read; raises TrilightError.
+        size: height and width as they must be; None for any.
+        what: the file in messages about its size.
+        separate: keep R, G and B apart.
+
+    Raises:
+        TrilightError: not an EXR file, truncated, of several parts, with other channels, larger
+            than MAX_RESOLUTION, of more than 3 GiB, of another size, or refused by `check`.
     """
     with _readable():
         header = read_header(data)

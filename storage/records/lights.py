@@ -73,7 +73,11 @@ def encode_lights_exr(lights_rgb: NDArray[np.float32]) -> bytes:
 
 
 def decode_lights_exr(data: bytes, shape: tuple[int, int, int]) -> NDArray[np.float32]:
-    """Return the lights of an OpenEXR file, float32 [L, H, W, 3]; raises as `decode_layers`."""
+    """Return the lights of an OpenEXR file, float32 of `shape`, [L, H, W], and 3.
+
+    Raises:
+        TrilightError: not an EXR file, truncated, or with other channels or another size.
+    """
     num, *size = shape
     return _decode(data, _layers([""], num), (size[0], size[1]), "lights")
 
@@ -88,7 +92,9 @@ _BOUNCES = ("direct", "indirect")
 def part_names(*, bounces: bool, lobes: bool) -> tuple[str, ...]:
     """Return the names of the parts, which other renderers use too; empty where all is together.
 
-    Bounces are direct and indirect light; lobes are the diffuse and the specular one.
+    Args:
+        bounces: whether direct and indirect light are apart.
+        lobes: whether the diffuse and the specular lobe are.
     """
     kinds = [names for names, is_separate in ((_LOBES, lobes), (_BOUNCES, bounces)) if is_separate]
     return tuple("_".join(words) for words in itertools.product(*kinds)) if kinds else ()
@@ -109,7 +115,8 @@ def sum_of_parts(parts_rgb: Parts) -> NDArray[np.float32]:
 def part_layers(parts_rgb: Parts) -> tuple[list[str], NDArray[np.float32]]:
     """Return the names of the layers of one view's parts, and their pictures [N, R, R, 3].
 
-    Parts are [R, R, 3] each, or [L, R, R, 3] of L lights apart.
+    Args:
+        parts_rgb: [R, R, 3] each, or [L, R, R, 3] of L lights apart.
     """
     stacked = np.stack(list(parts_rgb.values()))
     num_lights = stacked.shape[1] if stacked.ndim == 5 else None
@@ -127,7 +134,9 @@ def decode_parts_exr(
     """Return the parts of an OpenEXR file, float32 [H, W, 3], or [L, H, W, 3] of lights apart.
 
     `names`, `size` (H and W) and `num_lights` (None where they are together) are as they must be.
-    It raises as `decode_layers`.
+
+    Raises:
+        TrilightError: not an EXR file, truncated, or with other channels or another size.
     """
     pictures = _decode(data, _layers(names, num_lights), size, "parts")
     lights = () if num_lights is None else (num_lights,)

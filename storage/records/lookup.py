@@ -36,7 +36,9 @@ _LEAST_AREA = 1e-12
 def u_directions(corners: NDArray[np.floating], uv: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the unit directions [T, 3] in which u grows on triangles; 0 where they have none.
 
-    Corners have positions [T, 3, 3] and texture coordinates [T, 3, 2].
+    Args:
+        corners: [T, 3, 3] positions.
+        uv: [T, 3, 2] texture coordinates of the corners.
     """
     edges = (corners[:, 1:] - corners[:, :1]).astype(np.float64)
     steps = (uv[:, 1:].astype(np.float64) - uv[:, :1]).astype(np.float64)
@@ -52,8 +54,10 @@ def mapped_normals(
 ) -> NDArray[np.float64]:
     """Return shading normals [..., 3] by their map; unmapped where a frame has no u direction.
 
-    Given are the unit normals, the directions of `u_directions` and the linear values of the map,
-    [..., 3] each.
+    Args:
+        normals: [..., 3] unit, unmapped.
+        u_direction: [..., 3] as of `u_directions`.
+        texels: [..., 3] linear values of the map.
     """
     along = (u_direction * normals).sum(axis=-1, keepdims=True)
     tangent = u_direction - along * normals
@@ -113,7 +117,10 @@ def textured_rows(
 ) -> NDArray[np.float32]:
     """Return the material rows [N, M] of places on surfaces, with their textures.
 
-    Places are given by rows [N] of `scene.materials` and texture coordinates [N, 2].
+    Args:
+        scene: passes `Scene.check`.
+        material_index: [N] rows of `scene.materials`.
+        uv: [N, 2] texture coordinates there.
     """
     rows = scene.materials[material_index]
     if scene.material_textures is None:

@@ -77,8 +77,10 @@ EMITTER = "emitter"
 def locked_uids(objects: Iterable[tuple[str, str]], provenance: Mapping[str, Any]) -> list[str]:
     """Return the uids of all that a scene has of a lock, sorted: objects, textures and a map.
 
-    Objects are given by kind and uid; floors and lamps are in no lock, and what an object emits is
-    of that. The provenance may be from outside: what `maps` says counts where it is text.
+    Args:
+        objects: kind and uid of each row of the scene's objects; floors and lamps are in none, what
+            an object emits is of that.
+        provenance: of the scene, perhaps from outside; what `maps` says counts where it is text.
     """
     maps = provenance.get("maps", ())
     map_uids = (

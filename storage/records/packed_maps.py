@@ -72,8 +72,13 @@ class HeldMaps:
     ) -> Map:
         """Return the map of some bytes: the held one, or what `unpack` returns, then held.
 
-        Two threads that miss the same map both unpack it. `kind` and `sha256` are what the map is
-        said to be and to hold; `unpack` raises unless it is so.
+        Two threads that miss the same map both unpack it.
+
+        Args:
+            kind: what it is said to be.
+            sha256: of the content that it is said to have.
+            packed: what it is unpacked from.
+            unpack: makes the map, and raises unless it is lawful and has this content.
         """
         key = kind, sha256, sha256_hex(packed)
         with self._lock:
@@ -251,10 +256,14 @@ def unpacked_maps(
 ) -> dict[str, Any]:
     """Return the fields `textures` and `environment` of a scene, whose arrays are read-only.
 
-    `maps` are those of `maps_record`, from outside. The bytes are among `members`, by name. Maps
-    that other samples hold are not unpacked again. It raises TrilightError where they are not of
-    that form, a map is missing or damaged, all of them take more than MAX_MAPS_BYTES, or one has
-    another content than its name says.
+    Args:
+        maps: what `maps_record` gave, from outside.
+        members: bytes of the maps by the names of their members; others are ignored.
+        held: those of other samples, which are not unpacked again; None where there is no other.
+
+    Raises:
+        TrilightError: not of that form, a map is missing or damaged, all of them take more than
+            MAX_MAPS_BYTES, or one has another content than its name says.
     """
     textures, skies = map_entries(maps)
     packed: dict[str, bytes] = {}

@@ -85,9 +85,12 @@ def with_textures(
 def chosen_maps(
     scene: "Scene", triangles: NDArray[np.integer], materials: NDArray[np.integer]
 ) -> dict[str, Any]:
-    """Return the fields that textures take in a scene of other triangles [T] and materials [M].
+    """Return the fields that textures take in a scene of other triangles and materials.
 
-    These are rows of those of `scene`, or NEW; a new material has no textures.
+    Args:
+        scene: what they are taken from.
+        triangles: [T] rows of its triangles, or NEW.
+        materials: [M] rows of its materials, or NEW for one that has no textures.
     """
     if scene.uv is None or scene.material_textures is None:
         return {}

@@ -19,9 +19,10 @@ MAX_HEADER_BYTES = 1 << 20
 
 
 def open_plain(path: Path) -> BinaryIO:
-    """Open a regular file for reading; raises OSError as `open`, and for all else.
+    """Open a regular file for reading.
 
-    Opening a FIFO would block forever.
+    Raises:
+        OSError: as `open`, or it is something else: opening a FIFO would block forever.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # of regular files, it changes nothing
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -51,8 +52,9 @@ def read_safetensors(
 ) -> tuple[dict[str, NDArray], dict[str, str]]:
     """Return arrays and metadata of a safetensors file held in memory.
 
-    It raises as `safetensors_header`, and where the library refuses the bytes: it checks every
-    offset against the length of `data`.
+    Raises:
+        TrilightError: as `safetensors_header`, or the library refuses the bytes (it checks every
+            offset against the length of `data`).
     """
     header = safetensors_header(data, max_header_bytes, name=name)
     try:
@@ -69,8 +71,9 @@ def safetensors_header(
 ) -> dict[str, Any]:
     """Return the header of a safetensors file held in memory, or of as much as a header may take.
 
-    It raises TrilightError, with `name`, for bytes that are truncated, a longer header, or no JSON
-    object.
+    Raises:
+        TrilightError: the bytes are truncated, the header is larger than `max_header_bytes`, or it
+            is no JSON object; `name` is the file in messages.
     """
     length = int.from_bytes(data[:8], "little")
     if len(data) < 8 or length > min(max_header_bytes, len(data) - 8):

@@ -220,8 +220,9 @@ def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, by
 def decode_sample(key: str, members: Mapping[str, bytes], held: HeldMaps | None = None) -> Sample:
     """Return the sample of its members (suffix to bytes); `held` as `decode_scene`.
 
-    It raises TrilightError for a member that is missing, unreadable or of another schema version.
-    Laws are not checked here; `Sample.check` does that before a network learns from it.
+    Raises:
+        TrilightError: a member is missing, unreadable or of another schema version. Laws are not
+            checked here; `Sample.check` does that before a network learns from it.
     """
     record = decode_scene(key, members, held)
     with name_errors(key):
@@ -346,8 +347,11 @@ def check_radiance(
 ) -> None:
     """Raise TrilightError, which names the pixel, where radiance is not finite or below 0.
 
-    Of the pictures [C, R, R, 3], messages number the first `first_view`, and say `which` part of
-    the light they hold, behind a space.
+    Args:
+        key: of the sample.
+        which: part of its pictures, behind a space; empty for all light.
+        radiance_rgb: pictures [C, R, R, 3].
+        first_view: number of the first of them.
     """
     if radiance_rgb.min() >= 0 and radiance_rgb.max() < math.inf:  # NaN is neither
         return
@@ -422,8 +426,9 @@ def stored_sample(
 ) -> StoredSample:
     """Return the sample of its members; `held` as `decode_scene`.
 
-    It raises TrilightError for a scene or record that is missing, unreadable or unlawful, and
-    unless it has as many records of views, and pictures, as cameras.
+    Raises:
+        TrilightError: its scene or record is missing, unreadable or breaks a law, or it has not as
+            many records of views, and pictures, as cameras.
     """
     record = decode_scene(key, members, held)
     require_lawful(record)

@@ -60,7 +60,13 @@ def version_of(facts: Mapping[str, Any]) -> dict[str, str]:
 
 
 def download(url: RemoteUrl, stream: BinaryIO, *, num_bytes: int | None, max_bytes: int) -> None:
-    """Write all bytes of a file to an open one, from its start: exactly, or at most, so many.
+    """Write all bytes of a file to an open one, from its start.
+
+    Args:
+        url: the file.
+        stream: where they go.
+        num_bytes: how many there must be, where that is known.
+        max_bytes: how many there may be, where it is not.
 
     It raises TransferFailed as `facts_of`, and where it has another size than `num_bytes`, breaks
     off again and again without moving on, or comes too slowly (storage.remote.retries);

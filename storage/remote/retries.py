@@ -41,8 +41,12 @@ def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) ->
     """Retry a function after transient errors, with growing pauses.
 
     The pause before try n is PAUSE_S 2^(n-1), at most MAX_PAUSE_S, times a random factor between a
-    half and one and a half, so that many readers of one server do not come back all at once. Where
-    the file of `pace` came at the least rate since the last error, tries are counted again from 1.
+    half and one and a half, so that many readers of one server do not come back all at once.
+
+    Args:
+        function: what to try.
+        pace: of the file that is on its way; where it came at the least rate since the last error,
+            the tries are counted again from 1.
 
     It raises TransferFailed, and TrilightError, as the function; `download_failed` for any other
     exception, or a file that comes too slowly; an EnvironmentFailure where the disk is full.

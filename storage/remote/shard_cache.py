@@ -45,9 +45,15 @@ class ShardCache:
     def open(self, url: RemoteUrl, *, num_bytes: int | None, sha256: str | None) -> BinaryIO:
         """Return a shard, open for reading and safe from removal until it is closed.
 
-        A manifest says its size and digest; without a digest, the shard is known by what the server
-        says of it, and its bytes are not checked. It raises TrilightError where it cannot be
-        fetched, has another size, twice has the wrong bytes, or the disk is full.
+        Args:
+            url: the shard.
+            num_bytes: its size, where a manifest says it.
+            sha256: its digest, where a manifest says it; without one, the shard is known by what
+                the server says of it, and its bytes are not checked.
+
+        Raises:
+            TrilightError: it cannot be fetched, has another size, twice has the wrong bytes, or
+                the disk is full.
         """
         try:
             path = self.root / _name(url, sha256)

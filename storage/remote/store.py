@@ -55,14 +55,16 @@ class Store(ABC):
     def get(self, name: str, num_bytes: int | None = None) -> bytes | None:
         """Return a file, or its first bytes; None where there is none.
 
-        It raises TrilightError where it cannot be read, an EnvironmentFailure where that may pass.
+        Raises:
+            TrilightError: it cannot be read (an EnvironmentFailure where that may pass).
         """
 
     @abstractmethod
     def put(self, name: str, content: Path | bytes) -> None:
         """Write a file, or replace it; one that stands at its place in a folder stays.
 
-        It raises TrilightError where that fails, an EnvironmentFailure where that may pass.
+        Raises:
+            TrilightError: it cannot be written (an EnvironmentFailure where that may pass).
         """
 
     @abstractmethod

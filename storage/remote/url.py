@@ -66,7 +66,11 @@ class RemoteUrl:
 
 
 def parse_url(source: str, *, what: str) -> RemoteUrl | Path:
-    """Return where a path or URL is: on this machine, or on a server; messages begin with `what`.
+    """Return where something is: on this machine, or on a server.
+
+    Args:
+        source: a path, or a URL.
+        what: begins every message, such as `objects`.
 
     It raises TrilightError for a URL that is chained (`::`), runs a program (`pipe:`), has a scheme
     that is not admitted, names no host or bucket, or holds a password where none is read.

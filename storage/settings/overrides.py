@@ -72,8 +72,11 @@ def _write_value(value: Any) -> str:
 def apply_overrides(settings: Settings, overrides: Mapping[str, Any]) -> Settings:
     """Return settings, a frozen dataclass, with the values of overrides, all at once.
 
-    Values that only fit each other may therefore come in any order. It raises TrilightError for a
-    name that does not exist, a value of another kind, or one that the settings refuse.
+    Values that only fit each other may therefore come in any order.
+
+    Raises:
+        TrilightError: a name that does not exist, a value of another kind, or one that the
+            settings themselves refuse; a name that is nearly right is asked back.
     """
     result: Settings = _replace_fields(
         settings, [(n.split("."), v, n) for n, v in overrides.items()]

@@ -239,9 +239,13 @@ def declared_passes() -> tuple[Pass, ...]:
 
 
 def pass_names(words: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of the passes that words, names or shorter ones, mean, each once, in order.
+    """Return the names of the passes of one scene that words mean, each once, in their own order.
 
-    It raises TrilightError where there is no such pass, or it needs another moment of the scene.
+    Args:
+        words: names of passes, or their shorter words.
+
+    Raises:
+        TrilightError: there is no such pass, or it needs another moment of the scene.
     """
     passes = [each for each in declared_passes() if each.name != MOTION]
     meant = {word: each.name for each in passes for word in (each.short, each.name) if word}

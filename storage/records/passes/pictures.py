@@ -229,7 +229,9 @@ def passes_exr(
 def decode_passes_exr(data: bytes, resolution: int) -> dict[str, NDArray]:
     """Return the passes in a file by name, as `picture_passes`; `coverage` is among them.
 
-    It raises as `decode_channels`, and for channels that are no whole passes.
+    Raises:
+        TrilightError: not an EXR file, truncated, of another size, or with channels that are no
+            whole passes.
     """
     stored_channels = set(channel_names(data))
     passes = [each for each in declared_passes() if stored_channels >= set(each.exr_channels)]
