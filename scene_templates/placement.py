@@ -109,10 +109,18 @@ def place_objects(
     object_scale: Range,
     overlaps: bool,
 ) -> tuple[Pose, ...]:
-    """Draw a pose for each shape; raises Rejected, "no_room", where no arrangement was found.
+    """Draw a pose for each shape.
 
-    Without shell parts, they are in the middle of the world. `object_scale` is the range of the
-    bounding spheres' diameters, before halving.
+    Args:
+        rng: where the numbers come from.
+        settings: how objects are placed.
+        space: where; without shell parts, in the middle of the world.
+        shapes: what they look like.
+        object_scale: range of the bounding spheres' diameters, before halving.
+        overlaps: whether objects may meet.
+
+    Raises:
+        Rejected: "no_room" if no arrangement was found.
     """
     for _ in range(ARRANGEMENT_TRIES):
         # A recipe's size is a diameter in a room of side 2: half of it here, and half again.

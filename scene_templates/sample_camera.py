@@ -42,7 +42,9 @@ class Sector:
     def direction_at(self, across: float, up: float) -> NDArray[np.float64]:
         """Return the unit direction [3] of a position; equal areas of both are equal solid angles.
 
-        Both are 0 to 1: from one side of the azimuth to the other, and from the least elevation up.
+        Args:
+            across: 0 to 1, from one side of the azimuth to the other.
+            up: 0 to 1, from the least elevation to the greatest.
         """
         low, high = (math.sin(math.radians(angle)) for angle in self.elevation_deg)
         return self._direction(low + (high - low) * up, (2 * across - 1) * self.half_width_deg)
@@ -89,8 +91,11 @@ def path_position(
 ) -> tuple[float, float] | None:
     """Return the position of a view on a path (`Sector.direction_at`); None for `random`.
 
-    Views are counted from 0. `rng` is of the scene, the same for all of its views: it turns the
-    path.
+    Args:
+        path: the path.
+        view: number of the view, from 0.
+        num_views: number of the scene's views.
+        rng: of the scene, the same for all of its views: it turns the path.
     """
     azimuth_shift, height = rng.random(2).tolist()
     up = (view + 0.5) / num_views
@@ -115,7 +120,11 @@ def sample_camera(
 ) -> CameraPose:
     """Draw one camera pose by look-at. Whether it sees anything is for the caller to find out.
 
-    `position` is that of the direction in the sector (`Sector.direction_at`); None to draw it.
+    Args:
+        rng: where the numbers come from.
+        settings: the ranges.
+        sector: directions from which the layout is seen.
+        position: of the direction in the sector (`Sector.direction_at`); None to draw it.
     """
     if settings.elevation_deg is not None:
         sector = dataclasses.replace(sector, elevation_deg=settings.elevation_deg)

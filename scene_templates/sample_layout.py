@@ -70,8 +70,14 @@ def sample_layout(
 ) -> Layout:
     """Draw a layout of the planned kind.
 
-    Families of the settings are ignored, since the plan has one; `shapes` are what its
-    `plan.num_objects` objects look like. It raises Rejected, "no_room", where they do not fit.
+    Args:
+        rng: where the numbers come from.
+        settings: the ranges; its families are ignored, since the plan has one.
+        plan: the family and the counts.
+        shapes: what the `plan.num_objects` objects look like.
+
+    Raises:
+        Rejected: "no_room" if the objects do not fit.
     """
     family = plan.family
     template = TEMPLATES[family.template]

@@ -76,8 +76,11 @@ def sample_material(
 ) -> SurfaceLook:
     """Draw a surface: mostly white energy split between a coloured diffuse and a specular.
 
-    `smooth_share` is the probability of interpolated normals. Of many colours, each triangle of a
-    shell has one, and of an object each triangle or shading group.
+    Args:
+        rng: where the numbers come from.
+        settings: the ranges.
+        smooth_share: probability of interpolated normals.
+        kind: whether the triangles or the shading groups get the colours where there are many.
     """
     albedo_sum = rng.uniform(*settings.albedo_sum)
     specular = albedo_sum * rng.uniform(*settings.specular_ratio)

@@ -70,8 +70,13 @@ def draw_look(
 ) -> TexturedLook | None:
     """Return the texture of a surface, or None where it has none.
 
-    Whether it has one is drawn first: another `share` changes no texture that is there still. The
-    licences are those of what is in the scene already.
+    Whether it has one is drawn first: another `share` changes no texture that is there still.
+
+    Args:
+        rng: the stream of this surface.
+        settings: the shares and the ranges.
+        own: a user's own textures.
+        licences: of what is in the scene already.
     """
     if rng.random() >= settings.share:
         return None

@@ -79,8 +79,13 @@ def draw_user_map(
 ) -> UserMap[Made] | None:
     """Return one of a user's own, each equally likely, or None where a procedural one is taken.
 
-    Nothing is drawn of `rng` where the share is 0 or there is none. The licences are those of what
-    is in the scene already.
+    Nothing is drawn of `rng` where the share is 0 or there is none.
+
+    Args:
+        rng: the stream.
+        own: the textures or maps.
+        share: probability of one.
+        licences: of what is in the scene already.
     """
     if not (share and user_maps) or rng.random() >= share:
         return None

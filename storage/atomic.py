@@ -60,10 +60,16 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def append_line(path: Path, line: str, *, durable: bool = False) -> None:
-    """Append a line, without a line break, to a file, whose folder may be missing.
+    """Append a line to a file, whose folder may be missing.
 
-    With `durable`, of a file with one writer: drop a last line that a kill has cut, and return only
-    when the new line is on the disk. It raises TrilightError where the file cannot be written.
+    Args:
+        path: the file.
+        line: text without a line break.
+        durable: of a file with one writer, drop a last line that a kill has cut, and return only
+            when the new line is on the disk.
+
+    Raises:
+        TrilightError: the disk is full or the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -84,8 +90,10 @@ def append_line(path: Path, line: str, *, durable: bool = False) -> None:
 def remove_leftovers(folder: Path, *, older_than_s: float = 0.0) -> None:
     """Delete what killed writers left below `folder`. Call only while holding its lock.
 
-    Files that were written to in the last `older_than_s` stay: locks may not reach every machine
-    that writes there.
+    Args:
+        folder: where to look, however deep.
+        older_than_s: files that were written to more recently stay; for locks that may not reach
+            every machine that writes there.
     """
     for place, _, names in os.walk(folder):  # a third of the time of rglob, of a million files
         for name in filter(lambda name: name.endswith(TEMPORARY_SUFFIX), names):

@@ -11,7 +11,8 @@ from storage.errors import TrilightError
 def cache_folder(name: str) -> Path:
     """Return a folder of the user's cache: below TRILIGHT_CACHE, or ~/.cache/trilight.
 
-    It raises TrilightError without a home directory, or where something else is at the place.
+    Raises:
+        TrilightError: there is no home directory, or something else is where the cache would be.
     """
     configured = os.environ.get("TRILIGHT_CACHE")
     try:
@@ -33,7 +34,8 @@ def cache_folder(name: str) -> Path:
 def private_folder(path: Path) -> Path:
     """Make a folder that only its user may enter, or make an existing one so, and return it.
 
-    It raises TrilightError where that cannot be, or all users share it, as /tmp.
+    Raises:
+        TrilightError: it cannot be made so, or is shared by all users, as /tmp is.
     """
     try:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)

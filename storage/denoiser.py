@@ -149,7 +149,9 @@ class Filter:
 def open_device(device: DenoiserDevice, threads: int = 0) -> Any:
     """Return a device of Open Image Denoise; raises RuntimeError where there is none.
 
-    CUDA is the first GPU, on which Mitsuba renders too; 0 threads of the processor are all cores.
+    Args:
+        device: CPU, or CUDA for the first GPU, on which Mitsuba renders too.
+        threads: of the processor; 0 is all cores.
     """
     oidn = load_oidn()
     opened = oidn.Device(getattr(oidn, f"OIDN_DEVICE_TYPE_{device}"))

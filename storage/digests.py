@@ -30,7 +30,8 @@ def sha256_of_stream(stream: BinaryIO) -> str:
 def seal_of(data: bytes, sha256: str) -> str:
     """Return the sha256 of sealed bytes, which hold it: of all but its first 64 digits.
 
-    It raises ValueError where the digits are not there.
+    Raises:
+        ValueError: the digits are not there.
     """
     start = data.index(sha256.encode())
     view = memoryview(data)

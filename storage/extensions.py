@@ -137,8 +137,13 @@ def function_name(name: str) -> str:
 def load_reference(reference: str) -> Iterator[Any]:
     """Provide what the function of FILE.py:FUNCTION returns, while its file may register it.
 
-    What is no function stands for itself. The reference is one of `is_reference`, typed by the
-    person whose computer this is. It raises as `load_extension`, and as the function.
+    What is no function stands for itself.
+
+    Args:
+        reference: for which `is_reference` holds; typed by the person whose computer this is.
+
+    Raises:
+        TrilightError: as `load_extension`, or the file does not define it, or it raises something.
     """
     match = _REFERENCE.fullmatch(reference)
     assert match is not None, reference
@@ -176,9 +181,14 @@ def extension_digests(part: Decided) -> dict[str, str]:
 
 
 def require_same_extensions(what: str, before: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Raise TrilightError where extensions are not those that `what` was begun with.
+    """Refuse to go on with other extensions than something was begun with.
 
-    `before` and `now` are of `extension_digests`; the message names the first that differs.
+    Args:
+        what: was begun, as messages name it.
+        before, now: as `extension_digests` returns them.
+
+    Raises:
+        TrilightError: one is missing, new, or another file; the message names it.
     """
     for name in sorted({*before, *now}):
         if before.get(name) == now.get(name):
@@ -242,7 +252,11 @@ def _as_loading(extension: Extension) -> Iterator[None]:
 
 @contextmanager
 def _mistakes_of(path: Path) -> Iterator[None]:
-    """Turn what code of an extension raises into a TrilightError with the line of the file."""
+    """Turn what code of an extension raises into one line with the line of the file.
+
+    Raises:
+        TrilightError: the code raised something.
+    """
     try:
         yield
     except (Exception, SystemExit) as error:
@@ -251,9 +265,10 @@ def _mistakes_of(path: Path) -> Iterator[None]:
 
 @contextmanager
 def mistakes_of_entry(entry: str) -> Iterator[None]:
-    """Turn what an extension's entry, such as a family, raises into a TrilightError with its place.
+    """Turn what an extension's entry, such as a family, raises into one line with its place.
 
-    Errors of other code are raised as they are.
+    Raises:
+        TrilightError: the code raised something; other code's errors are raised as they are.
     """
     try:
         yield

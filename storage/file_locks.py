@@ -40,8 +40,12 @@ _unlocked = itertools.count()
 def hold_lock(path: Path, *, wait: bool = False) -> Iterator[bool]:
     """Hold the lock of a file, a claim, for the block; yield whether it is ours.
 
-    The file is created here, and its holder may delete it. With `wait`, the claim always becomes
-    ours. It raises TrilightError where the folder cannot be written.
+    Args:
+        path: the file of the claim; it is created here, and its holder may delete it.
+        wait: until the claim is free, so that it always becomes ours.
+
+    Raises:
+        TrilightError: the folder cannot be written.
     """
     descriptor = _acquire_lock(path, wait)
     try:
@@ -52,7 +56,11 @@ def hold_lock(path: Path, *, wait: bool = False) -> Iterator[bool]:
 
 
 def open_lock(path: Path) -> int:
-    """Return the descriptor of a lock's file, which is made where it is missing; as `hold_lock`."""
+    """Return the descriptor of a lock's file, which is created where it is missing.
+
+    Raises:
+        TrilightError: the folder cannot be written.
+    """
     tries = 0
     while True:
         try:

@@ -16,8 +16,10 @@ def available_cores() -> int:
     """Return the number of cores that this process may keep busy, rounded up.
 
     TRILIGHT_CORES sets it, so that several workers can share one machine; by default it is the
-    smaller of the affinity, which Slurm and taskset set, and the quota of its control groups. It
-    raises TrilightError where TRILIGHT_CORES is not a number from 1.
+    smaller of the affinity, which Slurm and taskset set, and the quota of its control groups.
+
+    Raises:
+        TrilightError: TRILIGHT_CORES is not a number from 1.
     """
     if value := os.environ.get("TRILIGHT_CORES"):
         if not value.isdecimal() or int(value) < 1:

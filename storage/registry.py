@@ -86,11 +86,17 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             extension.undo.append(lambda: self._remove(name))
 
     def resolve(self, reference: str, as_entry: Callable[[Any], Entry]) -> str:
-        """Return the name of an entry that was typed on a command line; it may be unknown.
+        """Return the name of an entry that was typed on a command line.
 
-        FILE.py:FUNCTION runs a file of their own and registers what the function returns, as
-        `as_entry` makes an entry of it, as `FILE.py:FUNCTION` without the folder. It raises
-        TrilightError where the file cannot be loaded (storage.extensions), or does not define it.
+        FILE.py:FUNCTION runs a file of their own and registers what the function returns as
+        `FILE.py:FUNCTION` without the folder.
+
+        Args:
+            typed: a name, which may be unknown, or FILE.py:FUNCTION.
+            as_entry: makes an entry of what the function returned, or raises TrilightError.
+
+        Raises:
+            TrilightError: the file cannot be loaded (storage.extensions), or does not define it.
         """
         if not is_reference(reference):
             return reference

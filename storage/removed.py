@@ -19,8 +19,13 @@ def without_removed(
 ) -> dict[str, Any]:
     """Return a stored record without the removed settings.
 
-    `removed` has them at the values that meant none; it raises TrilightError, which begins with
-    `source`, for another value.
+    Args:
+        record: settings by name.
+        removed: the removed settings, at the values that meant none.
+        source: what stands before a setting's name in the refusal.
+
+    Raises:
+        TrilightError: a removed setting has another value.
     """
     for name, off in removed.items():
         if record.get(name, off) != off:

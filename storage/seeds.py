@@ -11,10 +11,15 @@ import numpy as np
 
 
 def rng_for(seed: int, purpose: str, *indices: int) -> np.random.Generator:
-    """Return the independent PCG64 generator that belongs to one purpose, such as "camera".
+    """Return the generator that belongs to one purpose.
 
-    Equal arguments always give equal streams. The seed is that of the whole dataset, any integer
-    from 0; indices, such as scene and attempt, tell this use from others.
+    Args:
+        seed: the seed of the whole dataset, any integer from 0.
+        purpose: what the numbers are for, such as "scene" or "camera".
+        indices: what tells this use from others, such as scene index and attempt.
+
+    Returns:
+        An independent PCG64 generator; equal arguments always give equal streams.
     """
     return np.random.default_rng(np.frombuffer(_name_digest(seed, purpose, indices), np.uint32))
 

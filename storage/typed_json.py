@@ -81,7 +81,11 @@ def read_json(data: bytes | str, kind: type[T], source: str) -> T:
 def read_json_lines(data: bytes, kind: type[T], source: str, *, torn_end: bool = False) -> list[T]:
     """Return the values of lines of JSON; raises as `read_json`, naming the line.
 
-    With `torn_end`, a last line that a kill has cut, which no line break ends, is left out.
+    Args:
+        data: the lines.
+        kind: type of each.
+        source: the file, for messages.
+        torn_end: leave out a last line that a kill has cut, which no line break ends.
     """
     lines = data[: data.rfind(b"\n") + 1 if torn_end else None].splitlines()
     return [read_json(line, kind, f"{source}:{row}") for row, line in enumerate(lines, start=1)]

@@ -72,9 +72,13 @@ class SkyDraws(RecordedSampler):
         sun_elevation_deg: tuple[float, float] = (2.0, 75.0),
         sun_to_sky: tuple[float, float] = (0.5, 8.0),
     ) -> None:
-        """Begin a sky, of which all lights have any colour with a probability of `coloured_share`.
+        """Begin a sky.
 
-        The ranges are the sun's elevation, and the sun's irradiance over the sky's.
+        Args:
+            rng: where the numbers come from.
+            coloured_share: probability of lights of any colour, for all lights of the sky.
+            sun_elevation_deg: range of the sun's elevation.
+            sun_to_sky: range of the sun's irradiance over the sky's.
         """
         super().__init__(rng)
         self._coloured = self.holds("coloured lights", coloured_share)
@@ -82,7 +86,12 @@ class SkyDraws(RecordedSampler):
         self.sun_to_sky = sun_to_sky
 
     def light(self, name: str, *, mired: tuple[float, float]) -> Numbers:
-        """Return the colour [3], of mean 1, of a light, uniform in a range of `planckian_rgb`."""
+        """Return the colour [3], of mean 1, of a light.
+
+        Args:
+            name: of the light.
+            mired: natural range of its colour (`planckian_rgb`), uniform in it.
+        """
         if not self._coloured:
             return planckian_rgb(self.uniform(f"{name}: mired", *mired))
         return self._any_colour(name)
@@ -344,10 +353,14 @@ class SkyMapSettings:
 
 
 def draw_sky(rng: np.random.Generator, settings: SkyMapSettings) -> SkyMap:
-    """Draw a sky of one of the families, of a generator such as `rng_for(seed, "sky", number)`.
+    """Draw a sky of one of the families.
 
     Equal generators and settings give equal bytes on every processor with IEEE arithmetic
     (scene_templates.exact). A sky of 256 rows takes 0.03 to 0.5 core-seconds.
+
+    Args:
+        rng: such as `rng_for(seed, "sky", number)`.
+        settings: the ranges.
     """
     name = settings.families[int(rng.integers(len(settings.families)))]
     texels = SkyTexels(settings.height)

@@ -104,8 +104,12 @@ class SkyTexels:
     def noise(self, rng: np.random.Generator, cells: float, *, octaves: int = 1) -> Numbers:
         """Return noise [H, 2H] of mean 0, the same everywhere on the sphere: no seam and no poles.
 
-        It is gradient noise in space, looked up on the sphere, with `cells` of the first octave
-        along a radius. Each octave has half the amplitude; there are as many as texels can show.
+        It is gradient noise in space, looked up on the sphere; each octave has half the amplitude.
+
+        Args:
+            rng: a stream of its own.
+            cells: of the first octave along a radius.
+            octaves: how many, as far as texels can show them.
         """
         total = np.zeros((self.height, 2 * self.height))
         gain = NOISE_SCALE

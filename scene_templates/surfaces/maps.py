@@ -80,10 +80,13 @@ class Finish:
 
 
 def finish(base_rgb: ArrayLike, *, specular_share: float, roughness: float, metal: bool) -> Finish:
-    """Return the finish of a base colour [3] in [0, MOST_ALBEDO].
+    """Return the finish of a base colour.
 
-    `specular_share` of the light is reflected by the specular lobe, of this roughness. Its colour
-    is that of a metal, or grey.
+    Args:
+        base_rgb: [3] in [0, MOST_ALBEDO].
+        specular_share: of the light, what is reflected by the specular lobe.
+        roughness: of that lobe.
+        metal: whether the colour is that of the specular lobe; otherwise that is grey.
     """
     base = np.clip(np.asarray(base_rgb, np.float64), 0, MOST_ALBEDO)
     share = min(specular_share, MOST_ALBEDO)
@@ -135,9 +138,12 @@ class SurfaceDraws(RecordedSampler):
     def __init__(
         self, rng: np.random.Generator, *, natural_share: float, albedo: tuple[float, float]
     ) -> None:
-        """Begin a surface, in natural colours throughout with a probability of `natural_share`.
+        """Begin a surface.
 
-        Otherwise each channel is in the range `albedo`.
+        Args:
+            rng: where the numbers come from.
+            natural_share: probability of the family's natural colours, for all of its finishes.
+            albedo: range of each channel otherwise.
         """
         super().__init__(rng)
         self._natural = self.holds("natural colours", natural_share)

@@ -466,12 +466,20 @@ class SurfaceMapSettings:
 
 
 def draw_surface(rng: np.random.Generator, settings: SurfaceMapSettings) -> SurfaceMaps:
-    """Draw a surface of one of the families: maps that repeat in both directions.
+    """Draw a surface of one of the families.
 
     Equal generators and settings give equal bytes on every processor with IEEE arithmetic: maps are
-    made of + - * /, square roots and comparisons of float64, and rounded to float32 once. A map of
-    256 x 256 texels takes 0.005 to 0.15 core-seconds. What is drawn of `rng`, such as
-    `rng_for(seed, "surface", number)`, does not depend on the size.
+    made of + - * /, square roots and comparisons of float64, and rounded to float32 once.
+
+    A map of 256 x 256 texels takes 0.005 to 0.15 core-seconds.
+
+    Args:
+        rng: such as `rng_for(seed, "surface", number)`. What is drawn of it does not depend on the
+            size.
+        settings: the ranges.
+
+    Returns:
+        float32 maps [N, N, 3], [N, N, 3] and [N, N, 1] that repeat in both directions.
     """
     name = settings.families[int(rng.integers(len(settings.families)))]
     draws = SurfaceDraws(rng, natural_share=settings.natural_share, albedo=settings.albedo)

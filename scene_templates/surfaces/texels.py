@@ -121,8 +121,12 @@ def stones(
 ) -> Stones:
     """Return the Voronoi cells of one point in each square of a lattice (Worley's noise).
 
-    There are `cells` squares per side. `jitter` is how far the points leave the middle of their
-    squares: 1 is anywhere in it. `moved` is added to u and v before the look-up.
+    Args:
+        texels: where to look.
+        rng: a stream of its own.
+        cells: squares per side.
+        jitter: how far the points leave the middle of their squares: 1 is anywhere in it.
+        moved: what is added to u and v before the look-up.
     """
     offsets = 0.5 + jitter * (rng.random((cells, cells, 2)) - 0.5)
     du, dv = moved if moved is not None else (0.0, 0.0)

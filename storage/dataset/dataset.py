@@ -79,10 +79,14 @@ class LocalFiles(_Files):
             raise _open_error(path, error) from error
 
     def open(self, shard: ShardEntry, *, checked: bool) -> BinaryIO:
-        """Open a shard for reading, after a check of its digest where `checked`.
+        """Open a shard for reading.
 
-        An unchanged file is checked once. It raises TrilightError where the shard is missing, or
-        its bytes are not those of the manifest.
+        Args:
+            shard: which one.
+            checked: check its digest first, once as long as the file stays unchanged.
+
+        Raises:
+            TrilightError: it is missing, or its bytes are not those of the manifest.
         """
         path = self.root / shard.name
         try:
@@ -129,7 +133,12 @@ class RemoteDatasetFiles(_Files):
         return None
 
     def num_bytes(self, shard: ShardEntry) -> int | None:
-        """Return the size of a shard, or None where its server does not state it."""
+        """Return the size of a shard, or None where the server does not state it.
+
+        Raises:
+            ShardMissing: there is none.
+            Unreadable: the server gives no answer.
+        """
         url = self.url.child(shard.name)
         try:
             return facts_of(url).num_bytes
@@ -139,7 +148,11 @@ class RemoteDatasetFiles(_Files):
             raise unreadable(url, error) from error
 
     def open(self, shard: ShardEntry, *, checked: bool) -> BinaryIO:
-        """Open a shard of `storage.remote.shard_cache`; its digest is always checked on arrival."""
+        """Open a shard for reading; its digest is always checked on arrival.
+
+        Raises:
+            TrilightError: as `storage.remote.shard_cache`.
+        """
         url = self.url.child(shard.name)
         return shard_cache().open(url, num_bytes=shard.num_bytes, sha256=shard.sha256)
 
@@ -160,7 +173,13 @@ _OF_DAMAGED_BYTES = (ValueError, LookupError, TypeError, EOFError, RecursionErro
 def reading(dataset: str, shard: str) -> Iterator[None]:
     """Turn any error of reading a shard into one sentence with the next step.
 
-    Only what damaged bytes cause is turned; of a shard that was not read it says nothing more.
+    Args:
+        dataset: its place, for messages.
+        shard: its name.
+
+    Raises:
+        TrilightError: the block raised one, or another error that damaged bytes cause; of what was
+            not read it says nothing more.
     """
     try:
         yield

@@ -29,7 +29,8 @@ class Derivation:
 def derivation_of(settings: Mapping[str, Any]) -> Derivation | None:
     """Return what the settings of a dataset say of its sources; None where it was generated.
 
-    It raises TrilightError where they say it in another way.
+    Raises:
+        TrilightError: they say it in another way.
     """
     if _GROUP not in settings:
         return None
@@ -55,7 +56,12 @@ def source_record(manifest: Manifest, *, key_offset: int) -> dict[str, Any]:
 
 
 def derived_settings(derivation: Derivation, *, scenes_per_shard: int | None) -> dict[str, Any]:
-    """Return the settings of a derived dataset; shards of its own are not its sources'."""
+    """Return the settings of a derived dataset.
+
+    Args:
+        derivation: how it was made.
+        scenes_per_shard: of its own shards, where they are not those of the sources.
+    """
     of_sources = [source["settings"] for source in derivation.sources]
     shared = common(of_sources)
     shared.pop(_GROUP, None)  # the one of a source stands in the record of that source

@@ -45,7 +45,12 @@ def numbered_path(number: int, name: str) -> str:
 
 
 def shard_names_in(root: Path, suffix: str = "") -> Iterator[str]:
-    """Yield the names of the shards of which a folder or its parts has a file with this suffix."""
+    """Yield the names of the shards of which a folder or its parts has a file.
+
+    Args:
+        root: the folder.
+        suffix: what such files have after the name of their shard.
+    """
     for part in _parts_in(root):
         yield from shard_names_in_part(root, part, suffix)
 
@@ -191,7 +196,8 @@ class DatasetFolder:
     def hold_exclusive_lock(self) -> Iterator[None]:
         """Hold the folder's lock exclusively; it ends with the process that holds it.
 
-        It raises TrilightError where the folder cannot be written, or another process works in it.
+        Raises:
+            TrilightError: the folder cannot be written, or another process is at work in it.
         """
         with hold_lock(self._lock) as ours:
             if not ours:
@@ -203,11 +209,16 @@ class DatasetFolder:
 
     @contextlib.contextmanager
     def hold_shared_lock(self, when_alone: Callable[[], None] = lambda: None) -> Iterator[None]:
-        """Hold the lock that the workers of a dataset share; raises as `when_alone` too.
+        """Hold the lock that the workers of a dataset share.
 
         A worker that is alone at first removes what killed writers left more than an hour ago,
-        unless another one has looked within that hour: to look costs the whole set. It also calls
-        `when_alone`, before another one can join.
+        unless another one has looked within that hour: to look costs the whole set.
+
+        Args:
+            when_alone: called by a worker that is alone at first, before another one can join.
+
+        Raises:
+            TrilightError: the folder cannot be written; or as `when_alone`.
         """
         descriptor = open_lock(self._lock)
         try:
@@ -247,12 +258,17 @@ _ADMITTED = f"expected a folder, or a URL of {' or '.join(WRITABLE)}"
 
 
 def dataset_folder(out: str) -> DatasetFolder:
-    """Return the folder of a dataset that is to be made in a folder, or below a URL of WRITABLE.
+    """Return the folder of a dataset that is to be made.
 
     For a bucket that is a folder of the cache, the same one whenever the same URL is named, with
-    the scenes that are not in a shard yet and a copy of the files next to the shards. It raises
-    TrilightError for a URL that is refused (storage.remote.url), cannot be written to only once, or
-    has a query.
+    the scenes that are not in a shard yet and a copy of the files next to the shards.
+
+    Args:
+        out: a folder, or a URL of WRITABLE.
+
+    Raises:
+        TrilightError: the URL is refused (storage.remote.url), is none that can be written to only
+            once, or has a query.
     """
     place = parse_url(out, what="out")
     if isinstance(place, Path):

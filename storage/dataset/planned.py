@@ -11,7 +11,8 @@ from storage.settings.described import from_record
 def planned_shards(manifest: Manifest) -> dict[str, int]:
     """Return the names of the shards of the finished dataset, with their numbers of scenes.
 
-    It raises TrilightError where the settings in the manifest do not say how it is divided.
+    Raises:
+        TrilightError: the settings in the manifest do not say how the dataset is divided.
     """
     if derivation_of(manifest.settings):  # it only ever appears whole
         return {entry.name: entry.num_samples for entry in manifest.shards}

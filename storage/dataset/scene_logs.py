@@ -56,7 +56,11 @@ def log_scene(
     cores: int,
     num_rejected: int,
 ) -> None:
-    """Append the row of a scene that is made; raises as `append_line`."""
+    """Append the row of a scene that is made.
+
+    Raises:
+        TrilightError: the disk is full or the folder cannot be written.
+    """
     row = SceneLog(
         scene=sample_key(scene_index),
         seconds=round(seconds, 3),

@@ -31,6 +31,9 @@ def write_shard(path: Path, samples: Iterable[tuple[str, Mapping[str, bytes]]]) 
 
     Equal samples give equal bytes. The file appears under its name only when it is complete, and
     never in the place of another: the first writer of a shard wins.
+
+    Raises:
+        TrilightError: the disk is full or the folder cannot be written.
     """
     with atomic_writer(path, replace=False) as stream:
         write_tar(stream, samples)
@@ -113,9 +116,16 @@ def scan_samples(
 ) -> Iterator[tuple[str, dict[str, Member]]]:
     """Yield (key, members by suffix) of each sample of an open shard, reading headers only.
 
-    Members of one sample must stand together, as WebDataset demands. `maps` takes up the maps by
-    their names: those before a sample are there when it is yielded, and all of them in the end. It
-    raises as `scan_members`, and where a member, a map or a key occurs twice.
+    Members of one sample must stand together, as WebDataset demands.
+
+    Args:
+        stream: the shard.
+        name: of the shard, for messages.
+        maps: takes up the maps by their names: those before a sample are there when it is yielded,
+            and all of them in the end.
+
+    Raises:
+        TrilightError: as `scan_members`, or a member, a map or a key occurs twice.
     """
     maps = {} if maps is None else maps
     seen: set[str] = set()
@@ -151,9 +161,15 @@ class ShardContents:
     def read(
         self, stream: BinaryIO, key: str, accepts: Callable[[str], bool] = lambda suffix: True
     ) -> dict[str, bytes]:
-        """Return members of a sample whose suffix is accepted, and the maps that its record names.
+        """Return members of a sample by suffix, and the maps that its record names.
 
-        It raises TrilightError where the shard has become shorter.
+        Args:
+            stream: the shard.
+            key: of the sample.
+            accepts: says of a suffix whether it is read.
+
+        Raises:
+            TrilightError: the shard has become shorter.
         """
         members = {
             suffix: read_member(stream, member)
@@ -171,7 +187,11 @@ def contents_of(stream: BinaryIO, name: str) -> ShardContents:
 
 
 def samples_of(stream: BinaryIO, name: str) -> Iterator[tuple[str, dict[str, bytes]]]:
-    """Yield (key, bytes by suffix) of each sample of an open shard; raises as `scan_samples`."""
+    """Yield (key, bytes of the members by suffix) of each sample of an open shard.
+
+    Raises:
+        TrilightError: as `scan_samples`.
+    """
     maps: dict[str, Member] = {}
     for key, members in scan_samples(stream, name, maps):
         yield key, ShardContents(samples={key: members}, maps=maps).read(stream, key)
@@ -182,8 +202,11 @@ def with_maps(
 ) -> dict[str, bytes]:
     """Return the members of a sample with those of the maps that its record names.
 
-    Without its record, nothing is added. A map that is missing stays so: what decodes the sample
-    says that. `read` returns the bytes at a place of `maps`, by the names of their members.
+    Args:
+        members: of the sample, by suffix; without its record, nothing is added.
+        maps: where the maps of the shard are, by the names of their members. One that is missing
+            stays so: what decodes the sample says that.
+        read: returns the bytes at such a place.
     """
     if not maps or "json" not in members:
         return members
@@ -195,13 +218,21 @@ def with_maps(
 
 
 def iterate_samples(path: Path) -> Iterator[tuple[str, dict[str, bytes]]]:
-    """Yield (key, members by suffix) of each sample of a shard; raises as `scan_samples`."""
+    """Yield (key, members by suffix) of each sample of a shard.
+
+    Raises:
+        TrilightError: as `scan_samples`, or the file cannot be read.
+    """
     with _open_shard(path) as stream:
         yield from samples_of(stream, path.name)
 
 
 def read_members(path: Path, key: str, suffixes: Collection[str]) -> dict[str, bytes]:
-    """Return some members of one sample of a shard by suffix; raises as `scan_samples`."""
+    """Return some members of one sample of a shard by suffix, reading no other.
+
+    Raises:
+        TrilightError: as `scan_samples`, the file cannot be read, or there is no such sample.
+    """
     with _open_shard(path) as stream:
         contents = contents_of(stream, path.name)
         if key in contents.samples:

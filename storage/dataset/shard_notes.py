@@ -93,7 +93,10 @@ def noted_shard(folder: DatasetFolder, name: str) -> ShardNote:
     """Return what is known of a shard that is there: its note, or else by reading the shard.
 
     A note that is older than the shard, or of another size, was of a shard before it. Of a shard
-    in a bucket the note alone is here. It raises as `index_shard`.
+    in a bucket the note alone is here.
+
+    Raises:
+        TrilightError: the file is not a whole shard.
     """
     path = note_of(folder, name)
     shard = folder.shard(name)
@@ -142,7 +145,7 @@ def fetch_notes(
 
 
 def with_unlisted(dataset: Dataset) -> Dataset:
-    """Return a dataset with the shards that are finished and not listed, as far as is known."""
+    """Return a dataset with the shards that are finished and not listed, as far as is known here."""
     unlisted = _notes(dataset)
     if not unlisted:
         return dataset

@@ -77,10 +77,13 @@ class ShardPlace:
 def listed_shards(patterns: Sequence[str]) -> list[ShardPlace]:
     """Return the shards that patterns name, in their order.
 
-    Patterns are paths or URLs; `{000000..000007}` stands for each number of a range, as wide as its
-    first end, and `{a,b}` for each of several texts. It raises TrilightError where a URL is refused
-    (storage.remote.url), a pattern is not closed or names more than MAX_SHARDS, a range runs
-    backwards, or a shard is named twice.
+    Args:
+        patterns: paths or URLs; `{000000..000007}` stands for each number of a range, as wide as
+            its first end, and `{a,b}` for each of several texts.
+
+    Raises:
+        TrilightError: a URL is refused (storage.remote.url), a pattern is not closed or names more
+            than MAX_SHARDS, a range runs backwards, or a shard is named twice.
     """
     texts = list(itertools.chain.from_iterable(expand_pattern(pattern) for pattern in patterns))
     places = [ShardPlace(place=parse_url(text, what=_WHAT)) for text in texts]
@@ -141,7 +144,10 @@ class OpenShard:
     def __init__(self, name: str, stream: BinaryIO, held: HeldMaps) -> None:
         """Look at the headers; raises TrilightError as `storage.dataset.shard`.
 
-        `held` has maps of this shard and others that were unpacked already.
+        Args:
+            name: for messages.
+            stream: the file.
+            held: maps of this shard and others that were unpacked already.
         """
         self.name = name
         self._stream = stream
@@ -179,14 +185,22 @@ class OpenShard:
         return data
 
     def sample(self, row: int) -> Sample:
-        """Return a sample that passes `Sample.check`; a TrilightError names shard and sample."""
+        """Return a sample that passes `Sample.check`.
+
+        Raises:
+            TrilightError: it is not whole, not readable or breaks a law; names shard and sample.
+        """
         with self._name_errors():
             sample = decode_sample(self._samples[row][0], self.members(row), self._held)
             sample.check()
             return sample
 
     def stored_sample(self, row: int) -> StoredSample:
-        """Return a sample whose pictures are unpacked when they are asked for; as `sample`."""
+        """Return a sample whose pictures are unpacked when they are asked for.
+
+        Raises:
+            TrilightError: its scene is not readable or breaks a law; names shard and sample.
+        """
         with self._name_errors():
             return stored_sample(self._samples[row][0], self.members(row), self._held)
 
@@ -219,7 +233,11 @@ class ShardSet(ABC):
 
     @abstractmethod
     def open(self, number: int) -> OpenShard:
-        """Open a shard, fetched and checked; else a TrilightError names it."""
+        """Open a shard, fetched and checked.
+
+        Raises:
+            TrilightError: it cannot be read, or is not what it should be; the message names it.
+        """
 
 
 class ManifestShards(ShardSet):

@@ -85,7 +85,11 @@ MOST_SHARDS = 1_000_000
 
 
 def shards_for(num_scenes: int, settings: "SplitSettings") -> int:
-    """Return how many shards hold at least `num_scenes`; raises TrilightError above MOST_SHARDS."""
+    """Return how many shards hold at least `num_scenes` scenes.
+
+    Raises:
+        TrilightError: more than MOST_SHARDS.
+    """
     if settings.listed_shards:
         return len(settings.listed_shards)
     count = -(-num_scenes // settings.scenes_per_shard)

@@ -112,7 +112,8 @@ class Statistics:
 def dataset_statistics(dataset: Dataset) -> Statistics:
     """Read samples but their pictures, through the headers of the shards: all, or a sample of them.
 
-    It raises TrilightError where a shard is missing or damaged.
+    Raises:
+        TrilightError: a shard is missing or damaged.
     """
     tally = _Tally()
     by_split = Counter[str]()

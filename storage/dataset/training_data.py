@@ -185,8 +185,11 @@ class MixedShards(ShardSet):
 def open_mixture(data: Sequence[str]) -> TrainingData:
     """Open what `--data` names where it may be more than one dataset.
 
-    It raises as `open_training_data`, and where a dataset is there twice or shards are beside
-    datasets.
+    Args:
+        data: roots of datasets, or any number of shards as `open_training_data` takes them.
+
+    Raises:
+        TrilightError: as `open_training_data`; a dataset is there twice, or shards beside datasets.
     """
     if len(data) < 2 or any(is_shards(text) for text in data):
         return open_training_data(data)

@@ -261,7 +261,11 @@ def encode_asset(asset: Asset) -> bytes:
 
 
 def decode_asset(data: bytes) -> Asset:
-    """Return the asset of a file; raises TrilightError where it is damaged or of another kind."""
+    """Return the asset of a file.
+
+    Raises:
+        TrilightError: the file is damaged, or another kind of safetensors file.
+    """
     arrays, metadata = read_safetensors(data)
     try:
         header = read_json(metadata.get("asset", ""), _Header, "its header")

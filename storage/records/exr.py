@@ -84,11 +84,16 @@ def encode_exr(
     *,
     attributes: Attributes | None = None,
 ) -> bytes:
-    """Return the OpenEXR file of a picture [R, R, 3], rounded to half floats; one thread.
+    """Return the OpenEXR file of a picture, rounded to half floats; one thread.
 
-    A lossy codec may leave values below 0, or infinite ones where the brightest rounds up: callers
-    look at what comes back. It raises TrilightError for a value that is not finite, negative, or
-    too large for a half float.
+    Args:
+        radiance_rgb: [R, R, 3] linear radiance, finite, in [0, 65504].
+        codec: how to pack it. A lossy one may leave values below 0, or infinite ones where the
+            brightest rounds up: callers look at what comes back.
+        attributes: more entries of the header, by name.
+
+    Raises:
+        TrilightError: a value is not finite, negative, or too large for a half float.
     """
     return encode_channels({"RGB": to_half(radiance_rgb)}, codec, attributes=attributes)
 
@@ -113,8 +118,9 @@ def encode_channels(
 ) -> bytes:
     """Return the OpenEXR file of named channels, [H, W] each or [H, W, 3] under the name RGB.
 
-    It raises TrilightError for an attribute that a header cannot hold: integers end at 2^31 - 1,
-    and floats with float32.
+    Raises:
+        TrilightError: a number among the attributes that a header cannot hold: integers end at
+            2^31 - 1, and floats with float32.
     """
     for name, value in (attributes or {}).items():
         _require_held(name, value)
@@ -141,7 +147,11 @@ def _require_held(name: str, value: str | int | float) -> None:
 
 
 def channel_names(data: bytes) -> list[str]:
-    """Return the names of the channels of an OpenEXR file; raises as `read_header`."""
+    """Return the names of the channels of an OpenEXR file of one part; reads no pixel.
+
+    Raises:
+        TrilightError: not an EXR file, truncated, or of several parts.
+    """
     return [str(channel.name) for channel in read_header(data)["channels"]]
 
 
@@ -164,6 +174,9 @@ def decode_stored(data: bytes) -> Stored:
     """Return the picture [H, W, 3] of `decode_exr` as the file holds it.
 
     A function of half floats, such as their logarithm, can be looked up by these bits.
+
+    Raises:
+        TrilightError: as `decode_exr`.
     """
     header: dict[str, Any] = {}
     pixels = decode_channels(data, "RGB", header.update)["RGB"]
@@ -217,7 +230,7 @@ def decode_channels(
 
 
 def read_header(data: bytes) -> Header:
-    """Return the header of an OpenEXR file; raises TrilightError for others, and several parts."""
+    """Return the header of an OpenEXR file of one part; raises TrilightError as `channel_names`."""
     with _readable():
         find_header_end(data)
         parts = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).parts
@@ -230,7 +243,8 @@ def read_header(data: bytes) -> Header:
 def find_header_end(data: bytes) -> int:
     """Return where the headers of an OpenEXR file end, found without the library.
 
-    It raises TrilightError where they have more attributes, channels or bytes than are read.
+    Raises:
+        TrilightError: they have more attributes, channels or bytes than are read.
     """
     is_many = int.from_bytes(data[4:8], "little") & MANY_PARTS
     at = 8

@@ -106,9 +106,13 @@ def material_columns() -> tuple[MaterialColumn, ...]:
 
 
 def laid_out(names: Sequence[str] | None = None) -> Iterator[tuple[MaterialColumn, slice]]:
-    """Yield columns and where their numbers stand in a row of `names`, or of all that are declared.
+    """Yield columns and where their numbers stand in a row that holds these, in this order.
 
-    It raises UndeclaredColumn for a name that is not declared.
+    Args:
+        names: of the columns; None: all that are declared, as in the rows of a scene.
+
+    Raises:
+        UndeclaredColumn: a name that is not declared.
     """
     start = 0
     for name in COLUMNS if names is None else names:
@@ -179,9 +183,13 @@ def stored_names(names: Sequence[str]) -> str | None:
 def completed_rows(stored: NDArray[np.float32], stated: str | None) -> NDArray[np.float32]:
     """Return rows with all declared columns of those that a file holds; others get defaults.
 
-    `stated` is what the file says of its columns (`stored_names`). It raises TrilightError where a
-    column is not declared here, or has another width, or `stated` is not of this form or does not
-    fit the array.
+    Args:
+        stored: [M, width] as the file has them.
+        stated: what it says of its columns (`stored_names`).
+
+    Raises:
+        TrilightError: a column is not declared here, or has another width; or `stated` is not of
+            this form or does not fit the array.
     """
     names = PUBLISHED_COLUMNS if stated is None else _names_of(stated)
     width = material_width(names)

@@ -103,7 +103,11 @@ def write_object_index(
     num_found: int,
     num_maps: int = 0,
 ) -> IndexFacts:
-    """Write the index of a lock atomically; arguments as the fields of `IndexFacts`."""
+    """Write the index of a lock atomically; arguments as the fields of `IndexFacts`.
+
+    Raises:
+        TrilightError: the file cannot be written.
+    """
     rows = sorted(objects, key=lambda row: (row.locked.split, row.locked.uid))
     camps = sorted({share_alike_camp(row.locked.licence) for row in rows})
     number = {camp: index for index, camp in enumerate(camps)}

@@ -117,7 +117,11 @@ def write_objects_lock(path: Path, objects: Iterable[LockedObject]) -> None:
 
 
 def read_objects_lock(path: Path) -> list[LockedObject]:
-    """Return the objects of a lock; raises TrilightError for a missing file, or a wrong line."""
+    """Return the objects of a lock.
+
+    Raises:
+        TrilightError: missing, or a line that is not a locked object.
+    """
     try:
         data = read_plain(path)
     except OSError as error:
@@ -137,7 +141,11 @@ def encode_failures(failures: Iterable[Failure]) -> bytes:
 
 
 def decode_failures(data: bytes) -> list[Failure]:
-    """Return the failures of a file of `encode_failures`; raises TrilightError for other lines."""
+    """Return the failures of a file that `encode_failures` made.
+
+    Raises:
+        TrilightError: a line is not a failure.
+    """
     return read_json_lines(data, Failure, "failures.jsonl")
 
 
@@ -178,7 +186,11 @@ class LockRows:
     """The rows of a lock file; what it holds in memory does not depend on how many there are."""
 
     def __init__(self, path: Path) -> None:
-        """Open the lock; raises TrilightError where it is missing, or no plain file."""
+        """Open the lock.
+
+        Raises:
+            TrilightError: it is missing, or no plain file.
+        """
         self._path = path
         try:
             self._stream = open_plain(path)

@@ -149,7 +149,8 @@ def maps_digest(record: Mapping[str, Any]) -> NDArray[np.uint8]:
 def referenced_maps(record: Any) -> list[str]:
     """Return the member names of the maps that a scene's record names, each once.
 
-    It raises TrilightError where the entry `maps` is not of the form of `maps_record`.
+    Raises:
+        TrilightError: the record's entry `maps` is not of the form of `maps_record`.
     """
     if not isinstance(record, Mapping) or "maps" not in record:
         return []
@@ -158,7 +159,11 @@ def referenced_maps(record: Any) -> list[str]:
 
 
 def map_entries(maps: Any) -> tuple[Sequence[Entry], Sequence[Entry]]:
-    """Return what a record says of its textures, and of its sky; raises as `referenced_maps`."""
+    """Return what a record says of its textures, and of its environment, if there is one.
+
+    Raises:
+        TrilightError: as `referenced_maps`.
+    """
     if not isinstance(maps, Mapping) or not set(maps) <= {"textures", "environment"}:
         wrong_value("maps", maps, "textures, environment, or both")
     entries = maps.get("textures", [])
@@ -203,7 +208,11 @@ def checked_map(kind: type[Map], entry: Entry, values: NDArray, *, is_srgb: bool
 
 
 def described_map(entry: Entry, one: Map) -> Map:
-    """Return a map as an entry of `maps_record` calls and turns it, by a rotation or an error."""
+    """Return a map with the name, rights and turn that an entry of `maps_record` says.
+
+    Raises:
+        TrilightError: the turn is no rotation.
+    """
     source = MapSource(**{name: entry[name] for name in _SOURCE_FIELDS})
     if isinstance(one, Texture):
         return with_same_content(one, source=source)
@@ -228,7 +237,11 @@ def pack_map(one: Texture | Environment) -> bytes:
 
 
 def unpack_texture(data: bytes, name: str) -> Texture:
-    """Return the texture of `pack_map`; raises TrilightError, with `name`, for an unlawful one."""
+    """Return the texture of `pack_map`, called `name` in messages.
+
+    Raises:
+        TrilightError: no texture, damaged, or larger than MAX_MAPS_BYTES.
+    """
     packed_map = _PackedMap(data, name)
     if packed_map.form not in _FORMS[Texture] or packed_map.num_bytes_held > MAX_MAPS_BYTES:
         wrong_value(name, packed_map.form, f"a texture of at most {MAX_MAPS_BYTES} bytes")

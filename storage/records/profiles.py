@@ -48,9 +48,15 @@ _GZIP = 31
 def pack_picture(
     radiance_rgb: NDArray[np.float32], noise_floor_db: float, profile: Profile
 ) -> bytes:
-    """Return the OpenEXR file of a picture [R, R, 3] by a profile; raises as `encode_exr`.
+    """Return the OpenEXR file of a picture.
 
-    The error of the picture, as psnr_log_db, decides how much a codec may add.
+    Args:
+        radiance_rgb: [R, R, 3] linear radiance, finite, in [0, 65504].
+        noise_floor_db: error of the picture as psnr_log_db.
+        profile: how to pack it.
+
+    Raises:
+        TrilightError: a value that half floats cannot hold.
     """
     exact = encode_exr(radiance_rgb, ZIP)
     if profile == "lossless":
@@ -86,7 +92,8 @@ def pack_arrays(safetensors: bytes, profile: Profile) -> dict[str, bytes]:
 def unpack_arrays(members: Mapping[str, bytes]) -> bytes:
     """Return a scene's safetensors from a sample's members, whichever way they are packed.
 
-    It raises TrilightError for none, both, a damaged one, or more than MAX_ARRAY_BYTES.
+    Raises:
+        TrilightError: missing, there in both ways, damaged, or larger than MAX_ARRAY_BYTES.
     """
     forms = [suffix for suffix in (PLAIN, PACKED) if suffix in members]
     if len(forms) != 1:

@@ -69,11 +69,16 @@ def read_safetensors(
 def safetensors_header(
     data: bytes, max_header_bytes: int = MAX_HEADER_BYTES, *, name: str = "safetensors"
 ) -> dict[str, Any]:
-    """Return the header of a safetensors file held in memory, or of as much as a header may take.
+    """Return the header of a safetensors file held in memory, as it stands there.
+
+    Args:
+        data: the file, or as much of it as the header may take.
+        max_header_bytes: a longer header is refused.
+        name: of the file, for messages.
 
     Raises:
         TrilightError: the bytes are truncated, the header is larger than `max_header_bytes`, or it
-            is no JSON object; `name` is the file in messages.
+            is no JSON object.
     """
     length = int.from_bytes(data[:8], "little")
     if len(data) < 8 or length > min(max_header_bytes, len(data) - 8):

@@ -279,10 +279,13 @@ def _decode_parts(
 def decode_scene(
     key: str, members: Mapping[str, bytes], held: HeldMaps | None = None
 ) -> SceneRecord:
-    """Return a sample without its pictures, whose members may be absent; raises as `decode_sample`.
+    """Return a sample without its pictures, whose members may be absent.
 
     The maps that its record names are among the members, under the names that shards give them.
     Those that are held are not unpacked again; equal members give equal scenes with any.
+
+    Raises:
+        TrilightError: as `decode_sample`.
     """
     if "json" not in members:
         raise TrilightError(f"sample {key}: member {key}.json is missing.")
@@ -410,7 +413,12 @@ class StoredSample(SceneRecord):
     def lights_rgb(self, views: Sequence[int], resolution: int) -> NDArray[np.float32] | None:
         """Return radiance of each light alone [V, L, R, R, 3]; None where they are together.
 
-        `views` are at least one, and `resolution` is R of `pictures`. It raises as `pictures`.
+        Args:
+            views: at least one.
+            resolution: R, that of `pictures`.
+
+        Raises:
+            TrilightError: as `pictures`.
         """
         with name_errors(self.key):
             size = (resolution, resolution)

@@ -81,9 +81,13 @@ def encode_arrays(scene: Scene) -> bytes:
 def decode_arrays(data: bytes, maps: Any = None) -> dict[str, NDArray]:
     """Return the array fields of a scene from the bytes of `encode_arrays`.
 
-    `maps` is what the record of the scene says of its maps (storage.records.packed_maps). It raises
-    TrilightError where they are damaged, an array is missing, a material column is not declared
-    here, or the arrays are those of a scene with other maps.
+    Args:
+        data: the bytes.
+        maps: what the record of the scene says of its maps (storage.records.packed_maps).
+
+    Raises:
+        TrilightError: damaged, an array is missing, a material column is not declared here, or the
+            arrays are those of a scene with other maps.
     """
     arrays, metadata = read_safetensors(data)
     if missing := set(ARRAY_FIELDS) - set(arrays):
@@ -104,7 +108,11 @@ def scene_digest(scene: Scene) -> str:
 
 
 def encode_scene(scene: Scene) -> bytes:
-    """Return the `.safetensors` file of a scene; raises where it breaks a law, or is too large."""
+    """Return the `.safetensors` file of a scene.
+
+    Raises:
+        TrilightError: the scene breaks a law, or is larger than `decode_scene_file` accepts.
+    """
     scene.check()
     scene = without_constant_textures(scene)
     record = scene_record(scene)
@@ -129,7 +137,11 @@ def encode_scene(scene: Scene) -> bytes:
 
 
 def read_scene_file(path: Path) -> Scene:
-    """Return the scene of a `.safetensors` file; raises as `decode_scene_file`."""
+    """Return the scene of a `.safetensors` file; its size is checked before it is read.
+
+    Raises:
+        TrilightError: it cannot be read, or as `decode_scene_file`.
+    """
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_FILE_BYTES:
@@ -143,7 +155,11 @@ def read_scene_file(path: Path) -> Scene:
 
 
 def decode_scene_file(data: bytes, name: str) -> Scene:
-    """Return the scene of a `.safetensors` file held in memory, called `name` in messages.
+    """Return the scene of a `.safetensors` file held in memory.
+
+    Args:
+        data: the bytes.
+        name: of the file, for messages.
 
     It raises TrilightError where it is larger than MAX_FILE_BYTES or damaged, has an array too
     many, too few or of another type or shape, metadata that are not a scene's or of another schema
@@ -192,7 +208,11 @@ def require_version_of_maps(record: Mapping[str, Any]) -> None:
 
 
 def scene_objects(value: Any) -> tuple[SceneObject, ...]:
-    """Return the objects that a JSON value lists; raises TrilightError at the first wrong field."""
+    """Return the objects that a JSON value lists.
+
+    Raises:
+        TrilightError: no list, a field too many or too few, no text, or an unknown kind.
+    """
     if not isinstance(value, list):
         wrong_value("objects", value, "a list")
     fields = dict.fromkeys((field.name for field in dataclasses.fields(SceneObject)), str)
@@ -205,7 +225,11 @@ def scene_objects(value: Any) -> tuple[SceneObject, ...]:
 
 
 def scene_provenance(value: Any) -> Mapping[str, Any]:
-    """Return the provenance of a JSON value; raises TrilightError where it has another form."""
+    """Return the provenance of a JSON value.
+
+    Raises:
+        TrilightError: it is no object, or its template or excursion is malformed.
+    """
     if not isinstance(value, dict):
         wrong_value("provenance", value, "a JSON object")
     if not isinstance(value.get("template", ""), str):

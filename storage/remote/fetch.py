@@ -40,7 +40,12 @@ class Facts:
 
 
 def facts_of(url: RemoteUrl) -> Facts:
-    """Ask about a file; raises TransferFailed where there is none, or no answer."""
+    """Ask about a file.
+
+    Raises:
+        TransferFailed: there is none, it may not be seen, or the server gives no answer.
+        TrilightError: the driver's package is missing.
+    """
     driver = shared_driver(url)
     info = with_tries(lambda: _fresh_info(driver, url))
     if info.get("type") == "directory":
@@ -178,7 +183,9 @@ _CHANGED = "the file changed while it was read"
 def fetch_if_there(url: RemoteUrl, stream: BinaryIO, *, max_bytes: int) -> bool:
     """Write a file to an open one as `download`, and return True; False where there is none.
 
-    It raises Unreadable where it cannot be read, and as `download`.
+    Raises:
+        Unreadable: it cannot be read.
+        TrilightError: as `download`.
     """
     try:
         download(url, stream, num_bytes=None, max_bytes=max_bytes)

@@ -170,7 +170,12 @@ class Pace:
     def __init__(
         self, position: Callable[[], int], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """Begin to watch how many bytes have come; that falls where a transfer starts over."""
+        """Begin to watch.
+
+        Args:
+            position: how many bytes have come; falls where a transfer starts over.
+            clock: seconds.
+        """
         self._position = position
         self._clock = clock
         self._patience = PATIENCE

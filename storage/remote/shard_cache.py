@@ -35,9 +35,11 @@ class ShardCache:
     """A folder of shards by URL and hash."""
 
     def __init__(self, root: Path, max_bytes: int) -> None:
-        """Remember the folder, which is the cache's alone, and what all shards together may take.
+        """Remember the folder.
 
-        What is being read stays even beyond that.
+        Args:
+            root: the folder; belongs to the cache alone.
+            max_bytes: what all shards together may take. What is being read stays even beyond it.
         """
         self.root = root
         self.max_bytes = max_bytes
@@ -70,6 +72,11 @@ class ShardCache:
         """Move a shard of this machine into the cache, since it is on the server too.
 
         The file is gone afterwards, also where the cache has no room for it.
+
+        Args:
+            path: the shard.
+            url: where it is on the server.
+            sha256: its digest.
         """
         with contextlib.suppress(OSError):
             num_bytes = path.stat().st_size

@@ -146,8 +146,10 @@ class BucketStore(Store):
     def __init__(self, url: RemoteUrl, work: Path | None = None) -> None:
         """Name the folder.
 
-        `work` is a folder of this machine for its claims, and its name as their holder, which is
-        written at its first claim: a machine that is killed has its claims again at once.
+        Args:
+            url: the folder.
+            work: a folder of this machine for its claims, and its name as their holder, which is
+                written at its first claim: a machine that is killed has its claims again at once.
         """
         self.url = url
         self._work = work
@@ -195,7 +197,12 @@ class BucketStore(Store):
         return self._list_paths(folder, list_files)
 
     def list_all(self) -> set[str]:
-        """Return the names of all files, however deep; a thousand are a request."""
+        """Return the names of all files, however deep; a thousand names are a request.
+
+        Raises:
+            TrilightError: the bucket does not exist or may not be listed, or the server gives no
+                answer (an EnvironmentFailure where that may pass).
+        """
         return self._list_paths("", lambda driver, place: driver.find(place))
 
     def _list_paths(self, folder: str, find: Callable[[Any, str], Iterable[str]]) -> set[str]:

@@ -110,7 +110,8 @@ def parse_local_path(text: str) -> Path:
 def open_driver(url: RemoteUrl) -> Any:
     """Return the fsspec file system that reads a folder; it keeps no listings.
 
-    It raises TrilightError, which names the package, where that is not installed.
+    Raises:
+        TrilightError: its package is not installed; names the package.
     """
     package = PACKAGES[url.scheme]
     try:

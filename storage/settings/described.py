@@ -96,8 +96,10 @@ def leaves_out(*names: str) -> Any:
 def settings_record(group: Any, *, stated: bool = False) -> dict[str, Any]:
     """Return settings as JSON values, as manifests and checkpoints hold them.
 
-    With `stated`, what is at its default is left out: such a record stays what it is when a field
-    is added whose default is what was done before.
+    Args:
+        group: an instance.
+        stated: leave out what is at its default; such a record stays what it is when a field is
+            added whose default is what was done before.
     """
     adapter = _adapter(typing.cast(Any, type(group)))
     record: dict[str, Any] = adapter.dump_python(group, mode="json", exclude_defaults=stated)
@@ -107,13 +109,18 @@ def settings_record(group: Any, *, stated: bool = False) -> dict[str, Any]:
 def from_record(kind: type[Settings], record: Any) -> Settings:
     """Return the settings of a record; what it lacks is at its default.
 
-    It raises TrilightError for a value that they refuse, by its dotted place.
+    Raises:
+        TrilightError: a value that they refuse, by its dotted place.
     """
     return typing.cast(Settings, _read(record, kind, kind))
 
 
 def field_value(kind: type, field: FieldDescription, value: Any, display_name: str) -> Any:
-    """Return a JSON value as that of a field of `kind`; complaints call it `display_name`."""
+    """Return a JSON value as the value of a field of `kind`, which complaints call `display_name`.
+
+    Raises:
+        TrilightError: the value is of another type or outside its range.
+    """
     return _read(value, field.hint, kind, field=field, display_name=display_name)
 
 
@@ -127,7 +134,8 @@ def _read(value: Any, hint: Any, kind: type, **place: Any) -> Any:
 def parse_strictly(data: bytes | str, kind: Any, source: str) -> Any:
     """Return the value of a JSON text, of a type that is made of plain dataclasses, or None.
 
-    It raises TrilightError for other JSON; `source` begins the complaint.
+    Raises:
+        TrilightError: other JSON than the type says; `source` begins the complaint.
     """
     try:
         return _strict_adapter(kind).validate_json(data)
@@ -159,9 +167,13 @@ def _complaint(
 ) -> TrilightError:
     """Return what is wrong first: the place, the value and what was expected.
 
-    Values of `kind` were read, or of its `field` alone, which is shown as `display_name`. The
-    complaint begins with `called`, and `option` returns what a dotted place is called where people
-    write it.
+    Args:
+        error: what pydantic found.
+        kind: the class whose values were read.
+        called: begins the complaint.
+        option: returns what a dotted place is called where people write it.
+        field: the field whose value alone was read.
+        display_name: what is shown of that field.
     """
     mistakes = error.errors(include_url=False)
     # a name that is unknown says more than the one that lacks then

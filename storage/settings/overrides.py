@@ -31,8 +31,10 @@ Override = tuple[Sequence[str], Any, str]
 def json_or_word(text: str) -> Any:
     """Return the JSON value that a text is, or the text: what a person writes as a value.
 
-    Words in a list need no quotes either: [depth,normal]. It raises TrilightError for a number of
-    thousands of digits, or values nested hundreds deep.
+    Words in a list need no quotes either: [depth,normal].
+
+    Raises:
+        TrilightError: a number of thousands of digits, or values nested hundreds deep.
     """
     try:
         return json.loads(text)
@@ -46,7 +48,12 @@ def json_or_word(text: str) -> Any:
 
 
 def option_words(settings: Any, *, leave_out: tuple[str, ...] = ()) -> list[str]:
-    """Return the options of a command that state settings, without defaults and `leave_out`."""
+    """Return the options of a command that state settings, but for those at their default.
+
+    Args:
+        settings: an instance of a class of settings.
+        leave_out: fields that are not stated.
+    """
     kind: Any = type(settings)
     words: list[str] = []
     for field in describe_fields(kind):
@@ -85,9 +92,11 @@ def apply_overrides(settings: Settings, overrides: Mapping[str, Any]) -> Setting
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
-    """Return by dotted name what differs in a record `now` from that `before`.
+    """Return by dotted name what differs in a record; groups of another kind are whole.
 
-    Groups of another kind are whole; what `now` lacks does not differ.
+    Args:
+        before: a record (storage.settings.described.settings_record), or part of one.
+        now: that whose values are returned; what it lacks does not differ.
     """
     differing: dict[str, Any] = {}
     for name, value in now.items():

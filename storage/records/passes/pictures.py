@@ -200,8 +200,13 @@ def passes_exr(
 ) -> bytes:
     """Return the OpenEXR file of passes of one camera; equal arguments give equal bytes.
 
-    Arguments are those of `view_passes`, and `passes_in_file` says which passes the file has. It
-    raises as `view_passes`, and for a scene of more than 2^24 triangles.
+    Args:
+        scene: passes `Scene.check`.
+        names: of the passes; `passes_in_file` says which of them the file has.
+        view, resolution, rays_a_side: as `view_passes`.
+
+    Raises:
+        TrilightError: as `view_passes`, or the scene has more than 2^24 triangles.
     """
     if scene.num_triangles > MOST_IDS:
         raise TrilightError(
@@ -249,9 +254,15 @@ def picture_passes(
 ) -> dict[str, NDArray]:
     """Return passes of one view by name, one ray a pixel: the same numbers, stored or computed.
 
-    Arguments and result are those of `view_passes`, with float32 in place of float64. What
-    `stored`, an OpenEXR file of passes of this view, lacks is computed. It raises as
-    `decode_passes_exr` too.
+    Args:
+        scene, names, view, resolution: as `view_passes`.
+        stored: an OpenEXR file of passes of this view; what it lacks is computed.
+
+    Returns:
+        as `view_passes`, with float32 in place of float64.
+
+    Raises:
+        TrilightError: as `view_passes` and `decode_passes_exr`.
     """
     pictures = {} if stored is None else decode_passes_exr(stored, resolution)
     lacking = [name for name in names if name not in pictures]
