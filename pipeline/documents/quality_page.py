@@ -38,10 +38,14 @@ def encode_quality_page(
     budget: int,
     target: str,
 ) -> bytes:
-    """Return the page of accepted objects and of failures, the rejected ones.
+    """Return the page.
 
-    `pairs` has pictures by the name of their group, `unread` the unread parts of accepted objects
-    by uid. `budget` is the most triangles of an object, `target` that of the mesh stage in words.
+    Args:
+        rows: the accepted objects; `failures` are the rejected ones.
+        pairs: pictures by the name of their group.
+        unread: unread parts of accepted objects, by uid.
+        budget: most triangles of an object.
+        target: target of the mesh stage, in words.
     """
     requests = [row.materials for row in rows if row.materials is not None]
     return render_page(

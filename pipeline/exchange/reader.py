@@ -33,9 +33,10 @@ class SceneReader(contextlib.AbstractContextManager["SceneReader"]):
     """A child process that reads any number of sources; close it, or use a `with` block."""
 
     def __init__(self, albedo_over_one: AlbedoOverOne = "scale") -> None:
-        """Create the reader, with its treatment of albedos over 1 in RenderFormer's JSON.
+        """Create the reader; the child starts with the first call.
 
-        The child starts with the first call.
+        Args:
+            albedo_over_one: treatment of albedos over 1 in RenderFormer's JSON.
         """
         self._child = file_child()
         self._over_one = albedo_over_one
