@@ -75,7 +75,7 @@ def draw_look(
     Args:
         rng: the stream of this surface.
         settings: the shares and the ranges.
-        own: a user's own textures.
+        user_textures: a user's own textures.
         licences: of what is in the scene already.
     """
     if rng.random() >= settings.share:

@@ -83,7 +83,7 @@ def draw_user_map(
 
     Args:
         rng: the stream.
-        own: the textures or maps.
+        user_maps: the textures or maps.
         share: probability of one.
         licences: of what is in the scene already.
     """

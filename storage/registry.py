@@ -92,7 +92,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         `FILE.py:FUNCTION` without the folder.
 
         Args:
-            typed: a name, which may be unknown, or FILE.py:FUNCTION.
+            reference: a name, which may be unknown, or FILE.py:FUNCTION.
             as_entry: makes an entry of what the function returned, or raises TrilightError.
 
         Raises:

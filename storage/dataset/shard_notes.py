@@ -145,7 +145,7 @@ def fetch_notes(
 
 
 def with_unlisted(dataset: Dataset) -> Dataset:
-    """Return a dataset with the shards that are finished and not listed, as far as is known here."""
+    """Return a dataset with the shards that are finished and not listed, as far as known here."""
     unlisted = _notes(dataset)
     if not unlisted:
         return dataset
