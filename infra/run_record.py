@@ -9,8 +9,7 @@ from typing import Any
 from storage.errors import TrilightError
 from storage.records.safe_read import read_plain
 from storage.typed_json import read_json
-from train.folder import RunFolder
-from train.monitoring.rows import read_rows
+from train.folder import RunFolder, read_rows
 
 FIGURES = {
     "training_loss": ("loss",),

@@ -165,14 +165,14 @@ def tensors_of(scenes: SceneTensors | SceneBatch) -> dict[str, Tensor]:
     return {name: value for name, value in vars(scenes).items() if isinstance(value, Tensor)}
 
 
-def map_tensors(whole: Mapped, convert: Callable[[Tensor], Tensor]) -> Mapped:
+def map_tensors(scenes: Mapped, convert: Callable[[Tensor], Tensor]) -> Mapped:
     """Return the same scenes, or what holds them, with each tensor converted, as to a device."""
     fields = {
         name: convert(each) if isinstance(each, Tensor) else map_tensors(each, convert)
-        for name, each in vars(whole).items()
+        for name, each in vars(scenes).items()
         if isinstance(each, Tensor | SceneBatch | Traced)
     }
-    return dataclasses.replace(whole, **fields)  # type: ignore[type-var]
+    return dataclasses.replace(scenes, **fields)  # type: ignore[type-var]
 
 
 def in_light_units(batch: SceneBatch, unit_B3: Tensor) -> SceneBatch:

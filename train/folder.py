@@ -1,13 +1,17 @@
-"""Paths in the folder of a run, and the lock of the trainer that writes them."""
+"""Paths in the folder of a run, its log and notes, and the lock of the trainer that writes them."""
 
 import contextlib
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from storage.atomic import append_line
 from storage.errors import TrilightError
 from storage.file_locks import describe_holder, hold_lock
+from storage.records.safe_read import read_plain
+from storage.typed_json import read_json_lines
 
 if TYPE_CHECKING:
     from train.loop.distributed import DistributedContext
@@ -32,7 +36,7 @@ class RunFolder:
         self.tensorboard = root / "tensorboard"
         """Folder of TensorBoard's files: the log's numbers and the sheets."""
         self.notes = root / "notes.jsonl"
-        """Dated notes: starts, resumes, warnings (monitoring.rows)."""
+        """Dated notes: starts, resumes, warnings (`add_note`)."""
         self.monitoring = root / "watching"
         """Folder of the stacks of hung steps, and of the profiler's traces."""
         self.summary = root / "summary.json"
@@ -77,3 +81,31 @@ def claim_run(folder: RunFolder, dist_context: "DistributedContext") -> Iterator
 def pretty_json(record: object) -> bytes:
     """Return indented, sorted JSON with a final newline."""
     return json.dumps(record, indent=1, sort_keys=True).encode() + b"\n"
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a log, each with its `step`; a missing file has none.
+
+    Raises:
+        TrilightError: a line before the last is invalid; the last may be incomplete after a kill.
+    """
+    if not path.exists():
+        return []
+    rows = read_json_lines(read_plain(path), dict[str, Any], str(path), torn_end=True)
+    for number, row in enumerate(rows, start=1):
+        if not isinstance(row.get("step"), int):
+            raise TrilightError(f"{path}:{number}: step is {row.get('step')!r}; expected a number.")
+    return rows
+
+
+def add_note(path: Path, step: int, text: str) -> None:
+    """Append a sentence without its full stop.
+
+    Args:
+        step: number of steps that were done by then.
+
+    Raises:
+        TrilightError: the folder is full or cannot be written.
+    """
+    line = json.dumps({"step": step, "at_unix_s": round(time.time()), "text": text})
+    append_line(path, line)

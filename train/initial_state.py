@@ -21,7 +21,7 @@ from storage.extensions import extension_digests
 from storage.records.safe_read import read_plain
 from storage.typed_json import read_json
 from train.data.order import RECORD, plan_mixture
-from train.folder import RunFolder, pretty_json
+from train.folder import RunFolder, pretty_json, read_rows
 from train.loop.checkpoints import (
     newest_checkpoint,
     read_checkpoint,
@@ -32,7 +32,6 @@ from train.loop.distributed import DistributedContext
 from train.loop.optimizer import choose_muon_precision
 from train.loop.recorder import MetricsLog
 from train.loop.train_state import TrainState, new_state
-from train.monitoring.rows import read_rows
 from train.progress import TrainProgress
 from train.resume import Event, ResumePlan, StartOptions, event_records, plan_resume
 from train.settings import TrainSettings, stored_settings
@@ -213,24 +212,24 @@ def _record_execution_changes(
 ) -> None:
     """Report and record changed processes, threads and Muon precision."""
     header = checkpoint.header
-    muon = state.updater.muon_precision
-    now = {
+    now: dict[str, tuple[Any, Any]] = {
         "processes": (header["world_size"], dist_context.world_size),
         "threads": (header.get("threads"), torch.get_num_threads()),
         # the only one that there was
-        "muon_precision": (header.get("muon_precision", "bfloat16"), muon),
-    }
-    descriptions = {
-        "processes": f"{dist_context.world_size} processes instead of {header['world_size']}: "
-        "the same to rounding, not to the bit",
-        "threads": f"{torch.get_num_threads()} threads instead of {header.get('threads')}: the "
-        "same to rounding, not to the bit",
-        "muon_precision": f"Muon's products in {muon} instead of {now['muon_precision'][0]}, which "
-        "suits the processors here: the same to the rounding of bfloat16, not to the bit",
+        "muon_precision": (
+            header.get("muon_precision", "bfloat16"),
+            state.updater.muon_precision,
+        ),
     }
     for name, (before, after) in now.items():
-        if before is None or after is None or before == after:
+        if None in (before, after) or before == after:
             continue
-        progress.note(f"the run goes on with {descriptions[name]}")
+        text = f"{after} {name} instead of {before}: the same to rounding, not to the bit"
+        if name == "muon_precision":
+            text = (
+                f"Muon's products in {after} instead of {before}, which suits the processors here: "
+                "the same to the rounding of bfloat16, not to the bit"
+            )
+        progress.note(f"the run goes on with {text}")
         event = Event(step=state.step, kind="execution", name=name, before=before, after=after)
         state.history += (event,)

@@ -15,8 +15,7 @@ from storage.errors import TrilightError
 from storage.settings.described import from_record, settings_record
 from storage.settings.fields import describe_fields
 from storage.settings.overrides import apply_overrides, differences
-from train.loop.schedule import decay_start_step
-from train.settings import TrainSettings, known_settings
+from train.settings import TrainSettings, decay_start_step, known_settings
 
 DATA = "data"
 """Name of the change to other data. Its value is the start of their digest, after `sha256:` for a
@@ -158,11 +157,7 @@ def plan_resume(
     }
     settings = apply_overrides(before, execution_changes | named_decisions)
     new_values = differences(old_record, settings_record(settings))
-    # by setting, the earlier values that a command may still state
-    stated: dict[str, list[Any]] = {}
-    for event in past_events:
-        values = [event.before, event.after] if event.kind == "earlier" else [event.before]
-        stated.setdefault(event.name, values)
+    stated = _original_values(past_events)
     events = list[Event]()
     undecided = dict[str, Any]()
     for name, value in typed_otherwise.items():
@@ -192,6 +187,15 @@ def plan_resume(
 def event_records(events: Sequence[Event]) -> list[dict[str, Any]]:
     """Return events as the JSON records of checkpoints, settings.json and summary.json."""
     return [dataclasses.asdict(event) for event in events]
+
+
+def _original_values(past: Sequence[Event]) -> dict[str, list[Any]]:
+    """Return, by setting, the earlier values that a command may still state."""
+    stated: dict[str, list[Any]] = {}
+    for event in past:
+        values = [event.before, event.after] if event.kind == "earlier" else [event.before]
+        stated.setdefault(event.name, values)
+    return stated
 
 
 def _data_event(header: Mapping[str, Any], digest: str, decided: Any) -> Iterator[Event]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -20,20 +20,18 @@ from storage.errors import TrilightError
 from train.data.bad_samples import BadSampleCounter, first_samples
 from train.data.buckets import decodes_on_device, step_scenes
 from train.data.loader import LoaderSettings, choose_workers, detect_machine, load_batches
-from train.data.scenes import training_scene
+from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.metrics import Lead
 from train.evaluation.sheet import draw_validation_sheet, write_picture
 from train.evaluation.validation import Judge, median_picture
-from train.folder import RunFolder, claim_run, pretty_json
+from train.folder import RunFolder, add_note, claim_run, pretty_json, read_rows
 from train.initial_state import init_or_resume_state, plan_start
 from train.loop.distributed import DistributedContext
-from train.loop.recorder import Recorder
+from train.loop.recorder import Recorder, require_wandb
 from train.loop.train_state import TrainState
 from train.loop.trainer import Trainer, scene_flops
 from train.loss.lpips import load_lpips
 from train.loss.training_loss import TrainingLoss
-from train.monitoring.boards import require_wandb
-from train.monitoring.rows import add_note, read_rows
 from train.progress import TrainProgress
 from train.resume import Event, StartOptions
 from train.settings import TrainSettings, WatchSettings
@@ -187,8 +185,8 @@ def _train(
     dataset = open_mixture(data)
     # alike in all processes: torchrun counts restarts for each machine separately, and a network
     # file system shows a new file to one machine before another
-    found = dist_context.any(start.restartable and bool(saved_steps(folder.checkpoints)))
-    start = dataclasses.replace(start, resume=start.resume or found, restartable=False)
+    has_checkpoint = dist_context.any(start.restartable and bool(saved_steps(folder.checkpoints)))
+    start = dataclasses.replace(start, resume=start.resume or has_checkpoint, restartable=False)
     early_notes = _NoteBuffer(progress)
     for note in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
         early_notes.note(note)
@@ -223,19 +221,7 @@ def _train(
         recorder=recorder,
         watched=watched,
     )
-    stream = dataclasses.replace(
-        loader_settings(settings), lookup_in_threads=not decodes_on_device(dist_context.device)
-    )
-    scenes = load_batches(
-        dataset.split("train"),
-        stream,
-        state.step,
-        rank_slice=dist_context,
-        workers=workers,
-        unusable=state.bad_samples,
-        mixture=state.mixture,
-    )
-    with closing(scenes) as batches:
+    with closing(_batches(dataset, settings, state, dist_context, workers)) as batches:
         cost = partial(scene_flops, settings)
         most = settings.scenes_per_pass
         with closing(step_scenes(batches, cost, most, dist_context.device)) as steps:
@@ -244,6 +230,28 @@ def _train(
         return None
     recorder.close()
     return finish_run(state, settings, folder, dataset, judge, time.monotonic() - began)
+
+
+def _batches(
+    data: TrainingData,
+    settings: TrainSettings,
+    state: TrainState,
+    dist_context: DistributedContext,
+    workers: int,
+) -> Generator[list[TrainingScene], None, None]:
+    """Return the scenes of this process for each step, beginning with the state's step."""
+    stream = dataclasses.replace(
+        loader_settings(settings), lookup_in_threads=not decodes_on_device(dist_context.device)
+    )
+    return load_batches(
+        data.split("train"),
+        stream,
+        state.step,
+        rank_slice=dist_context,
+        workers=workers,
+        unusable=state.bad_samples,
+        mixture=state.mixture,
+    )
 
 
 class _NoteBuffer(TrainProgress):

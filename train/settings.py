@@ -6,6 +6,7 @@ weights are equal up to rounding, or do not depend on them. All other fields are
 run, and change only by a decision that the run records (train.resume).
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import field
 from typing import Annotated, Any, ClassVar, Literal
@@ -261,3 +262,33 @@ class WatchSettings:
     wandb: str | None = None
     """Project of Weights & Biases that the log is written to as well, if the package is installed;
     offline unless WANDB_MODE says otherwise. By default nothing is."""
+
+
+def decay_start_step(settings: TrainSettings) -> int | None:
+    """Return the number of steps after which a constant rate begins to fall.
+
+    None if the schedule has no constant rate, or no decay.
+    """
+    if settings.schedule != "wsd" or not settings.decay_share:
+        return None
+    begins = settings.num_steps - round(settings.decay_share * settings.num_steps)
+    return max(begins, settings.warmup_steps)
+
+
+def learning_rate(step: int, settings: TrainSettings) -> float:
+    """Return the rate of step 0 ... num_steps - 1; the first is above 0, the last the final one.
+
+    A warm-up, then a constant rate and a decay, or one cosine. A constant rate does not depend on
+    the number of steps. So until its decay begins, a run is exactly the first part of any longer
+    run, and can be extended from there (Hägele et al. 2024).
+    """
+    if step < settings.warmup_steps:
+        return settings.learning_rate * (step + 1) / (settings.warmup_steps + 1)
+    is_cosine = settings.schedule == "cosine"
+    begins = settings.warmup_steps if is_cosine else decay_start_step(settings)
+    if begins is None or step < begins:
+        return settings.learning_rate
+    decayed = min((step - begins) / max(settings.num_steps - 1 - begins, 1), 1.0)
+    height = 0.5 * (1 + math.cos(math.pi * decayed)) if is_cosine else 1 - math.sqrt(decayed)
+    final = settings.learning_rate * settings.final_rate_share
+    return final + (settings.learning_rate - final) * height

@@ -54,10 +54,9 @@ from tests.train.toy import toy_sample, toy_scene
 from train.data.augment import augment_scene
 from train.data.buckets import TrainingBatch, collate_batch
 from train.data.scenes import training_scene
-from train.loop.schedule import learning_rate
 from train.loop.train_state import new_state
 from train.loss.training_loss import TrainingLoss
-from train.settings import AugmentationSettings, LossSettings, TrainSettings
+from train.settings import AugmentationSettings, LossSettings, TrainSettings, learning_rate
 
 GROUPS: dict[type, str] = {
     SceneSettings: "",

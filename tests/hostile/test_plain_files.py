@@ -15,8 +15,8 @@ from storage.errors import TrilightError
 from storage.records.objects import read_failures, read_objects_lock
 from storage.records.scene_file import read_scene_file
 from tests.for_each import case
+from train.folder import read_rows
 from train.loop.checkpoints import read_checkpoint
-from train.monitoring.rows import read_rows
 
 READERS: list[Callable[[Path], object]] = [
     *(_bytes_of, _file_text, index_shard, read_checkpoint, read_failures, read_head),

@@ -37,10 +37,10 @@ from tests.http_server import Fault, Site, serve
 from tests.train.kit import TINY_MODEL, Heard, Killed, flip_a_bit, tiny_run, trained
 from tests.train.toy import write_toy_dataset
 from train.evaluation import validation
+from train.folder import read_rows
 from train.loop import trainer
 from train.loop.checkpoints import read_checkpoint
 from train.loop.interrupts import Stopped
-from train.monitoring.rows import read_rows
 from train.progress import TrainProgress
 from train.resume import StartOptions
 from train.run_training import TrainResult

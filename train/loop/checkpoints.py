@@ -38,11 +38,10 @@ from storage.settings.ranges import Within
 from storage.typed_json import FINITE, Sha256, read_json
 from train.data.order import RECORD, Mixture
 from train.loop.distributed import DistributedContext
-from train.loop.schedule import decay_start_step
 from train.loop.step import StepReport
 from train.loop.train_state import TrainState, new_state
 from train.resume import Event, ResumePlan, event_records
-from train.settings import Precision, TrainSettings, stored_settings
+from train.settings import Precision, TrainSettings, decay_start_step, stored_settings
 
 UNSEALED = "0" * 64
 """Placeholder of the sha256 while it is computed. Old checkpoints have no sha256."""

@@ -1,6 +1,6 @@
 """Optimizers of a run: AdamW, and Muon for the matrices; and whether a step is applied at all.
 
-The learning rate and its warm-up (warmup) are in train.loop.schedule. Muon works on stacks of equal
+The learning rate and its warm-up (warmup) are in train.settings. Muon works on stacks of equal
 matrices, split over all processes.
 
 A step whose loss or gradient is not finite must change nothing. On a CPU the host checks this at

@@ -131,8 +131,8 @@ class Stepper:
         for index, batch in enumerate(batches):
             last = index == len(batches) - 1
             net = self._net  # the gradients are exchanged with the last batch's
-            apart = not last and isinstance(net, DistributedDataParallel) and net
-            with apart.no_sync() if apart else contextlib.nullcontext():
+            distributed_net = not last and isinstance(net, DistributedDataParallel) and net
+            with distributed_net.no_sync() if distributed_net else contextlib.nullcontext():
                 sums += self._add_gradient(
                     batch.to(self._dist_context.device), num_views, last=last
                 )

@@ -24,13 +24,12 @@ from train.loop.distributed import DistributedContext
 from train.loop.interrupts import Stopped, ValidationInterrupted, deferred_interrupts
 from train.loop.optimizer import PRODUCTS
 from train.loop.recorder import Recorder
-from train.loop.schedule import decay_start_step, learning_rate
 from train.loop.step import PendingStats, Stepper, StepReport, explain_out_of_memory
 from train.loop.train_state import TrainState
 from train.loss.training_loss import TrainingLoss
 from train.monitoring.process_monitor import ProcessMonitor
 from train.progress import TrainProgress
-from train.settings import TrainSettings, WatchSettings
+from train.settings import TrainSettings, WatchSettings, decay_start_step, learning_rate
 
 
 class Window:

@@ -257,16 +257,18 @@ class ProcessMonitor:
         by_rank = [json.loads(text) for text in texts]
         if self._dist_context.world_size > 1:
             row["own_s"] = [said["own_s"] for said in by_rank]
-            # told once, until another one is the slowest
-            rank = slowest_rank(row["own_s"])
-            if rank is not None and rank != self._named_rank:
-                slow, fast = row["own_s"][rank], min(row["own_s"])
-                self._note(
-                    f"process {rank} of {len(by_rank)} is the slow one: {slow:.2g} s of its own in "
-                    f"each of the last steps, the fastest {fast:.2g} s; all wait for it"
-                )
-            self._named_rank = rank
+            self._note_slow_rank(row["own_s"])
         return row, _merge_spikes([said["spikes"] for said in by_rank])
+
+    def _note_slow_rank(self, own_s: Sequence[float]) -> None:
+        """Report a process that the others wait for, once until another one is the slowest."""
+        rank = slowest_rank(own_s)
+        if rank is not None and rank != self._named_rank:
+            self._note(
+                f"process {rank} of {len(own_s)} is the slow one: {own_s[rank]:.2g} s of its own "
+                f"in each of the last steps, the fastest {min(own_s):.2g} s; all wait for it"
+            )
+        self._named_rank = rank
 
 
 def _merge_spikes(by_rank: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:

@@ -19,13 +19,12 @@ from train.data.loader import load_batches
 from train.evaluation.validation import Judge
 from train.loop.distributed import DistributedContext
 from train.loop.optimizer import choose_muon_precision
-from train.loop.schedule import learning_rate
 from train.loop.step import Stepper
 from train.loop.train_state import new_state
 from train.loop.trainer import scene_flops
 from train.loss.training_loss import TrainingLoss
 from train.run_training import loader_settings
-from train.settings import TrainSettings
+from train.settings import TrainSettings, learning_rate
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

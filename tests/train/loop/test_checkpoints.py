@@ -34,7 +34,7 @@ from tests.extensions_kit import EXAMPLES, loaded, written
 from tests.for_each import for_each
 from tests.train.kit import ALONE, TINY_MODEL, flip_a_bit, stepper, tiny_run, toy_batch, trained
 from train.data.buckets import TrainingBatch
-from train.folder import RunFolder
+from train.folder import RunFolder, read_rows
 from train.loop import checkpoints, interrupts
 from train.loop.checkpoints import (
     UNSEALED,
@@ -48,7 +48,6 @@ from train.loop.distributed import DistributedContext, choose_device, join_proce
 from train.loop.interrupts import deferred_interrupts
 from train.loop.recorder import MetricsLog
 from train.loop.train_state import TrainState, new_state
-from train.monitoring.rows import read_rows
 from train.progress import TrainProgress
 from train.resume import plan_resume
 from train.settings import TrainSettings, known_settings

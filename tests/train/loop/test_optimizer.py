@@ -31,9 +31,8 @@ from train.data.scenes import TrainingScene, training_scene
 from train.loop import optimizer as muon_file
 from train.loop.distributed import DistributedContext
 from train.loop.optimizer import Updater, choose_muon_precision, muon, orthogonal, split_over_ranks
-from train.loop.schedule import decay_start_step, learning_rate
 from train.loop.train_state import new_state
-from train.settings import Precision, TrainSettings
+from train.settings import Precision, TrainSettings, decay_start_step, learning_rate
 
 RATE = 1e-3
 each_kind = pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from storage.seeds import rng_for
 from tests.conftest import ROOT
 from tests.infra.slurm.test_jobs import commands_in
 from tests.train.toy import write_toy_dataset
-from train.monitoring.rows import read_rows
+from train.folder import read_rows
 
 SMALL = {
     "model.rope_num_freqs": 1,

@@ -31,7 +31,7 @@ from tests.train.loop.test_optimizer import with_gradients
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.buckets import TrainingBatch, bucket_scenes, collate_batch
 from train.data.scenes import training_scene
-from train.folder import RunFolder
+from train.folder import RunFolder, read_rows
 from train.loop import compiled, optimizer
 from train.loop import step as step_module
 from train.loop.checkpoints import read_checkpoint
@@ -40,7 +40,6 @@ from train.loop.optimizer import Decision, Updater, move_along, move_towards
 from train.loop.step import Stepper, StepReport, predict_log10
 from train.loop.train_state import TrainState, ema_step, new_state
 from train.loss.training_loss import TrainingLoss
-from train.monitoring.rows import read_rows
 from train.settings import Compile, LossSettings, Precision
 
 RESOLUTION = 16

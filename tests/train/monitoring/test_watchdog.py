@@ -34,13 +34,13 @@ from tests.for_each import for_each
 from tests.train.kit import ALONE, CPU, Heard, Killed, stepper, tiny_run, toy_batch, trained
 from train.data import loader
 from train.data.scenes import TrainingScene
-from train.folder import RunFolder
+from train.folder import RunFolder, read_rows
 from train.loop.distributed import DistributedContext, join_processes
+from train.loop.recorder import WandbLogger, require_wandb, scalars
 from train.loop.step import StepReport
 from train.loop.train_state import new_state
 from train.monitoring import process_monitor, watchdog
 from train.monitoring.activity import PHASES, Activity, LayerNorms, layer_of
-from train.monitoring.boards import WandbLogger, require_wandb, scalars
 from train.monitoring.process_monitor import (
     LEAST_REMEMBERED,
     OWN_PHASES,
@@ -51,7 +51,6 @@ from train.monitoring.process_monitor import (
     slowest_rank,
     spike_bound,
 )
-from train.monitoring.rows import read_rows
 from train.monitoring.watchdog import Watchdog
 from train.progress import TrainProgress
 from train.run_training import train_run
