@@ -113,7 +113,7 @@ def test_an_array_makes_the_dataset_that_one_process_makes(
     one, array = (open_dataset(str(tmp_path / name)) for name in ("one", "set"))
     assert array.digest == one.digest
     for on in ("slurm", "kubernetes"):
-        with pytest.raises(TrilightError, match=f"--shards is 0:2; expected none .* {on}"):
+        with pytest.raises(TrilightError, match=f"--range is 0:2; expected none .* {on}"):
             find_executor(on, None, None).make(dataclasses.replace(shared, shards="0:2"), None)
 
 
