@@ -98,7 +98,7 @@ def _read_text(text: bytes) -> FileMesh:
     loops = _LOOP.findall(text)
     rest = _AROUND_LOOP.sub(b" ", _LOOP.sub(b" ", text)).strip(b"\0\x1a \n").split()
     if not is_closed or (rest and b"solid".startswith(rest[-1])):
-        raise Rejected("cut_off", "the STL ends within a facet or the word solid, or without endsolid")
+        raise Rejected("cut_off", "the STL ends within a facet, within solid, or without endsolid")
     broken = next((word for word in rest if word.removeprefix(b"end") in _WORDS), None)
     if broken is not None:
         why = f"the STL has {broken.decode()!r} where a facet is not complete"
