@@ -32,8 +32,7 @@ from storage.conventions import log10_radiance
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.metrics import flicker_log_db, psnr_log_db
-from storage.records.exr import read_header
-from storage.records.exr_layers import decode_picture, encode_picture
+from storage.records.exr import decode_picture, encode_picture, read_header
 from storage.records.lights import num_lights, rounded_to_half
 from storage.records.safe_read import read_plain
 from storage.records.scene import Scene

@@ -43,8 +43,7 @@ from storage.settings.fields import (
     parts_of,
 )
 from train.evaluation.options import EvaluationOptions, LeaderboardOptions
-from train.monitoring.settings import WatchSettings
-from train.settings import TrainSettings
+from train.settings import TrainSettings, WatchSettings
 
 _COMMANDS = """# Command line
 

@@ -121,13 +121,7 @@ def make_assets(
     """
     if workers < 1:
         raise TrilightError(f"workers is {workers}; expected at least 1.")
-    if folder.root.exists() and not folder.root.is_dir():
-        raise TrilightError(f"{folder.root}: is a file; expected a folder. Choose another --out.")
-    if folder.root.is_dir() and any(folder.root.iterdir()) and not folder.summary.exists():
-        raise TrilightError(
-            f"{folder.root}: holds files that `trilight assets` did not write; expected a new or "
-            "empty folder. Choose another --out."
-        )
+    _require_ours(folder)
     listed = find_objects(
         source,
         work_dir=cache_folder("objects"),
@@ -152,6 +146,16 @@ def make_assets(
     )
     _write(folder, settings, report, levels, _pairs(prepared, rows, levels, settings))
     return report
+
+
+def _require_ours(folder: AssetFolder) -> None:
+    if folder.root.exists() and not folder.root.is_dir():
+        raise TrilightError(f"{folder.root}: is a file; expected a folder. Choose another --out.")
+    if folder.root.is_dir() and any(folder.root.iterdir()) and not folder.summary.exists():
+        raise TrilightError(
+            f"{folder.root}: holds files that `trilight assets` did not write; expected a new or "
+            "empty folder. Choose another --out."
+        )
 
 
 def _geometry_sha256(level: Level) -> str:

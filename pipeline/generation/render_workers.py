@@ -29,8 +29,7 @@ from storage.digests import sha256_of_file
 from storage.errors import TrilightError
 from storage.extensions import extension_digests, require_same_extensions
 from storage.machine import available_cores
-from storage.records.lock_rows import LockRows
-from storage.records.objects import ObjectRecord
+from storage.records.objects import LockRows, ObjectRecord
 from storage.records.scene import Scene
 from storage.remote.safe_url import safe_url
 

@@ -116,8 +116,7 @@ class Visibility:
         is_object = is_hit & self._face_is_object[hits.triangle]
         behind = is_hit & (np.sum(hits.normal * toward, axis=1) > 0)
         nearest = float(hits.distance_m[is_hit].min(initial=np.inf))
-        low, high = self._boxes[:, 0], self._boxes[:, 1]
-        outside = np.maximum(np.maximum(low - origin, origin - high), 0)
+        outside = np.maximum(np.maximum(self._boxes[:, 0] - origin, origin - self._boxes[:, 1]), 0)
         to_box = float(np.sqrt(np.sum(np.square(outside), axis=1)).min(initial=np.inf))
         return ViewFacts(
             coverage=float(is_object.mean()),

@@ -29,21 +29,18 @@ from pipeline.objects.generated import BENCHMARK, PREFIX
 from pipeline.presets.settings import DatasetSettings
 from pipeline.presets.training import smoke
 from pipeline.renders.calibrated_error import versions_of_pictures
-from pipeline.renders.camera import PixelCamera
-from pipeline.renders.noise_floor import BLOCK_PX, Curve, clamped_radiance, secant_slope
-from pipeline.renders.numpy_arithmetic.host_pictures import (
+from pipeline.renders.host_pictures import (
+    Half,
     HostPictures,
     keep_converged,
-    with_mean_of,
-)
-from pipeline.renders.numpy_arithmetic.noise_floor import (
-    Half,
     measure_errors,
     squared_error,
+    with_mean_of,
 )
+from pipeline.renders.noise_floor import BLOCK_PX, Curve, clamped_radiance, secant_slope
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import Filtered, RenderSettings
-from pipeline.renders.tracer import Tracer
+from pipeline.renders.tracer import PixelCamera, Tracer
 from pipeline.renders.view_pictures import MeasuredLook
 from scene_templates.settings import SceneSettings
 from storage.conventions import log10_radiance

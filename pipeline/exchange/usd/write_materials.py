@@ -36,7 +36,6 @@ from pipeline.exchange.usd.authoring import (
     text_attributes,
     usd_value,
 )
-from pipeline.foreign.usd.colors import convert_to_rec709
 from pipeline.foreign.usd.shaders import (
     IOR_OF_CONSTANT_ALBEDOS,
     note_unsupported,
@@ -45,7 +44,7 @@ from pipeline.foreign.usd.shaders import (
     surface_shader,
 )
 from pipeline.foreign.usd.stage import OpenedStage
-from pipeline.foreign.usd.texture_nodes import find_sources, is_output
+from pipeline.foreign.usd.texture_nodes import convert_to_rec709, find_sources, is_output
 from storage.errors import TrilightError
 from storage.records.exr import MAX_RESOLUTION, channel_names, decode_channels, encode_channels
 from storage.records.material import (

@@ -30,7 +30,7 @@ from storage.dataset.scene_logs import log_scene
 from storage.dataset.shard import write_shard
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.passes.stored import decode_passes_exr, passes_exr
+from storage.records.passes.pictures import decode_passes_exr, passes_exr
 from storage.records.profiles import Profile
 from storage.records.sample import PartFloor, encode_sample
 from storage.records.scene import Scene

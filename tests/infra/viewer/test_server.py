@@ -36,9 +36,8 @@ from infra.viewer.server import (
 )
 from pipeline.exchange.convert import write_scene
 from pipeline.renders.mitsuba_variant import Variant, choose_variant
+from pipeline.shards.derive import Selection, list_scenes
 from pipeline.shards.finished_dataset import FinishedDataset
-from pipeline.shards.listing import list_scenes
-from pipeline.shards.plans import Selection
 from storage.conventions import preview_srgb8
 from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError

@@ -27,8 +27,7 @@ from storage.dataset.dataset import open_dataset
 from storage.dataset.manifest import write_manifest
 from storage.records.asset import AssetRow, OwnMaterials
 from storage.records.objects import Failure
-from storage.records.passes.pictures import view_passes
-from storage.records.passes.stored import decode_passes_exr
+from storage.records.passes.pictures import decode_passes_exr, view_passes
 from storage.records.sample import Sample
 from storage.records.scene import Scene
 from tests.command_line import trilight
