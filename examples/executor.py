@@ -32,7 +32,7 @@ def by_commands(options: GenerateOptions, address: str | None) -> Outcome:
     words = (*TRILIGHT, *generate_words(options), "--out", options.place)
 
     def make(shard: int) -> None:
-        command = [*words, "--shards", f"{shard}:{shard + 1}"]
+        command = [*words, "--range", f"{shard}:{shard + 1}"]
         ran = subprocess.run(command, capture_output=True, text=True, check=False)
         if ran.returncode:
             said = ran.stderr.strip().splitlines() or ["it said nothing"]

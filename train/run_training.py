@@ -124,7 +124,7 @@ UNJUDGED = (
 )
 
 
-def train_run(
+def run_training(
     settings: TrainSettings,
     *,
     data: Sequence[str],
@@ -180,7 +180,7 @@ def _train(
     watched: WatchSettings,
     progress: TrainProgress,
 ) -> TrainResult | None:
-    """Train and evaluate in a folder that is locked; arguments as in `train_run`."""
+    """Train and evaluate in a folder that is locked; arguments as in `run_training`."""
     began = time.monotonic()
     dataset = open_mixture(data)
     # alike in all processes: torchrun counts restarts for each machine separately, and a network
@@ -225,7 +225,7 @@ def _train(
         cost = partial(scene_flops, settings)
         most = settings.scenes_per_pass
         with closing(step_scenes(batches, cost, most, dist_context.device)) as steps:
-            trainer.run(steps)
+            trainer.train(steps)
     if recorder is None:
         return None
     recorder.close()

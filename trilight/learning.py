@@ -86,12 +86,12 @@ def _train_alone(
     device: str | None,
     **options: Any,
 ) -> "TrainResult":
-    """Run `train.run_training.train_run` in this process as the only rank."""
+    """Run `train.run_training.run_training` in this process as the only rank."""
     from train.loop.distributed import DistributedContext, choose_device
-    from train.run_training import train_run
+    from train.run_training import run_training
 
     data = [os.fspath(root) for root in roots]
     dist_context = DistributedContext(device=choose_device(device))
-    result = train_run(settings, data=data, dist_context=dist_context, **options)
+    result = run_training(settings, data=data, dist_context=dist_context, **options)
     assert result is not None  # rank 0 returns a result
     return result

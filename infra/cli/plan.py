@@ -47,7 +47,7 @@ def plan(
 ) -> None:
     if (options.scenes_from, options.revisits, options.shards) != (None,) * 3:
         raise TrilightError(
-            "plan: --scenes-from, --revisits or --shards was given; expected none of them, since a "
+            "plan: --scenes-from, --revisits or --range was given; expected none of them, since a "
             "whole dataset of new scenes is predicted."
         )
     options = with_base_settings(options, base)

@@ -133,16 +133,16 @@ def _launch(options: TrainOptions, watched: WatchSettings, output: OutputOptions
 def _run_training(
     options: TrainOptions, settings: TrainSettings, watched: WatchSettings, *, quiet: bool
 ) -> "TrainResult | None":
-    """Train by `train.run_training.train_run`; imports torch, which takes seconds."""
+    """Train by `train.run_training.run_training`; imports torch, which takes seconds."""
     require_torch("train")
     from train.loop.distributed import join_processes
     from train.loop.interrupts import Stopped
-    from train.run_training import train_run
+    from train.run_training import run_training
 
     with join_processes(options.device) as crew, progress_bars() as bars:
         progress = _QuietProgress() if quiet else _BarProgress(bars)
         try:
-            return train_run(
+            return run_training(
                 settings,
                 data=list(options.data),
                 out=Path(options.place),

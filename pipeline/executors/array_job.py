@@ -93,7 +93,7 @@ def array_job(
     """
     if options.scenes_from or options.revisits or options.shards:
         raise TrilightError(
-            f"submit {on}: expected no --scenes-from, --revisits or --shards: the array divides "
+            f"submit {on}: expected no --scenes-from, --revisits or --range: the array divides "
             "scenes that are composed. Start such a dataset by trilight generate on each machine."
         )
     source = options.objects or ""

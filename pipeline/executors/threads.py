@@ -75,7 +75,7 @@ def make_kubernetes(options: GenerateOptions, address: str | None) -> Outcome:
 def _make_part(options: GenerateOptions, runner: str, shards: Callable[[], str]) -> Outcome:
     if options.shards is not None:
         raise TrilightError(
-            f"--shards is {options.shards}; expected none with --runner {runner}: the task's place "
+            f"--range is {options.shards}; expected none with --runner {runner}: the task's place "
             "in the array says which shards are made. Omit one of the two."
         )
     return make_dataset(dataclasses.replace(options, shards=shards()), ThreadRunner())

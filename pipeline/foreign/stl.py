@@ -97,8 +97,10 @@ def _read_text(text: bytes) -> FileMesh:
     text, is_closed = _strip_names(_ENDS.sub(rb"\1end", text) + b"\n")
     loops = _LOOP.findall(text)
     rest = _AROUND_LOOP.sub(b" ", _LOOP.sub(b" ", text)).strip(b"\0\x1a \n").split()
-    if not is_closed:
-        raise Rejected("cut_off", "the STL ends within a facet, or without endsolid")
+    if not is_closed or (rest and b"solid".startswith(rest[-1])):
+        raise Rejected(
+            "cut_off", "the STL ends within a facet or the word solid, or without endsolid"
+        )
     broken = next((word for word in rest if word.removeprefix(b"end") in _WORDS), None)
     if broken is not None:
         why = f"the STL has {broken.decode()!r} where a facet is not complete"

@@ -157,7 +157,7 @@ class SceneRenderer:
         pictures: ViewPictures = self._arithmetic(samples, self.tracer, camera, settings)
         if not self._sees_sky:
             samples.count_over(pictures.visible)
-        look = yield from self._sample_until_targets(samples, pictures)
+        look = yield from self._render_until_targets(samples, pictures)
         floor = look.floor
         missed = gaps_db(settings.targets_db, floor.by_metric)
         if settings.reject_at_cap and missed:
@@ -204,7 +204,7 @@ class SceneRenderer:
             "parts_rgb": dict(named) or None,
         }
 
-    def _sample_until_targets(
+    def _render_until_targets(
         self, samples: DualBuffer, pictures: ViewPictures
     ) -> Generator[Sampling, None, MeasuredLook]:
         targets_db = self._settings.targets_db

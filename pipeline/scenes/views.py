@@ -6,7 +6,7 @@ in another process.
 
 `Visibility` estimates what a camera sees, by ray casting on a coarse grid. A grid of 32 x 32 rays
 costs about a millisecond, and decides only if a picture is worth rendering: it may miss anything
-smaller than a grid cell. Everything is computed in the single precision of storage.raycast.embree:
+smaller than a grid cell. Everything is computed in the single precision of storage.raycast.caster:
 the cameras of a dataset depend on each bit of it.
 """
 

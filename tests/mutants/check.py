@@ -4,6 +4,7 @@ Each change is made in a copy of the tracked tree; its test must fail there, and
 What the list holds with a reason in place of a test (`equivalent`, `removed`) is left out.
 """
 
+import argparse
 import importlib
 import json
 import os
@@ -99,4 +100,6 @@ def main(ids: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("ids", metavar="ID", nargs="*")
+    sys.exit(main(parser.parse_args().ids))

@@ -4,6 +4,7 @@ Each is drawn by itself, since in a whole scene one hides the other. The line be
 defect is that of `statistics`.
 """
 
+import itertools
 import math
 
 import numpy as np
@@ -11,19 +12,14 @@ import pytest
 from numpy.typing import NDArray
 
 from scene_templates.layout import CameraPose
-from scene_templates.rooms import (
-    SIDES,
-    PatchPlacement,
-    SeparateSides,
-    SharedRoom,
-    SideRanges,
-    plane_of,
-)
+from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
+from scene_templates.rooms import SIDES, PatchPlacement, SharedRoom, plane_of
 from scene_templates.sample_camera import CameraSettings, Sector, sample_camera
 from scene_templates.sample_emitters import LightSettings, sample_emitters
 from scene_templates.templates import TEMPLATES
 from tests.for_each import for_each
 from tests.scene_templates.balls import DEFAULTS, MANY, Drawn, drawn, drawn_once, template_settings
+from tests.scene_templates.published import side_row
 from tests.scene_templates.statistics import (
     Table,
     alike,
@@ -38,7 +34,7 @@ COUNT = 800
 
 
 def _placements(
-    shell: SharedRoom | SeparateSides, template: str, count: int = COUNT
+    shell: SharedRoom, template: str, count: int = COUNT
 ) -> list[tuple[PatchPlacement, ...]]:
     rng = np.random.default_rng(0)
     return [shell.sample_room(rng, TEMPLATES[template].parts).patches for _ in range(count)]
@@ -83,28 +79,47 @@ def test_a_wrong_room_is_noticed() -> None:
     assert rows <= set(implausible(_shared_room_table(wrong)))
 
 
-def test_separate_sides_are_drawn_from_their_ranges() -> None:
-    """That the ranges are the published ones: test_every_side_has_its_published_ranges."""
-    ranges = SideRanges(
-        spin_deg=180.0, tilt_deg=10.0, scale=(0.9, 1.35), shift_x=(-0.05, 0.05),
-        shift_y=(-0.25, 0.25), shift_z=(0.15, 0.25),
-    )  # fmt: skip
-    shell = SeparateSides(floor=ranges, wall0=ranges, wall1=ranges, wall2=ranges)
-    rooms = _placements(shell, "open_box")
-    table: dict[str, float] = {}
-    for row, part in enumerate(TEMPLATES["open_box"].parts):
-        sides = [patches[row] for patches in rooms]
-        assert all(one.reach == 1 for one in sides)
-        turns, scale, move = (
-            np.array([getattr(one, name) for one in sides])
-            for name in ("rotation_deg", "scale", "translation")
-        )
-        for k, shift in enumerate((ranges.shift_x, ranges.shift_y, ranges.shift_z)):
-            most = ranges.spin_deg if k == SIDES[part].axis else ranges.tilt_deg
-            table[f"{part} turn {k}"] = uniform(turns[:, k], -most, most)
-            table[f"{part} scale {k}"] = uniform(scale[:, k], *ranges.scale)
-            table[f"{part} move {k}"] = uniform(move[:, k], *shift)
+def _sides_table(stage: int, drawn_policy: Policy, stated_policy: Policy) -> Table:
+    """p-values of every quantity of every side, over the families that share its ranges."""
+    found: dict[tuple[str, ...], list[float]] = {}
+    stated: dict[tuple[str, ...], tuple[float, float]] = {}
+    rng = np.random.default_rng(stage)
+    for family in (stage_1_families if stage == 1 else stage_2_families)(drawn_policy):
+        parts = TEMPLATES[family.template].parts
+        for _ in range(100):
+            patches = family.shell.sample_room(rng, parts).patches
+            for part, at in zip(parts, patches, strict=True):
+                assert at.reach == 1
+                axis = SIDES[part].axis
+                spin, tilt, scale, *moves = side_row(family.name, part, stated_policy, stage)
+                rows = [("spin", at.rotation_deg[axis], (-spin, spin))]
+                others = sorted({0, 1, 2} - {axis})
+                rows += [(f"tilt {k}", at.rotation_deg[k], (-tilt, tilt)) for k in others]
+                for k in range(3):
+                    rows.append((f"scale {k}", at.scale[k], scale))
+                    rows.append((f"move {k}", at.translation[k], moves[k]))
+                for quantity, value, bounds in rows:
+                    key = (family.template, part, quantity, str(bounds))
+                    found.setdefault(key, []).append(value)
+                    stated[key] = bounds
+    return {" ".join(key): uniform(values, *stated[key]) for key, values in found.items()}
+
+
+@for_each(("policy", "stage"), itertools.product(["original", "de-biased"], [1, 2]))
+def test_separate_sides_are_drawn_as_published(policy: Policy, stage: int) -> None:
+    table = _sides_table(stage, policy, policy)
     require_plausible(table)
+    if policy == "original":
+        return  # that one policy is told from the other is seen once
+    other: Policy = "original" if policy == "de-biased" else "de-biased"
+    mistaken = set(implausible(_sides_table(stage, other, policy)))
+    # The policies differ in every spin, in the tilts of the box, in stage 2 in some floors, and in
+    # nothing else.
+    assert all("spin" in row or "open_box" in row or "move 2" in row for row in mistaken)
+    spins = {row for row in table if "spin" in row and "(-0.0, 0.0)" not in row}
+    assert spins <= mistaken
+    assert any("tilt" in row for row in mistaken)
+    assert any("move 2" in row for row in mistaken) == (stage == 2)
 
 
 ROOM = {

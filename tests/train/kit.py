@@ -28,7 +28,7 @@ from train.loop.train_state import TrainState, new_state
 from train.loss.training_loss import TrainingLoss
 from train.progress import TrainProgress
 from train.resume import StartOptions
-from train.run_training import TrainResult, train_run
+from train.run_training import TrainResult, run_training
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
 
 CPU = torch.device("cpu")
@@ -97,7 +97,7 @@ def trained(
     """Run to the end in this process."""
     places = [str(data.folder.root)] if isinstance(data, Dataset) else data
     begun = start or StartOptions(resume=resume)
-    result = train_run(settings, data=places, out=out, start=begun, **rest)
+    result = run_training(settings, data=places, out=out, start=begun, **rest)
     assert result is not None
     return result
 

@@ -62,7 +62,7 @@ from train.loop.train_state import TrainState, new_state
 from train.loss.lpips import LINEAR_FILE, VGG16_FILE, load_lpips
 from train.presets import override_training_preset
 from train.resume import StartOptions
-from train.run_training import loader_settings, train_run
+from train.run_training import loader_settings, run_training
 from train.settings import AugmentationSettings, TrainSettings, learning_rate
 
 SMALL = dataclasses.replace(
@@ -304,11 +304,11 @@ def one_step_of(run: str, size: str) -> TrainSettings:
 
 
 def train_and_judge(run: str, size: str, data: str, lpips: str, out: Path) -> None:
-    """Train by train_run, evaluate and render."""
+    """Train by run_training, evaluate and render."""
     settings = one_step_of(run, size)
     with fake_card():
         start, crew = StartOptions(lpips=lpips), DistributedContext(device=CARD)
-        result = train_run(settings, data=[data], out=out, start=start, dist_context=crew)
+        result = run_training(settings, data=[data], out=out, start=start, dist_context=crew)
         assert result is not None and result.skipped_steps == 0
         network = RenderFormer(settings.model).to(CARD)
         distance = load_lpips(lpips)
@@ -330,10 +330,10 @@ def resume(data: str, lpips: str, out: Path) -> None:
     with pytest.MonkeyPatch.context() as patch, fake_card():
         patch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
         crew = DistributedContext(device=CARD)
-        train_run(first, data=[data], out=out / "first", dist_context=crew)
+        run_training(first, data=[data], out=out / "first", dist_context=crew)
         checkpoint = out / "first" / "checkpoints" / "step-000000002.safetensors"
         checkpoint.unlink()
-        train_run(
+        run_training(
             first,
             data=[data],
             out=out / "first",
@@ -341,7 +341,7 @@ def resume(data: str, lpips: str, out: Path) -> None:
             dist_context=crew,
         )
         start = StartOptions(begin_with=str(checkpoint), lpips=lpips)
-        train_run(second, data=[data], out=out / "second", start=start, dist_context=crew)
+        run_training(second, data=[data], out=out / "second", start=start, dist_context=crew)
     for name in ("first", "second"):
         record = json.loads((out / name / "settings.json").read_text())
         assert record["muon_precision"] == "bfloat16"

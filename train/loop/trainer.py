@@ -235,7 +235,7 @@ class Trainer:
             report_hang=progress.report_hang,
         )
 
-    def run(self, steps: Iterator[StepScenes]) -> None:
+    def train(self, steps: Iterator[StepScenes]) -> None:
         """Take all remaining steps; `steps` begins with that of the state's step.
 
         Raises:

@@ -249,6 +249,9 @@ def test_networks_that_know_no_sky_refuse_it_and_say_so_when_rendering(config: M
     with pytest.warns(UserWarning, match="does not know: it is missing here"):
         shown = NeuralRenderer(network).render(below, 32)
     assert np.array_equal(shown, NeuralRenderer(network).render(corner(), 32))
+    assert not any(
+        "environment" in note for note in NeuralRenderer(network).prepare(corner()).notes
+    )
 
 
 def test_a_sky_that_cameras_see_is_refused_and_left_black() -> None:

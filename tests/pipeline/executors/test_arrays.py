@@ -67,6 +67,11 @@ def test_the_tasks_of_an_array_have_equal_shares() -> None:
 GIVEN = {"TASKS": "0-1,7", "SHARDS_PER_TASK": "4"}
 
 
+def test_a_place_is_a_task_that_is_missing() -> None:
+    shares = [shards_of_place({**GIVEN, PLACE: str(place)}) for place in range(3)]
+    assert shares == ["0:4", "4:8", "28:32"]
+
+
 @for_each(
     ("on", "environment", "message"),
     [
@@ -113,7 +118,7 @@ def test_an_array_makes_the_dataset_that_one_process_makes(
     one, array = (open_dataset(str(tmp_path / name)) for name in ("one", "set"))
     assert array.digest == one.digest
     for on in ("slurm", "kubernetes"):
-        with pytest.raises(TrilightError, match=f"--shards is 0:2; expected none .* {on}"):
+        with pytest.raises(TrilightError, match=f"--range is 0:2; expected none .* {on}"):
             find_executor(on, None, None).make(dataclasses.replace(shared, shards="0:2"), None)
 
 
@@ -314,7 +319,6 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Made:
 def test_every_place_makes_what_is_missing_and_nothing_else(made: Made) -> None:
     manifest = made()
     spec = manifest["spec"]
-    assert shards_of_place({**GIVEN, PLACE: "2"}) == "28:32"
     (container,) = spec["template"]["spec"]["containers"]
     environment = {row["name"]: row["value"] for row in container["env"]}
     places = range(spec["completions"])

@@ -83,8 +83,11 @@ def test_rendering_on_a_gpu_takes_its_limit(
         yield
 
     monkeypatch.setattr(runner, "concurrency", limit)
-    work = runner.Opaque(lambda: list(taken), on_gpu=device == "gpu")
-    assert cast(Any, runner.make_scenes).fn("0", work) == held
+    monkeypatch.setattr(runner, "make_task", lambda job, pieces: (job, pieces, list(taken)))
+    monkeypatch.setattr(runner.make_scenes, "submit", cast(Any, runner.make_scenes).fn)
+    job, pieces = SimpleNamespace(device=device), (SimpleNamespace(shard_index=0, first=0),)
+    submit = cast(Any, runner.PrefectRunner().submit)
+    assert submit(pieces, job) == (job, pieces, held)
 
 
 def test_documents_are_tried_again_where_that_can_help() -> None:

@@ -42,7 +42,7 @@ from train.data.order import RECORD, Mixture, RankSlice, plan_mixture
 from train.data.scenes import TrainingScene, stored_levels
 from train.loop.checkpoints import read_checkpoint
 from train.resume import StartOptions
-from train.run_training import train_run
+from train.run_training import run_training
 from train.settings import AugmentationSettings
 
 BATCH = 4
@@ -200,9 +200,9 @@ def test_a_run_of_two_datasets_resumes_to_the_bit_and_takes_up_a_third(
     three = [*roots, str(tmp_path / "third")]
     digest = open_mixture(three).digest
     with pytest.raises(TrilightError, match=r"--change data=mix:[0-9a-f]{12}"):
-        train_run(settings, data=three, out=out, start=StartOptions(resume=True))
+        run_training(settings, data=three, out=out, start=StartOptions(resume=True))
     decided = {"data": digest[:16], "data_weights": (1.0, 2.0, 1.0), "num_steps": 10}
-    train_run(settings, data=three, out=out, start=StartOptions(resume=True, decisions=decided))
+    run_training(settings, data=three, out=out, start=StartOptions(resume=True, decisions=decided))
     header = read_checkpoint(path_of_step(out / "checkpoints", 10)).header
     assert header[RECORD]["first"] == 24 and header[RECORD]["before"] == [8, 16, 0]
 

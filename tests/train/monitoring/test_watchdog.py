@@ -53,7 +53,7 @@ from train.monitoring.process_monitor import (
 )
 from train.monitoring.watchdog import Watchdog
 from train.progress import TrainProgress
-from train.run_training import train_run
+from train.run_training import run_training
 from train.settings import WatchSettings
 
 
@@ -215,7 +215,7 @@ def main(data: str, out: Path) -> None:
     with join_processes("cpu") as crew:
         slow_from(crew)
         watched = WatchSettings(hang_after_s=1.0, hang_factor=2.0)
-        train_run(
+        run_training(
             settings, data=[data], out=out, dist_context=crew, watched=watched, progress=Said()
         )
 
