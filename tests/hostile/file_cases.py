@@ -144,7 +144,7 @@ def _changed(*where: Any, value: Any) -> Make:
         for key in where[:-1]:
             at = at[next(iter(at)) if key == "ANY" else key]
         at[where[-1]] = value
-        (folder / "s.json").write_text(json.dumps(scene))
+        (folder / "s.json").write_text(json.dumps(scene).replace('"BIG"', "1e400"))
 
     return make
 
@@ -158,7 +158,7 @@ def _mesh(spoil: Callable[[Path], object]) -> Make:
 
 
 def json_cases() -> Iterator[tuple[str, Make, str]]:
-    """Yield name, what writes `s.json`, and what comes of it; test_renderformer_json has fields."""
+    """Yield name, what writes `s.json`, and what has to come of it."""
     mesh = ("objects", "ANY", "mesh_path")
     values: tuple[Any, ...] = (
         "../outside/secret.obj", "/etc/passwd", "linked/secret.obj", "link.obj", "", ".", "..",
@@ -179,12 +179,42 @@ def json_cases() -> Iterator[tuple[str, Make, str]]:
     }
     for kind, spoil in kinds.items():
         yield f"mesh is {kind}", _mesh(spoil), "refused"
+    transform = ("objects", "ANY", "transform")
+    for field in ("translation", "rotation", "scale"):
+        for value in ([1e30] * 3, ["BIG"] * 3, [1, 2], "x", None, [[1, 2, 3]] * 3, [True] * 3):
+            shown = str(value)[:20]
+            yield f"{field} {shown}", _changed(*transform, field, value=value), "refused"
     material = ("objects", "ANY", "material")
+    for field, values in {
+        "diffuse": (2, -1), "specular": (2, -1), "emissive": (1e10, -1),
+    }.items():  # fmt: skip
+        for number in values:
+            yield f"{field} {number}", _changed(*material, field, value=[number] * 3), "refused"
     yield "diffuse and specular", _changed(*material, "specular", value=[0.9] * 3), "any"
     yield "emission 1e9", _changed(*material, "emissive", value=[1e9] * 3), "any"
+    for fov in (0, 180, -1, 1e30, "x", None):
+        yield f"angle {fov}", _changed("cameras", 0, "fov", value=fov), "refused"
     same = _changed("cameras", 0, "position", value=[0, 0, 0])
     yield "a camera that looks at itself", same, "any"
+    yield "no cameras", _changed("cameras", value=[]), "any"
+    yield "100000 cameras", _changed("cameras", value=[{}] * 100_000), "refused"
+    yield "no objects", _changed("objects", value={}), "refused"
+    yield (
+        "100000 objects",
+        _changed("objects", value={str(i): 0 for i in range(100_000)}),
+        "refused",
+    )
+    yield "another version", _changed("version", value="9"), "refused"
     yield "a field that is not known", _changed("script", value="rm -rf"), "read"
+    remesh = _changed("objects", "ANY", "remesh_target_face_num", value=10**9)
+    yield "remeshed to 10^9 faces", remesh, "refused"
+    for kind, data in {
+        "empty": b"", "a list": b"[]", "a number": b"1", "noise": bytes(range(256)),
+        "deep": b"[" * 10**6, "deep objects": b'{"a":' * 10**5, "cut": b'{"scene_name": "x"',
+        "a name twice": b'{"version": "1.0", "version": "1.0"}', "digits": b"9" * 10**6,
+        "half a letter": b'{"scene_name": "\xc3"}', "UTF-16": '{"a": 1}'.encode("utf-16"),
+    }.items():  # fmt: skip
+        yield f"JSON is {kind}", _bytes("s.json", data), "refused"
     yield "JSON is a fifo", lambda folder: os.mkfifo(folder / "s.json"), "refused"
     yield "JSON is endless", lambda f: (f / "s.json").symlink_to("/dev/zero"), "refused"
     yield "JSON of 8 TB", lambda folder: _sparse(folder / "s.json"), "refused"

@@ -6,6 +6,7 @@ Light of groups adds up to the scene's. Demodulated pictures: what reflects noth
 import dataclasses
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -95,6 +96,39 @@ def test_other_cameras_see_the_same_prepared_scene() -> None:
         renderer.view(prepared, scene.c2w[1], float(scene.fov_deg[1]), 16),
         renderer.render(scene, 16)[1],
     )
+
+
+def _light_of(model: RenderFormer, scene: Scene, device: torch.device) -> Tensor:
+    """Stand for the first stage of an exactly linear network: the light of each channel."""
+    tensors = scene_tensors(scene)
+    a, b, c = tensors.triangles_T33.double().unbind(dim=1)
+    area_T = torch.linalg.cross(b - a, c - a).norm(dim=-1) / 2
+    emission_T3 = torch.pow(10.0, tensors.material_TM[:, EMISSION].double()) - 1
+    return (area_T[:, None] * emission_T3).sum(dim=0)
+
+
+def _flat_picture(_: RenderFormer, light_3: Tensor, cameras: Any, resolution: int) -> Tensor:
+    """Stand for its second stage: every pixel shows that light."""
+    return torch.log10(1 + light_3).expand(1, 1, resolution, resolution, 3)
+
+
+@for_each(("count", "most"), [(64, 8), (64, 1), (9, 8), (20, 3)])
+def test_groups_give_what_a_linear_network_gives_at_once(
+    monkeypatch: pytest.MonkeyPatch, count: int, most: int
+) -> None:
+    """Emission goes through log10 in float32: 1e-6 relative."""
+    monkeypatch.setattr(inference, "_encode", _light_of)
+    monkeypatch.setattr(RenderFormer, "decode", _flat_picture)
+    scene, renderer = many_lights(count), NeuralRenderer(network())
+
+    def picture(lights_per_pass: int) -> NDArray[np.float32]:
+        prepared = renderer.prepare(scene, lights_per_pass=lights_per_pass)
+        assert len(prepared.groups) == -(-count // lights_per_pass)
+        return renderer.view(prepared, scene.c2w[0], 40.0, 8)
+
+    at_once = picture(count)
+    assert at_once.min() > 0.1
+    np.testing.assert_allclose(picture(most), at_once, rtol=1e-6)
 
 
 def test_extremes_give_finite_pictures() -> None:

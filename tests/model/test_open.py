@@ -77,11 +77,21 @@ def test_round_trip_is_exact_and_reproducible(head: str) -> None:
     assert encode_weights(again) == data
 
 
-def test_wrong_tensors_are_listed() -> None:
+@for_each(
+    ("name", "tensor", "message"),
+    [
+        ("decoder.token_W", None, r"decoder.token_W is missing, expected \(48,\)"),
+        ("decoder.token_W", torch.zeros(3), r"decoder.token_W is \(3,\), expected \(48,\)"),
+        ("stranger", torch.zeros(3), r"stranger is \(3,\), expected no such tensor"),
+    ],
+)
+def test_wrong_tensors_are_listed(name: str, tensor: Tensor | None, message: str) -> None:
     config = tiny_config()
     tensors = load(encode_weights(awake(config, torch.float32)))
-    tensors["decoder.token_W"] = torch.zeros(3)
-    with pytest.raises(TrilightError, match=r"decoder.token_W is \(3,\), expected \(48,\)"):
+    tensors.pop(name, None)
+    if tensor is not None:
+        tensors[name] = tensor
+    with pytest.raises(TrilightError, match=message):
         decode_weights(save(tensors, metadata={CONFIG_KEY: encode_config(config)}))
     with pytest.raises(TrilightError, match="the file has no trilight_model entry"):
         decode_weights(save(tensors))
@@ -492,8 +502,9 @@ def test_a_pixel_that_differs_is_in_both_differences(
     name = "output.log10_radiance_bvchw"
     expected = load_file(base)[name].float()
     expected[(place,) * 5] += 1e-6
-    found = differences(Path(changed(base, tmp_path, name, expected)))
-    assert found["padded"] > TOLERANCE and found["unpadded"] > TOLERANCE
+    path = changed(base, tmp_path, name, expected)
+    found = differences(Path(path))
+    assert found["padded"] > TOLERANCE and found["unpadded"] > TOLERANCE and main([path]) == 1
 
 
 def test_the_command_fails_on_nan(

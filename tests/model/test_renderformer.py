@@ -6,6 +6,7 @@ rays are the conventions', and rotary products see differences of positions only
 """
 
 import dataclasses
+import math
 from functools import partial
 
 import numpy as np
@@ -15,11 +16,13 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from model.attention import attend, attend_in_windows, cut_windows
-from model.layers import CrossAttention, merge_heads, split_heads
+from model.layers import CrossAttention, SelfAttention, merge_heads, split_heads
 from model.positions import (
     Rotation,
     TriangleRotary,
     camera_rotation,
+    encode_normals,
+    encoded_normal_width,
     rotate,
     to_camera,
     token_positions,
@@ -398,6 +401,22 @@ def test_a_shifted_cut_has_whole_windows_strips_and_corners() -> None:
     assert torch.equal(windows.order_Q[windows.back_Q], torch.arange(24**2))
 
 
+@for_each("shifted", [False, True])
+def test_a_bundle_reaches_its_own_window_only(shifted: bool) -> None:
+    layer = SelfAttention(8, 2).double()
+    windows = cut_windows(8, 4, shifted=shifted, device=CPU)
+    x = torch.randn(1, 64, 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    moved = x.clone()
+    moved[0, 0] += 1
+    with torch.no_grad():
+        change = (layer(moved, windows=windows) - layer(x, windows=windows)).abs().amax(dim=-1)
+    reached = change.unflatten(1, (8, 8))[0] > 0
+    width = 2 if shifted else 4
+    expected = torch.zeros(8, 8, dtype=torch.bool)
+    expected[:width, :width] = True
+    assert torch.equal(reached, expected)
+
+
 def test_a_cut_is_made_once_and_asks_no_device() -> None:
     """On the meta device there is nobody to ask; what inference cut, training may use."""
     with torch.inference_mode():
@@ -434,6 +453,21 @@ def test_a_bundle_holds_its_patch_channel_major_and_unbundling_inverts_it() -> N
     assert torch.equal(unbundle(bundles, patch), picture)
 
 
+@for_each("num_freqs", [1, 2, 3, 6])
+def test_products_of_rotated_vectors_depend_on_the_difference_of_positions(num_freqs: int) -> None:
+    rotary = TriangleRotary(num_freqs=num_freqs, max_freq=5.0, head_width=128).double()
+    generator = torch.Generator().manual_seed(0)
+    q, k = torch.randn(2, 1, 1, 1, 128, generator=generator, dtype=torch.float64)
+    here, there, shift = torch.randn(3, 1, 1, 3, 3, generator=generator, dtype=torch.float64)
+
+    def product(offset: torch.Tensor) -> torch.Tensor:
+        return (rotate(q, *rotary(here + offset)) * rotate(k, *rotary(there + offset))).sum()
+
+    # float64 sums of 128 products of size 1
+    torch.testing.assert_close(product(shift), product(0 * shift), rtol=0, atol=1e-12)
+    assert abs(product(shift) - (q * k).sum()) > 1e-3, "positions must matter at all"
+
+
 def test_angles_are_coordinate_times_frequency_coordinate_major() -> None:
     rotary = TriangleRotary(num_freqs=2, max_freq=5.0, head_width=40)
     cos, sin = rotary(torch.arange(1.0, 10.0).reshape(1, 1, 3, 3))
@@ -457,6 +491,35 @@ def test_frequencies_are_log_spaced(num_freqs: int, max_freq: float, expected: l
     rotary = TriangleRotary(num_freqs=num_freqs, max_freq=max_freq, head_width=128)
     # two printed decimals
     torch.testing.assert_close(rotary.freqs_F, torch.tensor(expected), rtol=0, atol=6e-3)
+
+
+def test_rotation_pairs_channel_i_with_channel_i_plus_half() -> None:
+    x = torch.eye(4).reshape(1, 4, 1, 4)
+    angle = torch.tensor([0.3, 0.7])
+    turned = rotate(x, angle.cos().reshape(1, 1, 2), angle.sin().reshape(1, 1, 2))[0, :, 0]
+    a, b = 0.3, 0.7
+    expected = torch.tensor(
+        [
+            [math.cos(a), 0, math.sin(a), 0],
+            [0, math.cos(b), 0, math.sin(b)],
+            [-math.sin(a), 0, math.cos(a), 0],
+            [0, -math.sin(b), 0, math.cos(b)],
+        ]
+    )
+    torch.testing.assert_close(turned, expected)
+
+
+def test_normal_encoding_of_known_numbers() -> None:
+    normals = torch.linspace(-1, 1, 9, dtype=torch.float64).reshape(1, 1, 3, 3)
+    encoded = encode_normals(normals, octaves=3)[0, 0]
+    flat = normals.flatten()
+    phases = [c * 2**k for c in flat.tolist() for k in range(3)]
+    sines = [math.sin(p) for p in phases]
+    cosines = [math.cos(p) for p in phases]
+    expected = torch.tensor([*flat.tolist(), *sines, *cosines], dtype=torch.float64)
+    assert len(encoded) == encoded_normal_width(3)
+    # sin(x + pi / 2) for cos(x), in float64
+    torch.testing.assert_close(encoded, expected, rtol=0, atol=1e-14)
 
 
 def test_camera_space_is_the_inverse_pose() -> None:

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from model.config import ModelConfig
 from model.hits import decoder
+from model.hits.decoder import _around
 from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import SOURCE, DeviceTriangles, build_tree
 from model.hits.traced import INPUTS
@@ -26,7 +27,7 @@ from model.hits.tracing import traced_scene, traced_views, with_traced
 from model.hits.view_inputs import Channel
 from model.inference import NeuralRenderer
 from model.renderformer import RenderFormer, radiance
-from model.scene_tensors import SceneTensors, batch_scenes, map_tensors, scene_tensors
+from model.scene_tensors import SceneBatch, SceneTensors, batch_scenes, map_tensors, scene_tensors
 from model.weights import decode_weights, encode_weights
 from storage.errors import TrilightError
 from storage.raycast.caster import RayHits, Triangles
@@ -50,10 +51,48 @@ def tensors(scene: Scene, config: ModelConfig | None = None) -> SceneTensors:
     return with_traced(scene_tensors(scene), PX, config or hits_config(), 0)
 
 
+def in_double(batch: SceneBatch) -> SceneBatch:
+    return map_tensors(batch, lambda each: each.double() if each.is_floating_point() else each)
+
+
 @torch.no_grad()
 def picture(model: RenderFormer, *scenes: SceneTensors) -> Tensor:
     shown: Tensor = model(batch_scenes(scenes), PX)
     return shown
+
+
+def test_anchors_around_a_part_are_those_beside_it() -> None:
+    numbers = torch.arange(16.0).reshape(1, 16, 1)
+    around = _around(numbers, 4)[0, ..., 0]
+    assert around[5].tolist() == [0, 1, 2, 4, 5, 6, 8, 9, 10]
+    assert around[0].tolist() == [0, 0, 1, 0, 0, 1, 4, 4, 5], "at the rim the nearest stand again"
+
+
+def test_gradients_are_those_of_differences() -> None:
+    """In double precision, for some weights of every part."""
+    model = network().double()
+    scenes = in_double(batch_scenes([tensors(corner())]))
+
+    def value() -> Tensor:
+        total: Tensor = model(scenes, PX).square().sum()
+        return total
+
+    model.zero_grad()
+    value().backward()
+    for weight in (model.decoder.head.last.weight, model.decoder.told.weight,
+                   model.encoder.tokens.light.weight, model.decoder.head.nearness):  # fmt: skip
+        flat, grad = weight.data.view(-1), weight.grad.view(-1)
+        at = int(grad.abs().argmax())
+        step = 1e-5
+        flat[at] += step
+        with torch.no_grad():
+            above = value()
+        flat[at] -= 2 * step
+        with torch.no_grad():
+            below = value()
+        flat[at] += step
+        # central differences: the error falls with the square of the step
+        assert float((above - below) / (2 * step)) == pytest.approx(float(grad[at]), rel=1e-4)
 
 
 def test_a_picture_that_moves_by_half_an_anchor_shows_no_seam() -> None:
@@ -90,9 +129,7 @@ def test_all_views_at_once_are_the_views_one_by_one(monkeypatch: pytest.MonkeyPa
 
     What a bias of keys is told is zero but for rounding, hence a least scale for all.
     """
-    batch = batch_scenes([tensors(corner())] * 2)
-    batch = map_tensors(batch, lambda each: each.double() if each.is_floating_point() else each)
-    model = network().double()
+    model, batch = network().double(), in_double(batch_scenes([tensors(corner())] * 2))
     results = []
     for _ in range(2):
         model.zero_grad()

@@ -32,6 +32,7 @@ from tests.model.hits.kit import FLOOR, corner, direct, lit_scene, traced
 from tests.model.kit import awake, hits_config, render, tiny_config
 from tests.pipeline.renders.scene_kit import join, material, quad, sphere
 from tests.sky_maps import as_sky, constant, night, one_sun, six_poles, smooth
+from train.data.augment import mirror_sky, permute_sky_channels, rotate_sky, scale_sky
 
 
 def _floor(sky: Environment) -> Scene:
@@ -217,6 +218,29 @@ def test_scene_and_sky_turned_together_have_the_same_draws_elsewhere() -> None:
     assert np.abs(TURN @ SkySampler(smooth()).sample_directions(u) - there).max() < 1e-6
 
 
+SKY = smooth(rotation=uniform_rotation(np.random.default_rng(8)).astype(np.float32))
+DIRECTIONS = np.random.default_rng(0).normal(size=(500, 3))
+HERE = environment_values(SKY, DIRECTIONS)
+
+
+def test_light_comes_from_where_a_symmetry_puts_it() -> None:
+    """Rotations are kept in float32, by which this sky changes by less than 1e-6."""
+    rotation, sides = uniform_rotation(np.random.default_rng(9)), np.array([-1, 1, 1], np.float32)
+    there = environment_values(rotate_sky(SKY, rotation), DIRECTIONS @ rotation.T)
+    assert np.abs(there - HERE).max() < 3e-6
+    mirrored = mirror_sky(SKY, sides)
+    mirrored.check()
+    assert np.abs(environment_values(mirrored, DIRECTIONS * sides) - HERE).max() < 3e-6
+    twice = mirror_sky(mirrored, sides)
+    assert np.array_equal(twice.radiance_rgb, SKY.radiance_rgb)
+    assert np.array_equal(twice.rotation, SKY.rotation)
+    order = np.array([1, 2, 0])
+    assert np.array_equal(
+        environment_values(permute_sky_channels(SKY, order), DIRECTIONS), HERE[:, order]
+    )
+    assert np.abs(environment_values(scale_sky(SKY, 3.0), DIRECTIONS) - 3 * HERE).max() < 1e-6
+
+
 @for_each("config", [tiny_config(), hits_config()])
 def test_networks_that_know_no_sky_refuse_it_and_say_so_when_rendering(config: ModelConfig) -> None:
     network, below = awake(config, torch.float32), corner(sky=smooth())
@@ -225,6 +249,9 @@ def test_networks_that_know_no_sky_refuse_it_and_say_so_when_rendering(config: M
     with pytest.warns(UserWarning, match="does not know: it is missing here"):
         shown = NeuralRenderer(network).render(below, 32)
     assert np.array_equal(shown, NeuralRenderer(network).render(corner(), 32))
+    assert not any(
+        "environment" in note for note in NeuralRenderer(network).prepare(corner()).notes
+    )
 
 
 def test_a_sky_that_cameras_see_is_refused_and_left_black() -> None:

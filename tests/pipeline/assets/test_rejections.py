@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.assets.settings import AssetSettings
+from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
 from storage.records.asset import Asset
@@ -160,6 +160,20 @@ def test_bad_files(tmp_path: Path, name: str) -> None:
     assert reason_of(path) == reason
 
 
+@for_each("keep", [0.1, 0.5, 0.97])
+def test_files_that_were_cut_off(tmp_path: Path, keep: float) -> None:
+    for path in (
+        write_glb(tmp_path / "a.glb", *gltf_tree(BALL)),
+        write_stl(tmp_path / "a.stl", BALL),
+        write_ply(tmp_path / "a.ply", BALL),
+        write_off(tmp_path / "a.off", BALL),
+    ):
+        data = path.read_bytes()
+        path.write_bytes(data[: int(keep * len(data))])
+        expected = {"cut_off", "load_error", "header_size_mismatch", "index_range", "no_faces"}
+        assert reason_of(path) in expected
+
+
 @for_each("write", [write_stl, write_ply, write_off, write_obj])
 def test_limits_of_size(tmp_path: Path, write: Callable[[Path, TriangleMesh], Path]) -> None:
     path = write(tmp_path / f"a.{write.__name__[-3:]}", BALL)
@@ -175,6 +189,16 @@ def test_a_header_of_too_many_faces_is_enough(tmp_path: Path) -> None:
     path.write_bytes(header + end + b"\xff" * len(body))
     assert reason_of(path, AssetSettings(max_source_faces=79)) == "too_many_faces"
     assert reason_of(path, AssetSettings(max_source_faces=80)) != "too_many_faces"
+
+
+def test_errors_beyond_the_bound_are_stated_and_their_levels_left_out(tmp_path: Path) -> None:
+    path = write_obj(tmp_path / "a.obj", knot())
+    settings = AssetSettings(budgets=(1000,), gate=GateSettings(max_error_p99=1e-4))
+    with pytest.raises(Rejected, match=r"error_over_bound: p99 distance \d+\.\d+%"):
+        prepare(path, settings)
+    gate = GateSettings(max_error_p99=0.01)
+    asset = prepare(path, AssetSettings(budgets=(1400, 60), gate=gate))
+    assert [level.record.budget for level in asset.levels] == [1400]
 
 
 def test_what_is_no_file_and_odd_names_of_what_is_one(tmp_path: Path) -> None:
@@ -311,7 +335,7 @@ def test_instances_count_as_faces_and_buffers_do_not_lead_out(tmp_path: Path) ->
 WATCH = """
 import json, sys
 from pathlib import Path
-from pipeline.assets.settings import AssetSettings
+from pipeline.assets.settings import AssetSettings, GateSettings
 from tests.pipeline.assets.meshes_by_hand import prepare
 import pipeline.assets.decimation.pymeshlab_filters
 opened = []

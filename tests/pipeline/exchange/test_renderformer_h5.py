@@ -50,10 +50,6 @@ def awkward_scene() -> Scene:
 
 
 def test_the_layout_and_its_quirks(tmp_path: Path) -> None:
-    """RenderFormer-Studio's `renderformer data validate-h5` asks for these types and shapes.
-
-    src/renderformer/data/h5/validate.py at a5daa311, of the first version's files.
-    """
     sample = tiny_sample()
     write_renderformer_h5(tmp_path / "a.h5", sample.scene, sample.radiance_rgb)
     arrays = arrays_of(tmp_path / "a.h5")

@@ -206,7 +206,7 @@ def test_a_bad_target_is_refused_by_name(bad: float) -> None:
         dataclasses.replace(sample, lights_rgb=lights).check()
 
 
-def test_a_view_takes_its_target_and_noise_along_and_targets_are_logarithms() -> None:
+def test_a_view_takes_its_target_and_noise_along_and_targets_are_logarithms(data: Dataset) -> None:
     sample = toy_sample(4, resolution=16)
     target = training_scene(sample, 16).target_VRR3.numpy()
     np.testing.assert_allclose(10.0**target - 1, sample.radiance_rgb, atol=1e-6)  # float32 log
@@ -217,6 +217,8 @@ def test_a_view_takes_its_target_and_noise_along_and_targets_are_logarithms() ->
     require_few_triangles(sample.key, sample.scene, most)
     with pytest.raises(TrilightError, match=f"{most} triangles; the run takes at most {most - 1}"):
         require_few_triangles(sample.key, sample.scene, most - 1)
+    with pytest.raises(TrilightError, match="the run takes at most 1"):
+        take(data, dataclasses.replace(SETTINGS, most_triangles=1), 1)
     with pytest.raises(TrilightError, match=r"not kept apart, which light_mix needs.*per_light"):
         training_scene(sample, 16, lights_apart=True)
 
@@ -319,8 +321,12 @@ def test_an_epoch_uses_every_sample_once_and_windows_of_shards_follow_each_other
     assert [place.position for place in found] == list(range(2 * total))
     for epoch in (found[:total], found[total:]):
         assert {(place.shard, place.row) for place in epoch} == every
-        windows = [place.arrival // window for place in epoch]
-        assert windows == sorted(windows) and len({p.shard for p in epoch}) <= len(sizes)
+        numbers = [place.arrival // window for place in epoch]
+        assert numbers == sorted(numbers), "one window of shards after the other"
+        for _, shared in itertools.groupby(epoch, lambda place: place.arrival // window):
+            visits = list(shared)
+            held = {place.shard for place in visits}
+            assert len(held) <= window and len(visits) == sum(sizes[shard] for shard in held)
 
 
 @settings(deadline=None)  # a busy machine is no failure

@@ -35,7 +35,7 @@ from train.folder import RunFolder, read_rows
 from train.loop import compiled, optimizer
 from train.loop import step as step_module
 from train.loop.checkpoints import read_checkpoint
-from train.loop.compiled import compile_parts, compiled_parts
+from train.loop.compiled import compile_parts, compiled_parts, undo_compiling
 from train.loop.optimizer import Decision, Updater, move_along, move_towards
 from train.loop.step import Stepper, StepReport, predict_log10
 from train.loop.train_state import TrainState, ema_step, new_state
@@ -469,3 +469,11 @@ def test_what_cannot_be_compiled_is_trained_all_the_same(monkeypatch: pytest.Mon
     insisting = _uncompilable(monkeypatch, compile="yes")
     with pytest.raises(TrilightError, match="cannot compile the network.*--set compile=no"):
         insisting.step([batch], 1e-3)
+
+
+def test_compiling_is_undone() -> None:
+    model, objective = awake(tiny_config()), OBJECTIVE
+    compile_parts(model, objective, "yes", CPU)
+    undo_compiling(model, objective)
+    for _, module, method in compiled_parts(model, objective):
+        assert module._compiled_call_impl is None and method not in vars(module)

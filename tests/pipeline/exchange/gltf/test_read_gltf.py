@@ -191,6 +191,12 @@ def test_a_missing_picture_leaves_the_factor(tmp_path: Path) -> None:
     assert row_at(found.scene, 0.5, 0.5)[:3] == pytest.approx([1 - F] * 3, abs=1e-6)
 
 
+@for_each("uri", ["../a.png", "http://example.com/a.png", "/etc/hostname"])
+def test_pictures_elsewhere_are_refused(tmp_path: Path, uri: str) -> None:
+    with pytest.raises(TrilightError, match=r"a\.glb: .*lies (outside|elsewhere)"):
+        read(tmp_path, uri)
+
+
 def test_a_mesh_without_coordinates_takes_the_mean_and_one_texel_is_a_constant(
     tmp_path: Path,
 ) -> None:
