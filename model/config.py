@@ -6,6 +6,7 @@ block. `SIZES` has the named configurations.
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, ClassVar, Literal, NoReturn
 
 from storage.errors import TrilightError
@@ -33,6 +34,31 @@ HITS_PX = 8
 
 LAYERS = 256
 """Maximum number of layers of a stage: twenty times the largest published network's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BundleStage:
+    """View stage of ray bundles, as published."""
+
+    albedo_rays: int
+    """Rays along a side of each pixel that trace its albedo; 0 where radiance is predicted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HitStage:
+    """View stage of traced visible surfaces; ModelConfig describes the fields."""
+
+    hit_rays: int
+    hit_anchors: int
+    gather_rays: int
+    pixel_width: int
+    filter_width: int
+    sky_rays: int
+    denoise_from_px: int
+
+    def denoises(self, resolution: int) -> bool:
+        """Return whether the light of pictures of a width is denoised before the network."""
+        return 0 < self.denoise_from_px <= resolution
 
 
 @checked("model config")
@@ -135,7 +161,7 @@ class ModelConfig:
 
     def _check_hits(self) -> None:
         required = {"hit_anchors": self.hit_anchors, "pixel_width": self.pixel_width}
-        if self.by_hits:
+        if self.view_stage == "hits":
             for name, value in {"hit_rays": self.hit_rays, **required}.items():
                 if value < 1:
                     _wrong(f"{name} {value} with view_stage hits", "1 or more")
@@ -159,13 +185,11 @@ class ModelConfig:
             _wrong(f"hit_rays {self.hit_rays} with view_stage bundles", expected)
 
     @property
-    def by_hits(self) -> bool:
-        """True for the view stage `hits`, whose views are traced before the network runs."""
-        return self.view_stage == "hits"
-
-    def denoises(self, resolution: int) -> bool:
-        """Return whether the light of pictures of a width is denoised before the network."""
-        return 0 < self.denoise_from_px <= resolution
+    def stage(self) -> BundleStage | HitStage:
+        """Sizes of the view stage."""
+        if self.view_stage == "bundles":
+            return BundleStage(albedo_rays=self.hit_rays)
+        return HitStage(**{field.name: getattr(self, field.name) for field in fields(HitStage)})
 
     @property
     def head_width(self) -> int:
@@ -307,6 +331,13 @@ SIZES: Registry[Callable[[], ModelConfig]] = Registry(
 and no name, so that it opens without its size being registered."""
 
 ModelConfig.PRESETS = SIZES
+
+
+def hit_stage(config: ModelConfig) -> HitStage:
+    """Return the view stage `hits`; raises TrilightError where the network has another one."""
+    if not isinstance(config.stage, HitStage):
+        _wrong(f"view_stage {config.view_stage}", "hits")
+    return config.stage
 
 
 def _check_columns(names: tuple[str, ...]) -> None:

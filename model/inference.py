@@ -24,6 +24,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from model.config import HitStage, hit_stage
 from model.hits.traced import Traced, denoise_traced
 from model.open import find_network
 from model.positions import EncodedScene
@@ -269,7 +270,7 @@ class NeuralRenderer:
             knows_sky = self._model.config.sky_rays
             sky = dataclasses.replace(sky, is_seen=False) if knows_sky else None
             scene = dataclasses.replace(scene, environment=sky)
-        by_hits = self._model.config.by_hits
+        by_hits = isinstance(self._model.config.stage, HitStage)
         all_lights = [LightGroup(scene=scene, fraction=1.0)]
         groups = [
             (_encode(self._model, group.scene, self.device), group.fraction)
@@ -300,7 +301,7 @@ class NeuralRenderer:
         angle = torch.tensor(fov_deg, dtype=torch.float32, device=self.device)
         views = prepared.views
         if resolution not in views:
-            if self._model.config.by_hits:
+            if isinstance(self._model.config.stage, HitStage):
                 ((encoded, _),) = prepared.groups
                 views[resolution] = _TracedView(self._model, encoded, resolution)
             else:
@@ -322,7 +323,8 @@ class NeuralRenderer:
     def resolution_notes(self, resolution: int) -> tuple[str, ...]:
         """Return sentences on what pictures of this width by this network lack."""
         trained = self.trained.resolution
-        if trained is None or resolution == trained or self._model.config.by_hits:
+        by_pixel = isinstance(self._model.config.stage, HitStage)
+        if trained is None or resolution == trained or by_pixel:
             return ()
         return (
             f"pictures of {resolution} pixels, and the network was trained on {trained}: expect "
@@ -409,7 +411,7 @@ class _TracedView:
     def __call__(self, c2w_44: Tensor, fov_deg: Tensor) -> Tensor:
         """Return linear radiance [R, R, 3] of at least 0."""
         traced = Traced(*self._trace(c2w_44, fov_deg))
-        denoised = denoise_traced(traced, self._model.config)
+        denoised = denoise_traced(traced, hit_stage(self._model.config))
         (picture_RR3,) = self._decode(*denoised.tensors())
         return picture_RR3
 

@@ -118,10 +118,11 @@ def find_network(place: str | Path) -> NetworkFile:
         read = read_checkpoint(checkpoint)  # all of it: its digest verifies it
         settings = read.header.get("settings")
         width = settings.get("resolution") if isinstance(settings, dict) else None
+        config = decode_config(read.header["model"], f"checkpoint {checkpoint}")
         return NetworkFile(
             path=checkpoint,
             trained=TrainedRange(resolution=width if isinstance(width, int) else None),
-            any_width=decode_config(read.header["model"], f"checkpoint {checkpoint}").by_hits,
+            any_width=config.view_stage == "hits",
             open=read.network,
         )
     weights = _weights_file(source, path)
@@ -130,7 +131,7 @@ def find_network(place: str | Path) -> NetworkFile:
         return NetworkFile(
             path=weights,
             trained=trained_range(metadata) or TrainedRange(),
-            any_width=decode_config(metadata[CONFIG_KEY], str(weights)).by_hits,
+            any_width=decode_config(metadata[CONFIG_KEY], str(weights)).view_stage == "hits",
             open=lambda: from_tensors(*read_tensors(weights), str(weights)),
         )
     return NetworkFile(

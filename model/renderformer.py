@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from model.attention import Keys, Packing, pack_tokens
-from model.config import ModelConfig
+from model.config import BundleStage, HitStage, ModelConfig, hit_stage
 from model.demodulated import albedo_of_cameras, compose_radiance
 from model.hits.decoder import HitDecoder
 from model.hits.lit_scene import LitScene
@@ -61,7 +61,8 @@ class TriangleTokens(nn.Module):
         self.material_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
         self.normal = nn.Linear(encoded_normal_width(self.octaves), config.width)
         self.normal_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
-        self.light = nn.Linear(SIDE_LIGHTS, config.width) if config.by_hits else None
+        reads_light = isinstance(config.stage, HitStage)
+        self.light = nn.Linear(SIDE_LIGHTS, config.width) if reads_light else None
 
     def forward(
         self, material_BTM: Tensor, normals_BT33: Tensor, light_BTL: Tensor | None = None
@@ -150,7 +151,7 @@ class RenderFormer(nn.Module):
             head_width=config.head_width,
         )
         self.encoder: Any = TriangleEncoder(config, rotary) if config.scene_tokens else None
-        stage = HitDecoder if config.by_hits else ViewDecoder
+        stage = HitDecoder if isinstance(config.stage, HitStage) else ViewDecoder
         self.decoder: Any = stage(config, rotary)
 
     def forward(self, batch: SceneBatch, resolution: int) -> Tensor:
@@ -160,25 +161,27 @@ class RenderFormer(nn.Module):
             TrilightError: the resolution is not a multiple of `config.picture_px`, or the network
                 does not support the sky of a scene.
         """
+        stage = self.config.stage
         albedo_BVRR6 = batch.albedo_BVRR6
-        if not self.config.by_hits and albedo_BVRR6 is None:
+        if isinstance(stage, BundleStage) and albedo_BVRR6 is None:
             return self.decode(self.encode(batch), batch, resolution)
         self._require_resolution(resolution)
-        if not self.config.by_hits:
+        if isinstance(stage, BundleStage):
             return self._bundles(self._encode_scenes(batch), batch, resolution, albedo_BVRR6)
         scenes: tuple[TracedScene, ...] = ()
         traced = batch.traced
         if traced is None:
             scenes = traced_batch(batch)
-            traced = traced_cameras(scenes, batch, resolution, self.config)
-            traced = denoise_traced(traced, self.config)
+            traced = traced_cameras(scenes, batch, resolution, stage)
+            traced = denoise_traced(traced, stage)
         encoded = self._encode_scenes(batch, scenes, traced.sides_T12, traced.unit_3)
         return self.decode_traced(encoded, traced)
 
     def encode(self, batch: SceneBatch) -> EncodedScene:
         """Return the encoded scenes of a batch; its cameras are ignored."""
-        if not self.config.by_hits:
-            surfaces = lit_scenes(batch) if self.config.demodulated else ()
+        stage = self.config.stage
+        if isinstance(stage, BundleStage):
+            surfaces = lit_scenes(batch) if stage.albedo_rays else ()
             return self._encode_scenes(batch, surfaces=surfaces)
         scenes = traced_batch(batch)
         sides_BT12 = pad_sequence([each.sides_T12 for each in scenes], True)
@@ -238,18 +241,19 @@ class RenderFormer(nn.Module):
             TrilightError: the resolution is no such multiple.
         """
         self._require_resolution(resolution)
-        if self.config.by_hits:
+        stage = self.config.stage
+        if isinstance(stage, HitStage):
             traced = self.trace(scene, cameras, resolution)
-            return self.decode_traced(scene, denoise_traced(traced, self.config))
+            return self.decode_traced(scene, denoise_traced(traced, stage))
         albedo_BVRR6 = None
-        if rays := self.config.hit_rays:
+        if rays := stage.albedo_rays:
             albedo_BVRR6 = albedo_of_cameras(scene.surfaces, cameras, resolution, rays)
         return self._bundles(scene, cameras, resolution, albedo_BVRR6)
 
     def trace(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Traced:
         """Return the traced inputs of views, for `hits`; arguments are as of `decode`."""
         with tf32(self.tf32):
-            return traced_cameras(scene.traced, cameras, resolution, self.config)
+            return traced_cameras(scene.traced, cameras, resolution, hit_stage(self.config))
 
     def decode_traced(self, scene: EncodedScene, traced: Traced) -> Tensor:
         """Return the pictures [B, V, R, R, 3] of traced views, denoised where the network asks."""

@@ -12,7 +12,7 @@ from model.hits.view_inputs import Channel
 from storage.denoiser import Features, denoise, gpu_is_supported
 
 if TYPE_CHECKING:  # it loads pydantic
-    from model.config import ModelConfig
+    from model.config import HitStage
 
 INPUTS = ("open", "direct", "mirrored", "gathered", "tokens")
 """Inputs that a network of hits may lack: light from lamps as if nothing stood between, with its
@@ -81,7 +81,7 @@ def stack_traced(scenes: Sequence[Traced]) -> Traced:
 _SUMMED = (Channel.SHOWN_DIFFUSE, Channel.DIRECT_SPECULAR, Channel.MIRRORED)
 
 
-def denoise_traced(traced: Traced, config: "ModelConfig") -> Traced:
+def denoise_traced(traced: Traced, stage: "HitStage") -> Traced:
     """Return views whose direct and mirrored light is filtered as one picture, if a network asks.
 
     It is in SHOWN_DIFFUSE; DIRECT_SPECULAR and MIRRORED become 0: two filters cost twice as much
@@ -90,10 +90,10 @@ def denoise_traced(traced: Traced, config: "ModelConfig") -> Traced:
 
     Args:
         traced: views of one scene, or of a batch; on any device.
-        config: of the network.
+        stage: of the network.
     """
     resolution = traced.pixels_VRRC.shape[-2]
-    if not config.denoises(resolution):
+    if not stage.denoises(resolution):
         return traced
     unit = traced.unit_3[..., None, None, None, :].expand(*traced.pixels_VRRC.shape[:-3], 1, 1, 3)
     views = traced.pixels_VRRC.clone()

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.config import ModelConfig
+from model.config import HitStage, ModelConfig, hit_stage
 from model.hits.device_arrays import DeviceArray, DevicePlace
 from model.hits.device_rays import DeviceTriangles, compiled_kernel
 from model.hits.lit_scene import LitScene
@@ -69,7 +69,7 @@ class TracedScene:
         )
 
     def view(
-        self, c2w_44: Tensor, fov_deg: Tensor, resolution: int, config: ModelConfig, seed: int
+        self, c2w_44: Tensor, fov_deg: Tensor, resolution: int, stage: HitStage, seed: int
     ) -> ViewInputs:
         """Trace the inputs of one view."""
         place = self.lit.place
@@ -81,10 +81,10 @@ class TracedScene:
             c2w,
             angle,
             resolution,
-            rays_a_side=config.hit_rays,
-            anchors_a_side=math.gcd(config.hit_anchors, resolution),  # it divides the width
-            gather_rays=config.gather_rays,
-            sky_rays=config.sky_rays,
+            rays_a_side=stage.hit_rays,
+            anchors_a_side=math.gcd(stage.hit_anchors, resolution),  # it divides the width
+            gather_rays=stage.gather_rays,
+            sky_rays=stage.sky_rays,
             seed=seed,
         )
 
@@ -151,21 +151,22 @@ def with_traced(
     if device is not None:
         ready = ready.on(device)
     cameras = [each.to(ready.unit_3.device) for each in (scene.c2w_V44, scene.fov_deg_V)]
-    traced = traced_views(ready, cameras[0], cameras[1], resolution, config, seed)
+    stage = hit_stage(config)
+    traced = traced_views(ready, cameras[0], cameras[1], resolution, stage, seed)
     place = scene.c2w_V44.device
-    traced = map_tensors(denoise_traced(traced, config), lambda each: each.to(place))
+    traced = map_tensors(denoise_traced(traced, stage), lambda each: each.to(place))
     return dataclasses.replace(scene, traced=traced)
 
 
 def traced_cameras(
-    scenes: tuple[TracedScene, ...], cameras: Cameras, resolution: int, config: ModelConfig
+    scenes: tuple[TracedScene, ...], cameras: Cameras, resolution: int, stage: HitStage
 ) -> Traced:
     """Trace the inputs of any cameras of the scenes of a batch.
 
     It is where the cameras are, and of their type.
     """
     traced = [
-        traced_views(scene, c2w_V44, fov_deg_V, resolution, config)
+        traced_views(scene, c2w_V44, fov_deg_V, resolution, stage)
         for scene, c2w_V44, fov_deg_V in zip(
             scenes, cameras.c2w_BV44, cameras.fov_deg_BV, strict=True
         )
@@ -183,12 +184,12 @@ def traced_views(
     c2w_V44: Tensor,
     fov_deg_V: Tensor,
     resolution: int,
-    config: ModelConfig,
+    stage: HitStage,
     seed: int = 0,
 ) -> Traced:
     """Return the tensors of some views of a scene, where its rays are traced."""
     views = [
-        scene.view(c2w_44, fov_deg, resolution, config, seed)
+        scene.view(c2w_44, fov_deg, resolution, stage, seed)
         for c2w_44, fov_deg in zip(c2w_V44, fov_deg_V, strict=True)
     ]
     return Traced(

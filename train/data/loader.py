@@ -280,14 +280,16 @@ class _SceneMaker:
         if settings.network is None:
             return seen
         # imported here since they load pydantic
+        from model.config import BundleStage
         from model.demodulated import with_albedo
         from model.hits.tracing import with_traced
 
         # after the augmentation, which therefore need not transform traced inputs
-        if not settings.network.by_hits:
-            if not settings.network.demodulated:
+        stage = settings.network.stage
+        if isinstance(stage, BundleStage):
+            if not stage.albedo_rays:
                 return seen
-            tensors = with_albedo(seen.tensors, settings.resolution, settings.network.hit_rays)
+            tensors = with_albedo(seen.tensors, settings.resolution, stage.albedo_rays)
             return dataclasses.replace(seen, tensors=tensors)
         noise = int(rng.integers(2**31))
         tensors = with_traced(seen.tensors, settings.resolution, settings.network, noise)

@@ -97,7 +97,7 @@ def judge_views(config: EvalConfig, scene_done: Callable[[], None]) -> list[Judg
     every, first = spread_views(config.tracer_views, config.num_scenes)
     for number, sample in enumerate(config.samples()):
         scene = validation_scene(sample, config.resolution)
-        if config.network.config.by_hits:
+        if config.network.config.view_stage == "hits":
             tensors = with_traced(
                 scene.scene.tensors,
                 config.resolution,
@@ -245,7 +245,7 @@ def grouped_pictures(
     Returns:
         Linear radiance [V, R, R, 3] of at least 0, or None if one pass takes every light.
     """
-    if network.config.by_hits or len(light_groups(scene, MAX_LIGHTS)) == 1:
+    if network.config.view_stage == "hits" or len(light_groups(scene, MAX_LIGHTS)) == 1:
         return None
     renderer = NeuralRenderer(network)
     prepared = renderer.prepare(scene)

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from model.config import ModelConfig
+from model.config import ModelConfig, hit_stage
 from model.hits import decoder
 from model.hits.decoder import _around
 from model.hits.device_arrays import DeviceArray, DevicePlace
@@ -282,13 +282,13 @@ def test_a_view_of_tensors_is_numpys(scene: Scene) -> None:
     numpy_form = traced_scene(lit_scene(scene))
     tensor_form = numpy_form.on_place(DevicePlace(HOST), _OnHost)
     camera = torch.tensor(scene.c2w[0]), torch.tensor(float(scene.fov_deg[0]))
-    config = hits_config(hit_rays=2, gather_rays=4)
-    given = (*camera, 32, config, 0)
+    stage = hit_stage(hits_config(hit_rays=2, gather_rays=4))
+    given = (*camera, 32, stage, 0)
     expected, got = numpy_form.view(*given), tensor_form.view(*given)
     for name, array in vars(expected).items():
         tensor = getattr(got, name).tensor
         np.testing.assert_allclose(tensor.numpy(), array, rtol=1e-3, atol=2e-5, err_msg=name)
-    denoising = dataclasses.replace(config, denoise_from_px=32)
+    denoising = dataclasses.replace(stage, denoise_from_px=32)
     views = [
         traced_views(form, camera[0][None], camera[1][None], 32, denoising).pixels_VRRC
         for form in (numpy_form, tensor_form)

@@ -9,6 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from model.config import hit_stage
 from model.hits.traced import Traced, denoise_traced
 from model.hits.tracing import with_traced
 from model.hits.view_inputs import NUM_CHANNELS, Channel
@@ -224,7 +225,7 @@ def _traced(**changes: int) -> Tensor:
 def _denoise(pixels_VRRC: Tensor, unit_3: Tensor) -> Tensor:
     empty = torch.zeros(0)
     views = Traced(empty, unit_3, pixels_VRRC, empty, empty, empty)
-    return denoise_traced(views, hits_config(denoise_from_px=WIDE_PX)).pixels_VRRC
+    return denoise_traced(views, hit_stage(hits_config(denoise_from_px=WIDE_PX))).pixels_VRRC
 
 
 def _light(pixels: Tensor) -> Tensor:
