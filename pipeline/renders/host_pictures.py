@@ -1,4 +1,9 @@
-"""`HostPictures`: the arithmetic of a view in numpy, on sums that are read back."""
+"""`HostPictures`: the arithmetic of a view in numpy, on sums that are read back.
+
+All that must stay in numpy for published sets is here: sums in another order change last digits.
+Sets choose it by their render settings (`arithmetic`). All others take
+pipeline.renders.device_pictures, of which this is the tests' oracle.
+"""
 
 import functools
 from collections.abc import Sequence
