@@ -19,7 +19,7 @@ from infra.cli.console import (
 from infra.cli.everyday import HELP_FLAGS
 from infra.cli.options import OutputOptions, command
 from infra.cli.overrides import BaseSettings, with_base_settings
-from pipeline.executors.array_job import (
+from pipeline.executors.slurm_and_kubernetes import (
     ArrayJob,
     DatasetByArray,
     KubernetesOptions,

@@ -3,8 +3,8 @@
 `--runner slurm` and `--runner kubernetes` make the shards of one task of an array so. No task
 submits another, and none waits for another: they share the folder or bucket that `--out` names, and
 the task that makes the last shard finishes the dataset. `trilight submit` makes such arrays
-(pipeline.executors.array_job), and so does infra/slurm/generate.sbatch. None has run on a real
-cluster yet; tests give tasks the variables that the manuals document.
+(pipeline.executors.slurm_and_kubernetes), and so does infra/slurm/generate.sbatch. None has run on
+a real cluster yet; tests give tasks the variables that the manuals document.
 
 Kubernetes starts the same container with the index 0, 1, 2, ... in JOB_COMPLETION_INDEX, and again
 with the same index when a task is lost. TASKS maps each index to a task, such as 0-3,7, so that

@@ -17,7 +17,7 @@ from prefect import flow
 from prefect.deployments import run_deployment
 from prefect.logging import get_run_logger
 
-from pipeline.executors.array_job import (
+from pipeline.executors.slurm_and_kubernetes import (
     DatasetByArray,
     array_job,
     options_from_environment,

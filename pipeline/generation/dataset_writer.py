@@ -18,7 +18,7 @@ from typing import Any
 
 from pipeline.presets.settings import DatasetSettings, differences
 from pipeline.renders.mitsuba_variant import device_of
-from pipeline.shards.pack import (
+from pipeline.shards.pack_shards import (
     PLANNED,
     PublishedShards,
     adopt,

@@ -38,7 +38,7 @@ from pipeline.renders.mitsuba_variant import (
     gpu_memory_bytes,
     visible_gpus,
 )
-from pipeline.shards.pack import UnfinishedShard
+from pipeline.shards.pack_shards import UnfinishedShard
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, read_head
 from storage.dataset.settings import SplitSettings

@@ -6,7 +6,7 @@
     meshes     the same objects, cleaned, with fewer triangles       pipeline.assets.stage
     scenes     meshes with a room, materials, lights and cameras     pipeline.scenes.compose
     renders    a picture of each camera, down to the stated error     pipeline.renders.renderer
-    shards     tars of finished scenes, the same bytes everywhere    pipeline.shards.pack
+    shards     tars of finished scenes, the same bytes everywhere    pipeline.shards.pack_shards
     documents  card, report and contact sheet for readers            pipeline.documents
 
 The objects are frozen after the mesh stage (scene files instead, if scenes come from files; the
@@ -19,7 +19,7 @@ crash costs one attempt.
 The files on disk are the only state, and every step may be killed at any moment. A mesh is kept in
 the asset store, a scene in the staging folder, a shard in the dataset; the next run looks for these
 and makes the rest. Several runs on one folder share the work (storage.file_locks), and those on one
-bucket share batches of objects (storage.remote.store) and shards (pipeline.shards.pack).
+bucket share batches of objects (storage.remote.store) and shards (pipeline.shards.pack_shards).
 """
 
 import contextlib
@@ -66,7 +66,7 @@ from pipeline.isolation import ChildFailed, IsolatedChild, with_retries
 from pipeline.presets.registry import DATASET_PRESETS, object_source
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import environment
-from pipeline.shards.pack import UnfinishedShard, hold_dataset_lock
+from pipeline.shards.pack_shards import UnfinishedShard, hold_dataset_lock
 from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.progress import write_asked

@@ -214,7 +214,7 @@ def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
     """Return the names of the planned shards that are there, listed or not, and do not grow.
 
     A bucket is asked what it holds, where it may be asked and something is not listed yet: a shard
-    is finished there when it and the note on it have come (pipeline.shards.pack).
+    is finished there when it and the note on it have come (pipeline.shards.pack_shards).
     """
     if isinstance(dataset.files, LocalFiles):
         existing = existing_shards(DatasetFolder(dataset.files.root)) & set(planned)

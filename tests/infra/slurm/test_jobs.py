@@ -12,7 +12,7 @@ from uuid import UUID
 
 import pytest
 
-from pipeline.executors import array_job as arrays
+from pipeline.executors import slurm_and_kubernetes as arrays
 from pipeline.flows import submission
 from pipeline.flows.submission import RunStatus, SubmittedRun
 from tests.command_line import trilight

@@ -14,8 +14,9 @@ from typing import Any
 
 import pytest
 
-from pipeline.executors import array_job as arrays
-from pipeline.executors.array_job import (
+from pipeline.executors import slurm_and_kubernetes as arrays
+from pipeline.executors.registry import EXECUTORS, find_executor
+from pipeline.executors.slurm_and_kubernetes import (
     MAX_TASKS,
     ArrayJob,
     KubernetesOptions,
@@ -24,7 +25,6 @@ from pipeline.executors.array_job import (
     sbatch_command,
     sbatch_environment,
 )
-from pipeline.executors.registry import EXECUTORS, find_executor
 from pipeline.executors.threads import PLACE, shards_of_place, shards_of_task
 from pipeline.generation.generate_options import GenerateOptions
 from storage.dataset.dataset import open_dataset

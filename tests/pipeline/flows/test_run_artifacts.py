@@ -13,13 +13,13 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from pipeline.executors.array_job import (
+from pipeline.executors.registry import find_executor
+from pipeline.executors.slurm_and_kubernetes import (
     ArrayJob,
     DatasetByArray,
     KubernetesOptions,
     options_from_environment,
 )
-from pipeline.executors.registry import find_executor
 from pipeline.flows import prefect_flows, prefect_runner
 from pipeline.flows.prefect_flows import make_by_array
 from pipeline.flows.prefect_runner import (

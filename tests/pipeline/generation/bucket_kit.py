@@ -12,7 +12,7 @@ import pytest
 from pipeline.generation import dataset_writer
 from pipeline.generation.dataset_writer import DatasetWriter, begin_or_resume_dataset
 from pipeline.presets.registry import preset_settings
-from pipeline.shards.pack import hold_dataset_lock, pack_shard
+from pipeline.shards.pack_shards import hold_dataset_lock, pack_shard
 from storage.dataset.layout import dataset_folder
 from storage.dataset.staging import stage_scene
 from storage.records.objects import Failure

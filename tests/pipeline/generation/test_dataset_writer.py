@@ -13,7 +13,7 @@ from pipeline.objects.generated import generate_objects
 from pipeline.presets.registry import preset_settings
 from pipeline.presets.settings import DatasetSettings
 from pipeline.renders.mitsuba_variant import Device, Variant, _ProbeResult, device_of, environment
-from pipeline.shards.pack import pack_shard
+from pipeline.shards.pack_shards import pack_shard
 from storage.dataset import layout
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder

@@ -19,7 +19,7 @@ from pipeline.generation.dataset_writer import begin_or_resume_dataset
 from pipeline.generation.derive_dataset import derive_dataset
 from pipeline.shards.derive import DeriveOptions, Selection, derive_shards
 from pipeline.shards.finished_dataset import open_finished
-from pipeline.shards.pack import pack_shard
+from pipeline.shards.pack_shards import pack_shard
 from storage.dataset import layout
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.derived import derivation_of

@@ -18,7 +18,7 @@ from pipeline.generation.pipeline import make_dataset, make_task, prepare_datase
 from pipeline.isolation import call_with_retries
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings, resolve_dataset_preset
 from pipeline.shards.derive import _extensions
-from pipeline.shards.pack import hold_dataset_lock
+from pipeline.shards.pack_shards import hold_dataset_lock
 from scene_templates.families import FAMILIES
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder

@@ -15,7 +15,7 @@ from pipeline.generation import pipeline
 from pipeline.generation.generate_options import GenerateOptions
 from pipeline.generation.pipeline import make_dataset, prepare_dataset
 from pipeline.presets.registry import DATASET_PRESETS, preset_settings
-from pipeline.shards import pack
+from pipeline.shards import pack_shards as pack
 from storage.dataset.dataset import open_dataset, open_listed
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.executors.array_job import KubernetesOptions, array_job, job_manifest
 from pipeline.executors.registry import find_executor
+from pipeline.executors.slurm_and_kubernetes import KubernetesOptions, array_job, job_manifest
 from pipeline.executors.threads import PLACE
 from pipeline.generation.object_batches import (
     ObjectWork,

@@ -20,8 +20,8 @@ from pipeline.generation.generation_run import Piece, Run, Runner, ShardJob, Tas
 from pipeline.generation.pipeline import make_dataset, make_piece
 from pipeline.generation.scene_worker import SceneAttempt
 from pipeline.isolation import ChildFailed, ChildPool, IsolatedChild
-from pipeline.shards import pack
-from pipeline.shards.pack import UnfinishedShard, pack_shard
+from pipeline.shards import pack_shards as pack
+from pipeline.shards.pack_shards import UnfinishedShard, pack_shard
 from storage import file_locks
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry, index_shard

@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.generation.dataset_writer import begin_or_resume_dataset
 from pipeline.generation.generate_options import GenerateOptions
-from pipeline.shards.pack import hold_dataset_lock
+from pipeline.shards.pack_shards import hold_dataset_lock
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import dataset_folder
 from storage.dataset.training_data import open_training_data
