@@ -32,7 +32,7 @@ from storage.conventions import log10_radiance
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.metrics import flicker_log_db, psnr_log_db
-from storage.records.exr import decode_picture, encode_picture, read_header
+from storage.records.exr import decode_layers, encode_layers, read_header
 from storage.records.lights import num_lights, rounded_to_half
 from storage.records.safe_read import read_plain
 from storage.records.scene import Scene
@@ -168,7 +168,7 @@ def load_matching_picture(
         if stored.get(_PREFIX + _REQUEST) != header[_REQUEST]:
             return None
         names = {channel.name.rpartition(".")[0] for channel in stored["channels"]}
-        radiance_rgb = decode_picture(data, names - {""})
+        radiance_rgb = decode_layers(data, ["", *names - {""}])[0]
     except (OSError, RuntimeError, ValueError, TrilightError):
         return None
     described = {_PREFIX + name for name in header}
@@ -191,7 +191,8 @@ def write_picture(
         TrilightError: a value is not finite, or the file cannot be written.
     """
     named = {_PREFIX + name: value for name, value in (dict(header) | dict(facts)).items()}
-    write_atomically(path, encode_picture(image.radiance_rgb, image.layers_rgb, named))
+    layers_rgb = {"": image.radiance_rgb, **image.layers_rgb}
+    write_atomically(path, encode_layers(layers_rgb, named))
     radiance_rgb = rounded_to_half(image.radiance_rgb)
     return _picture_file(path, facts, radiance_rgb, seconds), radiance_rgb
 

@@ -7,7 +7,7 @@ The file itself says how it is packed, so a reader need not be told. Which codec
 import contextlib
 import io
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -321,53 +321,31 @@ def _list_names(names: Sequence[str]) -> str:
     return f"{', '.join(names[:_MOST_LISTED])} and {len(names) - _MOST_LISTED} more"
 
 
-def encode_layers(names: Sequence[str], radiance_rgb: NDArray[np.float32]) -> bytes:
-    """Return the OpenEXR file of pictures [N, R, R, 3] by names of layers; raises as `encode_exr`.
-
-    The channels of a layer are `<layer>.R`, `.G` and `.B`.
-    """
-    return encode_channels(_channels(names, radiance_rgb))
-
-
-def encode_picture(
-    radiance_rgb: NDArray[np.float32],
-    layers_rgb: Mapping[str, NDArray[np.float32]],
-    attributes: Attributes,
+def encode_layers(
+    layers_rgb: Mapping[str, NDArray[np.float32]], attributes: Attributes | None = None
 ) -> bytes:
-    """Return the OpenEXR file of a picture [R, R, 3] and its layers; raises as `encode_exr`."""
-    if not layers_rgb:
-        return encode_exr(radiance_rgb, attributes=attributes)
-    layers = _channels(tuple(layers_rgb), np.stack(list(layers_rgb.values())))
-    return encode_channels({"RGB": to_half(radiance_rgb), **layers}, attributes=attributes)
+    """Return the OpenEXR file of pictures [R, R, 3] by names of layers; raises as `encode_exr`.
 
-
-def decode_picture(data: bytes, layers: Collection[str]) -> NDArray[np.float32]:
-    """Return the picture [H, W, 3] of a file without these layers; raises as `decode_exr`."""
-    if not layers:
-        return decode_exr(data)
-    names = ["R", "G", "B", *(f"{layer}.{channel}" for layer in layers for channel in "RGB")]
-    by_channel = decode_channels(data, names, separate=True)
-    return np.stack([by_channel[channel] for channel in "RGB"], axis=-1).astype(np.float32)
-
-
-def _channels(
-    names: Sequence[str], radiance_rgb: NDArray[np.float32]
-) -> dict[str, NDArray[np.float16]]:
-    return {
-        f"{name}.{channel}": np.ascontiguousarray(picture[..., index])
-        for name, picture in zip(names, to_half(radiance_rgb), strict=True)
-        for index, channel in enumerate("RGB")
-    }
+    The channels of a layer are `<layer>.R`, `.G` and `.B`, those of the layer "" have no prefix.
+    """
+    pictures = to_half(np.stack(list(layers_rgb.values())))
+    planes = np.moveaxis(pictures, -1, 1).reshape(-1, *pictures.shape[1:3])
+    channels = dict(zip(_channels_of(layers_rgb), np.ascontiguousarray(planes), strict=True))
+    return encode_channels(channels, attributes=attributes)
 
 
 def decode_layers(
-    data: bytes, names: Sequence[str], size: tuple[int, int], what: str
+    data: bytes, names: Sequence[str], size: tuple[int, int] | None = None, what: str = "picture"
 ) -> NDArray[np.float32]:
-    """Return the pictures of an OpenEXR file, float32 [N, H, W, 3]; raises as `decode_channels`.
+    """Return the pictures of an OpenEXR file, float32 [N, H, W, 3]; arguments as `decode_channels`.
 
-    `names` of the layers and `size`, H and W, are as they must be; messages say `what`.
+    `names` are those of all of its layers.
     """
-    channels = [f"{name}.{channel}" for name in names for channel in "RGB"]
+    channels = _channels_of(names)
     by_channel = decode_channels(data, channels, size=size, what=what, separate=True)
     planes = np.stack([np.asarray(by_channel[name], np.float32) for name in channels])
-    return np.moveaxis(planes.reshape(len(names), 3, *size), 1, -1).copy()
+    return np.moveaxis(planes.reshape(len(names), 3, *planes.shape[1:]), 1, -1).copy()
+
+
+def _channels_of(layers: Iterable[str]) -> list[str]:
+    return [f"{layer}.{channel}".strip(".") for layer in layers for channel in "RGB"]

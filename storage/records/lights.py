@@ -67,23 +67,11 @@ def sum_of_lights(lights_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
         return total.astype(np.float16).astype(np.float32)
 
 
-def encode_lights_exr(lights_rgb: NDArray[np.float32]) -> bytes:
-    """Return the OpenEXR file of lights [L, R, R, 3]; raises as `encode_layers`."""
-    return encode_layers(_layers([""], len(lights_rgb)), lights_rgb)
-
-
-def decode_lights_exr(data: bytes, shape: tuple[int, int, int]) -> NDArray[np.float32]:
-    """Return the lights of an OpenEXR file, float32 of `shape`, [L, H, W], and 3.
-
-    Raises:
-        TrilightError: not an EXR file, truncated, or with other channels or another size.
-    """
-    num, *size = shape
-    return _decode(data, _layers([""], num), (size[0], size[1]), "lights")
-
-
 Parts = Mapping[str, NDArray[np.float32]]
 """Radiance by the name of the part, in the order of `part_names`."""
+
+ALL_LIGHT = ""
+"""Name of the only part where lights are apart and parts are not."""
 
 _LOBES = ("diffuse", "specular")
 _BOUNCES = ("direct", "indirect")
@@ -112,20 +100,16 @@ def sum_of_parts(parts_rgb: Parts) -> NDArray[np.float32]:
     return sum_of_lights(np.stack(list(parts_rgb.values())))
 
 
-def part_layers(parts_rgb: Parts) -> tuple[list[str], NDArray[np.float32]]:
-    """Return the names of the layers of one view's parts, and their pictures [N, R, R, 3].
+def encode_parts_exr(parts_rgb: Parts) -> bytes:
+    """Return the OpenEXR file of one view's parts; raises as `encode_layers`.
 
     Args:
-        parts_rgb: [R, R, 3] each, or [L, R, R, 3] of L lights apart.
+        parts_rgb: [R, R, 3] each, or [L, R, R, 3] of L lights apart; ALL_LIGHT where there are no
+            parts.
     """
     stacked = np.stack(list(parts_rgb.values()))
-    num_lights = stacked.shape[1] if stacked.ndim == 5 else None
-    return _layers(tuple(parts_rgb), num_lights), stacked.reshape(-1, *stacked.shape[-3:])
-
-
-def encode_parts_exr(parts_rgb: Parts) -> bytes:
-    """Return the OpenEXR file of one view's parts, as `part_layers`; raises as `encode_layers`."""
-    return encode_layers(*part_layers(parts_rgb))
+    layers = _layers(tuple(parts_rgb), stacked.shape[1] if stacked.ndim == 5 else None)
+    return encode_layers(dict(zip(layers, stacked.reshape(-1, *stacked.shape[-3:]), strict=True)))
 
 
 def decode_parts_exr(
@@ -138,17 +122,13 @@ def decode_parts_exr(
     Raises:
         TrilightError: not an EXR file, truncated, or with other channels or another size.
     """
-    pictures = _decode(data, _layers(names, num_lights), size, "parts")
-    lights = () if num_lights is None else (num_lights,)
-    return dict(zip(names, pictures.reshape(len(names), *lights, *size, 3), strict=True))
-
-
-def _decode(
-    data: bytes, layers: Sequence[str], size: tuple[int, int], what: str
-) -> NDArray[np.float32]:
+    layers = _layers(names, num_lights)
+    what = "parts" if any(names) else "lights"
     if len(layers) > MAX_LIGHTS:
         raise TrilightError(f"{what}: {len(layers)} pictures; expected at most {MAX_LIGHTS}.")
-    return decode_layers(data, layers, size, what)
+    pictures = decode_layers(data, layers, size, what)
+    lights = () if num_lights is None else (num_lights,)
+    return dict(zip(names, pictures.reshape(len(names), *lights, *size, 3), strict=True))
 
 
 def _layers(names: Sequence[str], num_lights: int | None) -> list[str]:

@@ -30,11 +30,10 @@ from storage.errors import TrilightError
 from storage.raycast.first_hits import require_row
 from storage.records.exr import FIRST_ILLEGAL, Stored, decode_exr, decode_stored, to_float32
 from storage.records.lights import (
+    ALL_LIGHT,
     KNOWN_PARTS,
     Parts,
-    decode_lights_exr,
     decode_parts_exr,
-    encode_lights_exr,
     encode_parts_exr,
     num_light_pictures,
 )
@@ -205,13 +204,11 @@ def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, by
     of_pictures = profile if together else "lossless"
     for view, (picture, made) in enumerate(zip(sample.radiance_rgb, sample.views, strict=True)):
         members[f"{view}.exr"] = pack_picture(picture, made.noise_floor_db, of_pictures)
-    if sample.lights_rgb is not None:
-        for view, lights in enumerate(sample.lights_rgb):
-            members[f"{view}.lights.exr"] = encode_lights_exr(lights)
-    if sample.parts_rgb is not None:
-        for view in range(len(sample.views)):
-            of_view = {name: pictures[view] for name, pictures in sample.parts_rgb.items()}
-            members[f"{view}.parts.exr"] = encode_parts_exr(of_view)
+    lights = {} if sample.lights_rgb is None else {ALL_LIGHT: sample.lights_rgb}
+    for what, apart in (("lights", lights), ("parts", sample.parts_rgb or {})):
+        for view in range(len(sample.views)) if apart else ():
+            of_view = {name: pictures[view] for name, pictures in apart.items()}
+            members[f"{view}.{what}.exr"] = encode_parts_exr(of_view)
     for view, packed in enumerate(sample.passes_exr or ()):
         members[f"{view}.passes.exr"] = packed
     return {**members, **packed_maps(scene), **sample.kept_members}
@@ -226,14 +223,17 @@ def decode_sample(key: str, members: Mapping[str, bytes], held: HeldMaps | None 
     """
     record = decode_scene(key, members, held)
     with name_errors(key):
-        pictures = [decode_exr(members[f"{view}.exr"]) for view in range(len(record.views))]
-        radiance_rgb = np.stack(pictures)
-        every = range(len(pictures))
+        every = range(len(record.views))
+        radiance_rgb = np.stack([decode_exr(members[f"{view}.exr"]) for view in every])
+        size = radiance_rgb.shape[1:3]
+        lights_rgb = _decode_lights(record.scene, every, size, members)
+        lit = None if lights_rgb is None else record.scene
+        names = tuple(record.views[0].parts or ())
         return Sample(
             **vars(record),
             radiance_rgb=radiance_rgb,
-            lights_rgb=decode_lights(record.scene, every, pictures[0].shape, members),
-            parts_rgb=_decode_parts(record, radiance_rgb, members),
+            lights_rgb=lights_rgb,
+            parts_rgb=_decode_parts("parts", names, every, size, lit, members),
             passes_exr=_of_views("passes", every, members),
         )
 
@@ -247,32 +247,33 @@ def _of_views(
     return tuple(members[f"{view}.{what}.exr"] for view in views)
 
 
-def decode_lights(
-    scene: Scene, views: Sequence[int], size: Sequence[int], members: Mapping[str, bytes]
+def _decode_lights(
+    scene: Scene, views: Sequence[int], size: tuple[int, ...], members: Mapping[str, bytes]
 ) -> NDArray[np.float32] | None:
-    """Return the lights [V, L, R, R, 3] of some views; None where they are together.
-
-    Raises KeyError for a member that is missing, and as `decode_lights_exr`. `size` begins with the
-    height and the width of the pictures.
-    """
-    packed = _of_views("lights", views, members)
-    if packed is None:
-        return None
-    shape = (num_light_pictures(scene), size[0], size[1])
-    return np.stack([decode_lights_exr(data, shape) for data in packed])
+    """Return the lights [V, L, R, R, 3] of some views; None where they are together."""
+    parts = _decode_parts("lights", (ALL_LIGHT,), views, size, scene, members)
+    return None if parts is None else parts[ALL_LIGHT]
 
 
 def _decode_parts(
-    record: SceneRecord, radiance_rgb: NDArray[np.float32], members: Mapping[str, bytes]
+    what: str,
+    names: Sequence[str],
+    views: Sequence[int],
+    size: tuple[int, ...],
+    scene: Scene | None,
+    members: Mapping[str, bytes],
 ) -> dict[str, NDArray[np.float32]] | None:
-    packed = _of_views("parts", range(len(radiance_rgb)), members)
+    """Return what the members `<view>.<what>.exr` hold of some views; None where there are none.
+
+    `scene` is None where lights are together. It raises KeyError for a member that is missing, and
+    as `decode_parts_exr`.
+    """
+    packed = _of_views(what, views, members)
     if packed is None:
         return None
-    lights_apart = any(suffix.endswith(".lights.exr") for suffix in members)
-    num = num_light_pictures(record.scene) if lights_apart else None
-    names = list(record.views[0].parts or ())
-    size = radiance_rgb.shape[1], radiance_rgb.shape[2]
-    by_view = [decode_parts_exr(data, names, size, num) for data in packed]
+    height, width = size
+    num_lights = None if scene is None else num_light_pictures(scene)
+    by_view = [decode_parts_exr(data, names, (height, width), num_lights) for data in packed]
     return {name: np.stack([of_view[name] for of_view in by_view]) for name in names}
 
 
@@ -422,7 +423,7 @@ class StoredSample(SceneRecord):
         """
         with name_errors(self.key):
             size = (resolution, resolution)
-            lights_rgb = decode_lights(self.scene, views, size, self.members)
+            lights_rgb = _decode_lights(self.scene, views, size, self.members)
         if lights_rgb is not None:
             for view, lights in zip(views, lights_rgb, strict=True):
                 check_lights(self.key, lights[None], first_view=view)

@@ -7,7 +7,7 @@ Conversions copy a scene whole and therefore do not count.
 import dataclasses
 import gzip
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,7 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_channels, encode_exr
 from storage.records.lights import (
-    decode_lights_exr,
     decode_parts_exr,
-    encode_lights_exr,
     encode_parts_exr,
     num_lights,
 )
@@ -165,16 +163,14 @@ def _brighter_picture(members: Members) -> None:
     members["1.exr"] = encode_exr(decode_exr(members["1.exr"]) * np.float32(2))
 
 
-def _brighter_light(members: Members) -> None:
-    shape = (num_lights(_sample().scene), _PIXELS, _PIXELS)
-    lights = decode_lights_exr(members["1.lights.exr"], shape)
-    members["1.lights.exr"] = encode_lights_exr(lights * np.float32(2))
+def _brighter_parts(what: str, names: Sequence[str]) -> Change:
+    def change(members: Members) -> None:
+        num = num_lights(_sample().scene)
+        parts = decode_parts_exr(members[f"1.{what}.exr"], names, (_PIXELS, _PIXELS), num)
+        brighter = {name: 2 * part for name, part in parts.items()}
+        members[f"1.{what}.exr"] = encode_parts_exr(brighter)
 
-
-def _brighter_part(members: Members) -> None:
-    num = num_lights(_sample().scene)
-    parts = decode_parts_exr(members["1.parts.exr"], _PARTS, (_PIXELS, _PIXELS), num)
-    members["1.parts.exr"] = encode_parts_exr({name: 2 * part for name, part in parts.items()})
+    return change
 
 
 def _other_objects(members: Members) -> None:
@@ -192,8 +188,8 @@ def _changes() -> dict[str, Change]:
     changes |= {f"{ARRAYS} {name}": _change_array(name) for name in sorted(load(members[ARRAYS]))}
     return changes | {
         "1.exr": _brighter_picture,
-        "1.lights.exr": _brighter_light,
-        "1.parts.exr": _brighter_part,
+        "1.lights.exr": _brighter_parts("lights", ("",)),
+        "1.parts.exr": _brighter_parts("parts", _PARTS),
         "1.passes.exr": _other_objects,
     }
 

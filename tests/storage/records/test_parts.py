@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import itertools
 import json
 from typing import Any
 
@@ -16,11 +17,10 @@ from storage.dataset.verify import check_sample
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_exr
 from storage.records.lights import (
+    ALL_LIGHT,
     KNOWN_PARTS,
     MAX_LIGHTS,
-    decode_lights_exr,
     decode_parts_exr,
-    encode_lights_exr,
     encode_parts_exr,
     num_light_pictures,
     num_lights,
@@ -58,25 +58,7 @@ def _lit_sample(**changes: Any) -> Sample:
     return dataclasses.replace(made, **fields | changes)
 
 
-@for_each("count", [1, 2, 12, MAX_LIGHTS])
-def test_lights_come_back_exactly_and_in_order(count: int) -> None:
-    lights = _noise(count, *SIZE)
-    data = encode_lights_exr(lights)
-    back = decode_lights_exr(data, (count, 16, 16))
-    assert back.dtype == np.float32
-    np.testing.assert_array_equal(back, lights)
-    assert encode_lights_exr(back) == data
-    channels = OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()
-    assert set(channels) == {f"light{i}.{name}" for i in range(count) for name in "RGB"}
-    last = channels[f"light{count - 1}.G"].pixels
-    np.testing.assert_array_equal(last, lights[-1, ..., 1])
-
-
-def test_another_shape_is_refused_and_a_sum_beyond_half_floats_is_seen() -> None:
-    data = encode_lights_exr(_noise(2, *SIZE))
-    for shape in ((3, 16, 16), (2, 8, 16), (2, 16, 24), (MAX_LIGHTS + 1, 16, 16)):
-        with pytest.raises(TrilightError, match="lights: |channels are light0.B, .*; expected l"):
-            decode_lights_exr(data, shape)
+def test_a_sum_beyond_half_floats_is_seen() -> None:
     lights = np.full((2, 8, 8, 3), HALF_FLOAT_MAX * 0.6, np.float32)
     assert np.isinf(sum_of_lights(rounded_to_half(lights))).all()
 
@@ -183,9 +165,13 @@ def test_the_names_are_those_of_other_renderers_in_alphabetical_order() -> None:
         assert names == tuple(sorted(names))
 
 
-@for_each("lights", [None, 1, 3])
-@for_each("names", KNOWN_PARTS)
-def test_parts_come_back_exactly(names: tuple[str, ...], lights: int | None) -> None:
+LIGHTS = [((ALL_LIGHT,), count) for count in (1, 2, 12, MAX_LIGHTS)]
+
+
+@for_each(("names", "lights"), [*LIGHTS, *itertools.product(KNOWN_PARTS, [None, 1, 3])])
+def test_lights_and_parts_come_back_exactly_and_in_order(
+    names: tuple[str, ...], lights: int | None
+) -> None:
     parts = _parts(names, SIZE if lights is None else (lights, *SIZE))
     data = encode_parts_exr(parts)
     back = decode_parts_exr(data, names, SIZE, lights)
@@ -193,10 +179,13 @@ def test_parts_come_back_exactly(names: tuple[str, ...], lights: int | None) -> 
     for name in names:
         assert back[name].dtype == np.float32
         np.testing.assert_array_equal(back[name], parts[name])
+    assert encode_parts_exr(back) == data
     channels = OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()
+    assert len(channels) == 3 * len(names) * (lights or 1)
     prefix = "" if lights is None else f"light{lights - 1}."
-    green = parts[names[1]] if lights is None else parts[names[1]][-1]
-    np.testing.assert_array_equal(channels[f"{prefix}{names[1]}.G"].pixels, green[..., 1])
+    green = parts[names[-1]] if lights is None else parts[names[-1]][-1]
+    layer = f"{prefix}{names[-1]}".strip(".")
+    np.testing.assert_array_equal(channels[f"{layer}.G"].pixels, green[..., 1])
 
 
 @for_each("names", KNOWN_PARTS)
@@ -205,7 +194,8 @@ def test_the_stored_sum_is_exact(names: tuple[str, ...]) -> None:
     for seed in range(5):
         parts, lights = _parts(names, SIZE, seed), _noise(7, *SIZE, seed=seed)
         parts_back = decode_parts_exr(encode_parts_exr(parts), names, SIZE, None)
-        lights_back = decode_lights_exr(encode_lights_exr(lights), (7, *SIZE))
+        packed = encode_parts_exr({ALL_LIGHT: lights})
+        lights_back = decode_parts_exr(packed, (ALL_LIGHT,), SIZE, 7)[ALL_LIGHT]
         for stored, back, each in (
             (sum_of_parts(parts), sum_of_parts(parts_back), list(parts.values())),
             (sum_of_lights(lights), sum_of_lights(lights_back), list(lights)),
@@ -224,7 +214,9 @@ def test_the_stored_sum_is_exact(names: tuple[str, ...]) -> None:
         (KNOWN_PARTS[1], SIZE, None, "channels are direct.B"),
         (KNOWN_PARTS[0], SIZE, 1, "channels are direct.B"),
         (KNOWN_PARTS[0], (8, 16), None, r"parts: \[16, 16\] pixels; expected \[8, 16\]"),
-        (KNOWN_PARTS[0], SIZE, MAX_LIGHTS // 2 + 1, "66 pictures; expected at most 64"),
+        (KNOWN_PARTS[0], SIZE, MAX_LIGHTS // 2 + 1, "parts: 66 pictures; expected at most 64"),
+        ((ALL_LIGHT,), SIZE, MAX_LIGHTS + 1, "lights: 65 pictures; expected at most 64"),
+        ((ALL_LIGHT,), (16, 24), 2, r"lights: \[16, 16\] pixels; expected \[16, 24\]"),
     ],
 )
 def test_other_parts_are_refused(

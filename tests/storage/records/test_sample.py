@@ -26,7 +26,7 @@ from storage.dataset.statistics import dataset_statistics
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.exr import ExrCodec, decode_exr, encode_channels, encode_exr
-from storage.records.lights import MAX_LIGHTS, decode_lights_exr, encode_lights_exr
+from storage.records.lights import ALL_LIGHT, MAX_LIGHTS, decode_parts_exr, encode_parts_exr
 from storage.records.profiles import (
     DWA_LEVELS,
     LAW_DB,
@@ -232,12 +232,12 @@ import resource, sys
 from pathlib import Path
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr
-from storage.records.lights import decode_lights_exr
+from storage.records.lights import decode_parts_exr
 for path, read_as in zip(sys.argv[1::2], sys.argv[2::2]):
     data = Path(path).read_bytes()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     try:
-        decode_lights_exr(data, (2, 2048, 2048)) if read_as == "lights" else decode_exr(data)
+        decode_exr(data) if read_as == "picture" else decode_parts_exr(data, [""], (2048, 2048), 2)
     except TrilightError as error:
         print(error)
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
@@ -311,16 +311,21 @@ def _with_window(data: bytes, height: int, width: int) -> bytes:
 
 
 def test_bytes_are_bounded_by_what_is_expected() -> None:
-    lights = encode_lights_exr(np.zeros((MAX_LIGHTS, 8, 8, 3), np.float32))
+    lights = encode_parts_exr({ALL_LIGHT: np.zeros((MAX_LIGHTS, 8, 8, 3), np.float32)})
+
+    def decode(side: int, expected: int) -> None:
+        data = _with_window(lights, side, side)
+        decode_parts_exr(data, (ALL_LIGHT,), (expected, expected), MAX_LIGHTS)
+
     with pytest.raises(
         TrilightError, match=r"192 channels of \[4096, 4096\] pixels may take 128849"
     ):
-        decode_lights_exr(_with_window(lights, 4096, 4096), (MAX_LIGHTS, 4096, 4096))
+        decode(4096, 4096)
     # What the renderer writes at most is not refused for its size, but for its missing pixels.
     with pytest.raises(TrilightError, match="not a readable OpenEXR file|a channel is no"):
-        decode_lights_exr(_with_window(lights, 2048, 2048), (MAX_LIGHTS, 2048, 2048))
+        decode(2048, 2048)
     with pytest.raises(TrilightError, match=r"^lights: \[1000001, 1000001\] pixels"):
-        decode_lights_exr(_with_window(lights, 1_000_001, 1_000_001), (MAX_LIGHTS, 8, 8))
+        decode(1_000_001, 8)
     picture = encode_exr(np.zeros((16, 16, 3), np.float32))
     with pytest.raises(TrilightError, match="data window spans|not a readable"):
         decode_exr(_with_window(picture, 1_000_001, 1_000_001))
