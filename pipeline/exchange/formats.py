@@ -39,9 +39,8 @@ from storage.records.material import columns_in_use
 from storage.records.profiles import PACKED, PLAIN
 from storage.records.retextured import without_maps, without_normal_maps
 from storage.records.sample import decode_sample, decode_scene
-from storage.records.scene import Scene, SceneObject
+from storage.records.scene import MAP_ARRAYS, Scene, SceneObject
 from storage.records.scene_file import encode_scene, read_scene_file
-from storage.records.scene_maps import MAP_ARRAYS
 from storage.registry import Registry
 
 SEPARATOR = "::"

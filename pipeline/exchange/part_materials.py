@@ -30,7 +30,7 @@ from pipeline.foreign.picture import Picture, Wrap, spread_points
 from storage.conventions import srgb8
 from storage.records.exr import MAX_RESOLUTION
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
-from storage.records.scene_maps import MAX_UV
+from storage.records.scene import MAX_UV
 from storage.records.texture import MapSource
 
 _MAX_TILES = 8

@@ -25,9 +25,8 @@ from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.safe_read import read_safetensors, safetensors_header
-from storage.records.scene import Scene
+from storage.records.scene import MAX_TEXTURES, Scene
 from storage.records.scene_laws import require_fields, wrong_value
-from storage.records.scene_maps import MAX_TEXTURES
 from storage.records.texture import MAX_MAPS_BYTES, MapSource, Texture
 
 HELD_BYTES = 1 << 26

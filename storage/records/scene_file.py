@@ -39,9 +39,15 @@ from storage.records.packed_maps import (
 )
 from storage.records.retextured import without_constant_textures
 from storage.records.safe_read import read_safetensors
-from storage.records.scene import ARRAY_FIELDS, OBJECT_KINDS, Scene, SceneObject
+from storage.records.scene import (
+    ARRAY_FIELDS,
+    MAP_ARRAYS,
+    MAX_TEXTURES,
+    OBJECT_KINDS,
+    Scene,
+    SceneObject,
+)
 from storage.records.scene_laws import require_fields, wrong_value
-from storage.records.scene_maps import MAP_ARRAYS, MAX_TEXTURES
 from storage.records.texture import MAX_MAPS_BYTES, Texture
 
 MAX_FILE_BYTES = (256 << 20) + MAX_MAPS_BYTES

@@ -42,8 +42,7 @@ from storage.array_hints import array_scalar
 from storage.dataset.settings import ListedShard, SplitSettings
 from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
-from storage.records.scene import Scene
-from storage.records.scene_maps import MAP_ARRAYS, MAX_TEXTURES
+from storage.records.scene import MAP_ARRAYS, MAX_TEXTURES, Scene
 from storage.records.texture import CONSTANT
 from storage.settings.described import checked
 from storage.settings.fields import FieldDescription, describe_fields

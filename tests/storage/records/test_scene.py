@@ -233,7 +233,7 @@ def test_albedos_are_compared_where_they_meet() -> None:
 def test_albedos_of_other_sizes_are_compared_between_their_texels() -> None:
     """Slow twin: the sum on a fine grid comes near the sum that the law finds, from below."""
     from storage.records.lookup import texture_values
-    from storage.records.scene_maps import _greatest_sum
+    from storage.records.scene import _greatest_sum
 
     rng = np.random.default_rng(3)
     for size, other in (((3, 4), (2, 5)), ((1, 7), (6, 1)), ((4, 4), (8, 8))):
