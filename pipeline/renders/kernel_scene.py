@@ -14,7 +14,7 @@ from pipeline.renders.emitter_table import EmissionCone, EmitterTable
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
 from pipeline.renders.guide_table import GuideTable
 from pipeline.renders.sky_table import SkyTable, sky_share
-from pipeline.renders.surface_table import SurfacePoint, surface_table
+from pipeline.renders.surface_table import SurfacePoint, SurfaceTable
 from pipeline.renders.tracer import split_triangles
 from storage.records.lights import part_names, shining_sky
 from storage.records.scene import Scene
@@ -55,7 +55,7 @@ class KernelScene:
         """mi.Scene without emitters: what camera rays meet."""
         self.everything = build_mitsuba_scene(scene, order, child=self.surfaces)
         """mi.Scene with emitters: what all other rays meet."""
-        self.table = surface_table(scene, order)
+        self.table = SurfaceTable(scene, order)
         self.emitters = EmitterTable(scene, emitters, may_be_dark=sky is not None)
         self.cone = EmissionCone(scene)
         self.guide: GuideTable | None = None

@@ -38,7 +38,11 @@ class SurfacePoint:
 
 
 class SurfaceTable:
-    """The triangles `order` of a scene, in that order."""
+    """The triangles `order` of a scene, in that order.
+
+    Where a scene has textures, the material is found at each place instead. Scenes without them
+    have another kernel.
+    """
 
     def __init__(self, scene: Scene, order: NDArray[np.intp]) -> None:
         corners = scene.vertex_positions[scene.faces[order]]
@@ -61,6 +65,7 @@ class SurfaceTable:
         padded = np.zeros((len(rows), 4 * _GROUPS), np.float32)
         padded[:, : rows.shape[1]] = rows
         self._rows = own_floats(padded)
+        self._textures = KernelTextures(scene, order) if scene.textures else None
 
     def point(self, triangle: Any, barycentric: Any, active: Any) -> SurfacePoint:
         """Return the point at barycentric coordinates (weights of the 2nd and 3rd corner)."""
@@ -91,12 +96,16 @@ class SurfaceTable:
         )
         # Opposite normals may cancel: a zero normal reflects nothing, where 0 / 0 would spread.
         length_sq = dr.maximum(dr.squared_norm(normal), _TINY)
-        return normal * dr.rsqrt(length_sq), lobes
+        normal = normal * dr.rsqrt(length_sq)
+        if self._textures is not None:
+            lobes = self._textures.lobes(triangle, barycentric, lobes, active)
+        return normal, lobes
 
     def mapped_normal(self, normal: Any, triangle: Any, barycentric: Any, active: Any) -> Any:
         """Return the normal (Vector3f) of `shading` by its map; None where the scene has no map."""
-        del normal, triangle, barycentric, active
-        return None
+        if self._textures is None:
+            return None
+        return self._textures.mapped_normal(normal, triangle, barycentric, active)
 
     def _group(self, triangle: Any, group: int, active: Any) -> Any:
         return dr.gather(mi.Vector4f, self._rows, triangle * _GROUPS + group, active)
@@ -139,6 +148,8 @@ class KernelTextures:
         self._numbers = _texels(numbers, _NUMBER)
         places = _places(colours) | _places(numbers)
         self._rows = _lookups(scene, scene.material_textures, places)
+        roughness = np.linspace(0, 1, ROUGHNESS_STEPS)
+        self._mean_albedo = own_floats(mean_albedo(np.square(roughness), "correlated"))
         self._u_directions: Any = None
         if scene.normal_textures is None:
             return
@@ -181,27 +192,50 @@ class KernelTextures:
         material = dr.gather(mi.UInt32, self._material, triangle, active)
         return u - dr.floor(u), v - dr.floor(v), material
 
-    def values(
-        self, triangle: Any, barycentric: Any, columns: tuple[Any, Any, Any], active: Any
-    ) -> tuple[Any, Any, Any]:
-        """Return diffuse and specular albedo (Color3f) and roughness (Float) of a place.
+    def lobes(
+        self, triangle: Any, barycentric: Any, constant: KernelLobes, active: Any
+    ) -> KernelLobes:
+        """Return the material of a place.
+
+        The shares of the lobes and their multiple scattering follow the values of the textures.
 
         Args:
             triangle: UInt32.
             barycentric: Point2f, the weights of the 2nd and 3rd corner.
-            columns: what they are where no texture stands for them.
+            constant: what the material is where no texture stands for it.
             active: Bool.
         """
         u, v, material = self._place(triangle, barycentric, active)
+        columns = constant.diffuse, constant.specular, dr.sqrt(constant.alpha)
         kinds = (mi.Color3f, mi.Color3f, mi.Float)
         values = []
-        for place, (kind, constant) in enumerate(zip(kinds, columns, strict=True)):
+        for place, (kind, column) in enumerate(zip(kinds, columns, strict=True)):
             row = material * len(TEXTURED) + place
             texture = dr.gather(mi.Vector4u, self._rows, row, active)
             textured = active & (texture.w > 0)
             value = self._bilinear(kind, texture, u, v, textured)
-            values.append(dr.select(textured, value, constant))
-        return values[0], values[1], values[2]
+            values.append(dr.select(textured, value, column))
+        diffuse, specular, roughness = values
+        alpha = dr.maximum(dr.square(roughness), MIN_ALPHA)
+        most = dr.max(diffuse)
+        mirrored = dr.max(specular)
+        reflects = most + mirrored > 0
+        return KernelLobes(
+            diffuse=diffuse,
+            specular=specular,
+            alpha=alpha,
+            weight=dr.select(reflects, mirrored / (most + mirrored), 0),
+            multiscatter=self._scattered_again(specular, alpha, active),
+        )
+
+    def _scattered_again(self, specular: Any, alpha: Any, active: Any) -> Any:
+        """Return Fms (Color3f) of storage.optics.multiscatter."""
+        place = dr.sqrt(alpha) * (ROUGHNESS_STEPS - 1)
+        row = dr.minimum(mi.UInt32(place), ROUGHNESS_STEPS - 2)
+        low = dr.gather(mi.Float, self._mean_albedo, row, active)
+        high = dr.gather(mi.Float, self._mean_albedo, row + 1, active)
+        mean = dr.lerp(low, high, place - mi.Float(row))
+        return specular * mean / (1 - specular * (1 - mean))
 
     def _bilinear(self, kind: Any, texture: Any, u: Any, v: Any, active: Any) -> Any:
         """Return the value at u and v in [0, 1] of a texture (Vector4u: first, width, height)."""
@@ -267,51 +301,3 @@ def _texels(textures: list[Texture], floats: int) -> Any:
             values[begin : begin + len(linear), : texture.channels] = linear
         first += len(flat)
     return own_floats(values)
-
-
-class TexturedTable(SurfaceTable):
-    """The triangles `order` of a textured scene, in that order.
-
-    What `SurfaceTable` knows of a triangle in advance is found at each place here: the shares of
-    the lobes and their multiple scattering follow the values that the textures have there. Scenes
-    without textures have the other table, and with it another kernel.
-    """
-
-    def __init__(self, scene: Scene, order: NDArray[np.intp]) -> None:
-        super().__init__(scene, order)
-        self._textures = KernelTextures(scene, order)
-        roughness = np.linspace(0, 1, ROUGHNESS_STEPS)
-        self._mean_albedo = own_floats(mean_albedo(np.square(roughness), "correlated"))
-
-    def shading(self, triangle: Any, barycentric: Any, active: Any) -> tuple[Any, KernelLobes]:
-        normal, lobes = super().shading(triangle, barycentric, active)
-        columns = lobes.diffuse, lobes.specular, dr.sqrt(lobes.alpha)
-        diffuse, specular, roughness = self._textures.values(triangle, barycentric, columns, active)
-        alpha = dr.maximum(dr.square(roughness), MIN_ALPHA)
-        most = dr.max(diffuse)
-        mirrored = dr.max(specular)
-        reflects = most + mirrored > 0
-        return normal, KernelLobes(
-            diffuse=diffuse,
-            specular=specular,
-            alpha=alpha,
-            weight=dr.select(reflects, mirrored / (most + mirrored), 0),
-            multiscatter=self._scattered_again(specular, alpha, active),
-        )
-
-    def mapped_normal(self, normal: Any, triangle: Any, barycentric: Any, active: Any) -> Any:
-        return self._textures.mapped_normal(normal, triangle, barycentric, active)
-
-    def _scattered_again(self, specular: Any, alpha: Any, active: Any) -> Any:
-        """Return Fms (Color3f) of storage.optics.multiscatter."""
-        place = dr.sqrt(alpha) * (ROUGHNESS_STEPS - 1)
-        row = dr.minimum(mi.UInt32(place), ROUGHNESS_STEPS - 2)
-        low = dr.gather(mi.Float, self._mean_albedo, row, active)
-        high = dr.gather(mi.Float, self._mean_albedo, row + 1, active)
-        mean = dr.lerp(low, high, place - mi.Float(row))
-        return specular * mean / (1 - specular * (1 - mean))
-
-
-def surface_table(scene: Scene, order: NDArray[np.intp]) -> SurfaceTable:
-    """Return the table of a scene, with textures where it has some."""
-    return TexturedTable(scene, order) if scene.textures else SurfaceTable(scene, order)
