@@ -12,7 +12,6 @@ one entry `maps`: the sha256 of each, with its name and rights, and how the envi
 import dataclasses
 import re
 import threading
-import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
@@ -24,7 +23,12 @@ from safetensors.numpy import save
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.environment import Environment
-from storage.records.safe_read import read_safetensors, safetensors_header
+from storage.records.safe_read import (
+    pack_gzip,
+    read_safetensors,
+    safetensors_header,
+    unpack_gzip,
+)
 from storage.records.scene import MAX_TEXTURES, Scene
 from storage.records.scene_laws import require_fields, wrong_value
 from storage.records.texture import MAX_MAPS_BYTES, MapSource, Texture
@@ -47,7 +51,6 @@ _FORM = "form"
 _FORMS: Mapping[type, Sequence[str]] = {Texture: ("srgb", "linear"), Environment: ("environment",)}
 _DTYPES = {"U8": np.uint8, "F16": np.float16, "F32": np.float32}
 _MOST_HEADER = 1 << 10
-_GZIP = 31
 
 
 class HeldMaps:
@@ -230,9 +233,9 @@ def packed_maps(scene: Scene) -> dict[str, bytes]:
 def pack_map(one: Texture | Environment) -> bytes:
     """Return the bytes of a texture, or of an environment's map, however it is turned."""
     form = _FORMS[type(one)][isinstance(one, Texture) and not one.is_srgb]
-    data = save({_ARRAY: np.ascontiguousarray(stored_values(_array(one)))}, {_FORM: form})
-    packer = zlib.compressobj(level=6, wbits=_GZIP)
-    return packer.compress(data) + packer.flush()
+    return pack_gzip(
+        save({_ARRAY: np.ascontiguousarray(stored_values(_array(one)))}, {_FORM: form})
+    )
 
 
 def unpack_texture(data: bytes, name: str) -> Texture:
@@ -317,7 +320,8 @@ class _PackedMap:
     def __init__(self, data: bytes, name: str) -> None:
         self.name = name
         self._data = data
-        header = safetensors_header(self._unpack(8 + _MOST_HEADER), _MOST_HEADER, name=name)
+        head = unpack_gzip(data, 8 + _MOST_HEADER, name, is_whole=False)
+        header = safetensors_header(head, _MOST_HEADER, name=name)
         entry = header.get(_ARRAY)
         metadata = header.get("__metadata__")
         if set(header) != {_ARRAY, "__metadata__"} or not isinstance(entry, Mapping):
@@ -338,16 +342,6 @@ class _PackedMap:
 
     def values(self) -> NDArray:
         """Return the array as it is held in memory."""
-        data = self._unpack(8 + _MOST_HEADER + self._num_bytes, require_end=True)
+        data = unpack_gzip(self._data, 8 + _MOST_HEADER + self._num_bytes, self.name)
         arrays, _ = read_safetensors(data, _MOST_HEADER, name=self.name)
         return held_values(arrays[_ARRAY])
-
-    def _unpack(self, most: int, *, require_end: bool = False) -> bytes:
-        unpacker = zlib.decompressobj(wbits=_GZIP)
-        try:
-            data = unpacker.decompress(self._data, most)
-        except zlib.error as error:
-            raise TrilightError(f"{self.name}: damaged.") from error
-        if require_end and (not unpacker.eof or unpacker.unused_data):
-            raise TrilightError(f"{self.name}: cut short, or goes on after its end.")
-        return data

@@ -13,7 +13,6 @@ nearly holds over the pixels that show geometry too. It is tested on what comes 
 a view that no level serves, or serves in fewer bytes, is packed without loss.
 """
 
-import zlib
 from collections.abc import Mapping
 from typing import Literal, get_args
 
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.exr import ZIP, ExrCodec, decode_exr, encode_exr
+from storage.records.safe_read import pack_gzip, unpack_gzip
 
 Profile = Literal["lossless", "compact"]
 PROFILES: tuple[Profile, ...] = get_args(Profile)
@@ -40,9 +40,6 @@ PACKED = "scene.safetensors.gz"
 
 MAX_ARRAY_BYTES = 1 << 28
 """Maximum size of a scene's unpacked arrays; a million triangles take 68 MB."""
-
-_GZIP = 31
-"""zlib's name for a gzip stream; its header then holds no time."""
 
 
 def pack_picture(
@@ -85,8 +82,7 @@ def pack_arrays(safetensors: bytes, profile: Profile) -> dict[str, bytes]:
     """Return the member of a scene's arrays, by suffix; equal bytes give equal bytes."""
     if profile == "lossless":
         return {PLAIN: safetensors}
-    packer = zlib.compressobj(level=6, wbits=_GZIP)
-    return {PACKED: packer.compress(safetensors) + packer.flush()}
+    return {PACKED: pack_gzip(safetensors)}
 
 
 def unpack_arrays(members: Mapping[str, bytes]) -> bytes:
@@ -101,17 +97,6 @@ def unpack_arrays(members: Mapping[str, bytes]) -> bytes:
             f"member {PLAIN} is {'there in two forms' if forms else 'missing'}; expected it "
             f"or {PACKED}."
         )
-    data = members[forms[0]]
     if forms == [PLAIN]:
-        return data
-    unpacker = zlib.decompressobj(wbits=_GZIP)
-    try:
-        arrays = unpacker.decompress(data, MAX_ARRAY_BYTES)
-    except zlib.error as error:
-        raise TrilightError(f"member {PACKED} is damaged ({error}).") from error
-    if not unpacker.eof or unpacker.unused_data:
-        raise TrilightError(
-            f"member {PACKED} is cut short, goes on after its end, or holds more than "
-            f"{MAX_ARRAY_BYTES} bytes."
-        )
-    return arrays
+        return members[PLAIN]
+    return unpack_gzip(members[PACKED], MAX_ARRAY_BYTES, f"member {PACKED}")

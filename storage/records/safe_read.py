@@ -1,9 +1,10 @@
-"""Reading from outside: only plain files, and no header decides how much memory is taken."""
+"""Reading from outside: only plain files, and nothing in them decides how much memory is taken."""
 
 import errno
 import json
 import os
 import stat
+import zlib
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,6 +17,9 @@ from storage.errors import TrilightError
 
 MAX_HEADER_BYTES = 1 << 20
 """A scene's header takes about 1 KiB."""
+
+_GZIP = 31
+"""zlib's name for a gzip stream; its header then holds no time."""
 
 
 def open_plain(path: Path) -> BinaryIO:
@@ -93,3 +97,32 @@ def safetensors_header(
     if not isinstance(header, dict):
         raise TrilightError(f"{name}: the header is not a JSON object.")
     return header
+
+
+def pack_gzip(data: bytes) -> bytes:
+    """Return a gzip stream of some bytes; equal bytes give equal streams."""
+    return zlib.compress(data, 6, wbits=_GZIP)
+
+
+def unpack_gzip(packed: bytes, most: int, name: str, *, is_whole: bool = True) -> bytes:
+    """Return what a gzip stream holds, at most so many bytes.
+
+    Args:
+        packed: the stream.
+        most: bytes of memory that may be taken.
+        name: of the stream, for messages.
+        is_whole: refuse a stream that holds more, is cut short or has bytes after its end.
+
+    Raises:
+        TrilightError: damaged, or not whole.
+    """
+    unpacker = zlib.decompressobj(wbits=_GZIP)
+    try:
+        data = unpacker.decompress(packed, most)
+    except zlib.error as error:
+        raise TrilightError(f"{name} is damaged ({error}).") from error
+    if is_whole and (not unpacker.eof or unpacker.unused_data):
+        raise TrilightError(
+            f"{name} is cut short, goes on after its end, or holds more than {most} bytes."
+        )
+    return data

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from storage.conventions import MAPS_VERSION, SCHEMA_VERSION
+from storage.conventions import MAPS_VERSION, SCHEMA_VERSION, require_readable
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.environment import Environment
@@ -306,11 +306,7 @@ def _metadata_record(metadata: Mapping[str, str]) -> dict[str, Any]:
         said = f" ({error})" if isinstance(error, TrilightError) else ""
         raise TrilightError(f"scene: metadata {_METADATA} are not JSON{said}.") from error
     version = record.get("schema_version") if isinstance(record, dict) else None
-    if version not in (SCHEMA_VERSION, MAPS_VERSION):
-        raise TrilightError(
-            f"scene: schema version {version!r:.60}; this Trilight reads {SCHEMA_VERSION} and "
-            f"{MAPS_VERSION}. Use the release that made it."
-        )
+    require_readable(version, "scene", (SCHEMA_VERSION, MAPS_VERSION))
     require_version_of_maps(record)
     return dict(record)
 
