@@ -50,8 +50,8 @@ def require_readable(
         *earlier, last = map(str, versions)
         readable = f"{', '.join(earlier)} and {last}"
         raise TrilightError(
-            f"{where}: schema version {version!r:.60}; this Trilight reads {readable}. Use the release "
-            "that made it, or make it again with `trilight generate`."
+            f"{where}: schema version {version!r:.60}; this Trilight reads {readable}. Use the "
+            "release that made it, or make it again with `trilight generate`."
         )
 
 

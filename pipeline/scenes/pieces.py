@@ -119,14 +119,23 @@ def with_skin(piece: ScenePiece, skin: Skin) -> ScenePiece:
 def emitter_piece(emitter: Emitter, row: int) -> ScenePiece:
     """Return an emitter: one triangle with a material row of its own."""
     mesh = flat_shaded(emitter.triangle.astype(np.float32), np.array([[0, 1, 2]], np.uint32))
-    materials = default_rows(1)
-    materials[:, DIFFUSE] = emitter.reflectance
-    materials[:, ROUGHNESS] = 1.0
-    materials[:, EMISSION] = emitter.radiance_rgb
     entry = SceneObject(name=f"emitter{row}", kind="emitter")
-    return ScenePiece(
-        entry=entry, mesh=mesh, materials=materials, material_index=np.zeros(1, np.int64)
-    )
+    return lamp_piece(entry, mesh, np.array([emitter.radiance_rgb]), emitter.reflectance)
+
+
+def lamp_piece(
+    entry: SceneObject,
+    mesh: ShadedMesh,
+    radiance_rgb: NDArray[np.floating],
+    reflectance: NDArray[np.float32] | float,
+) -> ScenePiece:
+    """Return an emitter whose triangles have these radiances [T, 3]."""
+    rows, index = np.unique(radiance_rgb.astype(np.float32), axis=0, return_inverse=True)
+    materials = default_rows(len(rows))
+    materials[:, DIFFUSE] = reflectance
+    materials[:, ROUGHNESS] = 1.0
+    materials[:, EMISSION] = rows
+    return ScenePiece(entry=entry, mesh=mesh, materials=materials, material_index=index.ravel())
 
 
 def _shade_mesh(

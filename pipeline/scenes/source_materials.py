@@ -12,12 +12,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scenes.pieces import ScenePiece, Skin
+from pipeline.scenes.pieces import ScenePiece, Skin, lamp_piece
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.sample_material import MaterialSettings
 from storage.errors import Rejected, TrilightError
 from storage.records.asset import Level, LevelSkin
-from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, default_rows
+from storage.records.material import DIFFUSE, EMISSION
 from storage.records.objects import LockedObject
 from storage.records.scene import SceneObject
 from storage.records.texture import NORMAL, TEXTURED, MapSource
@@ -111,7 +111,8 @@ def with_source_emission(
             continue
         entry = _entry(piece.entry, taken)
         taken.add(entry.name)
-        emitter = _emitter(_part(plain[row], emits), entry, scale * emission[emits], reflected)
+        mesh = _part(plain[row], emits).mesh
+        emitter = lamp_piece(entry, mesh, scale * emission[emits], reflected)
         if emits.all():
             plain[row] = emitter
         else:
@@ -133,22 +134,6 @@ def _scale(objects: Sequence[ScenePiece], lamps: Sequence[ScenePiece], share: fl
     drawn = sum(float(areas @ radiance.mean(axis=1)) for radiance, areas in lit)
     greatest = max(float(radiance.max()) for radiance, _ in lit)
     return min(share * drawn / power, greatest / brightest)
-
-
-def _emitter(
-    piece: ScenePiece,
-    entry: SceneObject,
-    radiance: NDArray[np.floating],
-    reflected: NDArray[np.float32],
-) -> ScenePiece:
-    rows, index = np.unique(radiance.astype(np.float32), axis=0, return_inverse=True)
-    materials = default_rows(len(rows))
-    materials[:, DIFFUSE] = reflected
-    materials[:, ROUGHNESS] = 1.0
-    materials[:, EMISSION] = rows
-    return ScenePiece(
-        entry=entry, mesh=piece.mesh, materials=materials, material_index=index.ravel()
-    )
 
 
 def _part(piece: ScenePiece, chosen: NDArray[np.bool_]) -> ScenePiece:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from storage.errors import Rejected
 from storage.licences import share_alike_camp
 from storage.records.asset import Asset, Level
-from storage.records.object_index import CampSizes
+from storage.records.object_index import CampSizes, camp_sizes
 from storage.records.objects import LockedObject
 
 _CHUNK = 1 << 16
@@ -51,16 +51,7 @@ class FitTable:
         names = sorted({*camps}) or [""]
         sizes = np.array(least, np.int64)
         numbers = np.array([names.index(camp) for camp in camps] or [0] * len(least), np.int64)
-        return cls(
-            sizes,
-            numbers,
-            names,
-            {
-                name: CampSizes(count=len(some), least=int(some.min()), most=int(some.max()))
-                for number, name in enumerate(names)
-                if len(some := sizes[numbers == number])
-            },
-        )
+        return cls(sizes, numbers, names, camp_sizes(sizes, numbers, names))
 
     def size(self, row: int) -> int:
         return int(self._least[row : row + 1][0])

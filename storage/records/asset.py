@@ -243,20 +243,12 @@ def encode_asset(asset: Asset) -> bytes:
         arrays[f"faces_{name}"] = np.ascontiguousarray(level.faces)
         if level.skin is not None:
             arrays |= _skin_arrays(level.skin, name)
-    header: dict[str, Any] = {
-        "geometry_sha256": asset.geometry_sha256,
-        "source_sha256": asset.source_sha256,
-        "recipe": asset.recipe,
-        "source": dataclasses.asdict(asset.source),
-        "levels": [dataclasses.asdict(level.record) for level in asset.levels],
-    }
-    if asset.materials is not None:
-        header["materials"] = dataclasses.asdict(asset.materials)
-        header["skins"] = {
-            str(level.record.budget): dataclasses.asdict(level.skin.quality)
-            for level in asset.levels
-            if level.skin is not None
-        }
+    skins = {str(each.record.budget): each.skin.quality for each in asset.levels if each.skin}
+    facts = {field.name: getattr(asset, field.name) for field in dataclasses.fields(_Facts)}
+    levels = tuple(level.record for level in asset.levels)
+    header = dataclasses.asdict(_Header(**facts, levels=levels, skins=skins))
+    if asset.materials is None:
+        del header["materials"], header["skins"]
     return save(arrays, metadata={"asset": json.dumps(header, sort_keys=True)})
 
 
@@ -275,8 +267,8 @@ def decode_asset(data: bytes) -> Asset:
             f"asset: a safetensors file with arrays {', '.join(arrays) or 'none'} does not hold "
             f"one ({error}); expected a file of the asset store. Delete it: it is made again."
         ) from error
-    fields = {name: value for name, value in vars(header).items() if name != "skins"}
-    return Asset(**{**fields, "levels": levels})
+    facts = {field.name: getattr(header, field.name) for field in dataclasses.fields(_Facts)}
+    return Asset(**facts, levels=levels)
 
 
 def _level(

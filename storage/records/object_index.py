@@ -112,13 +112,21 @@ def write_object_index(
     camps = sorted({share_alike_camp(row.locked.licence) for row in rows})
     number = {camp: index for index, camp in enumerate(camps)}
     camp = np.array([number[share_alike_camp(row.locked.licence)] for row in rows], "<u2")
+    least = np.array([row.least_triangles for row in rows], "<u4")
     names = bytes.fromhex("".join(row.asset_name for row in rows))
     arrays: dict[str, NDArray[Any]] = {
         "offset": np.array([row.offset for row in rows], "<u8"),
-        "least": np.array([row.least_triangles for row in rows], "<u4"),
+        "least": least,
         "camp": camp,
         "name": np.frombuffer(names, "<u1").reshape(-1, _NAME_BYTES),
     }
+    splits = {}
+    start = 0
+    for split, group in groupby(rows, key=attrgetter("locked.split")):
+        stop = start + sum(1 for _ in group)
+        sizes = camp_sizes(least[start:stop], camp[start:stop], camps)
+        splits[split] = SplitRows(start=start, stop=stop, camps=sizes)
+        start = stop
     facts = IndexFacts(
         lock_sha256=lock_sha256,
         lock_bytes=lock_bytes,
@@ -126,37 +134,29 @@ def write_object_index(
         num_found=num_found,
         num_maps=num_maps,
         camps=tuple(camps),
-        splits=_split_rows(rows, arrays["least"], camp, camps),
+        splits=splits,
     )
     header = json.dumps(dataclasses.asdict(facts), sort_keys=True)
     write_atomically(path, save(arrays, metadata={"objects": header}))
     return facts
 
 
-def _split_rows(
-    rows: Sequence[IndexedObject],
-    least: NDArray[Any],
-    camp: NDArray[Any],
-    camps: Sequence[str],
-) -> dict[str, SplitRows]:
-    splits = {}
-    start = 0
-    for split, group in groupby(rows, key=attrgetter("locked.split")):
-        stop = start + sum(1 for _ in group)
-        sizes = {
-            name: least[start:stop][camp[start:stop] == index] for index, name in enumerate(camps)
-        }
-        splits[split] = SplitRows(
-            start=start,
-            stop=stop,
-            camps={
-                name: CampSizes(count=len(some), least=int(some.min()), most=int(some.max()))
-                for name, some in sizes.items()
-                if len(some)
-            },
-        )
-        start = stop
-    return splits
+def camp_sizes(
+    least: NDArray[Any], camp: NDArray[Any], camps: Sequence[str]
+) -> dict[str, CampSizes]:
+    """Return the sizes of the objects of each camp that occurs.
+
+    Args:
+        least: [N] triangles of the coarsest level of each object.
+        camp: [N] number of the camp of each object.
+        camps: names of the camps by number.
+    """
+    sizes = {name: least[camp == number] for number, name in enumerate(camps)}
+    return {
+        name: CampSizes(count=len(some), least=int(some.min()), most=int(some.max()))
+        for name, some in sizes.items()
+        if len(some)
+    }
 
 
 class ObjectIndex:
