@@ -123,7 +123,11 @@ def encode_channels(
             2^31 - 1, and floats with float32.
     """
     for name, value in (attributes or {}).items():
-        _require_held(name, value)
+        within = INT32 if isinstance(value, int) else FLOAT32
+        if not isinstance(value, str) and not within.holds(value):
+            raise TrilightError(  # OpenEXR would wrap it around, or make it infinite
+                f"picture: attribute {name} is {value!r}; expected a number {within}, or text."
+            )
     header: dict[str, object] = {
         "compression": getattr(OpenEXR, f"{codec.compression}_COMPRESSION"),
         "type": OpenEXR.scanlineimage,
@@ -133,17 +137,6 @@ def encode_channels(
     stream = io.BytesIO()
     OpenEXR.File({**header, **(attributes or {})}, dict(channels), num_threads=0).write(stream)
     return stream.getvalue()
-
-
-def _require_held(name: str, value: str | int | float) -> None:
-    """Raise TrilightError for a number that OpenEXR would wrap around, or make infinite."""
-    if isinstance(value, str):
-        return
-    within = INT32 if isinstance(value, int) else FLOAT32
-    if not within.holds(value):
-        raise TrilightError(
-            f"picture: attribute {name} is {value!r}; expected a number {within}, or text."
-        )
 
 
 def channel_names(data: bytes) -> list[str]:

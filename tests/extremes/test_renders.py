@@ -28,16 +28,17 @@ from storage.records.exr import decode_exr, encode_exr
 from storage.records.lights import sum_of_parts
 from storage.records.scene import Scene
 from tests.for_each import case
-from tests.pipeline.renders.guided_scenes import FLOOR as GUIDED_FLOOR
-from tests.pipeline.renders.guided_scenes import LAMP as GUIDED_LAMP
-from tests.pipeline.renders.guided_scenes import WALL, lit_by_a_mirror
 from tests.pipeline.renders.sampling import assert_agree, camera_of, render_blocks
 from tests.pipeline.renders.scene_kit import (
+    GUIDED_FLOOR,
+    GUIDED_LAMP,
+    GUIDED_WALL,
     Part,
     box,
     flat,
     join,
     light,
+    lit_by_a_mirror,
     material,
     quad,
     sphere,
@@ -224,7 +225,7 @@ def test_any_multiple_of_eight_is_a_resolution(
 
 METAL = material(specular=0.9, roughness=0.3)
 MATT = material(diffuse=0.6)
-ROOM = [quad(GUIDED_FLOOR, MATT), quad(WALL, METAL), sphere([0, 0.2, 0.4], 0.3, METAL, 6)]
+ROOM = [quad(GUIDED_FLOOR, MATT), quad(GUIDED_WALL, METAL), sphere([0, 0.2, 0.4], 0.3, METAL, 6)]
 
 
 def _seen(parts: list[Part]) -> Scene:

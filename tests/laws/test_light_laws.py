@@ -8,19 +8,18 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders.tracer import load_tracer
-from scene_templates.rotations import uniform_rotation
 from storage.conventions import camera_rays
 from storage.records.lookup import environment_values
 from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
 from tests.oracle.plugin_tracer import PluginTracer
-from tests.pipeline.renders.closed_forms import lambert_irradiance
 from tests.pipeline.renders.sampling import (
     SIGMAS,
     Estimate,
     assert_agree,
     camera_of,
     exact,
+    lambert_irradiance,
     render_blocks,
 )
 from tests.pipeline.renders.scene_kit import (
@@ -34,8 +33,7 @@ from tests.pipeline.renders.scene_kit import (
     quad,
     sphere,
 )
-from tests.rigid_motion import moved
-from tests.sky_maps import COLOURS, POLES, constant, one_sun, six_poles, smooth
+from tests.sky_maps import COLOURS, POLES, constant, six_poles, smooth
 
 LIGHT = np.array([[-0.3, -0.2, 1.0], [0.4, -0.1, 1.2], [0.0, 0.5, 0.9]])
 FLOOR = [[-12, -12, 0], [12, -12, 0], [12, 12, 0], [-12, 12, 0]]
@@ -237,16 +235,6 @@ def test_a_mirror_shows_each_pole_in_its_place(tracer: Any) -> None:
         )
         # The albedo tables of energy compensation are right to 0.1 %, and 1024 samples find all.
         assert picture.mean(axis=(0, 1)) == pytest.approx(COLOURS[name], rel=0.01), name
-
-
-def test_a_scene_and_its_sky_may_be_turned_together() -> None:
-    rotation = uniform_rotation(np.random.default_rng(4))
-    sky = one_sun(3e3)
-    scene = open_scene(sky)
-    turned = dataclasses.replace(sky, rotation=(rotation @ sky.rotation).astype(np.float32))
-    there = dataclasses.replace(moved(scene, rotation, [0.3, -0.2, 0.1]), environment=turned)
-    here = render_blocks(scene, first_seed=99, passes=8)
-    assert_agree(render_blocks(there, passes=8), here)
 
 
 def test_a_black_sky_is_none() -> None:

@@ -16,8 +16,13 @@ from storage.records.scene import Scene
 from tests.oracle import plugin_scene
 from tests.oracle.plugin_scene import scaled_albedos
 from tests.oracle.plugin_tracer import PluginTracer
-from tests.pipeline.renders.closed_forms import lambert_irradiance
-from tests.pipeline.renders.sampling import assert_agree, camera_of, exact, render_blocks
+from tests.pipeline.renders.sampling import (
+    assert_agree,
+    camera_of,
+    exact,
+    lambert_irradiance,
+    render_blocks,
+)
 from tests.pipeline.renders.scene_kit import (
     Part,
     flat,

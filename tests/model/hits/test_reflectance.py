@@ -23,7 +23,7 @@ from model.hits.view_inputs import Channel
 from storage.optics.multiscatter import directional_albedo
 from tests.for_each import for_each
 from tests.model.hits.kit import FLOOR, LAMP, corner, lit_scene, traced
-from tests.pipeline.renders.closed_forms import lambert_irradiance
+from tests.pipeline.renders.sampling import lambert_irradiance
 from tests.pipeline.renders.scene_kit import box, join, light, material, quad
 
 COUNT = 20_000

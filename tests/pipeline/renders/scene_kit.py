@@ -4,6 +4,7 @@
 triangle lights), so that tests and measurements of the renderer need no other stage.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,7 @@ from storage.records.environment import Environment
 from storage.records.retextured import with_textures
 from storage.records.scene import ObjectKind, Scene, SceneObject
 from storage.records.texture import Texture
+from tests.textured_by_hand import bumps
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -186,6 +188,25 @@ def textured(
     return found
 
 
+def mapped(parts: list[Part], normals: Texture, turn_uv: NDArray | None = None) -> Scene:
+    """Return parts, of which the first has a normal map; u and v go with x and y."""
+    scene = join(parts, eye=(0, -0.02, 4), fov_deg=30)
+    place = scene.vertex_positions[scene.faces.ravel(), :2]
+    uv = (1.5 * (place if turn_uv is None else place @ turn_uv.T)).astype(np.float32)
+    index = np.full((len(parts), 3), -1, np.int32)
+    rows = np.array([0] + [-1] * (len(parts) - 1), np.int32)
+    found = with_textures(scene, uv, (normals,), index, rows)
+    found.check()
+    return found
+
+
+def bumpy_room() -> Scene:
+    """Return a ball on a floor whose normals are up to 65 degrees off."""
+    ball = sphere([0.2, 0.1, 0.4], 0.4, material(diffuse=0.2, specular=0.7, roughness=0.3), 8)
+    floor = textured_floor(material(diffuse=0.3, specular=0.6, roughness=0.4))
+    return mapped([floor, ball, SKY_LAMP], bumps(1, 1.5))
+
+
 def noise_map(seed: int, channels: int, low: float, high: float) -> Texture:
     """Return a texture of 7 x 5 independent texels."""
     drawn = np.random.default_rng(seed).uniform(low, high, (5, 7, channels))
@@ -262,3 +283,45 @@ def _random_light(rng: np.random.Generator, kind: int) -> NDArray[np.float64]:
     q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     corners = (base * rng.uniform(2.0, 2.5, 3)) @ q.T
     return corners + _open_direction(rng, kind) * rng.uniform(2.1, 2.7)
+
+
+GUIDED_FLOOR = [[-1.5, -1.5, 0], [1.5, -1.5, 0], [1.5, 1.5, 0], [-1.5, 1.5, 0]]
+GUIDED_WALL = [[-1.5, 1.5, 0], [1.5, 1.5, 0], [1.5, 1.5, 2], [-1.5, 1.5, 2]]
+GUIDED_LAMP = [[0.8, 0.3, 1.3], [1.2, 0.3, 1.3], [0.9, 0.7, 1.4]]
+
+
+def mirrors(roughness: float = 0.3) -> Scene:
+    """A mirror shows a matt floor on which metal throws light."""
+    metal = material(specular=[0.9, 0.8, 0.7], roughness=roughness)
+    parts = [
+        quad(GUIDED_FLOOR, material(diffuse=0.6, specular=0.2, roughness=0.5)),
+        quad(np.subtract(GUIDED_WALL, [0, 0.3, 0]), material(specular=0.9, roughness=0.2)),
+        box([0.4, -0.2, 0.4], 0.5, metal, 0.4),
+        sphere([-0.4, 0.2, 0.3], 0.25, metal, 6),
+        light(GUIDED_LAMP, 30.0, 0.5),
+    ]
+    return join(parts, eye=(0.3, -2.4, 1.0), target=(0, 0.6, 0.4), fov_deg=50)
+
+
+@functools.cache
+def lit_by_a_mirror(size: float, roughness: float = 0.3) -> Scene:
+    """A lamp of so many metres in a black box, which is open towards a mirror.
+
+    Floor and walls are matt, and all light on them came from the mirror. So both hits of camera
+    paths and light paths have a large part of it: what one of them takes for the density of the
+    other shows in the mean.
+    """
+    centre, matt = np.array([-0.9, 0, 0.8]), material(diffuse=0.8)
+    shade = box([0, 0, 0], 1.0, material()).triangles
+    open_shade = shade[shade.mean(axis=1)[:, 0] < 0.49] * [0.21, 1.2 * size, 1.2 * size]
+    mirror = [[1.2, -0.6, 0.2], [1.2, 0.6, 0.2], [1.2, 0.6, 1.4], [1.2, -0.6, 1.4]]
+    lamp = np.array([[0.0, -0.5, -0.5], [0, 0.5, -0.5], [0, 0, 0.5]]) * size
+    parts = [
+        quad(GUIDED_FLOOR, matt),
+        quad(GUIDED_WALL, matt),
+        quad([[-1.5, -1.5, 0], [-1.5, 1.5, 0], [-1.5, 1.5, 2], [-1.5, -1.5, 2]], matt),
+        quad(mirror, material(specular=0.95, roughness=roughness)),
+        flat(open_shade + centre + [0.095, 0, 0], material(), "shell"),
+        light(lamp + centre, 200.0),
+    ]
+    return join(parts, eye=(-0.2, -3.2, 1.2), target=(0, 0.6, 0.6), fov_deg=45)

@@ -26,14 +26,23 @@ from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.vector_tracer import VectorTracer
 from storage.records.scene import Scene
-from tests.pipeline.renders.guided_scenes import FLOOR, LAMP, WALL, lit_by_a_mirror, mirrors
 from tests.pipeline.renders.sampling import (
     assert_same_light,
     camera_of,
     render_blocks,
     render_passes,
 )
-from tests.pipeline.renders.scene_kit import join, light, material, quad
+from tests.pipeline.renders.scene_kit import (
+    GUIDED_FLOOR,
+    GUIDED_LAMP,
+    GUIDED_WALL,
+    join,
+    light,
+    lit_by_a_mirror,
+    material,
+    mirrors,
+    quad,
+)
 from tests.sky_maps import smooth
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -95,7 +104,9 @@ def test_guided_camera_paths_have_less_noise_where_a_mirror_is_the_lamp() -> Non
 
 
 def test_a_matt_scene_has_nothing_to_learn() -> None:
-    scene = join([quad(FLOOR, material(diffuse=0.6)), light(LAMP, 30.0)], eye=(0, -2, 1))
+    scene = join(
+        [quad(GUIDED_FLOOR, material(diffuse=0.6)), light(GUIDED_LAMP, 30.0)], eye=(0, -2, 1)
+    )
     assert _tracer(scene).with_guide()._scene.guide is None
     nothing = np.zeros(0, np.int64)
     cells = GuideCells(np.random.default_rng(5).normal(size=(9, 3, 3)))
@@ -128,8 +139,11 @@ def test_only_views_that_miss_their_floor_are_guided(monkeypatch: pytest.MonkeyP
 
 def test_lights_apart_share_a_table_and_add_up() -> None:
     """What was learnt of both lamps guides the paths of each: unbiased, as any table is."""
-    lamps = [light(np.array(LAMP) - [1.8 * k, 0, 0.2 * k], 30.0 - 20 * k) for k in range(2)]
-    parts = [quad(FLOOR, material(diffuse=0.6)), quad(WALL, material(specular=0.9, roughness=0.2))]
+    lamps = [light(np.array(GUIDED_LAMP) - [1.8 * k, 0, 0.2 * k], 30.0 - 20 * k) for k in range(2)]
+    parts = [
+        quad(GUIDED_FLOOR, material(diffuse=0.6)),
+        quad(GUIDED_WALL, material(specular=0.9, roughness=0.2)),
+    ]
     both = join([*parts, *lamps], eye=(0.3, -2.4, 1.0), target=(0, 0.6, 0.4), fov_deg=50)
     tracer = _tracer(both)
     alone = [tracer.only_light(row).with_guide() for row in (2, 3)]

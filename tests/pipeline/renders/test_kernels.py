@@ -26,9 +26,17 @@ from pipeline.renders.vector_tracer import VectorTracer
 from pipeline.renders.view_pictures import MeasuredLook
 from storage.records.scene import Scene
 from tests.for_each import for_each
-from tests.pipeline.renders.guided_scenes import lit_by_a_mirror, mirrors
 from tests.pipeline.renders.sampling import camera_of, render_view
-from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene, sphere
+from tests.pipeline.renders.scene_kit import (
+    join,
+    light,
+    lit_by_a_mirror,
+    material,
+    mirrors,
+    quad,
+    sampled_like_scene,
+    sphere,
+)
 from tests.pipeline.renders.test_renderer import lit_scene
 
 pytestmark = pytest.mark.usefixtures("llvm")

@@ -1,7 +1,6 @@
-"""Normal maps in the kernel: frames, energy, and Mitsuba's own `normalmap` beside them."""
+"""Normal maps in the kernel: frames and energy; test_twin_tracers has Mitsuba's `normalmap`."""
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -12,27 +11,20 @@ from scene_templates.rotations import uniform_rotation
 from storage.raycast.first_hits import first_hits
 from storage.records.lookup import FLAT, LEAST_Z, mapped_normals, u_directions
 from storage.records.passes.pictures import view_passes
-from storage.records.retextured import with_textures
 from storage.records.scene import Scene
 from storage.records.texture import Texture
-from tests.oracle.kernel_bsdf import exact_twin
-from tests.pipeline.renders.closed_forms import lambert_irradiance
 from tests.pipeline.renders.sampling import (
-    assert_agree,
-    assert_honest,
     camera_of,
-    render_blocks,
-    scores,
+    lambert_irradiance,
 )
 from tests.pipeline.renders.scene_kit import (
     SKY_LAMP,
-    Part,
     furnace,
     join,
     light,
+    mapped,
     material,
     noise_map,
-    quad,
     sphere,
     textured_floor,
 )
@@ -42,49 +34,8 @@ from tests.textured_by_hand import bumps
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-def mapped(parts: list[Part], normals: Texture, turn_uv: NDArray | None = None) -> Scene:
-    """Return parts, of which the first has a normal map; u and v go with x and y."""
-    scene = join(parts, eye=(0, -0.02, 4), fov_deg=30)
-    place = scene.vertex_positions[scene.faces.ravel(), :2]
-    uv = (1.5 * (place if turn_uv is None else place @ turn_uv.T)).astype(np.float32)
-    index = np.full((len(parts), 3), -1, np.int32)
-    rows = np.array([0] + [-1] * (len(parts) - 1), np.int32)
-    found = with_textures(scene, uv, (normals,), index, rows)
-    found.check()
-    return found
-
-
 def one_slope(normal: NDArray[np.float64]) -> Texture:
     return Texture(texels=((normal + 1) / 2).astype(np.float32)[None, None])
-
-
-def _room() -> Scene:
-    ball = sphere([0.2, 0.1, 0.4], 0.4, material(diffuse=0.2, specular=0.7, roughness=0.3), 8)
-    floor = textured_floor(material(diffuse=0.3, specular=0.6, roughness=0.4))
-    return mapped([floor, ball, SKY_LAMP], bumps(1, 1.5))
-
-
-def _caustics() -> Scene:
-    """A bumpy, smooth mirror that throws the light of a small lamp on a floor: light paths land."""
-    panel = [[-0.9, 0.5, 0.02], [0.9, 0.5, 0.02], [0.9, 0.7, 1.2], [-0.9, 0.7, 1.2]]
-    mirror = quad(panel, material(specular=0.9, roughness=0.25))
-    lamp = light([[-0.2, -0.9, 0.8], [0.2, -0.9, 0.8], [0, -0.9, 1.1]], 40.0)
-    return mapped([mirror, textured_floor(material(diffuse=0.8)), lamp], bumps(2, 0.8))
-
-
-@pytest.mark.parametrize("made", [_room, _caustics])
-def test_the_kernel_agrees_with_mitsubas_normalmap(
-    made: Callable[[], Scene], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With normals up to 65 degrees off, many of which turn away from the viewer or the lamp."""
-    scene = made()
-    ours = render_blocks(scene)
-    twin = exact_twin(scene, monkeypatch, max_depth=10, rr_depth=5)
-    theirs = render_blocks(scene, first_seed=500, tracer=twin)
-    assert_agree(ours, theirs, slack=1e-3)
-    assert_honest(ours, theirs)
-    smooth = render_blocks(dataclasses.replace(scene, normal_textures=None), passes=4)
-    assert np.abs(scores(ours, smooth)).max() > 20  # the test sees the map
 
 
 def test_a_flat_map_is_none_in_every_bit_and_flat_texels_change_nothing() -> None:
@@ -181,13 +132,6 @@ def test_guides_and_passes_are_the_definition_and_turn_with_the_scene() -> None:
         there = first_hits(moved(scene, rotation, [0.3, -0.2, 0.1]), resolution=32)
         back = np.nan_to_num(there.shading_normal) @ rotation
         assert np.mean(np.linalg.norm(back - guide, axis=-1) > 1e-3) < 0.03
-
-
-def test_a_moved_scene_shows_the_same_picture() -> None:
-    scene = _room()
-    motion = uniform_rotation(np.random.default_rng(4)), [0.4, -0.1, 0.2]
-    there = render_blocks(moved(scene, *motion), first_seed=900)
-    assert_agree(render_blocks(scene), there, slack=1e-3)
 
 
 def test_frames_without_a_direction_and_odd_texels_leave_unit_normals() -> None:

@@ -26,7 +26,6 @@ from storage.records.lights import (
 )
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene
-from tests.pipeline.renders.guided_scenes import mirrors
 from tests.pipeline.renders.sampling import assert_agree, blocks_of, camera_of, exact, render_view
 from tests.pipeline.renders.scene_kit import (
     box,
@@ -34,6 +33,7 @@ from tests.pipeline.renders.scene_kit import (
     join,
     light,
     material,
+    mirrors,
     open_scene,
     quad,
     sphere,

@@ -30,12 +30,12 @@ from tests.pipeline.renders.scene_kit import (
     box,
     join,
     light,
+    mapped,
     material,
     quad,
     sphere,
     textured_floor,
 )
-from tests.pipeline.renders.test_normal_maps import mapped
 from tests.pipeline.scenes.example_scenes import example_scene
 from tests.textured_by_hand import bumps
 

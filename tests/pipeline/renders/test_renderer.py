@@ -29,13 +29,20 @@ from storage.records.lights import (
 from storage.records.scene import Scene, SceneObject
 from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
-from tests.pipeline.renders.guided_scenes import mirrors
 from tests.pipeline.renders.sampling import (
     camera_of,
     printed_by,
     render_view,
 )
-from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene, sphere
+from tests.pipeline.renders.scene_kit import (
+    join,
+    light,
+    material,
+    mirrors,
+    quad,
+    sampled_like_scene,
+    sphere,
+)
 from tests.sky_maps import constant
 
 CHEAP = RenderSettings(resolution=32, noise_floor_db=60.0, min_spp=32, max_spp=32)

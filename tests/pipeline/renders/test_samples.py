@@ -38,9 +38,8 @@ from storage.errors import TrilightError
 from storage.metrics import MAX_DB, psnr_linear_db, psnr_log_db
 from storage.records.scene import Scene
 from tests.oracle.plugin_tracer import HostSum
-from tests.pipeline.renders.guided_scenes import lit_by_a_mirror
 from tests.pipeline.renders.sampling import camera_of
-from tests.pipeline.renders.scene_kit import sampled_like_scene
+from tests.pipeline.renders.scene_kit import lit_by_a_mirror, sampled_like_scene
 
 CAMERA = PixelCamera(c2w=np.eye(4), fov_deg=40.0, resolution=32)
 PX = 32

@@ -11,16 +11,17 @@ import pytest
 from pipeline.renders.tracer import load_tracer
 from scene_templates.rotations import uniform_rotation
 from storage.conventions import camera_rays
+from storage.records.retextured import NO_TEXTURES
 from storage.records.scene import Scene
 from storage.records.texture import Texture
 from tests.oracle.kernel_bsdf import exact_twin
 from tests.oracle.plugin_tracer import PluginTracer
-from tests.pipeline.renders.closed_forms import lambert_irradiance
 from tests.pipeline.renders.sampling import (
     assert_agree,
     assert_honest,
     camera_of,
     exact,
+    lambert_irradiance,
     printed_by,
     render_blocks,
     scores,
@@ -28,10 +29,12 @@ from tests.pipeline.renders.sampling import (
 from tests.pipeline.renders.scene_kit import (
     SKY_LAMP,
     Part,
+    bumpy_room,
     flat,
     furniture,
     join,
     light,
+    mapped,
     material,
     noise_map,
     open_scene,
@@ -41,6 +44,7 @@ from tests.pipeline.renders.scene_kit import (
     textured_floor,
 )
 from tests.sky_maps import night, one_sun, smooth
+from tests.textured_by_hand import bumps
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -67,10 +71,20 @@ def _textured_room(texture: Texture, index: list[int], **columns: float) -> Call
     return made
 
 
+def _bumpy_caustics() -> Scene:
+    """A bumpy, smooth mirror that throws the light of a small lamp on a floor: light paths land."""
+    panel = [[-0.9, 0.5, 0.02], [0.9, 0.5, 0.02], [0.9, 0.7, 1.2], [-0.9, 0.7, 1.2]]
+    mirror = quad(panel, material(specular=0.9, roughness=0.25))
+    lamp = light([[-0.2, -0.9, 0.8], [0.2, -0.9, 0.8], [0, -0.9, 1.1]], 40.0)
+    return mapped([mirror, textured_floor(material(diffuse=0.8)), lamp], bumps(2, 0.8))
+
+
 TURN = uniform_rotation(np.random.default_rng(3)).astype(np.float32)
 QUICK: dict[str, Callable[[], Scene]] = {
     "lamps": lambda: _room(5),
     "sun": lambda: open_scene(one_sun(1e5)),
+    "bumps": bumpy_room,  # many normals turn away from the viewer or the lamp
+    "bumpy caustics": _bumpy_caustics,
 }
 SLOW: dict[str, Callable[[], Scene]] = {
     "smooth": lambda: open_scene(smooth(rotation=TURN), 0),
@@ -92,7 +106,7 @@ SLOW: dict[str, Callable[[], Scene]] = {
 def test_both_integrators_agree_within_their_noise(
     made: Callable[[], Scene], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Around one and the same BRDF, at every roughness, with white emitters."""
+    """Around one and the same BRDF, at every roughness, with white emitters and normal maps."""
     scene = made()
     ours = render_blocks(scene)
     twin = exact_twin(scene, monkeypatch, max_depth=10, rr_depth=5)
@@ -106,8 +120,7 @@ def test_both_integrators_agree_within_their_noise(
     wider = {"most": 1.35, "bias": 0.5} if scene.environment else {}
     assert_honest(ours, theirs, **wider)
     if scene.textures:
-        without = dataclasses.replace(scene, uv=None, textures=(), material_textures=None)
-        plain = render_blocks(without, passes=4)
+        plain = render_blocks(dataclasses.replace(scene, **NO_TEXTURES), passes=4)
         assert np.abs(scores(ours, plain)).max() > 20  # the test sees textures
 
 

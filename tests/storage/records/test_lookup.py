@@ -12,35 +12,26 @@ from storage.records.scene_facts import SkyFacts, sky_facts, texture_families, t
 from storage.records.texture import MapSource, Texture
 from tests.for_each import for_each
 from tests.scenes_by_hand import FLOOR, tiny_scene
+from tests.sky_maps import COLOURS, POLES, six_poles
 from tests.textured_by_hand import colour_texture, number_texture, sky, textured_scene
-
-SIX = {"+X": (1, 0, 0), "-X": (-1, 0, 0), "+Y": (0, 1, 0), "-Y": (0, -1, 0), "+Z": (0, 0, 1),
-       "-Z": (0, 0, -1)}  # fmt: skip
 
 
 def test_six_directions_stand_where_the_conventions_say() -> None:
     """The table of Blender: centre +X, a quarter +Y, three quarters -Y, the border -X, top +Z."""
     expected = {"+X": (0.5, 0.5), "+Y": (0.25, 0.5), "-Y": (0.75, 0.5)}
     for name, place in expected.items():
-        assert latlong_uv(SIX[name]) == pytest.approx(place, abs=1e-15)
-    assert latlong_uv(SIX["-X"])[0] % 1 == pytest.approx(0, abs=1e-15)
-    assert latlong_uv(SIX["+Z"])[1] == 1 and latlong_uv(SIX["-Z"])[1] == 0
+        assert latlong_uv(POLES[name]) == pytest.approx(place, abs=1e-15)
+    assert latlong_uv(POLES["-X"])[0] % 1 == pytest.approx(0, abs=1e-15)
+    assert latlong_uv(POLES["+Z"])[1] == 1 and latlong_uv(POLES["-Z"])[1] == 0
 
 
 def test_six_coloured_poles_shine_from_their_directions() -> None:
-    """A map of 8 x 16 with one colour about each axis; turning by 90 degrees or a mirror fails."""
-    radiance = np.zeros((8, 16, 3), np.float32)
-    colours = {"+X": 1, "-X": 2, "+Y": 3, "-Y": 4, "+Z": 5, "-Z": 6}
-    radiance[0], radiance[-1] = colours["+Z"], colours["-Z"]
-    for name, columns in {"+X": (7, 8), "+Y": (3, 4), "-Y": (11, 12), "-X": (15, 0)}.items():
-        radiance[3:5, columns] = colours[name]
-    environment = Environment(radiance_rgb=radiance)
-    for name, direction in SIX.items():
-        assert environment_values(environment, direction) == pytest.approx([colours[name]] * 3)
-    cycled = Environment(radiance_rgb=radiance, rotation=sky().rotation)  # X to Y, Y to Z, Z to X
-    for name, direction in SIX.items():
-        turned = np.roll(direction, 1)
-        assert environment_values(cycled, turned) == pytest.approx([colours[name]] * 3)
+    """Turning by 90 degrees or a mirror fails; `latlong_direction` draws the map by the table."""
+    for rotation in (np.eye(3, dtype=np.float32), sky().rotation):
+        environment = six_poles(rotation=rotation)
+        for name, direction in POLES.items():
+            found = environment_values(environment, rotation @ direction)
+            assert found == pytest.approx(COLOURS[name])
 
 
 def test_directions_and_places_are_inverse() -> None:
