@@ -82,38 +82,17 @@ def test_a_cube_keeps_its_edges_and_a_sphere_becomes_round() -> None:
     assert np.sum(ball.normals * ball.positions, axis=1).min() > np.cos(np.radians(1))
 
 
-def test_groups_agree_with_a_slow_twin() -> None:
+def test_groups_agree_with_those_of_trimesh() -> None:
     for positions, faces in _shapes():
         normals = face_normals(positions, faces)
+        beside = trimesh.graph.face_adjacency(faces)
+        cosine = np.sum(np.prod(normals[beside], axis=1), axis=1)
         for angle_deg in (10.0, 30.0, 60.0):
-            groups = shading_groups(faces, normals, angle_deg)
-            twin = _slow_groups(faces, normals, angle_deg)
-            pairs = set(zip(groups.tolist(), twin, strict=True))
-            assert len(pairs) == len(set(twin)) == len(set(groups.tolist()))
-
-
-def _slow_groups(
-    faces: NDArray[np.uint32], normals: NDArray[np.float64], angle_deg: float
-) -> list[int]:
-    """Flood fill over shared edges, one face at a time."""
-    edges: dict[frozenset[int], list[int]] = {}
-    for row, face in enumerate(faces.tolist()):
-        for a, b in zip(face, [*face[1:], face[0]], strict=True):
-            edges.setdefault(frozenset((a, b)), []).append(row)
-    label = [-1] * len(faces)
-    for start in range(len(faces)):
-        stack = [start] if label[start] < 0 else []
-        while stack:
-            row = stack.pop()
-            label[row] = start
-            for a in range(3):
-                edge = frozenset((int(faces[row, a]), int(faces[row, (a + 1) % 3])))
-                for other in edges[edge]:
-                    cosine = float(normals[row] @ normals[other])
-                    joined = len(edges[edge]) == 2 and cosine >= np.cos(np.radians(angle_deg))
-                    if joined and label[other] < 0:
-                        stack.append(other)
-    return label
+            groups = shading_groups(faces, normals, angle_deg).tolist()
+            joined = beside[cosine >= np.cos(np.radians(angle_deg))]
+            twin = trimesh.graph.connected_component_labels(joined, len(faces)).tolist()
+            pairs = set(zip(groups, twin, strict=True))
+            assert len(pairs) == len(set(twin)) == len(set(groups))
 
 
 def test_an_edge_of_three_faces_is_sharp() -> None:

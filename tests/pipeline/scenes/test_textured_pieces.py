@@ -70,7 +70,7 @@ def _scene(settings: SceneSettings, index: int, pool: list[PooledAsset] | None =
     return first_scene(settings, pool or small_pool(), seed=0, scene_index=index)
 
 
-def _skinned(level: Level, seed: int = 0, every: int = 0) -> Level:
+def _skinned(level: Level, seed: int = 0, every: int = 0, *, mapped: bool = False) -> Level:
     """Return a level with noise on it, whose every so-manieth triangle emits, ever redder."""
     drawn = np.random.default_rng(seed).uniform(0, 0.5, (4, 4, 7)).astype(np.float32)
     parts = (slice(0, 3), slice(3, 6), slice(6, 7))
@@ -81,15 +81,17 @@ def _skinned(level: Level, seed: int = 0, every: int = 0) -> Level:
         emission = np.zeros((len(level.faces), 3), np.float32)
         emission[::every] = np.linspace([1, 0.5, 0.2], [3, 0.1, 0], len(emission[::every]))
         skin = dataclasses.replace(skin, emission=emission)
+    if mapped:
+        skin = dataclasses.replace(skin, packed_normal=pack_map(bumps(seed)))
     return dataclasses.replace(level, skin=skin)
 
 
-def _pool(every: int = 0) -> list[PooledAsset]:
+def _pool(every: int = 0, *, mapped: bool = False) -> list[PooledAsset]:
     """All but the first object have a skin at every level."""
     bare, *others = small_pool()
     skinned = [bare]
     for seed, entry in enumerate(others):
-        levels = tuple(_skinned(level, seed, every) for level in entry.asset.levels)
+        levels = tuple(_skinned(each, seed, every, mapped=mapped) for each in entry.asset.levels)
         asset = dataclasses.replace(entry.asset, levels=levels)
         skinned.append(dataclasses.replace(entry, asset=asset))
     return skinned
@@ -243,11 +245,6 @@ def _corners(piece: ScenePiece) -> NDArray[np.float64]:
     return piece.mesh.positions[piece.mesh.faces].astype(np.float64)
 
 
-def _areas(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return np.asarray(np.linalg.norm(cross, axis=1) / 2)
-
-
 def _edges(piece: ScenePiece) -> dict[frozenset[bytes], int]:
     """How many faces each edge has, by the bytes of its ends: as a renderer meets them."""
     found: dict[frozenset[bytes], int] = {}
@@ -281,39 +278,31 @@ def test_the_surface_stays_where_it_is_with_its_materials(name: str) -> None:
     piece = _piece(ALL[name], smooth=True)
     after = subdivide(piece, 200)
     old, new = _corners(piece), _corners(after)
-    assert abs(_areas(new).sum() / _areas(old).sum() - 1) < ROUNDING
+    assert abs(trimesh.triangles.area(new).sum() / trimesh.triangles.area(old).sum() - 1) < ROUNDING
     owner = np.array([_owner(old, corners) for corners in new])
     assert (np.bincount(owner, minlength=len(old)) > 0).all()
     assert np.array_equal(piece.materials, after.materials)
     assert np.array_equal(piece.material_index[owner], after.material_index)
     assert np.array_equal(piece.mesh.groups[owner], after.mesh.groups)
-    for row, area in enumerate(_areas(old)):
-        assert abs(_areas(new)[owner == row].sum() - area) < ROUNDING
+    for row, area in enumerate(trimesh.triangles.area(old)):
+        assert abs(trimesh.triangles.area(new)[owner == row].sum() - area) < ROUNDING
     facing = np.sum(_unit_normals(old)[owner] * _unit_normals(new), axis=1)
     # The needle is 0.5 mm wide: rounding of 6e-8 turns its smallest parts by a few 1e-4.
     assert facing.min() > 0.999
 
 
 def _unit_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cross = trimesh.triangles.cross(corners)
     return np.asarray(cross / np.linalg.norm(cross, axis=1, keepdims=True))
 
 
 def _owner(old: NDArray[np.float64], corners: NDArray[np.float64]) -> int:
-    """The old triangle that holds all three corners, by barycentric coordinates and height."""
-    normal = _unit_normals(old)
-    a, b, c = old[:, 0], old[:, 1], old[:, 2]
-    worst = np.zeros(len(old))
-    doubled = 2 * _areas(old)
-    for point in corners:
-        height = np.abs(np.sum((point - a) * normal, axis=1))
-        inside = [
-            np.sum(np.cross(q - p, point - p) * normal, axis=1) / doubled
-            for p, q in ((a, b), (b, c), (c, a))
-        ]
-        # In units of the triangle a rounding of 1e-7 is 2e-4 of the needle's width.
-        outside = np.maximum(-np.min(inside, axis=0) - 1e-3, 0)
-        worst = np.maximum(worst, height + outside)
+    """The old triangle that holds all three corners."""
+    distances = [
+        np.linalg.norm(trimesh.triangles.closest_point(old, points) - points, axis=1)
+        for points in np.repeat(corners[:, None], len(old), axis=1)
+    ]
+    worst = np.max(distances, axis=0)
     nearest = int(worst.argmin())
     assert worst[nearest] < ROUNDING
     return nearest
@@ -409,21 +398,7 @@ def test_an_object_whose_textures_break_a_law_costs_scenes_by_its_name() -> None
 
 def test_a_normal_map_comes_with_the_rights_of_its_object_and_changes_nothing_else() -> None:
     """Networks read the same surfaces, and parts without a map say so."""
-    pool = _pool()
-    mapped = []
-    for seed, entry in enumerate(pool):
-        levels = [
-            level
-            if level.skin is None
-            else dataclasses.replace(
-                level,
-                skin=dataclasses.replace(level.skin, packed_normal=pack_map(bumps(seed))),
-            )
-            for level in entry.asset.levels
-        ]
-        asset = dataclasses.replace(entry.asset, levels=tuple(levels))
-        mapped.append(dataclasses.replace(entry, asset=asset))
-    plain, scene = (_scene(OWN, 1, each) for each in (pool, mapped))
+    plain, scene = _scene(OWN, 1, _pool()), _scene(OWN, 1, _pool(mapped=True))
     scene.check()
     assert scene.normal_textures is not None and scene.material_textures is not None
     textured = (scene.material_textures >= 0).all(axis=1)
@@ -458,13 +433,12 @@ def test_subdivision_moves_no_colour() -> None:
     corners = whole.mesh.positions[whole.mesh.faces].astype(np.float64)
     before = skin.uv.reshape(-1, 3, 2).astype(np.float64)
     for centre, found in zip(centres, uv, strict=True):
-        matches = []
-        for triangle, its_uv in zip(corners, before, strict=True):
-            weights = np.linalg.lstsq(np.vstack([triangle.T, np.ones(3)]), [*centre, 1], rcond=None)
-            off = np.abs(np.vstack([triangle.T, np.ones(3)]) @ weights[0] - [*centre, 1]).max()
-            if off < 1e-6 and weights[0].min() > -1e-6:
-                matches.append(np.abs(weights[0] @ its_uv - found).max())
-        assert min(matches) < 1e-5  # float32 positions
+        points = np.tile(centre, (len(corners), 1))
+        nearest = trimesh.triangles.closest_point(corners, points)
+        holds = np.abs(nearest - centre).max(axis=1) < 1e-6
+        weights = trimesh.triangles.points_to_barycentric(corners, points)[:, None]
+        off = np.abs((weights @ before)[:, 0] - found).max(axis=1)
+        assert off[holds].min() < 1e-5  # float32 positions
 
 
 QUAD = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
@@ -473,9 +447,7 @@ FACES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
 
 def powers(scene: Scene) -> dict[bool, float]:
     """Area times mean radiance by whether an emitter is a lamp."""
-    corners = scene.vertex_positions[scene.faces].astype(float)
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    power = np.linalg.norm(cross, axis=1) / 2
+    power = trimesh.triangles.area(scene.vertex_positions[scene.faces].astype(float))
     power *= scene.materials[scene.material_index, EMISSION].mean(axis=1)
     lamp = np.array([entry.is_lamp for entry in scene.objects])[scene.object_index]
     return {True: float(power[lamp].sum()), False: float(power[~lamp].sum())}

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
 
 from storage.optics import multiscatter
 from storage.optics.fresnel import constant_albedos
@@ -48,15 +49,9 @@ def stretched(cosine: NDArray, alpha: NDArray) -> NDArray[np.float64]:
 
 def interpolated(x: NDArray, alpha: NDArray, smith: Smith) -> NDArray[np.float64]:
     """Return what both tracers read from the table."""
-    table = albedo_table(smith)
-    u, v = np.sqrt(x) * (X_STEPS - 1), np.sqrt(alpha) * (ROUGHNESS_STEPS - 1)
-    i = np.minimum(u.astype(int), X_STEPS - 2)
-    j = np.minimum(v.astype(int), ROUGHNESS_STEPS - 2)
-    u, v = u - i, v - j
-    low = table[j, i] * (1 - u) + table[j, i + 1] * u
-    high = table[j + 1, i] * (1 - u) + table[j + 1, i + 1] * u
-    mixed: NDArray[np.float64] = low * (1 - v) + high * v
-    return mixed
+    places = np.linspace(0, 1, ROUGHNESS_STEPS), np.linspace(0, 1, X_STEPS)
+    table = RegularGridInterpolator(places, albedo_table(smith))
+    return np.asarray(table(np.stack([np.sqrt(alpha), np.sqrt(x)], axis=-1)), np.float64)
 
 
 @for_each("smith", SMITHS)
