@@ -393,8 +393,6 @@ def denoise_arrays(
         pictures: [3 R^2] mi.Float, pixel by pixel.
         guides: albedo and normal of each.
     """
-    import drjit as dr  # only after `activate`
-
     opened = open_filter(resolution, quality)
     if (dr.backend_v(pictures[0]) == dr.JitBackend.CUDA) != opened.is_on_gpu:
         kind = type(pictures[0])

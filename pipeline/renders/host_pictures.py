@@ -24,7 +24,7 @@ from pipeline.renders.noise_floor import (
     estimate_noise_floor_db,
     secant_slope,
 )
-from pipeline.renders.samples import DualBuffer, tile_means
+from pipeline.renders.samples import DualBuffer, by_tiles, tile_means
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.tracer import PixelCamera, Tracer
 from pipeline.renders.view_pictures import (
@@ -118,7 +118,7 @@ def measure_errors(
     residual = slope * (picture - raw)
     probe = slope * (0.5 * (a.raw_rgb.astype(np.float64) - b.raw_rgb))
     difference = slope * (a.denoised_rgb.astype(np.float64) - b.denoised_rgb)
-    blocks = [_block_means(values) for values in (residual, probe, difference)]
+    blocks = [tile_means(values) for values in (residual, probe, difference)]
     to_mean = BLOCK_PX**2 / count
 
     def over_pixels(values: NDArray[np.float64]) -> float:
@@ -143,12 +143,6 @@ def measure_errors(
     )  # fmt: skip
 
 
-def _block_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    across = len(values) // BLOCK_PX
-    means: NDArray[np.float64] = values.reshape(across, BLOCK_PX, across, BLOCK_PX, 3).mean((1, 3))
-    return means
-
-
 def _means(a: Half, b: Half) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the means of both halves, denoised and raw."""
     denoised = 0.5 * (a.denoised_rgb.astype(np.float64) + b.denoised_rgb)
@@ -161,15 +155,10 @@ def _floor_db(
     error = squared_error(a, b, curve) * pixels
     surprise = float((surprises(a, b, curve) * pixels).max())
     mean = error.sum() / max(int(pixels.sum()), 1)
-    counts = _block_sums(pixels.astype(np.float64))
-    return estimate_noise_floor_db(mean, surprise, _block_sums(error), counts, standard_errors)
-
-
-def _block_sums(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    across = len(values) // BLOCK_PX
-    blocks = values.reshape(across, BLOCK_PX, across, BLOCK_PX)
-    sums: NDArray[np.float64] = blocks.sum(axis=(1, 3)).ravel()
-    return sums
+    sums, counts = (
+        by_tiles(values).sum(axis=(1, 3)).ravel() for values in (error, pixels.astype(np.float64))
+    )
+    return estimate_noise_floor_db(mean, surprise, sums, counts, standard_errors)
 
 
 _METRICS = (

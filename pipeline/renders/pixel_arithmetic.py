@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from pipeline.renders.noise_floor import BLOCK_PX, SMALLEST_STEP
+from pipeline.renders.noise_floor import SMALLEST_STEP
 from pipeline.renders.samples import TILE_PX
 from pipeline.renders.view_pictures import (
     DARKER,
@@ -22,7 +22,6 @@ from pipeline.renders.view_pictures import (
     add_up,
 )
 
-assert BLOCK_PX == TILE_PX  # one order of pixels serves both
 TILE = TILE_PX * TILE_PX
 """Pixels of a tile."""
 

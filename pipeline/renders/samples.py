@@ -27,6 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.renders.noise_floor import BLOCK_PX
 from pipeline.renders.settings import PASS_SPP, Filtered
 from pipeline.renders.tracer import Chosen, PixelCamera, Tracer
 from storage.seeds import seed_for
@@ -145,8 +146,8 @@ class DualBuffer:
                 tracer.guide()
 
 
-TILE_PX = 8
-"""Pixels across a tile; the widths of pictures are multiples of it."""
+TILE_PX = BLOCK_PX
+"""Pixels across a tile; one order of pixels serves both. Widths of pictures are multiples of it."""
 
 _PASS = PASS_SPP[0]
 """Samples per pixel of a pass over tiles; there is no choice before a half has as many."""
@@ -258,10 +259,15 @@ def passes_of_tiles(
     return passes(high).astype(np.int64)
 
 
-def tile_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the means over the tiles [T, T] of a picture [R, R]."""
+def by_tiles(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a picture [R, R, ...] as [T, TILE_PX, T, TILE_PX, ...]: axes 1 and 3 are in a tile."""
     across = len(values) // TILE_PX
-    means: NDArray[np.float64] = values.reshape(across, TILE_PX, across, TILE_PX).mean(axis=(1, 3))
+    return values.reshape(across, TILE_PX, across, TILE_PX, *values.shape[2:])
+
+
+def tile_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the means over the tiles [T, T, ...] of a picture [R, R, ...]."""
+    means: NDArray[np.float64] = by_tiles(values).mean(axis=(1, 3))
     return means
 
 
