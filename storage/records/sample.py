@@ -24,7 +24,6 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.conventions import require_readable
 from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.raycast.first_hits import require_row
@@ -45,9 +44,8 @@ from storage.records.scene import Scene
 from storage.records.scene_file import (
     decode_arrays,
     encode_arrays,
-    require_version_of_maps,
-    scene_objects,
-    scene_provenance,
+    read_scene_record,
+    scene_of_record,
     scene_record,
 )
 from storage.settings.ranges import Within
@@ -290,21 +288,13 @@ def decode_scene(
     """
     if "json" not in members:
         raise TrilightError(f"sample {key}: member {key}.json is missing.")
-    try:
-        record = json.loads(members["json"])
-    except (ValueError, RecursionError) as error:
-        raise TrilightError(f"sample {key}: member {key}.json is not JSON ({error}).") from error
-    version = record.get("schema_version") if isinstance(record, dict) else None
-    require_readable(version, f"sample {key}")
     with name_errors(key):
+        record = read_scene_record(members["json"], f"member {key}.json")
         views = _views(record["views"])
-        objects = scene_objects(record["objects"])
-        require_version_of_maps(record)
         maps = record.get("maps")
         fields = {} if maps is None else unpacked_maps(maps, members, held)
         fields |= decode_arrays(unpack_arrays(members), maps)
-        provenance = scene_provenance(record["provenance"])
-        scene = Scene(objects=objects, provenance=provenance, **fields)
+        scene = scene_of_record(record, **fields)
     return SceneRecord(key=key, scene=scene, views=views)
 
 

@@ -13,7 +13,7 @@ laws of `Scene.check`, types and shapes among them, hold for every scene that is
 import dataclasses
 import json
 import stat
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from storage.conventions import MAPS_VERSION, SCHEMA_VERSION, require_readable
+from storage.conventions import (
+    MAPS_VERSION,
+    READABLE_VERSIONS,
+    SCHEMA_VERSION,
+    require_readable,
+)
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.environment import Environment
@@ -61,6 +66,7 @@ CARRIED = frozenset(
 )
 """What the form holds of a scene (pipeline.exchange.formats): all of it, added columns too."""
 
+_VERSIONS = (SCHEMA_VERSION, MAPS_VERSION)
 _METADATA = "trilight_scene"
 _COLUMNS = "material_columns"
 _MAPS = "maps"
@@ -176,15 +182,13 @@ def decode_scene_file(data: bytes, name: str) -> Scene:
     try:
         arrays, metadata = read_safetensors(data, MAX_HEADER_BYTES)
         _check_names(arrays)
-        record = _metadata_record(metadata)
+        if _METADATA not in metadata:
+            raise TrilightError(f"scene: metadata {_METADATA} are missing.")
+        record = read_scene_record(metadata[_METADATA], "scene: its record", _VERSIONS)
         arrays["materials"] = completed_rows(arrays["materials"], record.get(_COLUMNS))
         fields = _maps(record, arrays)
         fields |= {name: arrays[name] for name in (*ARRAY_FIELDS, *MAP_ARRAYS) if name in arrays}
-        scene = Scene(
-            objects=scene_objects(record.get("objects")),
-            provenance=scene_provenance(record.get("provenance")),
-            **fields,
-        )
+        scene = scene_of_record(record, **fields)
         scene.check()
     except TrilightError as error:
         raise TrilightError(f"{name}: {error}") from error
@@ -202,32 +206,54 @@ def scene_record(scene: Scene) -> dict[str, Any]:
     }
 
 
-def require_version_of_maps(record: Mapping[str, Any]) -> None:
-    """Raise TrilightError unless a record has MAPS_VERSION exactly where it names maps."""
-    version = record.get("schema_version")
+def read_scene_record(
+    text: bytes | str, what: str, versions: Sequence[int] = READABLE_VERSIONS
+) -> dict[str, Any]:
+    """Return the record of a scene from its JSON text, called `what` in messages.
+
+    Raises:
+        TrilightError: no JSON, another schema version, or none of MAPS_VERSION exactly where the
+            record names maps.
+    """
+    try:
+        record = json.loads(text, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise TrilightError(f"{what} is not JSON ({error}).") from error
+    version = record.get("schema_version") if isinstance(record, dict) else None
+    require_readable(version, what, versions)
     if (version == MAPS_VERSION) != (_MAPS in record):
         has = "names" if _MAPS in record else "does not name"
         raise TrilightError(
-            f"scene: its record {has} {_MAPS} and has schema version {version!r:.60}; expected "
-            f"{MAPS_VERSION} exactly where there are any."
+            f"{what} {has} {_MAPS} and has schema version {version}; expected {MAPS_VERSION} "
+            "exactly where there are any."
         )
+    return dict(record)
 
 
-def scene_objects(value: Any) -> tuple[SceneObject, ...]:
-    """Return the objects that a JSON value lists.
+def _refuse_constant(text: str) -> float:
+    raise TrilightError(f"{text} is no JSON number")
+
+
+def scene_of_record(record: Mapping[str, Any], **fields: Any) -> Scene:
+    """Return the scene of a record and of all other fields; its laws are not checked.
 
     Raises:
-        TrilightError: no list, a field too many or too few, no text, or an unknown kind.
+        TrilightError: the objects are no list, one has a field too many or too few, no text or an
+            unknown kind; or as `scene_provenance`.
     """
-    if not isinstance(value, list):
-        wrong_value("objects", value, "a list")
-    fields = dict.fromkeys((field.name for field in dataclasses.fields(SceneObject)), str)
-    for row, entry in enumerate(value):
-        require_fields(entry, f"objects[{row}]", fields)
+    objects = record.get("objects")
+    if not isinstance(objects, list):
+        wrong_value("objects", objects, "a list")
+    texts = dict.fromkeys((field.name for field in dataclasses.fields(SceneObject)), str)
+    for row, entry in enumerate(objects):
+        require_fields(entry, f"objects[{row}]", texts)
         if entry["kind"] not in OBJECT_KINDS:
             expected = f"one of {', '.join(OBJECT_KINDS)}"
             wrong_value(f"objects[{row}].kind", entry["kind"], expected)
-    return tuple(SceneObject(**entry) for entry in value)
+    provenance = scene_provenance(record.get("provenance"))
+    return Scene(
+        objects=tuple(SceneObject(**entry) for entry in objects), provenance=provenance, **fields
+    )
 
 
 def scene_provenance(value: Any) -> Mapping[str, Any]:
@@ -295,21 +321,3 @@ def _check_names(arrays: Mapping[str, NDArray]) -> None:
     total = sum(arrays[name].size * (1 if arrays[name].dtype == np.uint8 else 4) for name in maps)
     if total > MAX_MAPS_BYTES:
         wrong_value("textures and environment", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
-
-
-def _metadata_record(metadata: Mapping[str, str]) -> dict[str, Any]:
-    try:
-        record = json.loads(metadata[_METADATA], parse_constant=_refused_constant)
-    except KeyError as error:
-        raise TrilightError(f"scene: metadata {_METADATA} are missing.") from error
-    except (ValueError, RecursionError) as error:
-        said = f" ({error})" if isinstance(error, TrilightError) else ""
-        raise TrilightError(f"scene: metadata {_METADATA} are not JSON{said}.") from error
-    version = record.get("schema_version") if isinstance(record, dict) else None
-    require_readable(version, "scene", (SCHEMA_VERSION, MAPS_VERSION))
-    require_version_of_maps(record)
-    return dict(record)
-
-
-def _refused_constant(text: str) -> float:
-    raise TrilightError(f"{text} is no JSON number")
