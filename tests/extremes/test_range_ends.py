@@ -49,6 +49,7 @@ from tests.extremes.test_scenes import require_laws
 from tests.for_each import case, for_each
 from tests.model.kit import FAMILIES, attend_reference, awake, random_scene, tiny_config
 from tests.pipeline.renders.scene_kit import join, light, material, quad
+from tests.pipeline.scenes.small_pool import BLIND
 from tests.train.kit import stepper, tiny_run
 from tests.train.toy import toy_sample, toy_scene
 from train.data.augment import augment_scene
@@ -69,12 +70,6 @@ GROUPS: dict[type, str] = {
     ViewLaws: "views.",
 }
 """Under which name a group of scene settings stands."""
-
-BLIND: dict[str, Any] = {
-    "views.min_coverage": 0.0, "views.min_lit": 0.0, "views.max_shell_back": 1.0,
-    "views.min_depth": 0.0,
-}  # fmt: skip
-"""Every view is good enough."""
 
 BESIDE: dict[tuple[str, End], dict[str, Any]] = {
     ("max_triangles", "low"): {

@@ -19,7 +19,6 @@ from storage.conventions import look_at_c2w
 from storage.denoiser import Features, Quality, denoise
 from storage.errors import Rejected
 from storage.metrics import psnr_log_db
-from storage.records.exr import decode_exr, encode_exr
 from storage.records.lights import (
     light_rows,
     num_light_pictures,
@@ -224,23 +223,15 @@ def _lights(view: RenderedView) -> NDArray[np.float32]:
     return view.lights_rgb
 
 
-def test_the_stored_picture_is_the_sum_of_its_lights_in_the_order_of_objects() -> None:
-    view = render_view(lit_scene(), SETTINGS)
-    lights = _lights(view)
-    assert lights.shape == (3, 32, 32, 3)
-    np.testing.assert_array_equal(lights, rounded_to_half(lights))
-    np.testing.assert_array_equal(sum_of_lights(lights), view.radiance_rgb)
-    np.testing.assert_array_equal(decode_exr(encode_exr(view.radiance_rgb)), view.radiance_rgb)
-    for light_rgb, colour in zip(lights, COLOURS, strict=True):  # objects 0, 2 and 4
-        assert np.argmax(light_rgb.mean(axis=(0, 1))) == np.argmax(colour)
-
-
-def test_a_sky_is_the_last_light() -> None:
+def test_the_picture_is_the_sum_of_its_lights_in_the_order_of_objects_the_sky_last() -> None:
     scene = dataclasses.replace(lit_scene(), environment=constant(0.3))
     view = render_view(scene, SETTINGS)
     lights = _lights(view)
-    assert len(lights) == num_light_pictures(scene) == 4
+    assert lights.shape == (num_light_pictures(scene), 32, 32, 3) == (4, 32, 32, 3)
+    np.testing.assert_array_equal(lights, rounded_to_half(lights))
     np.testing.assert_array_equal(sum_of_lights(lights), view.radiance_rgb)
+    for light_rgb, colour in zip(lights, COLOURS, strict=False):  # objects 0, 2 and 4
+        assert np.argmax(light_rgb.mean(axis=(0, 1))) == np.argmax(colour)
     assert view.light_floors is not None and len(view.light_floors) == 4
     without = _lights(render_view(lit_scene(), SETTINGS))
     np.testing.assert_allclose(lights[:3].mean(axis=(1, 2)), without.mean(axis=(1, 2)), rtol=0.1)

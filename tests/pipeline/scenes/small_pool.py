@@ -48,6 +48,12 @@ STEP_ERROR = 0.02
 that finer levels are wanted wherever they fit."""
 
 
+BLIND = {
+    "views.min_coverage": 0.0, "views.min_lit": 0.0, "views.max_shell_back": 1.0,
+    "views.min_depth": 0.0,
+}  # fmt: skip
+"""Every view is good enough."""
+
 LOOK = SurfaceLook(
     diffuse_scale=1.0,
     diffuse_rgb=(0.1, 0.2, 0.3),

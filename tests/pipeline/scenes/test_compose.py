@@ -28,7 +28,7 @@ from storage.seeds import SceneKey
 from storage.settings.overrides import apply_overrides
 from tests.for_each import for_each
 from tests.pipeline.scenes.scene_facts import counts_of, digest, planes_of, points_of, rows_of
-from tests.pipeline.scenes.small_pool import first_scene, small_pool
+from tests.pipeline.scenes.small_pool import BLIND, first_scene, small_pool
 from tests.scene_templates.balls import template_settings
 
 SETTINGS = SceneSettings(families=DEFAULT_FAMILIES)
@@ -154,15 +154,6 @@ def test_real_objects_compose(real_pool: list[PooledAsset]) -> None:
         scene = first_scene(SETTINGS, real_pool, seed=0, scene_index=index)
         scene.check()
         assert scene.num_triangles <= SETTINGS.max_triangles
-
-
-BLIND = {
-    "views.min_coverage": 0.0,
-    "views.min_lit": 0.0,
-    "views.max_shell_back": 1.0,
-    "views.min_depth": 0.0,
-}
-"""Every view is good enough."""
 
 
 CROWD = {"families.num_objects": [3, 3], "placement.overlap_share": 0.0}
