@@ -5,6 +5,7 @@
 """
 
 import dataclasses
+import mmap
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -183,7 +184,7 @@ def _record(row: LockedObject | Failure) -> dict[str, Any]:
 
 
 class LockRows:
-    """The rows of a lock file; what it holds in memory does not depend on how many there are."""
+    """The rows of a lock file, which is mapped: memory does not depend on how many there are."""
 
     def __init__(self, path: Path) -> None:
         """Open the lock.
@@ -192,34 +193,35 @@ class LockRows:
             TrilightError: it is missing, or no plain file.
         """
         self._path = path
+        self._lines: mmap.mmap | bytes = b""
         try:
-            self._stream = open_plain(path)
+            with open_plain(path) as stream:
+                if os.fstat(stream.fileno()).st_size:  # nothing cannot be mapped
+                    self._lines = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         except OSError as error:
             raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
 
     @property
     def num_bytes(self) -> int:
         """Size of the file."""
-        return os.fstat(self._stream.fileno()).st_size
+        return len(self._lines)
 
     def at(self, offset: int) -> LockedObject:
         """Return the row that begins at a byte; raises TrilightError where none does."""
-        self._stream.seek(offset)
-        return self._row(self._stream.readline(), offset)
+        line = self._lines[offset : self._end(offset)]
+        return read_json(line, LockedObject, f"{self._path}: row at byte {offset}")
 
     def find(self, uid: str) -> LockedObject | None:
         """Return the row of a uid, or None: rows are sorted, so about 20 of a million are read."""
         low = 0
         high = self.num_bytes
         while low < high:
-            start = self._start_of_row((low + high) // 2, low)
-            self._stream.seek(start)
-            line = self._stream.readline()
-            row = self._row(line, start)
+            start = self._lines.rfind(b"\n", low, (low + high) // 2) + 1 or low
+            row = self.at(start)
             if row.uid == uid:
                 return row
             if row.uid < uid:
-                low = start + len(line)
+                low = self._end(start)
             else:
                 high = start
         return None
@@ -228,24 +230,9 @@ class LockRows:
         """Yield all rows, sorted by uid."""
         offset = 0
         while offset < self.num_bytes:
-            self._stream.seek(offset)
-            line = self._stream.readline()
-            yield self._row(line, offset)
-            offset += len(line)
+            yield self.at(offset)
+            offset = self._end(offset)
 
-    def _start_of_row(self, position: int, low: int) -> int:
-        """Return where the row of a byte begins; `low` is the beginning of some row before it."""
-        step = 1024
-        while position > low:
-            start = max(low, position - step)
-            self._stream.seek(start)
-            cut = self._stream.read(position - start).rfind(b"\n")
-            if cut >= 0:
-                return start + cut + 1
-            step = 2 * step
-            position = start
-        return low
-
-    def _row(self, line: bytes, offset: int) -> LockedObject:
-        place = f"{self._path}: row at byte {offset}"
-        return read_json(line, LockedObject, place)
+    def _end(self, offset: int) -> int:
+        """Return where the row of a byte ends, behind its line break."""
+        return self._lines.find(b"\n", offset) + 1 or self.num_bytes
