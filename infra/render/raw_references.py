@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.noise_floor import Curve, secant_slope
 from pipeline.renders.settings import PASS_SPP, RenderSettings
-from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer
+from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer, pixel_camera
 from storage.records.lights import light_rows, num_light_pictures
 from storage.records.scene import Scene
 from storage.seeds import seed_for
@@ -38,8 +38,7 @@ class RawReference:
 
 def first_camera(scene: Scene, resolution: int) -> PixelCamera:
     """Return the first camera of a scene for square pictures of `resolution` pixels."""
-    pose = np.asarray(scene.c2w[0], np.float64)
-    return PixelCamera(c2w=pose, fov_deg=float(scene.fov_deg[0]), resolution=resolution)
+    return pixel_camera(scene.c2w[0], scene.fov_deg[0], resolution)
 
 
 def raw_reference(scene: Scene, camera: PixelCamera, spp: int, *name: int) -> RawReference:

@@ -18,7 +18,7 @@ from pipeline.renders.calibrated_error import first_spp
 from pipeline.renders.renderer import SceneRenderer, representable, require_surfaces
 from pipeline.renders.results import GrowingPicture, RenderedView, run_to_end
 from pipeline.renders.settings import PASS_SPP, Depth, Filtered, RenderSettings, Resolution
-from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer
+from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer, pixel_camera
 from pipeline.renders.view_pictures import require_bounded
 from storage.denoiser import Features, Quality, denoise
 from storage.errors import Rejected, TrilightError
@@ -99,8 +99,7 @@ class PreviewRenderer:
             Rejected: "nonfinite_radiance" or "radiance_overflow", as of `SceneRenderer`.
         """
         settings = self._settings
-        pose = np.asarray(c2w, np.float64)
-        camera = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
+        camera = pixel_camera(c2w, fov_deg, settings.resolution)
         return preview_steps(self._tracer, camera, seed, settings.spp, settings.denoiser)
 
 
@@ -170,15 +169,14 @@ def timed_parts(
         resolution: pixels each way.
         clock: returns seconds; `time.process_time` counts those of all threads.
     """
-    pose = np.asarray(scene.c2w[0], np.float64)
-    fov_deg = float(scene.fov_deg[0])
     depths = {"max_depth": RenderSettings.max_depth, "rr_depth": RenderSettings.rr_depth}
     load_tracer(scene, **depths)  # the first one loads libraries as well
     began = clock()
     tracer = load_tracer(scene, **depths)
     seconds = {SCENE: clock() - began}
-    small = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=_SMALL)
-    camera = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=resolution)
+    small, camera = (
+        pixel_camera(scene.c2w[0], scene.fov_deg[0], px) for px in (_SMALL, resolution)
+    )
     for size in PASSES:
         tracer.radiance(small, seed=_SEED, spp=size)  # kernels are compiled, or read from disk
         seconds[_PASS(size)] = _median_s(
@@ -248,8 +246,7 @@ class ProgressiveRenderer:
         Raises:
             Rejected: as of `SceneRenderer.render_view`.
         """
-        pose = np.asarray(c2w, np.float64)
-        camera = PixelCamera(c2w=pose, fov_deg=fov_deg, resolution=self._settings.resolution)
+        camera = pixel_camera(c2w, fov_deg, self._settings.resolution)
         for spp in FIRST_LOOKS_SPP:
             steps = preview_steps(self._measured.tracer, camera, seed, spp, usual_filter(spp))
             preview = run_to_end(steps)

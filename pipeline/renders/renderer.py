@@ -35,7 +35,7 @@ from pipeline.renders.samples import (
     next_spp,
 )
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import PixelCamera, load_tracer
+from pipeline.renders.tracer import load_tracer, pixel_camera
 from pipeline.renders.view_pictures import MeasuredLook, ViewPictures
 from storage.conventions import HALF_FLOAT_MAX
 from storage.denoiser import set_denoiser_threads
@@ -111,7 +111,8 @@ class SceneRenderer:
             self._tracers = [self.tracer.only_light(row) for row in (*rows, *sky)]
         self._light_seed = light_seed if settings.light_paths == "scene" else None
         if self._light_seed is not None:
-            cameras = [self._camera(*view) for view in zip(scene.c2w, scene.fov_deg, strict=True)]
+            views = zip(scene.c2w, scene.fov_deg, strict=True)
+            cameras = [pixel_camera(*view, settings.resolution) for view in views]
             self._tracers = [tracer.for_views(cameras) for tracer in self._tracers]
 
     def render_view(self, c2w: ArrayLike, fov_deg: float, seed: int) -> RenderedView:
@@ -136,7 +137,7 @@ class SceneRenderer:
         """Do what `render_view` does: yield after each pass of one half, and last the picture."""
         settings = self._settings
         self._began_s = time.process_time()
-        camera = self._camera(c2w, fov_deg)
+        camera = pixel_camera(c2w, fov_deg, settings.resolution)
         settled = first_spp(settings)
         samples = DualBuffer(
             self._tracers,
@@ -183,10 +184,6 @@ class SceneRenderer:
             expected_error=look.expected,
             **stored,
         )
-
-    def _camera(self, c2w: ArrayLike, fov_deg: float) -> PixelCamera:
-        pose = np.asarray(c2w, np.float64)
-        return PixelCamera(c2w=pose, fov_deg=float(fov_deg), resolution=self._settings.resolution)
 
     def _to_stored(self, pictures: NDArray[np.float32]) -> dict[str, Any]:
         """Return the pictures of a view by their fields: the sum of what is apart, as stored."""

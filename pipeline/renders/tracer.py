@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from storage.denoiser import Features
 from storage.records.retextured import without_constant_textures
@@ -34,6 +34,12 @@ class PixelCamera:
         c2w = self.c2w.copy()
         c2w[:3, 3] *= factor
         return replace(self, c2w=c2w)
+
+
+def pixel_camera(c2w: ArrayLike, fov_deg: float, resolution: int) -> PixelCamera:
+    """Return the camera of a pose and an angle of any number type."""
+    pose = np.asarray(c2w, np.float64)
+    return PixelCamera(c2w=pose, fov_deg=float(fov_deg), resolution=resolution)
 
 
 Chosen = NDArray[np.bool_] | None

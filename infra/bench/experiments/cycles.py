@@ -23,7 +23,7 @@ from pipeline.presets.training import object_views
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import USUAL_FLOOR_DB
-from pipeline.renders.tracer import PixelCamera
+from pipeline.renders.tracer import pixel_camera
 from storage.conventions import log10_radiance
 from storage.metrics import psnr_linear_db
 from storage.records.scene import Scene
@@ -103,11 +103,7 @@ def _measure_object(context: BenchContext, trial: str) -> Figures:
     raws, _ = render_with_cycles(scene, px, spp, seeds=(0, 1), views=views)
     figures: dict[str, list[float]] = {"stated_objects_db": [], "ours_db": [], "theirs_db": []}
     for view in views:
-        camera = PixelCamera(
-            c2w=scene.c2w[view].astype(np.float64),
-            fov_deg=float(scene.fov_deg[view]),
-            resolution=px,
-        )
+        camera = pixel_camera(scene.c2w[view], scene.fov_deg[view], px)
         raw = context.child.call(raw_reference, scene, camera, OUR_SHARE * spp, view)
         a_rgb, b_rgb = (picture.astype(np.float64) for picture in raws[2 * view : 2 * view + 2])
         if view == 0:

@@ -11,7 +11,7 @@ from scipy import stats
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer
+from pipeline.renders.tracer import PixelCamera, Tracer, load_tracer, pixel_camera
 from storage.records.scene import Scene
 from tests.conftest import ROOT
 
@@ -31,11 +31,7 @@ class Estimate:
 
 
 def camera_of(scene: Scene, resolution: int, view: int = 0) -> PixelCamera:
-    return PixelCamera(
-        c2w=scene.c2w[view].astype(np.float64),
-        fov_deg=float(scene.fov_deg[view]),
-        resolution=resolution,
-    )
+    return pixel_camera(scene.c2w[view], scene.fov_deg[view], resolution)
 
 
 def render_view(scene: Scene, settings: RenderSettings, seed: int = 0) -> RenderedView:
