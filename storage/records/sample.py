@@ -203,9 +203,9 @@ def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, by
     for view, (picture, made) in enumerate(zip(sample.radiance_rgb, sample.views, strict=True)):
         members[f"{view}.exr"] = pack_picture(picture, made.noise_floor_db, of_pictures)
     lights = {} if sample.lights_rgb is None else {ALL_LIGHT: sample.lights_rgb}
-    for what, apart in (("lights", lights), ("parts", sample.parts_rgb or {})):
-        for view in range(len(sample.views)) if apart else ():
-            of_view = {name: pictures[view] for name, pictures in apart.items()}
+    for what, parts in (("lights", lights), ("parts", sample.parts_rgb or {})):
+        for view in range(len(sample.views)) if parts else ():
+            of_view = {name: pictures[view] for name, pictures in parts.items()}
             members[f"{view}.{what}.exr"] = encode_parts_exr(of_view)
     for view, packed in enumerate(sample.passes_exr or ()):
         members[f"{view}.passes.exr"] = packed
