@@ -172,10 +172,9 @@ class Sample(SceneRecord):
             )
         check_radiance(self.key, "", self.radiance_rgb)
         if self.lights_rgb is not None:
-            check_lights(self.key, self.lights_rgb)
+            check_radiance(self.key, "", self.lights_rgb)
         for part, pictures in (self.parts_rgb or {}).items():
-            for radiance_rgb in np.moveaxis(pictures, 1, 0) if pictures.ndim == 5 else [pictures]:
-                check_radiance(self.key, f" {part} light", radiance_rgb)
+            check_radiance(self.key, f" {part} light", pictures)
 
 
 def sample_key(scene_index: int) -> str:
@@ -344,9 +343,13 @@ def check_radiance(
     Args:
         key: of the sample.
         which: part of its pictures, behind a space; empty for all light.
-        radiance_rgb: pictures [C, R, R, 3].
+        radiance_rgb: pictures [C, R, R, 3], or [C, L, R, R, 3] of lights apart.
         first_view: number of the first of them.
     """
+    if radiance_rgb.ndim == 5:
+        for light, pictures in enumerate(np.moveaxis(radiance_rgb, 1, 0)):
+            check_radiance(key, f" light {light}{which}", pictures, first_view=first_view)
+        return
     if radiance_rgb.min() >= 0 and radiance_rgb.max() < math.inf:  # NaN is neither
         return
     wrong = np.argwhere(~(np.isfinite(radiance_rgb) & (radiance_rgb >= 0)))
@@ -356,12 +359,6 @@ def check_radiance(
         f"sample {key}: view {first_view + view}{which} has radiance {value} at pixel ({row}, "
         f"{column}); expected finite values from 0. Run `trilight verify` on the dataset."
     )
-
-
-def check_lights(key: str, lights_rgb: NDArray[np.float32], *, first_view: int = 0) -> None:
-    """Check lights [C, L, R, R, 3] as `check_radiance` does."""
-    for light, radiance_rgb in enumerate(np.moveaxis(lights_rgb, 1, 0)):
-        check_radiance(key, f" light {light}", radiance_rgb, first_view=first_view)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -416,7 +413,7 @@ class StoredSample(SceneRecord):
             lights_rgb = _decode_lights(self.scene, views, size, self.members)
         if lights_rgb is not None:
             for view, lights in zip(views, lights_rgb, strict=True):
-                check_lights(self.key, lights[None], first_view=view)
+                check_radiance(self.key, "", lights[None], first_view=view)
         return lights_rgb
 
 

@@ -283,5 +283,5 @@ def test_light_that_is_not_finite_is_refused() -> None:
         sample = _sample(lights=lights)
         assert sample.parts_rgb is not None
         sample.parts_rgb["indirect"].flat[5] = np.nan
-        with pytest.raises(TrilightError, match="view 0 indirect light has radiance nan"):
+        with pytest.raises(TrilightError, match="view 0 .*indirect light has radiance nan"):
             sample.check()
