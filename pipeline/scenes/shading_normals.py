@@ -75,19 +75,22 @@ def smooth_shaded(
     )
 
 
+def face_crosses(positions: NDArray[np.float32], faces: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Return geometric normals [T, 3], each as long as twice the area of its face."""
+    corners = positions.astype(np.float64)[faces]
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
 def face_normals(positions: NDArray[np.float32], faces: NDArray[np.uint32]) -> NDArray[np.float64]:
     """Return unit geometric normals [T, 3]; not finite for faces without area."""
-    corners = positions.astype(np.float64)[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cross = face_crosses(positions, faces)
     return cross / np.sqrt(np.sum(np.square(cross), axis=1, keepdims=True))
 
 
 def not_slivers(positions: NDArray[np.float32], faces: NDArray[np.uint32]) -> NDArray[np.bool_]:
     """Return a mask [F] of the faces that have an area after rounding to float32."""
-    corners = positions.astype(np.float64)[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    has_area: NDArray[np.bool_] = np.sqrt(np.sum(np.square(cross), axis=1)) > SMALLEST_DOUBLE_AREA
-    return has_area
+    double_area = np.sqrt(np.sum(np.square(face_crosses(positions, faces)), axis=1))
+    return np.asarray(double_area > SMALLEST_DOUBLE_AREA)
 
 
 def without_slivers(

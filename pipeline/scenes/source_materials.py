@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scenes.pieces import ScenePiece, Skin, lamp_piece
+from pipeline.scenes.shading_normals import face_crosses
 from pipeline.scenes.triangle_budget import PooledAsset
 from scene_templates.sample_material import MaterialSettings
 from storage.errors import Rejected, TrilightError
@@ -161,8 +162,7 @@ def _emission(piece: ScenePiece) -> NDArray[np.float32]:
 
 
 def _areas(piece: ScenePiece) -> NDArray[np.float64]:
-    corners = piece.mesh.positions[piece.mesh.faces].astype(np.float64)
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cross = face_crosses(piece.mesh.positions, piece.mesh.faces)
     return np.asarray(np.linalg.norm(cross, axis=1) / 2)
 
 

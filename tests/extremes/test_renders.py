@@ -255,7 +255,6 @@ def _lamp_that_fills_the_view() -> Scene:
 
 
 GUIDED = {
-    "lamp behind a mirror": lit_by_a_mirror(0.1),
     "hundred lamps": _hundred_lamps(),
     "roughness 0.01": lit_by_a_mirror(0.3, 0.01),
     "closed box": _closed_box(),
