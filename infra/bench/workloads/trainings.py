@@ -72,10 +72,10 @@ def training_figures(
     scores_by_view = []
     for judged in scenes.judge.scenes:
         mine = [next(views) for _ in judged.target_VRR3]
-        l1 = float(np.mean([view.log_l1 for view in mine]))
+        l1 = float(np.mean([view["log_l1"] for view in mine]))
         figures = {"seconds": seconds, "step_s": seconds / settings.num_steps}
         if np.isfinite(l1) and l1 > 0:
-            db = float(np.mean([view.psnr_log_db for view in mine]))
+            db = float(np.mean([view["psnr_log_db"] for view in mine]))
             figures |= {"log_l1": l1, "percent": 100 * float(np.log(l1)), "db": db}
         scores_by_view.append(figures)
     return scores_by_view
