@@ -7,6 +7,7 @@ which views are traced, over views that have both.
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,11 +31,9 @@ from train.data.scenes import training_scene
 from train.evaluation.equal_time import (
     CAPTION,
     TRACER,
-    EqualTimeResult,
     Filter,
     Level,
     Price,
-    TracerTimes,
     equal_time,
     sentences,
     spread_text,
@@ -222,12 +221,12 @@ def test_floors_of_metrics_without_a_measurement_are_of_drawn_noise() -> None:
     assert set(METRICS) - set(without) == {"lpips"}
 
 
-TIMES = EqualTimeResult(
-    network_first_s=0.12,
-    network_further_s=0.06,
-    scenes=4,
-    preview=TracerTimes(samples=4, denoiser="fast", first_s=0.025, further_s=0.022, note=""),
-)
+TIMES: dict[str, Any] = {
+    "network_first_s": 0.12, "network_further_s": 0.06, "scenes": 4, "missing": "",
+    "preview": {
+        "samples": 4, "denoiser": "fast", "first_s": 0.025, "further_s": 0.022, "note": "",
+    },
+}  # fmt: skip
 
 
 class StoredTargets(RendererHere):
@@ -276,14 +275,14 @@ def test_what_takes_longer_and_what_is_missing_is_said(
     judging: tuple[EvalConfig, list[JudgedView]],
 ) -> None:
     _, views = judging
-    dearest = TracerTimes(samples=1, denoiser="fast", first_s=0.1, further_s=0.07, note="slow")
-    dear = dataclasses.replace(TIMES, preview=dearest)
+    dearest = {"samples": 1, "denoiser": "fast", "first_s": 0.1, "further_s": 0.07, "note": "slow"}
+    dear = TIMES | {"preview": dearest}
     told = " ".join(sentences(equal_time(views, dear, "all")))
     assert "1 sample a pixel" in told and "longer than the network" in told and "slow." in told
     untraced = [dataclasses.replace(view, scores={NETWORK: view.scores[NETWORK]}) for view in views]
     own, line = sentences(equal_time(untraced, TIMES, "all"))
     assert line.endswith("is not shown: none of the judged views could be traced.")
-    lacking = dataclasses.replace(TIMES, preview=None, missing="no tracer here")
+    lacking = TIMES | {"preview": None, "missing": "no tracer here"}
     page = evaluation_page(record(views, {}, equal_time(views, lacking, "all")))
     assert own in page and "is not shown: no tracer here." in page
     assert "own time" not in evaluation_page(record(views, {}))
@@ -359,14 +358,15 @@ def test_samples_double_until_they_take_longer_than_the_network() -> None:
     }
     samples = [toy_sample(0), dataclasses.replace(toy_sample(1), key="000000001")]
     times = time_both(Clocked(6.0), previews, samples, note="slow")
-    assert times.preview is not None and times.scenes == 2 and times.missing == ""
-    assert (times.preview.samples, times.preview.denoiser) == (4, "high")
-    assert (times.preview.further_s, times.preview.note) == (5.6, "slow")
+    assert times["scenes"] == 2 and times["missing"] == ""
+    assert times["preview"] | {"first_s": 0} == {
+        "samples": 4, "denoiser": "high", "first_s": 0, "further_s": 5.6, "note": "slow",
+    }  # fmt: skip
     tried = [level for level, each in previews.items() if isinstance(each, Clocked) and each.loads]
     assert tried == [*((spp, denoiser) for spp in (1, 2, 4) for denoiser in FILTERS), (8, "fast")]
     least = time_both(Clocked(0.5), previews, samples)
-    assert least.preview is not None, "where nothing fits, the cheapest is shown"
-    assert (least.preview.samples, least.preview.denoiser) == (1, "fast")
+    least_level = least["preview"]["samples"], least["preview"]["denoiser"]
+    assert least_level == (1, "fast"), "where nothing fits, the cheapest is shown"
 
 
 def test_without_a_path_tracer_it_says_so_and_the_network_is_timed_all_the_same() -> None:
@@ -380,7 +380,7 @@ def test_without_a_path_tracer_it_says_so_and_the_network_is_timed_all_the_same(
     ):
         with case(said):
             times = time_both(network, previews, [sample], missing=missing)
-            assert times.preview is None and times.missing == said
-            assert times.network_further_s == 6.0 and times.scenes == 1
+            assert times["preview"] is None and times["missing"] == said
+            assert times["network_further_s"] == 6.0 and times["scenes"] == 1
     with pytest.raises(TrilightError, match="resolution is 20"):
         time_both(Clocked(1.0, lacking="resolution is 20"), {}, [sample])
