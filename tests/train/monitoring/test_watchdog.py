@@ -306,8 +306,8 @@ def test_the_trace_holds_the_steps_and_the_note_says_how_to_open_it(tmp_path: Pa
     for step in range(11, 18):
         profiler.begin_step(step)
         torch.ones(3, 3) @ torch.ones(3, 3)
-        profiler.end_step(step)
-    profiler.close(17)
+        profiler.end_step()
+    profiler.close()
     trace, table = tmp_path / "profile-steps-14-to-15.json.gz", "profile-steps-14-to-15.txt"
     with gzip.open(trace) as stream:
         events = json.load(stream)["traceEvents"]
@@ -323,8 +323,8 @@ def test_what_was_not_reached_is_told(tmp_path: Path, asked: int, steps: int) ->
     profiler = StepProfiler(asked, CPU, tmp_path, told.append)
     for step in range(1, steps + 1):
         profiler.begin_step(step)
-        profiler.end_step(step)
-    profiler.close(steps)
+        profiler.end_step()
+    profiler.close()
     ended = "nothing was profiled: the run ended before step 4 of this call"
     assert told == ([ended] if asked else [])
     assert list(tmp_path.iterdir()) == []
