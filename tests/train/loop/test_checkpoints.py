@@ -34,7 +34,7 @@ from tests.extensions_kit import EXAMPLES, loaded, written
 from tests.for_each import for_each
 from tests.train.kit import ALONE, TINY_MODEL, flip_a_bit, stepper, tiny_run, toy_batch, trained
 from train.data.buckets import TrainingBatch
-from train.folder import RunFolder, read_rows
+from train.folder import RunFolder
 from train.loop import checkpoints, interrupts
 from train.loop.checkpoints import (
     UNSEALED,
@@ -46,7 +46,6 @@ from train.loop.checkpoints import (
 )
 from train.loop.distributed import DistributedContext, choose_device, join_processes
 from train.loop.interrupts import deferred_interrupts
-from train.loop.recorder import MetricsLog
 from train.loop.train_state import TrainState, new_state
 from train.progress import TrainProgress
 from train.resume import plan_resume
@@ -314,17 +313,6 @@ def test_nothing_may_be_missing_and_no_bit_may_flip(tmp_path: Path) -> None:
             read_checkpoint(path)
     path.write_bytes(data)
     assert load(path).step == 1
-
-
-def test_the_log_is_cut_back_to_the_checkpoint(tmp_path: Path) -> None:
-    path = tmp_path / "metrics.jsonl"
-    log = MetricsLog(path, first_step=0)
-    for step in (2, 4, 6):
-        log.append({"step": step, "loss": 1.0 / step})
-    with path.open("ab") as stream:
-        stream.write(b'{"step": 8, "lo\xff\xff')
-    MetricsLog(path, first_step=4)
-    assert [row["step"] for row in read_rows(path)] == [2, 4]
 
 
 def test_a_run_of_an_extension_is_resumed_with_the_same_one_only(tmp_path: Path) -> None:

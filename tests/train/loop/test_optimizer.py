@@ -173,16 +173,6 @@ def test_a_cosine_and_a_wsd_rate_rise_once_and_fall_at_the_end() -> None:
     assert learning_rate(500, settings) == found[99], "no restart after the end"
 
 
-@for_each("share", [0.0, 0.1, 0.2, 0.5])
-def test_a_longer_wsd_run_has_the_same_rates_until_the_decay(share: float) -> None:
-    short = tiny_run(schedule="wsd", num_steps=60, warmup_steps=7, decay_share=share)
-    begins = decay_start_step(short)
-    for steps in (61, 100, 1000):
-        longer = tiny_run(schedule="wsd", num_steps=steps, warmup_steps=7, decay_share=share)
-        assert rates(longer)[: begins or 60] == rates(short)[: begins or 60]
-    assert begins == (None if share == 0 else 60 - round(60 * share))
-
-
 def test_the_decay_waits_for_the_warm_up() -> None:
     whole = tiny_run(schedule="wsd", num_steps=60, warmup_steps=50, decay_share=1.0)
     assert decay_start_step(whole) == 50
