@@ -101,7 +101,9 @@ def flops(config: ModelConfig, workload: Workload) -> dict[str, int]:
 
 def _meta_batch(config: ModelConfig, workload: Workload) -> SceneBatch:
     """Return a scene on the meta device, with its traced inputs, as the network reads it."""
-    t, v, r = workload.triangles, workload.views, workload.resolution
+    t = workload.triangles
+    v = workload.views
+    r = workload.resolution
     stage = config.stage
     traced = albedo = None
     if isinstance(stage, BundleStage):

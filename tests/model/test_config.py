@@ -20,7 +20,7 @@ from model.config import SIZES, BaseWidths, ModelConfig, base, hits_smoke, smoke
 from model.costs import Workload, costs, flops
 from model.precision import rounded_parts, set_precision, tf32
 from model.renderformer import RenderFormer, count_parameters
-from model.scene_tensors import SceneBatch, batch_scenes, map_tensors, scene_tensors, tensors_of
+from model.scene_tensors import SceneBatch, batch_scenes, map_tensors, scene_tensors
 from model.width_scales import WidthScale, scale_start, width_scales
 from storage.errors import TrilightError
 from storage.records.environment import Environment
@@ -36,6 +36,7 @@ from tests.model.kit import (
     picture_and_gradients,
     random_scene,
     render,
+    tensors_of,
     tiny_config,
 )
 from tests.train.toy import toy_scene

@@ -261,7 +261,8 @@ class BackgroundWriter:
 
     def wait(self) -> None:
         """Wait until the submitted job has ended; raises its error."""
-        last, self._last = self._last, None
+        last = self._last
+        self._last = None
         if last is not None:
             last.result()
 

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from model.hits.radiosity import scene_light
 from model.hits.tracing import lit_scene_of
 from model.hits.view_inputs import Channel, view_inputs
-from model.scene_tensors import SceneTensors, scene_tensors, tensors_of
+from model.scene_tensors import SceneTensors, scene_tensors
 from storage.errors import TrilightError
 from storage.records.sample import StoredSample, encode_sample, stored_sample
 from storage.records.scene import Scene
 from storage.seeds import rng_for
 from tests.for_each import for_each
 from tests.model.hits.kit import corner, textured
-from tests.model.kit import hits_config, tiny_config
+from tests.model.kit import hits_config, tensors_of, tiny_config
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.sky_maps import constant, smooth
 from tests.train.kit import bare_scene

@@ -22,7 +22,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.demodulated import with_albedo
-from model.scene_tensors import tensors_of
 from storage.dataset.dataset import Dataset
 from storage.dataset.shard import write_shard
 from storage.dataset.shard_set import OpenShard, ShardSet
@@ -33,7 +32,7 @@ from storage.records.sample import Sample, decode_sample, encode_sample, sample_
 from storage.seeds import rng_for
 from tests.conftest import ROOT
 from tests.for_each import for_each
-from tests.model.kit import tiny_config
+from tests.model.kit import tensors_of, tiny_config
 from tests.train.kit import take
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.augment import augment_scene
