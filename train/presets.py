@@ -343,19 +343,21 @@ def scale_intervals(run: TrainSettings, steps: int, stated: Mapping[str, Any]) -
 
     Args:
         steps: the smaller number of steps.
-        stated: values by name that the user gave; these are kept.
+        stated: values by name that the user gave; these are intervals.
     """
     if not 0 < steps < run.num_steps:
         return {}
     # other values are refused, by name, when the settings are made
-    kept = {name: value for name in _INTERVALS if isinstance(value := stated.get(name), int)}
-    kept = {name: value for name, value in kept.items() if value > 0}
+    intervals = {name: value for name in _INTERVALS if isinstance(value := stated.get(name), int)}
+    intervals = {name: value for name, value in intervals.items() if value > 0}
 
     def shorter(name: str, unit: int) -> int:
         exact = getattr(run, name) * steps / run.num_steps
-        return int(kept.get(name, max(round(exact / unit), 1) * unit))
+        return int(intervals.get(name, max(round(exact / unit), 1) * unit))
 
-    on_rows = [kept[name] for name in ("validate_every", "checkpoint_every") if name in kept]
+    on_rows = [
+        intervals[name] for name in ("validate_every", "checkpoint_every") if name in intervals
+    ]
     row = math.gcd(shorter("log_every", 1), *on_rows)
     scaled_steps = {
         "warmup_steps": round(run.warmup_steps * steps / run.num_steps),
