@@ -343,7 +343,7 @@ def scale_intervals(run: TrainSettings, steps: int, stated: Mapping[str, Any]) -
 
     Args:
         steps: the smaller number of steps.
-        stated: values by name that the user gave; these are intervals.
+        stated: values by name that the user gave; these are kept.
     """
     if not 0 < steps < run.num_steps:
         return {}

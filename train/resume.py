@@ -143,11 +143,6 @@ def plan_resume(
     step = header["step"]
     before = from_record(TrainSettings, known_settings(header["settings"], "checkpoint"))
     old = _by_dotted_name(settings_record(before))
-
-    def differing(settings: TrainSettings) -> dict[str, Any]:
-        now = _by_dotted_name(settings_record(settings))
-        return {name: value for name, value in now.items() if value != old[name]}
-
     past_events = tuple(Event(**record) for record in header.get("history", ()))
     named_decisions = {name: value for name, value in decisions.items() if name != DATA}
     for name, value in named_decisions.items():
@@ -156,12 +151,10 @@ def plan_resume(
                 f"--change {name}: it is execution, which is free when a run goes on; expected "
                 f"--set {name}={_to_text(value)}."
             )
-    typed_otherwise = differing(typed)
-    execution_changes = {
-        name: typed_otherwise[name] for name in typed_otherwise if name in _EXECUTION
-    }
+    typed_otherwise = _differing(old, typed)
+    execution_changes = {n: value for n, value in typed_otherwise.items() if n in _EXECUTION}
     settings = apply_overrides(before, execution_changes | named_decisions)
-    new_values = differing(settings)
+    new_values = _differing(old, settings)
     stated = _original_values(past_events)
     stored_names = _by_dotted_name(header["settings"])
     events = list[Event]()
@@ -193,6 +186,12 @@ def plan_resume(
 def event_records(events: Sequence[Event]) -> list[dict[str, Any]]:
     """Return events as the JSON records of checkpoints, settings.json and summary.json."""
     return [dataclasses.asdict(event) for event in events]
+
+
+def _differing(old: Mapping[str, Any], settings: TrainSettings) -> dict[str, Any]:
+    """Return the values that are not the old ones, by dotted name."""
+    now = _by_dotted_name(settings_record(settings))
+    return {name: value for name, value in now.items() if value != old[name]}
 
 
 def _original_values(past: Sequence[Event]) -> dict[str, list[Any]]:
