@@ -197,6 +197,15 @@ class ModelConfig:
         """Width of a ray bundle or window in pixels, of which pictures are a multiple."""
         return self.patch_px * max(1, self.window_bundles)
 
+    def require_resolution(self, resolution: int) -> None:
+        """Raise TrilightError unless pictures of this width can be made."""
+        step = self.picture_px
+        if resolution < step or resolution % step:
+            raise TrilightError(
+                f"resolution is {resolution}; expected a positive multiple of {step}, as "
+                "this network's ray bundles and windows need."
+            )
+
 
 def smoke() -> ModelConfig:
     """Return the size that two CPU cores train in minutes (128 wide, linear head)."""

@@ -192,7 +192,7 @@ def test_radiance_undoes_the_logarithm_and_bounds_the_dark() -> None:
 def test_a_resolution_that_bundles_or_windows_do_not_fill_is_refused(
     family: str, resolution: int, multiple: int
 ) -> None:
-    message = f"resolution {resolution}: expected a multiple of {multiple}"
+    message = f"resolution is {resolution}; expected a positive multiple of {multiple}"
     with pytest.raises(TrilightError, match=message):
         render(model_for(family), random_scene(2), resolution=resolution)
 
