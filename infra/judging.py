@@ -5,7 +5,7 @@ import copy
 import dataclasses
 import itertools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,6 @@ from storage.typed_json import read_json
 from train.evaluation.chart import plot_excursions
 from train.evaluation.equal_time import (
     TIMED_SCENES,
-    EqualTimeResult,
     Filter,
     Level,
     equal_time,
@@ -132,7 +131,7 @@ def judge_network(
 
 
 def _beside_tracer(
-    contest: EvalConfig, views: Sequence[JudgedView], times: EqualTimeResult
+    contest: EvalConfig, views: Sequence[JudgedView], times: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return the comparison with the path tracer as JSON values."""
     every, first = spread_views(contest.tracer_views, contest.num_scenes)
@@ -142,7 +141,7 @@ def _beside_tracer(
 
 def _time_tracer(
     contest: EvalConfig, stack: contextlib.ExitStack
-) -> tuple[EqualTimeResult, Renderer | None]:
+) -> tuple[dict[str, Any], Renderer | None]:
     """Time the network and the path tracer; return the latter, too, if it can trace the scenes."""
     network = NetworkRenderer(
         name=NETWORK,
@@ -167,8 +166,8 @@ def _time_tracer(
         times = time_both(network, previews, samples, missing=missing, note=note)
     finally:
         torch.set_num_threads(threads)
-    chosen = times.preview
-    return times, previews[chosen.samples, chosen.denoiser] if chosen else None
+    chosen = times["preview"]
+    return times, previews[chosen["samples"], chosen["denoiser"]] if chosen else None
 
 
 def _previews(

@@ -209,7 +209,7 @@ def _add_renderers(board: Board, checkpoints: Sequence[str], child: RenderChild)
         fitting = {}
         for name, network in networks.items():
             try:
-                network.require_resolution(px)
+                network.config.require_resolution(px)
                 fitting[name] = network
             except TrilightError as error:
                 why = str(error).rstrip(".")

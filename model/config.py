@@ -160,29 +160,25 @@ class ModelConfig:
             _wrong(f"patch_px {self.patch_px} with a dpt head", "8, which its grids multiply up to")
 
     def _check_hits(self) -> None:
-        required = {"hit_anchors": self.hit_anchors, "pixel_width": self.pixel_width}
-        if self.view_stage == "hits":
-            for name, value in {"hit_rays": self.hit_rays, **required}.items():
-                if value < 1:
-                    _wrong(f"{name} {value} with view_stage hits", "1 or more")
-            if self.hit_anchors % HITS_PX:
-                _wrong(f"hit_anchors {self.hit_anchors}", f"a multiple of {HITS_PX}")
-            if self.head != "linear" or self.window_bundles or self.patch_px != HITS_PX:
-                _wrong(
-                    f"view_stage hits with head {self.head}, window_bundles {self.window_bundles} "
-                    f"and patch_px {self.patch_px}",
-                    f"linear, 0 and {HITS_PX}",
-                )
-            if self.demodulated:
-                _wrong("demodulated with view_stage hits", "false")
-        elif any([*required.values(), self.gather_rays, self.filter_width, not self.scene_tokens]):
-            _wrong("fields of hits beside view_stage bundles", "0, and scene_tokens true")
-        elif self.sky_rays or self.denoise_from_px:
-            got = f"sky_rays {self.sky_rays} and denoise_from_px {self.denoise_from_px}"
-            _wrong(f"{got} with view_stage bundles", "0")
-        elif self.demodulated != (self.hit_rays > 0):
-            expected = "1 or more" if self.demodulated else "0, or demodulated true"
-            _wrong(f"hit_rays {self.hit_rays} with view_stage bundles", expected)
+        if self.view_stage == "bundles":
+            of_hits = {"scene_tokens", *(each.name for each in fields(HitStage))} - {"hit_rays"}
+            for each in fields(self):
+                value = getattr(self, each.name)
+                if each.name in of_hits and value != each.default:
+                    _wrong(f"{each.name} {value} with view_stage bundles", f"{each.default}")
+            if self.demodulated != (self.hit_rays > 0):
+                expected = "1 or more" if self.demodulated else "0, or demodulated true"
+                _wrong(f"hit_rays {self.hit_rays} with view_stage bundles", expected)
+            return
+        for name in ("hit_rays", "hit_anchors", "pixel_width"):
+            if getattr(self, name) < 1:
+                _wrong(f"{name} {getattr(self, name)} with view_stage hits", "1 or more")
+        if self.hit_anchors % HITS_PX:
+            _wrong(f"hit_anchors {self.hit_anchors}", f"a multiple of {HITS_PX}")
+        fixed = {"head": "linear", "window_bundles": 0, "patch_px": HITS_PX, "demodulated": False}
+        for name, value in fixed.items():
+            if getattr(self, name) != value:
+                _wrong(f"{name} {getattr(self, name)} with view_stage hits", f"{value}")
 
     @property
     def stage(self) -> BundleStage | HitStage:
@@ -200,6 +196,15 @@ class ModelConfig:
     def picture_px(self) -> int:
         """Width of a ray bundle or window in pixels, of which pictures are a multiple."""
         return self.patch_px * max(1, self.window_bundles)
+
+    def require_resolution(self, resolution: int) -> None:
+        """Raise TrilightError unless pictures of this width can be made."""
+        step = self.picture_px
+        if resolution < step or resolution % step:
+            raise TrilightError(
+                f"resolution is {resolution}; expected a positive multiple of {step}, as "
+                "this network's ray bundles and windows need."
+            )
 
 
 def smoke() -> ModelConfig:

@@ -24,7 +24,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from model.config import HitStage, hit_stage
+from model.config import HitStage, ModelConfig, hit_stage
 from model.hits.traced import Traced, denoise_traced
 from model.open import find_network
 from model.positions import EncodedScene
@@ -178,7 +178,8 @@ class NeuralRenderer:
             trained: what it was trained on, if that is known.
         """
         self._model = model.eval()
-        self._trained = trained or TrainedRange()
+        self.trained = trained or TrainedRange()
+        """Ranges that the network was trained on, as far as they are known."""
 
     @classmethod
     def load(
@@ -203,9 +204,9 @@ class NeuralRenderer:
         return cls(set_precision(network.open().to(place), precision), network.trained)
 
     @property
-    def trained(self) -> TrainedRange:
-        """Ranges that the network was trained on, as far as they are known."""
-        return self._trained
+    def config(self) -> ModelConfig:
+        """Configuration of the network."""
+        return self._model.config
 
     @property
     def device(self) -> torch.device:
@@ -240,7 +241,7 @@ class NeuralRenderer:
                 "resolution is None, and the network does not say what it was trained at; expected "
                 "a number of pixels."
             )
-        self.require_resolution(resolution)
+        self.config.require_resolution(resolution)
         prepared = self.prepare(scene)
         for note in (*prepared.notes, *self.resolution_notes(resolution)):
             warnings.warn(note, stacklevel=2)
@@ -267,10 +268,10 @@ class NeuralRenderer:
         below_sky = scene
         sky = scene.environment
         if sky is not None:  # its light alone, or nothing where it is not known
-            knows_sky = self._model.config.sky_rays
+            knows_sky = self.config.sky_rays
             sky = dataclasses.replace(sky, is_seen=False) if knows_sky else None
             scene = dataclasses.replace(scene, environment=sky)
-        by_hits = isinstance(self._model.config.stage, HitStage)
+        by_hits = isinstance(self.config.stage, HitStage)
         all_lights = [LightGroup(scene=scene, fraction=1.0)]
         groups = [
             (_encode(self._model, group.scene, self.device), group.fraction)
@@ -296,12 +297,12 @@ class NeuralRenderer:
         Raises:
             TrilightError: the resolution is none for this network.
         """
-        self.require_resolution(resolution)
+        self.config.require_resolution(resolution)
         c2w_44 = torch.as_tensor(np.asarray(c2w, np.float32), device=self.device)
         angle = torch.tensor(fov_deg, dtype=torch.float32, device=self.device)
         views = prepared.views
         if resolution not in views:
-            if isinstance(self._model.config.stage, HitStage):
+            if isinstance(self.config.stage, HitStage):
                 ((encoded, _),) = prepared.groups
                 views[resolution] = _TracedView(self._model, encoded, resolution)
             else:
@@ -311,19 +312,10 @@ class NeuralRenderer:
         picture: NDArray[np.float32] = views[resolution](c2w_44, angle).cpu().numpy()
         return picture
 
-    def require_resolution(self, resolution: int) -> None:
-        """Raise TrilightError unless pictures of this width can be made."""
-        step = self._model.config.picture_px
-        if resolution < step or resolution % step:
-            raise TrilightError(
-                f"resolution is {resolution}; expected a positive multiple of {step}, as "
-                "this network's ray bundles and windows need."
-            )
-
     def resolution_notes(self, resolution: int) -> tuple[str, ...]:
         """Return sentences on what pictures of this width by this network lack."""
         trained = self.trained.resolution
-        by_pixel = isinstance(self._model.config.stage, HitStage)
+        by_pixel = isinstance(self.config.stage, HitStage)
         if trained is None or resolution == trained or by_pixel:
             return ()
         return (
@@ -333,7 +325,7 @@ class NeuralRenderer:
 
     def _notes(self, scene: Scene, num_groups: int) -> tuple[str, ...]:
         notes = []
-        knows_sky = self._model.config.sky_rays
+        knows_sky = self.config.sky_rays
         if scene.environment is not None and not knows_sky:
             notes.append(
                 "the scene has an environment, whose light this network does not know: it is "
@@ -346,11 +338,11 @@ class NeuralRenderer:
                 f"the {int(scene.triangle_emits.sum())} emitting triangles are rendered in "
                 f"{num_groups} groups, whose pictures are added"
             )
-        if unread := unread_columns(scene.materials, self._model.config.material_columns):
+        if unread := unread_columns(scene.materials, self.config.material_columns):
             notes.append(
                 f"the network does not read {', '.join(unread)}, which materials of the scene have"
             )
-        most = self._trained.max_triangles
+        most = self.trained.max_triangles
         if most is not None and scene.num_triangles > most:
             notes.append(
                 f"{scene.num_triangles} triangles, and the network was trained on at most {most}: "
@@ -361,7 +353,7 @@ class NeuralRenderer:
 
     def _require_memory(self, num_triangles: int) -> None:
         """Refuse a scene of which one layer's tokens alone exceed the free memory."""
-        config = self._model.config
+        config = self.config
         least = num_triangles * (2 * config.hidden_width + 2 * config.width) * _FLOAT_BYTES
         on_card = self.device.type == "cuda"
         free = int(torch.cuda.mem_get_info(self.device)[0]) if on_card else free_memory()

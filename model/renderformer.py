@@ -39,7 +39,6 @@ from model.positions import (
 from model.precision import tf32, without_autocast
 from model.scene_tensors import Cameras, SceneBatch, in_light_units, require_known_sky
 from model.view_decoder import ViewDecoder
-from storage.errors import TrilightError
 from storage.records.material import material_width
 
 SIDE_LIGHTS = 12
@@ -165,7 +164,7 @@ class RenderFormer(nn.Module):
         albedo_BVRR6 = batch.albedo_BVRR6
         if isinstance(stage, BundleStage) and albedo_BVRR6 is None:
             return self.decode(self.encode(batch), batch, resolution)
-        self._require_resolution(resolution)
+        self.config.require_resolution(resolution)
         if isinstance(stage, BundleStage):
             return self._bundles(self._encode_scenes(batch), batch, resolution, albedo_BVRR6)
         scenes: tuple[TracedScene, ...] = ()
@@ -240,7 +239,7 @@ class RenderFormer(nn.Module):
         Raises:
             TrilightError: the resolution is no such multiple.
         """
-        self._require_resolution(resolution)
+        self.config.require_resolution(resolution)
         stage = self.config.stage
         if isinstance(stage, HitStage):
             traced = self.trace(scene, cameras, resolution)
@@ -274,15 +273,6 @@ class RenderFormer(nn.Module):
         if not self.config.demodulated or albedo_BVRR6 is None:
             return picture_BVRRC
         return compose_radiance(picture_BVRRC, albedo_BVRR6)
-
-    def _require_resolution(self, resolution: int) -> None:
-        picture_px = self.config.picture_px
-        if resolution < picture_px or resolution % picture_px:
-            unit = "a window of ray bundles" if self.config.window_bundles else "a ray bundle"
-            raise TrilightError(
-                f"resolution {resolution}: expected a multiple of {picture_px}, the width of "
-                f"{unit}. Choose the next one."
-            )
 
     def recompute_activations(self, enabled: bool) -> None:
         """Set whether activations are recomputed in the backward pass; by default they are kept."""

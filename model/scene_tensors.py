@@ -160,11 +160,6 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
     )
 
 
-def tensors_of(scenes: SceneTensors | SceneBatch) -> dict[str, Tensor]:
-    """Return the tensor fields by name."""
-    return {name: value for name, value in vars(scenes).items() if isinstance(value, Tensor)}
-
-
 def map_tensors(scenes: Mapped, convert: Callable[[Tensor], Tensor]) -> Mapped:
     """Return the same scenes, or what holds them, with each tensor converted, as to a device."""
     fields = {

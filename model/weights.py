@@ -213,30 +213,16 @@ def require_tensors(got: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -
         raise TrilightError(f"weights: {'; '.join(wrong[:5])}{more}.")
 
 
-_OMITTED_AT_DEFAULT = (
-    "material_columns",
-    "view_stage",
-    "hit_rays",
-    "hit_anchors",
-    "gather_rays",
-    "pixel_width",
-    "filter_width",
-    "scene_tokens",
-    "demodulated",
-    "sky_rays",
-    "denoise_from_px",
-)
-
-
 def encode_config(config: ModelConfig) -> str:
     """Return the JSON of a configuration.
 
-    Later settings are omitted at their defaults, so that bytes and digests of older networks stay
-    unchanged.
+    Settings after the first ones are omitted at their defaults, so that bytes and digests of older
+    networks stay unchanged.
     """
     fields = dataclasses.asdict(config)
-    for each in dataclasses.fields(config):
-        if each.name in _OMITTED_AT_DEFAULT and fields[each.name] == each.default:
+    later = list(fields).index("view_stage")
+    for each in dataclasses.fields(config)[later:]:
+        if fields[each.name] == each.default:
             del fields[each.name]
     return json.dumps(fields, sort_keys=True)
 

@@ -347,22 +347,16 @@ def scale_intervals(run: TrainSettings, steps: int, stated: Mapping[str, Any]) -
     """
     if not 0 < steps < run.num_steps:
         return {}
-    stated_intervals = {name: stated[name] for name in _INTERVALS if name in stated}
     # other values are refused, by name, when the settings are made
-    valid_intervals = {
-        name: value
-        for name, value in stated_intervals.items()
-        if isinstance(value, int) and value > 0
-    }
+    intervals = {name: value for name in _INTERVALS if isinstance(value := stated.get(name), int)}
+    intervals = {name: value for name, value in intervals.items() if value > 0}
 
     def shorter(name: str, unit: int) -> int:
         exact = getattr(run, name) * steps / run.num_steps
-        return int(valid_intervals.get(name, max(round(exact / unit), 1) * unit))
+        return int(intervals.get(name, max(round(exact / unit), 1) * unit))
 
     on_rows = [
-        valid_intervals[name]
-        for name in ("validate_every", "checkpoint_every")
-        if name in valid_intervals
+        intervals[name] for name in ("validate_every", "checkpoint_every") if name in intervals
     ]
     row = math.gcd(shorter("log_every", 1), *on_rows)
     scaled_steps = {

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from storage.errors import TrilightError
 from storage.settings.described import from_record, settings_record
 from storage.settings.fields import describe_fields
-from storage.settings.overrides import apply_overrides, differences
+from storage.settings.overrides import apply_overrides
 from train.settings import TrainSettings, decay_start_step, known_settings
 
 DATA = "data"
@@ -142,7 +142,7 @@ def plan_resume(
     """
     step = header["step"]
     before = from_record(TrainSettings, known_settings(header["settings"], "checkpoint"))
-    old_record = settings_record(before)
+    old = _by_dotted_name(settings_record(before))
     past_events = tuple(Event(**record) for record in header.get("history", ()))
     named_decisions = {name: value for name, value in decisions.items() if name != DATA}
     for name, value in named_decisions.items():
@@ -151,29 +151,28 @@ def plan_resume(
                 f"--change {name}: it is execution, which is free when a run goes on; expected "
                 f"--set {name}={_to_text(value)}."
             )
-    typed_otherwise = differences(old_record, settings_record(typed))
-    execution_changes = {
-        name: typed_otherwise[name] for name in typed_otherwise if name in _EXECUTION
-    }
+    typed_otherwise = _differing(old, typed)
+    execution_changes = {n: value for n, value in typed_otherwise.items() if n in _EXECUTION}
     settings = apply_overrides(before, execution_changes | named_decisions)
-    new_values = differences(old_record, settings_record(settings))
+    new_values = _differing(old, settings)
     stated = _original_values(past_events)
+    stored_names = _by_dotted_name(header["settings"])
     events = list[Event]()
     undecided = dict[str, Any]()
     for name, value in typed_otherwise.items():
         if name in new_values or value in stated.get(name, ()):
             continue
-        if _lacks(header["settings"], name):
-            stored = _value_at(old_record, name)
-            events.append(Event(step=step, kind="earlier", name=name, before=value, after=stored))
-        else:
+        if name in stored_names:
             undecided[name] = value
+        else:
+            events.append(
+                Event(step=step, kind="earlier", name=name, before=value, after=old[name])
+            )
     if undecided:
-        raise _undecided_error(old_record, undecided)
+        raise _undecided_error(old, undecided)
     for name, value in new_values.items():
         kind: Literal["execution", "meaning"] = "execution" if name in _EXECUTION else "meaning"
-        old = _value_at(old_record, name)
-        events.append(Event(step=step, kind=kind, name=name, before=old, after=value))
+        events.append(Event(step=step, kind=kind, name=name, before=old[name], after=value))
     events += _data_event(header, data_digest, decisions.get(DATA))
     _require_possible(before, settings, step, events)
     return ResumePlan(
@@ -187,6 +186,12 @@ def plan_resume(
 def event_records(events: Sequence[Event]) -> list[dict[str, Any]]:
     """Return events as the JSON records of checkpoints, settings.json and summary.json."""
     return [dataclasses.asdict(event) for event in events]
+
+
+def _differing(old: Mapping[str, Any], settings: TrainSettings) -> dict[str, Any]:
+    """Return the values that are not the old ones, by dotted name."""
+    now = _by_dotted_name(settings_record(settings))
+    return {name: value for name, value in now.items() if value != old[name]}
 
 
 def _original_values(past: Sequence[Event]) -> dict[str, list[Any]]:
@@ -221,11 +226,10 @@ def _data_event(header: Mapping[str, Any], digest: str, decided: Any) -> Iterato
 def _undecided_error(old: Mapping[str, Any], wrong: Mapping[str, Any]) -> TrilightError:
     """Return the error that lists settings that differ without a decision."""
     said = ", and ".join(
-        f"{name} is {_to_text(value)}, but the checkpoint was made with "
-        f"{_to_text(_value_at(old, name))}"
+        f"{name} is {_to_text(value)}, but the checkpoint was made with {_to_text(old[name])}"
         for name, value in wrong.items()
     )
-    back = " ".join(f"--set {name}={_to_text(_value_at(old, name))}" for name in wrong)
+    back = " ".join(f"--set {name}={_to_text(old[name])}" for name in wrong)
     if "num_steps" in wrong:
         back += " (and no --steps)"
     if fixed := [name for name in wrong if name.split(".")[0] in _FIXED]:
@@ -304,17 +308,10 @@ def _short_digest(digest: str) -> str:
     return f"{kind}:{digits[:12]}"
 
 
-def _value_at(record: Mapping[str, Any], name: str) -> Any:
-    """Return the value at a dotted name."""
-    value: Any = record
-    for part in name.split("."):
-        value = value[part]
-    return value
-
-
-def _lacks(record: Mapping[str, Any], name: str) -> bool:
-    try:
-        _value_at(record, name)
-    except (KeyError, TypeError):
-        return True
-    return False
+def _by_dotted_name(record: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the values of a record and of its groups."""
+    flat: dict[str, Any] = {}
+    for name, value in record.items():
+        is_group = isinstance(value, Mapping)
+        flat |= _by_dotted_name(value, f"{prefix}{name}.") if is_group else {prefix + name: value}
+    return flat

@@ -18,8 +18,8 @@ from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_mixture
 from storage.errors import TrilightError
 from train.data.bad_samples import BadSampleCounter, first_samples
-from train.data.buckets import decodes_on_device, step_scenes
-from train.data.loader import LoaderSettings, choose_workers, detect_machine, load_batches
+from train.data.buckets import step_scenes
+from train.data.loader import LoaderSettings, choose_workers, load_batches
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.metrics import Lead
 from train.evaluation.sheet import draw_validation_sheet, write_picture
@@ -29,7 +29,7 @@ from train.initial_state import init_or_resume_state, plan_start
 from train.loop.distributed import DistributedContext
 from train.loop.recorder import Recorder, require_wandb
 from train.loop.train_state import TrainState
-from train.loop.trainer import Trainer, scene_flops
+from train.loop.trainer import Trainer
 from train.loss.lpips import load_lpips
 from train.loss.training_loss import TrainingLoss
 from train.progress import TrainProgress
@@ -191,10 +191,9 @@ def _train(
     for note in (*dataset.notes, *(() if VALIDATION in dataset.splits else (UNJUDGED,))):
         early_notes.note(note)
     if workers is None:
-        machine = detect_machine()
-        threads = torch.get_num_threads()
         on_gpu = dist_context.device.type == "cuda"
-        workers, reason = choose_workers(machine, settings, on_gpu=on_gpu, busy_threads=threads)
+        threads = torch.get_num_threads()
+        workers, reason = choose_workers(settings, on_gpu=on_gpu, busy_threads=threads)
         early_notes.note(reason)
     plan = plan_start(settings, folder, dataset.digest, start, dist_context, early_notes)
     settings = plan.settings
@@ -222,9 +221,8 @@ def _train(
         watched=watched,
     )
     with closing(_batches(dataset, settings, state, dist_context, workers)) as batches:
-        cost = partial(scene_flops, settings)
         most = settings.scenes_per_pass
-        with closing(step_scenes(batches, cost, most, dist_context.device)) as steps:
+        with closing(step_scenes(batches, trainer.scene_flops, most, dist_context.device)) as steps:
             trainer.train(steps)
     if recorder is None:
         return None
@@ -240,9 +238,9 @@ def _batches(
     workers: int,
 ) -> Generator[list[TrainingScene], None, None]:
     """Return the scenes of this process for each step, beginning with the state's step."""
-    stream = dataclasses.replace(
-        loader_settings(settings), lookup_in_threads=not decodes_on_device(dist_context.device)
-    )
+    # on a GPU targets are looked up there, which saves work of decoding threads
+    in_threads = dist_context.device.type != "cuda"
+    stream = dataclasses.replace(loader_settings(settings), lookup_in_threads=in_threads)
     return load_batches(
         data.split("train"),
         stream,

@@ -88,7 +88,7 @@ class NetworkRenderer(RendererHere):
         if self.threads is not None:
             torch.set_num_threads(self.threads)
         network = self.opened or NeuralRenderer.load(self.checkpoint, precision=self.precision)
-        network.require_resolution(self.resolution)
+        network.config.require_resolution(self.resolution)
         return network
 
     @property

@@ -12,8 +12,7 @@ scales with the lamps exactly. There are no pixels from elsewhere in it, so any 
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from typing import Any, cast
 
 import torch
@@ -23,7 +22,7 @@ from torch.nn.functional import normalize, silu, softplus
 from model.attention import Keys, Packing, attend
 from model.config import HitStage, ModelConfig, hit_stage
 from model.hits.anchors import DEVICE_BLOCK
-from model.hits.light_filter import LightFilter, filter_flops
+from model.hits.light_filter import LightFilter
 from model.hits.traced import INPUTS, Traced
 from model.hits.view_inputs import Channel
 from model.layers import (
@@ -61,49 +60,6 @@ _NEAREST_M = 1e-3
 """Added to distances, so that a pixel that meets nothing divides by more than 0."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class AnchorOffset:
-    """Offsets of pixels to nine anchors, as fractions of the pixels' distance to the camera."""
-
-    unlike: tuple[Tensor, Tensor, Tensor]
-    """[M, P, 9] distance to the anchor, its distance to the pixel's plane, change of normal."""
-    anchors_M93: Tensor
-    """Positions of the anchors relative to the central one, meters."""
-    pixels_MP3: Tensor
-    """Positions of the pixels relative to the central anchor, meters."""
-    distance_MP1: Tensor
-
-    def mixture_offset(self, share_MP9: Tensor) -> Tensor:
-        """Return the offset of each pixel to its mixture of anchors, [M, P, 6]."""
-        unlike = [(share_MP9 * each).sum(dim=-1) for each in self.unlike]
-        offset = (share_MP9 @ self.anchors_M93 - self.pixels_MP3) / self.distance_MP1
-        return torch.cat([torch.stack(unlike, dim=-1), 4 * offset], dim=-1)
-
-
-def offsets_to_anchors(pixels_MPC: Tensor, anchors_M9C: Tensor) -> AnchorOffset:
-    """Return offsets to the anchors around; products of matrices, without [M, P, 9, 3]."""
-    center = anchors_M9C[:, NEIGHBOURS // 2, None, Channel.POSITION]
-    pixels_MP3 = pixels_MPC[..., Channel.POSITION] - center
-    anchors_M93 = anchors_M9C[..., Channel.POSITION] - center
-    distance_MP1 = pixels_MPC[..., Channel.DISTANCE] + _NEAREST_M
-    normal = normalize(pixels_MPC[..., Channel.NORMAL], dim=-1)
-    other = normalize(anchors_M9C[..., Channel.NORMAL], dim=-1)
-    squares = pixels_MP3.square().sum(dim=-1, keepdim=True)
-    squares = squares + anchors_M93.square().sum(dim=-1)[:, None]
-    separation = (squares - 2 * pixels_MP3 @ anchors_M93.mT).clamp(min=0).sqrt()
-    above = normal @ anchors_M93.mT - (normal * pixels_MP3).sum(dim=-1, keepdim=True)
-    return AnchorOffset(
-        unlike=(
-            (8 * separation / distance_MP1).clamp(max=FARTHEST),
-            (30 * above.abs() / distance_MP1).clamp(max=FARTHEST),
-            2 - 2 * normal @ other.mT,
-        ),
-        anchors_M93=anchors_M93,
-        pixels_MP3=pixels_MP3,
-        distance_MP1=distance_MP1,
-    )
-
-
 _SURFACE = 3 + 3 + 3 + 1 + 3 + 3 + 1 + 1 + 1 + 4
 """Number of features of the surfaces that a pixel and its mirrored ray see (`_surface`)."""
 
@@ -127,25 +83,6 @@ _GAINED = 3
 
 BLOCK_PIXELS = 2**12
 """Pixels that are computed at a time while rendering."""
-
-
-def view_flops(config: ModelConfig, tokens: int, resolution: int) -> dict[str, int]:
-    """Return the FLOPs of the parts of this stage for one view of a scene of so many tokens."""
-    d = config.width
-    stage = hit_stage(config)
-    p = stage.pixel_width
-    a = math.gcd(stage.hit_anchors, resolution) ** 2
-    asks = 4 * a * d * d + 4 * a * tokens * d if config.scene_tokens else 0
-    pixel = PIXEL_DIM * p + p * p + NEIGHBOURS * (2 * p + 3) + OFFSET_DIM * p + NEIGHBOURS * 4 * 3
-    pixel += (2 * p + 3) * 2 * p + 2 * p * p + p * 3 * (_GAINED + 2)
-    width = stage.filter_width
-    return {
-        "filter": filter_flops(PIXEL_DIM, width, resolution**2) if width else 0,
-        "anchors": 2 * a * ((PIXEL_DIM + 3) * d + d * d),
-        "cross-attention": config.decoder_layers * asks,
-        "view feed-forward": config.decoder_layers * 6 * a * d * config.hidden_width,
-        "head": 4 * a * d * p + 2 * resolution**2 * pixel,
-    }
 
 
 class AnchorLayer(nn.Module):
@@ -208,23 +145,42 @@ class PixelHead(nn.Module):
     def forward(
         self,
         features_MPF: Tensor,
+        pixels_MPC: Tensor,
         key_M9W: Tensor,
         value_M9W: Tensor,
-        offsets: AnchorOffset,
-        window_MP9: Tensor,
         gathered_M93: Tensor,
+        anchors_M9C: Tensor,
+        window_MP9: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Return the learned numbers [M, P, 15], and gathered light mixed for the pixels [M, P, 3].
 
         M parts of the picture have P pixels and nine anchors each; F numbers a pixel. `window` is
-        added to how much alike they are.
+        added to how much alike they are. Offsets are fractions of a pixel's distance to the camera.
         """
+        center = anchors_M9C[:, NEIGHBOURS // 2, None, Channel.POSITION]
+        pixels_MP3 = pixels_MPC[..., Channel.POSITION] - center
+        anchors_M93 = anchors_M9C[..., Channel.POSITION] - center
+        distance_MP1 = pixels_MPC[..., Channel.DISTANCE] + _NEAREST_M
+        normal = normalize(pixels_MPC[..., Channel.NORMAL], dim=-1)
+        other = normalize(anchors_M9C[..., Channel.NORMAL], dim=-1)
+        # products of matrices, without [M, P, 9, 3]
+        squares = pixels_MP3.square().sum(dim=-1, keepdim=True)
+        squares = squares + anchors_M93.square().sum(dim=-1)[:, None]
+        separation = (squares - 2 * pixels_MP3 @ anchors_M93.mT).clamp(min=0).sqrt()
+        above = normal @ anchors_M93.mT - (normal * pixels_MP3).sum(dim=-1, keepdim=True)
+        differences = (
+            (8 * separation / distance_MP1).clamp(max=FARTHEST),
+            (30 * above.abs() / distance_MP1).clamp(max=FARTHEST),
+            2 - 2 * normal @ other.mT,
+        )
         pixel_MPW = silu(self.told(features_MPF))
         alike_MP9 = self.query(pixel_MPW) @ key_M9W.mT / math.sqrt(key_M9W.shape[-1])
-        for weight, unlike_MP9 in zip(softplus(self.nearness), offsets.unlike, strict=True):
+        for weight, unlike_MP9 in zip(softplus(self.nearness), differences, strict=True):
             alike_MP9 = alike_MP9 - weight * unlike_MP9
         share_MP9 = (alike_MP9 + window_MP9).softmax(dim=-1)
-        known_MPW = share_MP9 @ value_M9W + self.place(offsets.mixture_offset(share_MP9))
+        unlike = torch.stack([(share_MP9 * each).sum(dim=-1) for each in differences], dim=-1)
+        offset = (share_MP9 @ anchors_M93 - pixels_MP3) / distance_MP1
+        known_MPW = share_MP9 @ value_M9W + self.place(torch.cat([unlike, 4 * offset], dim=-1))
         gathered_MP3 = share_MP9 @ gathered_M93
         both = torch.cat([pixel_MPW, known_MPW, torch.log1p(4 * gathered_MP3)], dim=-1)
         return self.last(silu(self.second(silu(self.first(both))))), gathered_MP3
@@ -269,11 +225,9 @@ class HitDecoder(nn.Module):
         with without_autocast(traced.pixels_VRRC.device):
             unit_B1113 = traced.unit_3[:, None, None, None, :]
             features, mirrored = self._pixel_features(traced, unit_B1113)
-            at = _at_anchors(traced)
-            anchor = torch.cat(
-                [at(features), torch.log1p(4 * traced.gathered_VA3 / unit_B1113[..., 0, :])], dim=-1
-            )
-            place = at(traced.pixels_VRRC)
+            light_BVA3 = torch.log1p(4 * traced.gathered_VA3 / unit_B1113[..., 0, :])
+            anchor = torch.cat([_at_anchors(features, traced.anchor_VA), light_BVA3], dim=-1)
+            place = _at_anchors(traced.pixels_VRRC, traced.anchor_VA)
         x_BVAW = self._read_scene(scene, traced, anchor, place[..., Channel.POSITION])
         device = traced.pixels_VRRC.device
         trains = torch.is_grad_enabled() and torch.is_autocast_enabled("cuda")
@@ -377,11 +331,10 @@ class HitDecoder(nn.Module):
         place_M9C: Tensor,
     ) -> Tensor:
         """Return the radiance [M, P, 3] of some parts of pictures."""
-        offsets = offsets_to_anchors(pixels_MPC, place_M9C)
         nothing_M19 = torch.where(place_M9C[..., 0] > 0, 0.0, -2 * FARTHEST)[:, None]
         window_MP9 = nothing_M19 + _log_window(round(pixels_MPC.shape[1] ** 0.5), unit_M13.device)
         learned, mixed = self.head(
-            features_MPF, key_M9W, value_M9W, offsets, window_MP9, gathered_M93
+            features_MPF, pixels_MPC, key_M9W, value_M9W, gathered_M93, place_M9C, window_MP9
         )
         return _compose_radiance(learned, mixed, mirrored_MP3, pixels_MPC, unit_M13)
 
@@ -426,14 +379,10 @@ def _surface(pixels: Tensor) -> Tensor:
     return torch.cat(surface, dim=-1)
 
 
-def _at_anchors(traced: Traced) -> Callable[[Tensor], Tensor]:
-    """Return a function that takes [B, V, R, R, K] and returns [B, V, A, K] at the anchors."""
-
-    def at(values: Tensor) -> Tensor:
-        index = traced.anchor_VA[..., None].expand(-1, -1, -1, values.shape[-1])
-        return values.flatten(2, 3).gather(2, index)
-
-    return at
+def _at_anchors(values: Tensor, anchor_VA: Tensor) -> Tensor:
+    """[B, V, R, R, K] -> [B, V, A, K]: the values at the anchors."""
+    index = anchor_VA[..., None].expand(-1, -1, -1, values.shape[-1])
+    return values.flatten(2, 3).gather(2, index)
 
 
 def _in_parts(values_VRRK: Tensor, side: int) -> Tensor:

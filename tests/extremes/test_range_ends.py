@@ -23,7 +23,7 @@ from model.layers import LAYER_NORM_EPS, Norm
 from model.open import BUILTIN_TOKENS, open_network
 from model.positions import TriangleRotary
 from model.renderformer import RenderFormer
-from model.scene_tensors import MAX_NETWORK_M, SceneBatch, batch_scenes, scene_tensors, tensors_of
+from model.scene_tensors import MAX_NETWORK_M, SceneBatch, batch_scenes, scene_tensors
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import MAX_SPP, RenderSettings
@@ -47,7 +47,14 @@ from tests.extremes.test_ranges import FIELDS, SMOKE, End
 from tests.extremes.test_renders import FLOOR, LAMP
 from tests.extremes.test_scenes import require_laws
 from tests.for_each import case, for_each
-from tests.model.kit import FAMILIES, attend_reference, awake, random_scene, tiny_config
+from tests.model.kit import (
+    FAMILIES,
+    attend_reference,
+    awake,
+    random_scene,
+    tensors_of,
+    tiny_config,
+)
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.pipeline.scenes.small_pool import BLIND
 from tests.train.kit import stepper, tiny_run

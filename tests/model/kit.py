@@ -78,6 +78,10 @@ def random_scene(
     )
 
 
+def tensors_of(scenes: SceneTensors) -> dict[str, Tensor]:
+    return {name: value for name, value in vars(scenes).items() if isinstance(value, Tensor)}
+
+
 def render(model: RenderFormer, *scenes: SceneTensors, resolution: int = RESOLUTION) -> Tensor:
     with torch.no_grad():
         pictures: Tensor = model(batch_scenes(scenes), resolution)

@@ -375,23 +375,6 @@ def test_resumed_after_every_step_is_uninterrupted(
     assert again.folder.weights.read_bytes() == whole.folder.weights.read_bytes()
 
 
-def test_a_network_with_windows_is_trained(dataset: Dataset, tmp_path: Path) -> None:
-    """As the large one is: a DPT on windows, whole ones and shifted ones."""
-    model = dataclasses.replace(
-        TINY_MODEL,
-        decoder_layers=2,
-        window_bundles=2,
-        head="dpt",
-        dpt_features=4,
-        dpt_channels=(4, 4, 4, 4),
-        dpt_taps=(0, 1, 0, 1),
-    )
-    settings = tiny_run(model=model, resolution=32, num_steps=20, learning_rate=5e-3)
-    result = trained(settings, dataset, tmp_path)
-    # 0.80 and 0.88 of it with two seeds
-    assert result.skipped_steps == 0 and result.loss_at_end < 0.95 * result.loss_at_start
-
-
 def test_muon_goes_on_in_another_precision_on_another_processor(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -126,11 +126,6 @@ class StepScenes:
     """Number of triangles of each scene, in the same order."""
 
 
-def decodes_on_device(device: torch.device) -> bool:
-    """Return whether targets are looked up on the device, which saves work of decoding threads."""
-    return device.type == "cuda"
-
-
 def step_scenes(
     scenes_per_step: Iterator[list[TrainingScene]],
     cost: Callable[[int], float],

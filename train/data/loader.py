@@ -380,48 +380,32 @@ SCENES_AT_WORK = 4
 _BYTES_OF_PIXEL = 12
 
 
-@dataclass(frozen=True, kw_only=True)
-class Machine:
-    """Resources of this node that the processes of a run share."""
-
-    cores: float
-    """Number of allowed cores, or the smaller CPU quota of their control group."""
-    free_bytes: int | None = None
-    """Free memory in bytes; None if unknown."""
-    processes: int = 1
-    """Number of the run's processes on this node."""
-
-
-def detect_machine(root: Path = Path("/")) -> Machine:
-    """Detect cores, memory and processes of this node; `root` is that of the file system."""
-    return Machine(
-        cores=allowed_cores(root),
-        free_bytes=free_memory(root),
-        processes=max(int(os.environ.get("LOCAL_WORLD_SIZE", "1")), 1),
-    )
-
-
 def choose_workers(
-    machine: Machine, settings: "TrainSettings", *, on_gpu: bool, busy_threads: int
+    settings: "TrainSettings", *, on_gpu: bool, busy_threads: int, root: Path = Path("/")
 ) -> tuple[int, str]:
     """Return the number of decoding threads, 1 or more, and its reason as a sentence.
+
+    The processes of a run on this node share its cores and its free memory.
 
     Args:
         settings: settings of the run, which determine the memory of its scenes.
         on_gpu: True if the network is on a GPU, for which the main thread needs a core.
         busy_threads: CPU threads of a network that is not on a GPU.
+        root: root of the file system, which tells cores and memory.
     """
-    cores = machine.cores / machine.processes
-    spare = cores - (1 if on_gpu else busy_threads)
+    cores = allowed_cores(root)
+    free_bytes = free_memory(root)
+    processes = max(int(os.environ.get("LOCAL_WORLD_SIZE", "1")), 1)
+    spare = cores / processes - (1 if on_gpu else busy_threads)
     threads = min(max(int(spare), 1), MAX_THREADS)
-    reason = f"{machine.cores:g} cores"
-    if machine.processes > 1:
-        reason += f" for {machine.processes} processes"
-    if machine.free_bytes is not None:
+    reason = f"{cores:g} cores"
+    if processes > 1:
+        reason += f" for {processes} processes"
+    if free_bytes is not None:
         scene = _BYTES_OF_PIXEL * settings.views_per_scene * settings.resolution**2
-        fits = machine.free_bytes // 2 // machine.processes // (SCENES_AT_WORK * scene)
+        fits = free_bytes // 2 // processes // (SCENES_AT_WORK * scene)
         if fits < threads:
             threads = max(fits, 1)
-            reason += f" and {machine.free_bytes / 2**30:.1f} GiB of free memory"
+            reason += f" and {free_bytes / 2**30:.1f} GiB of free memory"
     decision = "1 thread decodes" if threads == 1 else f"{threads} threads decode"
     return threads, f"{decision} samples, by {reason}"

@@ -149,10 +149,16 @@ def _place_labels(
         Bbox.from_extents(x - _CLEAR_PX, y - _CLEAR_PX, x + _CLEAR_PX, y + _CLEAR_PX)
         for x, y in centres
     ]
+    frame = axes.get_window_extent()
     for name, at in names:
         labels = [_label(axes, name, at, place) for place in _PLACES]
         boxes = [label.get_window_extent().padded(2) for label in labels]
-        free = [row for row, box in enumerate(boxes) if _is_free(axes, box, taken)]
+        free = [
+            row
+            for row, box in enumerate(boxes)
+            if frame.x0 <= box.x0 and frame.y0 <= box.y0 and box.x1 <= frame.x1
+            and box.y1 <= frame.y1 and not any(box.overlaps(other) for other in taken)
+        ]  # fmt: skip
         clear = [
             row
             for row in free
@@ -166,12 +172,7 @@ def _place_labels(
                 label.remove()
 
 
-def _label(
-    axes: Any,
-    name: str,
-    at: tuple[float, float],
-    place: tuple[int, int, str, str],
-) -> Any:
+def _label(axes: Any, name: str, at: tuple[float, float], place: tuple[int, int, str, str]) -> Any:
     right, up, across, along = place
     label = axes.annotate(
         name, at, xytext=(right, up), textcoords="offset points", fontsize=_FONT,
@@ -179,12 +180,6 @@ def _label(
     )  # fmt: skip
     label.set_in_layout(False)  # else the axes would make room for it, and positions would change
     return label
-
-
-def _is_free(axes: Any, box: Any, taken: Sequence[Any]) -> bool:
-    frame = axes.get_window_extent()
-    inside = frame.x0 <= box.x0 and frame.y0 <= box.y0 and box.x1 <= frame.x1 and box.y1 <= frame.y1
-    return inside and not any(box.overlaps(other) for other in taken)
 
 
 def plain_log(axis: Any) -> None:

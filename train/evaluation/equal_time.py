@@ -99,34 +99,6 @@ Level = tuple[int, Filter]
 """Samples per pixel, and the filter."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class TracerTimes(Price):
-    """Settings and times of the path tracer at equal time."""
-
-    samples: int
-    """Number of samples per pixel."""
-    denoiser: Filter
-    """Name of the denoiser's filter."""
-    note: str
-    """Remark about the machine's path tracer; empty if there is none."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EqualTimeResult:
-    """Median times on one CPU thread after a warm-up."""
-
-    network_first_s: float
-    """CPU seconds of the network for the first view of a scene."""
-    network_further_s: float
-    """CPU seconds of the network for each further view."""
-    scenes: int
-    """Number of scenes that were timed."""
-    preview: TracerTimes | None
-    """Times of the path tracer; None if nothing is traced."""
-    missing: str = ""
-    """Reason why nothing is traced; empty otherwise."""
-
-
 def spread_views(most_views: int, num_scenes: int) -> tuple[int, int]:
     """Return which views the path tracer is judged on: one scene in so many, its first so many."""
     return max(1, -(-num_scenes // max(most_views, 1))), max(1, most_views // max(num_scenes, 1))
@@ -147,10 +119,15 @@ def time_both(
     *,
     missing: str = "",
     note: str = "",
-) -> EqualTimeResult:
+) -> dict[str, Any]:
     """Time both on some scenes, and choose the samples that fit.
 
     The network is timed first, then the path tracer, then the network once more.
+
+    Returns:
+        Median CPU seconds of the network, `network_first_s` and `network_further_s`; the number of
+        timed `scenes`; `preview`, the samples, denoiser, price and note of the path tracer, or None
+        where nothing is traced; and `missing`, the reason for that.
 
     Args:
         network: the network on one thread of the processor.
@@ -182,20 +159,16 @@ def time_both(
     preview = None
     if theirs:
         fitting = [level for level in theirs if theirs[level].further_s <= middle.further_s]
-        samples_a_pixel, denoiser = level = [next(iter(theirs)), *fitting][-1]
-        preview = TracerTimes(
-            samples=samples_a_pixel,
-            denoiser=denoiser,
-            note=note,
-            **dataclasses.asdict(theirs[level]),
-        )
-    return EqualTimeResult(
-        network_first_s=middle.first_s,
-        network_further_s=middle.further_s,
-        scenes=len(timed),
-        preview=preview,
-        missing=missing,
-    )
+        level = [next(iter(theirs)), *fitting][-1]
+        chosen = {"samples": level[0], "denoiser": level[1], "note": note}
+        preview = chosen | dataclasses.asdict(theirs[level])
+    return {
+        "network_first_s": middle.first_s,
+        "network_further_s": middle.further_s,
+        "scenes": len(timed),
+        "preview": preview,
+        "missing": missing,
+    }
 
 
 def _preview_prices(
@@ -219,15 +192,16 @@ def _preview_prices(
     return prices
 
 
-def equal_time(views: Sequence[JudgedView], times: EqualTimeResult, which: str) -> dict[str, Any]:
+def equal_time(views: Sequence[JudgedView], times: Mapping[str, Any], which: str) -> dict[str, Any]:
     """Compare network and path tracer over the views that have both, as JSON values.
 
     Args:
+        times: result of `time_both`.
         which: description of the views that the tracer was scored on.
     """
     both = [view for view in views if TRACER in view.scores]
-    figures = dataclasses.asdict(times) | {"which": which, "views": len(both)}
-    if times.preview is None:
+    figures = {**times, "which": which, "views": len(both)}
+    if times["preview"] is None:
         return figures
     if not both:
         return figures | {"missing": "none of the judged views could be traced"}

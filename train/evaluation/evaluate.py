@@ -1,6 +1,7 @@
 """Evaluation of a network on every view of a split, with baselines that ignore the scene."""
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
@@ -247,13 +248,8 @@ def grouped_pictures(
     """
     if network.config.view_stage == "hits" or len(light_groups(scene, MAX_LIGHTS)) == 1:
         return None
-    renderer = NeuralRenderer(network)
-    prepared = renderer.prepare(scene)
-    pictures = [
-        renderer.view(prepared, c2w, float(fov_deg), resolution)
-        for c2w, fov_deg in zip(scene.c2w, scene.fov_deg, strict=True)
-    ]
-    return np.stack(pictures).astype(np.float64)
+    with warnings.catch_warnings(action="ignore"):  # that there are groups is known
+        return NeuralRenderer(network).render(scene, resolution).astype(np.float64)
 
 
 def withheld_pictures(

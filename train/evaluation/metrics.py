@@ -1,6 +1,6 @@
 """Metrics of a picture, scores of a validation, and summaries that include the worst views."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,43 +18,33 @@ from storage.seeds import rng_for
 from train.loss.lpips import Lpips
 from train.loss.training_loss import ssim, tone_map
 
+VALIDATED = ("log_l1", "psnr_log_db", "psnr_linear_db", "object_psnr_log_db")
+"""Metrics of the validations of a run."""
 
-@dataclass(frozen=True, kw_only=True)
-class ViewScore:
-    """Scores of one picture against its target; storage.metrics defines those in dB."""
-
-    log_l1: float
-    """Mean |log10(1 + a) - log10(1 + b)|: the training loss, of the finished picture."""
-    psnr_log_db: float
-    psnr_linear_db: float
-    object_psnr_log_db: float
+Scores = Mapping[str, float]
+"""Score of a picture by metric."""
 
 
-def score_view(radiance_rgb: NDArray, target_rgb: NDArray, hits: NDArray[np.bool_]) -> ViewScore:
-    """Score one picture [R, R, 3] of linear radiance; `hits` is [R, R] (judge.hit_masks)."""
-    difference = log10_radiance(radiance_rgb) - log10_radiance(target_rgb)
-    return ViewScore(
-        log_l1=float(np.abs(difference).mean(dtype=np.float64)),
-        psnr_log_db=psnr_log_db(radiance_rgb, target_rgb),
-        psnr_linear_db=psnr_linear_db(radiance_rgb, target_rgb),
-        object_psnr_log_db=object_psnr_log_db(radiance_rgb, target_rgb, hits),
-    )
+def score_view(radiance_rgb: NDArray, target_rgb: NDArray, hits: NDArray[np.bool_]) -> Scores:
+    """Score one picture [R, R, 3] of linear radiance by VALIDATED; `hits` is as in `hit_masks`."""
+    picture = JudgedPicture(radiance_rgb=radiance_rgb, target_rgb=target_rgb, hits=hits, lpips=None)
+    return {name: METRICS[name].score(picture) or 0.0 for name in VALIDATED}
 
 
-def summarize_scores(views: Sequence[ViewScore]) -> dict[str, float]:
+def summarize_scores(views: Sequence[Scores]) -> dict[str, float]:
     """Return mean log_l1, and median and the worse 5th percentile of each dB value."""
-    summary = {"log_l1": float(np.mean([view.log_l1 for view in views]))}
-    for metric in ("psnr_log_db", "psnr_linear_db", "object_psnr_log_db"):
-        values = [getattr(view, metric) for view in views]
+    summary = {"log_l1": float(np.mean([view["log_l1"] for view in views]))}
+    for metric in VALIDATED[1:]:
+        values = [view[metric] for view in views]
         summary[f"{metric}_median"] = float(np.median(values))
         summary[f"{metric}_p5"] = float(np.percentile(values, 5))
     return summary
 
 
-def fraction_better(views: Sequence[ViewScore], baseline: Sequence[ViewScore]) -> float:
+def fraction_better(views: Sequence[Scores], baseline: Sequence[Scores]) -> float:
     """Return the fraction of views whose log_l1 is below that of the baseline."""
     pairs = zip(views, baseline, strict=True)
-    return float(np.mean([view.log_l1 < other.log_l1 for view, other in pairs]))
+    return float(np.mean([view["log_l1"] < other["log_l1"] for view, other in pairs]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,11 +63,11 @@ class Lead:
 
 
 def lead(
-    views: Sequence[ViewScore], baseline: Sequence[ViewScore], views_of_scene: Sequence[int]
+    views: Sequence[Scores], baseline: Sequence[Scores], views_of_scene: Sequence[int]
 ) -> Lead:
     """Return the lead over a baseline on the same views; each scene counts once."""
     pairs = zip(views, baseline, strict=True)
-    of_view = np.array([other.log_l1 - view.log_l1 for view, other in pairs])
+    of_view = np.array([other["log_l1"] - view["log_l1"] for view, other in pairs])
     of_scene = [part.mean() for part in np.split(of_view, np.cumsum(views_of_scene)[:-1])]
     error = None
     if len(of_scene) > 1:
@@ -103,11 +93,6 @@ class JudgedPicture:
         """Picture and target [1, 3, R, R] as clamp(log2(1 + radiance), 0, 1), float64."""
         return _tone_map(self.radiance_rgb), _tone_map(self.target_rgb)
 
-    @cached_property
-    def score(self) -> ViewScore:
-        """Scores that validations of a training run use."""
-        return score_view(self.radiance_rgb, self.target_rgb, self.hits)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
@@ -124,6 +109,12 @@ class Metric:
     floor: Callable[[ViewRecord], float] | None = None
     """Returns the score of the target's measured noise; None scores noise of the measured size that
     is added to the target (`noise_floors`)."""
+
+
+def _log_l1(picture: JudgedPicture) -> float:
+    """Return the training loss, of the finished picture."""
+    difference = log10_radiance(picture.radiance_rgb) - log10_radiance(picture.target_rgb)
+    return float(np.abs(difference).mean(dtype=np.float64))
 
 
 def hdr_flip(radiance_rgb: NDArray, target_rgb: NDArray) -> float | None:
@@ -163,21 +154,23 @@ METRICS: Registry[Metric] = Registry(
     Metric,
     {
         "psnr_log_db": Metric(
-            score=lambda picture: picture.score.psnr_log_db,
+            score=lambda picture: psnr_log_db(picture.radiance_rgb, picture.target_rgb),
             higher_is_better=True,
             meaning="PSNR of log10(1 + radiance), peak 1, nothing clamped (storage.metrics)",
             decimals=2,
             floor=lambda view: view.noise_floor_db,
         ),
         "object_psnr_log_db": Metric(
-            score=lambda picture: picture.score.object_psnr_log_db,
+            score=lambda picture: object_psnr_log_db(
+                picture.radiance_rgb, picture.target_rgb, picture.hits
+            ),
             higher_is_better=True,
             meaning="the same over pixels whose ray meets geometry",
             decimals=2,
             floor=lambda view: view.object_noise_floor_db,
         ),
         "psnr_linear_db": Metric(
-            score=lambda picture: picture.score.psnr_linear_db,
+            score=lambda picture: psnr_linear_db(picture.radiance_rgb, picture.target_rgb),
             higher_is_better=True,
             meaning="PSNR of radiance clamped to [0, 1], peak 1; for published figures only",
             decimals=2,
@@ -200,7 +193,7 @@ METRICS: Registry[Metric] = Registry(
             meaning="mean HDR-FLIP of radiance (flip-evaluator, 67 pixels per degree, ACES)",
         ),
         "log_l1": Metric(
-            score=lambda picture: picture.score.log_l1,
+            score=_log_l1,
             higher_is_better=False,
             meaning="mean absolute error of log10(1 + radiance), after the output's ELU",
             floor=noise_rms,

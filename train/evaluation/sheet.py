@@ -137,8 +137,8 @@ def draw_validation_sheet(
             SheetView(
                 name=f"scene {judged.scene.key}, view 0",
                 scores=(
-                    f"log L1 {score.log_l1:.4f} (median picture {median.log_l1:.4f}), "
-                    f"{score.psnr_log_db:.1f} dB log, {score.psnr_linear_db:.1f} dB linear"
+                    f"log L1 {score['log_l1']:.4f} (median picture {median['log_l1']:.4f}), "
+                    f"{score['psnr_log_db']:.1f} dB log, {score['psnr_linear_db']:.1f} dB linear"
                 ),
                 target_rgb=judged.target_VRR3[0],
                 predicted_rgb=pictures[0],

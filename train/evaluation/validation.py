@@ -24,7 +24,7 @@ from train.data.buckets import collate_batch
 from train.data.scenes import TrainingScene, block_mean, training_scene
 from train.evaluation.metrics import (
     Lead,
-    ViewScore,
+    Scores,
     fraction_better,
     lead,
     score_view,
@@ -156,7 +156,7 @@ class ValidationResult:
 
     pictures: tuple[NDArray[np.float64], ...]
     """[V, R, R, 3] linear radiance of each scene."""
-    views: tuple[ViewScore, ...]
+    views: tuple[Scores, ...]
     """Scores of all views, scene after scene."""
     scores: dict[str, float]
     """Summary (evaluation.metrics), and `better_than_median`: the fraction of views won."""
@@ -221,9 +221,7 @@ def predict(model: RenderFormer, scene: TrainingScene) -> NDArray[np.float64]:
     return np.maximum(radiance(log10_VRR3.double()).cpu().numpy(), 0)
 
 
-def score_pictures(
-    pictures: Sequence[NDArray], judged: Sequence[ValidationScene]
-) -> list[ViewScore]:
+def score_pictures(pictures: Sequence[NDArray], judged: Sequence[ValidationScene]) -> list[Scores]:
     """Score the pictures [V, R, R, 3] of each scene, view by view."""
     return [
         score_view(picture, target, hits)

@@ -144,26 +144,6 @@ def choose_muon_precision(dist_context: DistributedContext) -> Precision:
     return "float32" if dist_context.any(not quick) else "bfloat16"
 
 
-def muon(
-    matrices: Sequence[Tensor] | Sequence[dict[str, Any]],
-    weight_decay: float,
-    precision: Precision,
-    thirds: Sequence[Tensor] = (),
-) -> torch.optim.Muon:
-    """Return the Muon optimizer of matrices [M, N].
-
-    Args:
-        matrices: weights, or parameter groups as torch's optimizers take them, each with its decay.
-        weight_decay: decay of weights without a group.
-        precision: precision of its products. With bfloat16 on a CPU it is torch's own class.
-        thirds: those of the weights that are three stacked matrices.
-    """
-    first = matrices[0] if isinstance(matrices[0], Tensor) else matrices[0]["params"][0]
-    if precision == "bfloat16" and not thirds and not defers_sync(first.device):
-        return torch.optim.Muon(matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
-    return StackedMuon(matrices, weight_decay, PRODUCTS[precision], thirds)
-
-
 PRODUCTS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 """Types of matrix products, by precision."""
 
@@ -184,21 +164,24 @@ class StackedMuon(torch.optim.Muon):
         self,
         matrices: Sequence[Tensor] | Sequence[dict[str, Any]],
         weight_decay: float,
-        products: torch.dtype,
-        thirds: Sequence[Tensor],
+        precision: Precision,
+        thirds: Sequence[Tensor] = (),
     ) -> None:
-        """Create the optimizer; arguments as in `muon`, with `products` a type."""
+        """Create the optimizer of matrices [M, N].
+
+        Args:
+            matrices: weights, or parameter groups as torch's optimizers take them, each with its
+                decay.
+            weight_decay: decay of weights without a group.
+            precision: precision of its products.
+            thirds: those of the weights that are three stacked matrices.
+        """
         super().__init__(matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
-        self._products = products
+        self._products = PRODUCTS[precision]
         cut = {id(weight) for weight in thirds}
         self._thirds = [
             [id(weight) in cut for weight in group["params"]] for group in self.param_groups
         ]
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state of a copy; torch's optimizers copy only their own fields."""
-        fields = {"_products": self._products, "_thirds": self._thirds, "decision": self.decision}
-        return super().__getstate__() | fields
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
@@ -344,7 +327,7 @@ class Updater:
             names = self._names
             thirds = [w for w, _ in muon_weights if by_thirds and names[w].endswith(_QKV)]
             groups = self._groups(muon_weights, settings)
-            optimizer = muon(groups, settings.weight_decay, precision, thirds=thirds)
+            optimizer = StackedMuon(groups, settings.weight_decay, precision, thirds)
             self._optimizers.append((optimizer, settings.muon_rate))
 
     def _groups(self, weights: Sequence[_Scaled], settings: TrainSettings) -> list[dict[str, Any]]:

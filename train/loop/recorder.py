@@ -1,7 +1,7 @@
 """Log, notes and curves that the first process writes during a run.
 
-Rows of the log go as named scalars to TensorBoard always, to Weights & Biases (W&B) if requested
-and installed.
+Rows of the log go as named scalars to TensorBoard always, and from there to Weights & Biases (W&B)
+if requested and installed.
 """
 
 import json
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from model.renderformer import count_parameters
 from storage.atomic import append_line, write_atomically
@@ -55,74 +54,6 @@ def scalars(row: Mapping[str, Any]) -> dict[str, float]:
     }
 
 
-class TensorBoardLogger:
-    """Writes the log's numbers and the validation sheets for TensorBoard.
-
-    A resumed run writes its rows after the first step again.
-    """
-
-    def __init__(self, folder: Path, *, first_step: int) -> None:
-        from torch.utils.tensorboard import SummaryWriter  # half a second to import
-
-        self._writer = SummaryWriter(str(folder), purge_step=first_step + 1)
-
-    def scalars(self, row: Mapping[str, Any]) -> None:
-        """Add a row of the log; values that are not numbers are left out."""
-        step = row["step"]
-        for name, value in scalars(row).items():
-            self._writer.add_scalar(name, value, step)
-
-    def sheet(self, step: int, sheet: Image.Image) -> None:
-        """Add a sheet of validation pictures."""
-        self._writer.add_image("validation", np.asarray(sheet), step, dataformats="HWC")
-
-    def close(self) -> None:
-        """Flush and close the files."""
-        self._writer.close()
-
-
-class WandbLogger:
-    """Logs the rows of a run to a project; each call of the trainer is one run in a group.
-
-    Nothing leaves the machine unless WANDB_MODE is `online`: `wandb sync` uploads it later.
-    """
-
-    def __init__(self, project: str, folder: Path, settings: Mapping[str, Any]) -> None:
-        """Start a run of the project.
-
-        Args:
-            folder: folder of the training, with files in `wandb/`; its name is that of the group.
-            settings: configuration of the run to display.
-
-        Raises:
-            TrilightError: the package is not installed.
-        """
-        self._wandb = _package()
-        name = folder.resolve().name
-        self._run = self._wandb.init(
-            project=project,
-            group=name,
-            dir=str(folder),
-            config=dict(settings),
-            mode=os.environ.get("WANDB_MODE", "offline"),
-        )
-        # a spike's row comes after later steps, so the step is logged as an ordinary value
-        self._run.define_metric("*", step_metric="step")
-
-    def scalars(self, row: Mapping[str, Any]) -> None:
-        """Add a row of the log."""
-        if numbers := scalars(row):
-            self._run.log({**numbers, "step": row["step"]})
-
-    def sheet(self, step: int, sheet: Image.Image) -> None:
-        """Add a sheet of validation pictures."""
-        self._run.log({"validation": self._wandb.Image(sheet), "step": step})
-
-    def close(self) -> None:
-        """End the run."""
-        self._run.finish()
-
-
 def require_wandb(project: str | None) -> None:
     """Raise early if the package is requested and missing.
 
@@ -141,6 +72,21 @@ def _package() -> Any:
             f"wandb is not installed, and the log is to go there too; expected `pip install wandb` "
             f"before, or no --wandb ({error})."
         ) from error
+
+
+def _begin_wandb_run(project: str, folder: Path, settings: TrainSettings) -> Any:
+    """Begin a run that follows TensorBoard's files; each call of the trainer is one in a group.
+
+    Nothing leaves the machine unless WANDB_MODE is `online`: `wandb sync` uploads it later.
+    """
+    return _package().init(
+        project=project,
+        group=folder.resolve().name,
+        dir=str(folder),
+        config=settings_record(settings),
+        mode=os.environ.get("WANDB_MODE", "offline"),
+        sync_tensorboard=True,
+    )
 
 
 class Recorder:
@@ -168,17 +114,22 @@ class Recorder:
         self._settings = settings
         self._judge = judge
         self._log = MetricsLog(folder.metrics, first_step=state.step)
-        self._boards: list[TensorBoardLogger | WandbLogger] = [
-            TensorBoardLogger(folder.tensorboard, first_step=state.step)
-        ]
-        if wandb is not None:
-            self._boards.append(WandbLogger(wandb, folder.root, settings_record(settings)))
+        self._wandb_run = None
+        if wandb is not None:  # before the writer, whose files it follows
+            self._wandb_run = _begin_wandb_run(wandb, folder.root, settings)
+        from torch.utils.tensorboard import SummaryWriter  # half a second to import
+
+        # a resumed run writes its rows after this step again
+        self._board = SummaryWriter(str(folder.tensorboard), purge_step=state.step + 1)
 
     def row(self, row: Mapping[str, Any]) -> None:
         """Write one row of the log."""
         self._log.append(row)
-        for board in self._boards:
-            board.scalars(row)
+        self._show_scalars(row)
+
+    def _show_scalars(self, row: Mapping[str, Any]) -> None:
+        for name, value in scalars(row).items():
+            self._board.add_scalar(name, value, row["step"])
 
     def note(self, step: int, text: str) -> None:
         """Report a sentence without its full stop, and append it to notes.jsonl."""
@@ -204,15 +155,15 @@ class Recorder:
         self.row({"step": state.step, "validation": validation.scores})
         sheet = draw_validation_sheet(self._settings, self._judge, validation, state.step)
         median = {"median_picture_log_l1": self._judge.median_scores["log_l1"]}
-        for board in self._boards:
-            board.scalars({"step": state.step, "validation": median})
-            board.sheet(state.step, sheet)
+        self._show_scalars({"step": state.step, "validation": median})
+        self._board.add_image("validation", np.asarray(sheet), state.step, dataformats="HWC")
         self.progress.report_validation(step=state.step, scores=validation.scores)
 
     def close(self) -> None:
-        """Flush and close all loggers."""
-        for board in self._boards:
-            board.close()
+        """Flush and close the files of TensorBoard, and end the run of W&B."""
+        self._board.close()
+        if self._wandb_run is not None:
+            self._wandb_run.finish()
 
 
 class MetricsLog:

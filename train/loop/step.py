@@ -161,21 +161,15 @@ class Stepper:
         return applied
 
     def sync(self, steps: Sequence[PendingStats]) -> tuple[list[StepReport], bool]:
-        """Wait for steps, and for pending layer statistics, with a single copy to the host.
+        """Wait for steps with a single copy to the host.
 
         Returns:
             The report of each step, in their order, and whether any process received a signal
             before one of them, which is equal in all processes.
         """
         self.activity.begin("device")
-        layers = self.layers.pending
-        parts = [*steps, *([] if layers is None else [layers.to(steps[0]).flatten()])]
-        values = torch.cat(parts).tolist()
+        rows = torch.stack([*steps]).tolist()
         self.activity.begin("other")
-        width = len(steps[0])
-        rows = [values[width * row : width * (row + 1)] for row in range(len(steps))]
-        if layers is not None:
-            self.layers.set_values(values[width * len(steps) :])
         return [_report(row) for row in rows], any(row[-1] > 0 for row in rows)
 
     def _add_gradient(self, batch: TrainingBatch, num_views: int, *, last: bool) -> Tensor:

@@ -6,16 +6,14 @@ once on a CPU, at each row of the log on a GPU, and before every validation and 
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import torch
 
-from model.costs import Workload, training_flops
+from model.costs import training_flops
 from storage.errors import TrilightError
 from train.data.buckets import CopyStream, StepScenes
 from train.folder import RunFolder
@@ -125,13 +123,12 @@ class DeadStartDetector:
 
     def __init__(self, settings: TrainSettings) -> None:
         self.due = settings.warmup_steps + WATCHED_STEPS
-        self._reports: deque[StepReport] = deque(maxlen=WATCHED_STEPS)
-        self._is_judged = False
+        self._seen: list[float] = []
 
     def add(self, step: int, report: StepReport) -> None:
         """Add the report of one step, counted from 1."""
-        if step <= self.due:
-            self._reports.append(report)
+        if self.due - WATCHED_STEPS < step <= self.due:
+            self._seen.append(report.brightness)
 
     def verdict(self, step: int) -> TrilightError | None:
         """Return the error of a dead start, checked once after `due` steps; else None.
@@ -139,12 +136,10 @@ class DeadStartDetector:
         A run that is resumed after that step is not checked again. `step` is the last one whose
         report was added.
         """
-        if step < self.due or self._is_judged:
+        if step < self.due or len(self._seen) < WATCHED_STEPS:
             return None
-        self._is_judged = True
-        if len(self._reports) < WATCHED_STEPS:
-            return None
-        brightest = max(report.brightness for report in self._reports)
+        brightest = max(self._seen)
+        self._seen = []
         if not brightest < DEAD_BRIGHTNESS:
             return None
         return TrilightError(
@@ -162,26 +157,9 @@ MAX_PENDING = 100
 """Maximum number of pending steps before the GPU is synced, however rare rows of the log are."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _PendingStep:
-    """A launched step whose statistics the host has not read yet."""
-
-    step: int
-    """Number of the step, from 1."""
-    keys: Sequence[str]
-    """Sample keys of this process's scenes."""
-    stats: PendingStats
-    """Statistics of the step, still on the device."""
-
-
-def scene_flops(settings: TrainSettings, num_triangles: int) -> int:
-    """Return the FLOPs of a scene with so many triangles in a training step."""
-    workload = Workload(
-        triangles=num_triangles,
-        views=settings.views_per_scene,
-        resolution=settings.resolution,
-    )
-    return training_flops(settings.model, workload)
+_PendingStep = tuple[int, Sequence[str], PendingStats]
+"""A launched step that the host has not read yet: its number from 1, sample keys of this process's
+scenes, and statistics, still on the device."""
 
 
 class Trainer:
@@ -192,6 +170,7 @@ class Trainer:
         asked_to_stop: True once a synced step says that a process received a signal.
         saved_step: step of the last checkpoint of this call; None before the first.
         num_reported_bad: messages about damaged data that were already reported.
+        scene_flops: returns the FLOPs of a scene with so many triangles in a step.
         dead_start: checks once, after the warm-up, that pictures are not black.
     """
 
@@ -214,6 +193,9 @@ class Trainer:
         self.folder = folder
         self.data_digest = data_digest
         self.recorder = recorder
+        self.scene_flops = training_flops(
+            settings.model, settings.views_per_scene, settings.resolution
+        )
         self.stepper = Stepper(state, settings, objective, dist_context)
         self.copies = CopyStream(dist_context.device)
         self.dead_start = DeadStartDetector(settings)
@@ -309,10 +291,10 @@ class Trainer:
             self._note(self.stepper.remarks.pop(0))
         self.window.views += settings.scenes_per_step * settings.views_per_scene
         self.window.waited_s += waited_s
-        self.window.flops += sum(scene_flops(settings, count) for count in scenes.num_triangles)
+        self.window.flops += sum(map(self.scene_flops, scenes.num_triangles))
         self.state.step += 1
         self.watch.end_step()
-        self.pending.append(_PendingStep(step=self.state.step, keys=scenes.keys, stats=stats))
+        self.pending.append((self.state.step, scenes.keys, stats))
         syncs = not self.stepper.defer_sync or self.watch.is_window_end(self.state.step)
         if syncs or len(self.pending) == MAX_PENDING:
             self._sync()
@@ -323,15 +305,15 @@ class Trainer:
         self.pending = []
         if not pending:
             return
-        reports, self.asked_to_stop = self.stepper.sync([each.stats for each in pending])
-        for each, report in zip(pending, reports, strict=True):
+        reports, self.asked_to_stop = self.stepper.sync([stats for _, _, stats in pending])
+        for (step, keys, _), report in zip(pending, reports, strict=True):
             self.state.reports.append(report)
-            self.dead_start.add(each.step, report)
-            self.watch.add_report(each.step, report, each.keys)
+            self.dead_start.add(step, report)
+            self.watch.add_report(step, report, keys)
             if report.applied:
                 self.state.skipped_in_a_row = 0
             else:
-                self._skip(each)
+                self._skip(step, keys)
         self.progress.advance(
             step=self.state.step,
             loss=reports[-1].loss,
@@ -339,18 +321,18 @@ class Trainer:
             views_per_s=self.window.views_per_s,
         )
 
-    def _skip(self, pending: _PendingStep) -> None:
+    def _skip(self, step: int, keys: Sequence[str]) -> None:
         """Count a skipped step and report its scenes; raise after too many in a row."""
         self.state.skipped_steps += 1
         self._note(
-            f"step {pending.step} was skipped, since its loss or gradient was not finite; "
-            f"its scenes were {', '.join(pending.keys)}",
-            pending.step,
+            f"step {step} was skipped, since its loss or gradient was not finite; "
+            f"its scenes were {', '.join(keys)}",
+            step,
         )
         self.state.skipped_in_a_row += 1
         if self.state.skipped_in_a_row == MAX_SKIPPED_IN_A_ROW:
             raise TrilightError(
-                f"training: {MAX_SKIPPED_IN_A_ROW} steps in a row up to step {pending.step} "
+                f"training: {MAX_SKIPPED_IN_A_ROW} steps in a row up to step {step} "
                 "had a loss or gradient that was not finite; the weights are unchanged by them. "
                 "Resumed as it is, it would come here again. Go on with --resume --change "
                 f"learning_rate={self.settings.learning_rate / 2:g}, or with another order of the "

@@ -82,7 +82,7 @@ class LayerNorms:
     """Norms of one expected update; other updates cost nothing.
 
     The weights are copied during that update, after the activations were freed, so that peak memory
-    does not rise. The norms leave the device with the statistics of the steps (loop.step).
+    does not rise. The norms stay on the device until the row of the log asks for them.
     """
 
     def __init__(self, model: nn.Module) -> None:
@@ -96,9 +96,7 @@ class LayerNorms:
         self._due = due
         self._grads: list[Tensor] = []
         self._before: list[list[Tensor]] = []
-        self.pending: Tensor | None = None
-        """New norms [layers, LAYER_COLUMNS] on the device; None if there are none."""
-        self._row: dict[str, list[float | None]] = {}
+        self._norms: Tensor | None = None
 
     @torch.no_grad()
     def record_gradients(self) -> None:
@@ -122,28 +120,21 @@ class LayerNorms:
             columns.append(torch.stack([grad, length, ratio]))
         if columns:
             self.expect_update(False)
-            self.pending = torch.stack(columns)
-
-    def set_values(self, values: Sequence[float]) -> None:
-        """Store the numbers of `pending` from the host, layer after layer."""
-        width = len(values) // len(self._groups)
-        rows = [values[width * row : width * (row + 1)] for row in range(len(self._groups))]
-        self.expect_update(False)
-        self._row = {
-            layer: [
-                float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None for value in row
-            ]
-            for layer, row in zip(self._groups, rows, strict=True)
-        }
+            self._norms = torch.stack(columns)
 
     def pop_row(self) -> dict[str, list[float | None]]:
         """Return LAYER_COLUMNS by layer of the measured update once; empty if there is none.
 
-        A number that is not finite is None.
+        It waits for the device. A number that is not finite is None.
         """
-        row = self._row
-        self._row = {}
-        return row
+        if self._norms is None:
+            return {}
+        rows = self._norms.tolist()
+        self.expect_update(False)
+        return {
+            layer: [float(f"{each:.{_DIGITS}g}") if math.isfinite(each) else None for each in row]
+            for layer, row in zip(self._groups, rows, strict=True)
+        }
 
 
 def layer_of(parameter: str) -> str:

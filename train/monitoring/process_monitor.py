@@ -111,51 +111,54 @@ class StepProfiler:
         self._device = device
         self._folder = folder
         self._note = note
-        self._seen = 0
+        self._step = 0
         self._first = 0
         self._profile: Any = None
+        self._is_written = False
 
     def begin_step(self, step: int) -> None:
         """Begin a step, counted from 1."""
-        if not self._steps:
+        self._step = step
+        if not self._steps or self._profile is not None:
             return
-        self._seen += 1
-        if self._seen == SKIPPED_STEPS + 1:
-            from torch.profiler import ProfilerActivity, profile
+        from torch.profiler import ProfilerActivity, profile, schedule
 
-            on_card = [ProfilerActivity.CUDA] if self._device.type == "cuda" else []
-            self._profile = profile(activities=[ProfilerActivity.CPU, *on_card])
-            self._profile.start()
-            self._first = step
+        on_gpu = [ProfilerActivity.CUDA] if self._device.type == "cuda" else []
+        self._first = step + SKIPPED_STEPS
+        self._profile = profile(
+            activities=[ProfilerActivity.CPU, *on_gpu],
+            schedule=schedule(
+                skip_first=SKIPPED_STEPS - 1, wait=0, warmup=1, active=self._steps, repeat=1
+            ),
+            on_trace_ready=self._write,
+        )
+        self._profile.start()
 
-    def end_step(self, step: int) -> None:
-        """End a step; write the trace after the last one."""
-        if self._profile is not None and step - self._first + 1 == self._steps:
-            self._write(step)
+    def end_step(self) -> None:
+        """End the step; the last of a trace writes it."""
+        if self._profile is not None:
+            self._profile.step()
 
-    def close(self, step: int) -> None:
+    def close(self) -> None:
         """Write an incomplete trace of a run that has ended."""
         if self._profile is not None:
-            self._write(step)
-        elif self._steps and self._seen <= SKIPPED_STEPS:
+            self._profile.stop()
+        if self._steps and not self._is_written:
             self._note(
                 f"nothing was profiled: the run ended before step {SKIPPED_STEPS + 1} of this call"
             )
 
-    def _write(self, last: int) -> None:
-        profiler = self._profile
-        self._profile = None
-        self._steps = 0
-        profiler.stop()
+    def _write(self, profiler: Any) -> None:
+        self._is_written = True
         self._folder.mkdir(parents=True, exist_ok=True)
-        trace = self._folder / f"profile-steps-{self._first}-to-{last}.json.gz"
+        trace = self._folder / f"profile-steps-{self._first}-to-{self._step}.json.gz"
         table = trace.with_name(trace.name.replace(".json.gz", ".txt"))
         profiler.export_chrome_trace(str(trace))
         order = f"self_{self._device.type}_time_total"
         table.write_text(profiler.key_averages().table(sort_by=order, row_limit=_ROWS))
         self._note(
-            f"steps {self._first} to {last} were profiled: open {trace} at chrome://tracing in "
-            f"Chromium or at ui.perfetto.dev; {table.name} beside it lists the dearest operators"
+            f"steps {self._first} to {self._step} were profiled: open {trace} at chrome://tracing "
+            f"in Chromium or at ui.perfetto.dev; {table.name} beside it lists the dearest operators"
         )
 
 
@@ -202,7 +205,7 @@ class ProcessMonitor:
 
     def __exit__(self, *error: object) -> None:
         self._watchdog.__exit__(*error)
-        self._profiler.close(self._step)
+        self._profiler.close()
 
     def begin_step(self, step: int) -> None:
         """Begin a step, counted from 1."""
@@ -214,7 +217,7 @@ class ProcessMonitor:
     def end_step(self) -> None:
         """End the step on the host; a GPU may still work on it."""
         self._steps += 1
-        self._profiler.end_step(self._step)
+        self._profiler.end_step()
 
     def add_report(self, step: int, report: StepReport, keys: Sequence[str]) -> None:
         """Check the report of a step; `keys` are those of this process's scenes."""

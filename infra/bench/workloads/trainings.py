@@ -4,11 +4,11 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
 
+from model.costs import training_flops
 from model.renderformer import RenderFormer
 from storage.dataset.shard_set import ShardSet
 from storage.dataset.training_data import open_training_data
@@ -21,7 +21,6 @@ from train.loop.distributed import DistributedContext
 from train.loop.optimizer import choose_muon_precision
 from train.loop.step import Stepper
 from train.loop.train_state import new_state
-from train.loop.trainer import scene_flops
 from train.loss.training_loss import TrainingLoss
 from train.run_training import loader_settings
 from train.settings import TrainSettings, learning_rate
@@ -73,10 +72,10 @@ def training_figures(
     scores_by_view = []
     for judged in scenes.judge.scenes:
         mine = [next(views) for _ in judged.target_VRR3]
-        l1 = float(np.mean([view.log_l1 for view in mine]))
+        l1 = float(np.mean([view["log_l1"] for view in mine]))
         figures = {"seconds": seconds, "step_s": seconds / settings.num_steps}
         if np.isfinite(l1) and l1 > 0:
-            db = float(np.mean([view.psnr_log_db for view in mine]))
+            db = float(np.mean([view["psnr_log_db"] for view in mine]))
             figures |= {"log_l1": l1, "percent": 100 * float(np.log(l1)), "db": db}
         scores_by_view.append(figures)
     return scores_by_view
@@ -88,7 +87,7 @@ def _trained_network(
     crew = DistributedContext(device=device)
     state = new_state(settings, device, muon_precision=choose_muon_precision(crew))
     stepper = Stepper(state, settings, TrainingLoss(settings.loss, None), crew)
-    cost = partial(scene_flops, settings)
+    cost = training_flops(settings.model, settings.views_per_scene, settings.resolution)
     stream = load_batches(
         shards,
         loader_settings(settings),

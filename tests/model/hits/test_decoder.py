@@ -235,7 +235,7 @@ def test_every_weight_has_a_gradient_and_comes_back_from_its_file(tokens: bool) 
         ({"pixel_width": 0}, "pixel_width 0"),
         ({"hit_anchors": 12}, "a multiple of 8"),
         ({"patch_px": 4}, "patch_px 4"),
-        ({"view_stage": "bundles"}, "fields of hits beside view_stage bundles"),
+        ({"view_stage": "bundles"}, "hit_anchors 8 with view_stage bundles; expected 0"),
     ],
 )
 def test_settings_that_go_not_together_are_refused(changes: dict[str, Any], message: str) -> None:

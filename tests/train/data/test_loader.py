@@ -22,11 +22,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.demodulated import with_albedo
-from model.scene_tensors import tensors_of
 from storage.dataset.dataset import Dataset
 from storage.dataset.shard import write_shard
 from storage.dataset.shard_set import OpenShard, ShardSet
-from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from storage.records.exr import encode_channels
 from storage.records.profiles import PROFILES, Profile
@@ -34,7 +32,7 @@ from storage.records.sample import Sample, decode_sample, encode_sample, sample_
 from storage.seeds import rng_for
 from tests.conftest import ROOT
 from tests.for_each import for_each
-from tests.model.kit import tiny_config
+from tests.model.kit import tensors_of, tiny_config
 from tests.train.kit import take
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.augment import augment_scene
@@ -118,15 +116,6 @@ def test_the_number_of_threads_changes_nothing(
     before = threading.active_count()
     assert identities(take(data, SETTINGS, WHOLE, workers=workers)) == identities(whole)
     assert threading.active_count() <= before, "closing the stream ends its threads"
-
-
-def test_a_list_of_the_same_shards_gives_the_same_batches(
-    data: Dataset, whole: list[list[TrainingScene]]
-) -> None:
-    listed = open_training_data([f"{data.folder.root}/train-{{000000..000004}}.tar"])
-    assert "without a manifest" in listed.notes[0]
-    assert identities(take(listed, SETTINGS, 4)) == identities(whole[:4])
-    assert identities(take(listed, SETTINGS, 2, first=3)) == identities(whole[3:5])
 
 
 def test_epochs_show_every_scene_and_differ(whole: list[list[TrainingScene]]) -> None:

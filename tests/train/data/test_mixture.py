@@ -29,13 +29,11 @@ from tests.train.fake_card import CARD, fake_card
 from tests.train.kit import CPU, keys_of, require_resumed_to_the_bit, take, tiny_run
 from tests.train.toy import write_toy_dataset
 from train.data.bad_samples import BadSampleCounter, first_samples
-from train.data.buckets import CopyStream, StepScenes, decodes_on_device, step_scenes
+from train.data.buckets import CopyStream, StepScenes, step_scenes
 from train.data.loader import (
     MAX_THREADS,
     LoaderSettings,
-    Machine,
     choose_workers,
-    detect_machine,
     load_batches,
 )
 from train.data.order import RECORD, Mixture, RankSlice, plan_mixture
@@ -210,32 +208,26 @@ def test_a_run_of_two_datasets_resumes_to_the_bit_and_takes_up_a_third(
 GIB = 1 << 30
 
 
-def system(root: Path, files: dict[str, str]) -> Path:
-    """Write files of a system into a folder; returns it."""
-    for name, text in files.items():
-        path = root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    return root
+FREE = "MemFree: 1 kB\nMemAvailable: {} kB\n"
 
 
 @for_each(
-    ("files", "cores", "free"),
+    ("files", "processes", "on_card", "threads", "said"),
     [
-        ({}, 16.0, None),
-        ({"proc/meminfo": "MemFree: 1 kB\nMemAvailable: 2097152 kB\n"}, 16.0, 2 * GIB),
-        ({"sys/fs/cgroup/cpu.max": "350000 100000\n"}, 3.5, None),
+        ({}, 1, True, MAX_THREADS, "8 threads decode samples, by 16 cores"),
+        ({}, 8, False, 1, "1 thread decodes samples, by 16 cores for 8 processes"),
+        ({"proc/meminfo": FREE.format(65536)}, 1, True, 5, "16 cores and 0.1 GiB of free memory"),
+        ({"sys/fs/cgroup/cpu.max": "350000 100000\n"}, 1, False, 2, "by 3.5 cores"),
         (
             {
                 "proc/self/cgroup": "0::/job/step\n",
                 "sys/fs/cgroup/job/cpu.max": "400000 100000",
                 "sys/fs/cgroup/job/step/cpu.max": "max 100000",
                 "sys/fs/cgroup/job/memory.max": f"{8 * GIB}",
-                "sys/fs/cgroup/job/memory.current": f"{5 * GIB}",
-                "proc/meminfo": "MemAvailable: 104857600 kB\n",
+                "sys/fs/cgroup/job/memory.current": f"{8 * GIB - (1 << 26)}",
+                "proc/meminfo": FREE.format(104857600),
             },
-            4.0,
-            3 * GIB,
+            2, True, 1, "by 4 cores for 2 processes",
         ),
         (
             {
@@ -245,39 +237,28 @@ def system(root: Path, files: dict[str, str]) -> Path:
                 "sys/fs/cgroup/memory/memory.limit_in_bytes": "9223372036854771712",
                 "sys/fs/cgroup/memory/memory.usage_in_bytes": "1000",
             },
-            2.0,
-            None,
+            1, True, 1, "by 2 cores",
         ),
     ],
-)
-def test_a_machine_is_what_its_files_say(
+)  # fmt: skip
+def test_threads_are_what_a_machine_spares_as_its_files_say(
     files: dict[str, str],
-    cores: float,
-    free: int | None,
+    processes: int,
+    on_card: bool,
+    threads: int,
+    said: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(16)), raising=False)
-    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
-    found = detect_machine(system(tmp_path, files))
-    assert found == Machine(cores=cores, free_bytes=free, processes=2)
-
-
-@for_each(
-    ("machine", "on_card", "threads", "said"),
-    [
-        (Machine(cores=2), False, 1, "1 thread decodes samples, by 2 cores"),
-        (Machine(cores=8), True, 7, "7 threads decode samples, by 8 cores"),
-        (Machine(cores=208, processes=8), True, MAX_THREADS, "by 208 cores for 8 processes"),
-        (Machine(cores=64, free_bytes=GIB // 16), True, 5, "64 cores and 0.1 GiB of free memory"),
-    ],
-)
-def test_threads_are_what_is_spare(
-    machine: Machine, on_card: bool, threads: int, said: str
-) -> None:
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", str(processes))
+    for name, text in files.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
     run = dataclasses.replace(tiny_run(resolution=256), views_per_scene=2)
-    found, reason = choose_workers(machine, run, on_gpu=on_card, busy_threads=1)
-    assert found == threads and said in reason
+    found, reason = choose_workers(run, on_gpu=on_card, busy_threads=1, root=tmp_path)
+    assert found == threads and reason.endswith(said), reason
 
 
 LIT = AugmentationSettings(mirror=True, channels=True, light_scale=3.0)
@@ -382,7 +363,6 @@ def test_a_card_gets_copies_beside_its_kernels(
     dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From pinned memory, all queued at once, each waited for alone, kept until it is used."""
-    assert decodes_on_device(CARD)
     said = logged(monkeypatch)
     with steps(dataset, CARD, lookup_in_threads=False) as found:
         step = next(found)

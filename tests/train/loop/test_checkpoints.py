@@ -34,7 +34,7 @@ from tests.extensions_kit import EXAMPLES, loaded, written
 from tests.for_each import for_each
 from tests.train.kit import ALONE, TINY_MODEL, flip_a_bit, stepper, tiny_run, toy_batch, trained
 from train.data.buckets import TrainingBatch
-from train.folder import RunFolder, read_rows
+from train.folder import RunFolder
 from train.loop import checkpoints, interrupts
 from train.loop.checkpoints import (
     UNSEALED,
@@ -46,7 +46,6 @@ from train.loop.checkpoints import (
 )
 from train.loop.distributed import DistributedContext, choose_device, join_processes
 from train.loop.interrupts import deferred_interrupts
-from train.loop.recorder import MetricsLog
 from train.loop.train_state import TrainState, new_state
 from train.progress import TrainProgress
 from train.resume import plan_resume
@@ -282,17 +281,6 @@ def load(path: Path) -> TrainState:
     return restore_state(checkpoint, plan_resume(checkpoint.header, typed, DIGEST, {}))
 
 
-@for_each("steps", [0, 3])
-def test_a_loaded_state_goes_on_to_the_bit(tmp_path: Path, steps: int) -> None:
-    state = stepped(steps)
-    loaded = load(save(tmp_path, state))
-    assert (loaded.step, loaded.skipped_steps) == (state.step, state.skipped_steps)
-    batch = toy_batch(1)
-    for each in (state, loaded):
-        one_step(each, batch)
-    assert equal_weights(state, loaded)
-
-
 def test_equal_states_give_equal_bytes_and_skipped_steps_are_no_updates(tmp_path: Path) -> None:
     one, other = (save(tmp_path / name, stepped()) for name in "ab")
     assert one.read_bytes() == other.read_bytes()
@@ -325,17 +313,6 @@ def test_nothing_may_be_missing_and_no_bit_may_flip(tmp_path: Path) -> None:
             read_checkpoint(path)
     path.write_bytes(data)
     assert load(path).step == 1
-
-
-def test_the_log_is_cut_back_to_the_checkpoint(tmp_path: Path) -> None:
-    path = tmp_path / "metrics.jsonl"
-    log = MetricsLog(path, first_step=0)
-    for step in (2, 4, 6):
-        log.append({"step": step, "loss": 1.0 / step})
-    with path.open("ab") as stream:
-        stream.write(b'{"step": 8, "lo\xff\xff')
-    MetricsLog(path, first_step=4)
-    assert [row["step"] for row in read_rows(path)] == [2, 4]
 
 
 def test_a_run_of_an_extension_is_resumed_with_the_same_one_only(tmp_path: Path) -> None:

@@ -254,11 +254,6 @@ def test_a_view_as_noisy_as_the_setting_counts_half() -> None:
     torch.testing.assert_close(shares, torch.tensor([[1.0, 0.5, 0.25]]).expand(2, 3))
 
 
-def test_nothing_takes_the_place_of_lpips_by_itself() -> None:
-    with pytest.raises(TrilightError, match=r"--lpips FOLDER .* --set loss.perceptual=ms_ssim"):
-        TrainingLoss(LossSettings(perceptual="lpips"), None)
-
-
 def test_the_hub_has_both_files_and_the_large_one_is_checked(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

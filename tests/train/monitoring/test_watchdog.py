@@ -36,7 +36,7 @@ from train.data import loader
 from train.data.scenes import TrainingScene
 from train.folder import RunFolder, read_rows
 from train.loop.distributed import DistributedContext, join_processes
-from train.loop.recorder import WandbLogger, require_wandb, scalars
+from train.loop.recorder import require_wandb, scalars
 from train.loop.step import StepReport
 from train.loop.train_state import new_state
 from train.monitoring import process_monitor, watchdog
@@ -292,9 +292,6 @@ def test_a_gradient_that_is_not_finite_is_none_and_a_missing_one_is_nothing() ->
     model[0].weight.grad = torch.full((1, 2), math.inf)
     layers.record_gradients()
     layers.record_update()
-    seen = layers.pending
-    assert seen is not None
-    layers.set_values(seen.flatten().tolist())
     row = layers.pop_row()
     assert row["0.weight"][0] is None
     assert row["1.weight"][0] == 0 == row["1.weight"][2]
@@ -306,8 +303,8 @@ def test_the_trace_holds_the_steps_and_the_note_says_how_to_open_it(tmp_path: Pa
     for step in range(11, 18):
         profiler.begin_step(step)
         torch.ones(3, 3) @ torch.ones(3, 3)
-        profiler.end_step(step)
-    profiler.close(17)
+        profiler.end_step()
+    profiler.close()
     trace, table = tmp_path / "profile-steps-14-to-15.json.gz", "profile-steps-14-to-15.txt"
     with gzip.open(trace) as stream:
         events = json.load(stream)["traceEvents"]
@@ -323,8 +320,8 @@ def test_what_was_not_reached_is_told(tmp_path: Path, asked: int, steps: int) ->
     profiler = StepProfiler(asked, CPU, tmp_path, told.append)
     for step in range(1, steps + 1):
         profiler.begin_step(step)
-        profiler.end_step(step)
-    profiler.close(steps)
+        profiler.end_step()
+    profiler.close()
     ended = "nothing was profiled: the run ended before step 4 of this call"
     assert told == ([ended] if asked else [])
     assert list(tmp_path.iterdir()) == []
@@ -370,38 +367,31 @@ def test_a_bound_is_median_and_deviations_and_neither_a_breath_nor_infinity_spik
         assert black.add(step, replace(REPORT, loss=0.0, grad_norm=0.0), []) == []
 
 
-@pytest.fixture
-def package(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
-    """Stands for wandb, and remembers what it was asked."""
-    package = MagicMock()
-    package.Image = lambda picture: ("picture", picture.size)
-    monkeypatch.setitem(sys.modules, "wandb", package)
-    return package
-
-
-def test_rows_and_sheets_of_a_run_are_logged_offline_or_as_the_user_says(
-    dataset: Dataset, package: MagicMock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@for_each("mode", [None, "online"])
+def test_wandb_follows_tensorboards_files_offline_or_as_the_user_says(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str | None
 ) -> None:
+    package, out, files = MagicMock(), tmp_path / "mine", list[Path]()
+
+    def init(**_: Any) -> Any:
+        files.extend(out.glob("tensorboard/*"))
+        return package.run
+
+    package.init.side_effect = init
+    monkeypatch.setitem(sys.modules, "wandb", package)
     monkeypatch.delenv("WANDB_MODE", raising=False)
-    settings, out = tiny_run(num_steps=4), tmp_path / "mine"
-    result = trained(settings, dataset, out, watched=WatchSettings(wandb="light"))
-    begun, board = dict(package.init.call_args.kwargs), package.init.return_value
+    if mode:
+        monkeypatch.setenv("WANDB_MODE", mode)
+    trained(tiny_run(num_steps=4), dataset, out, watched=WatchSettings(wandb="light"))
+    begun = dict(package.init.call_args.kwargs)
     config = begun.pop("config")
     assert (config["num_steps"], config["model"]["width"]) == (4, 36)
     assert begun == {
-        "project": "light", "group": "mine", "dir": str(out), "mode": "offline",
+        "project": "light", "group": "mine", "dir": str(out), "mode": mode or "offline",
+        "sync_tensorboard": True,
     }  # fmt: skip
-    rows = [row for row in read_rows(result.folder.metrics) if "loss" in row]
-    logged = [call.args[0] for call in board.log.call_args_list]
-    losses = {row["step"]: row["train/loss"] for row in logged if "train/loss" in row}
-    assert losses == {row["step"]: row["loss"] for row in rows}
-    assert any("validation/log_l1" in row and row["step"] == 4 for row in logged)
-    assert any(row.get("validation", "")[0:1] == ("picture",) for row in logged)
-    board.define_metric.assert_called_once_with("*", step_metric="step")
-    board.finish.assert_called_once_with()
-    monkeypatch.setenv("WANDB_MODE", "online")
-    WandbLogger("light", tmp_path, {})
-    assert package.init.call_args.kwargs["mode"] == "online"
+    assert not files and list(out.glob("tensorboard/*")), "it sees only files that come after it"
+    package.run.finish.assert_called_once_with()
 
 
 def test_where_it_is_missing_a_run_that_asks_for_it_does_not_begin(
