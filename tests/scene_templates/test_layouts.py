@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from scene_templates.families import DEFAULT_FAMILIES, Family
 from scene_templates.layout import Pose, ShellPart
-from scene_templates.placement import TOUCHING
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
 from scene_templates.rooms import (
     PATCH_FACES,
     SIDES,
-    Room,
+    TOUCHING,
     SeparateSides,
     SharedRoom,
     patch,
@@ -203,13 +202,6 @@ def _corner_normals(
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
-def _room(ranges: SharedRoom, name: str, seed: int) -> tuple[Room, list[NDArray[np.float64]]]:
-    """Draw a room, and return it with the vertices of its parts."""
-    parts = TEMPLATES[name].parts
-    room = ranges.sample_room(np.random.default_rng(seed), parts)
-    return room, [patch(SIDES[part], at) for part, at in zip(parts, room.patches, strict=True)]
-
-
 def _shells(ranges: SharedRoom, name: str, count: int) -> list[tuple[ShellPart, ...]]:
     """Draw whole layouts without objects."""
     settings = template_settings(name, {"families.num_objects": [0, 0]})
@@ -273,12 +265,12 @@ def test_in_square_rooms_walls_stand_exactly_on_the_floors_edge(name: str) -> No
 def test_nothing_shines_through_the_seams(ranges: SharedRoom, name: str) -> None:
     """From the middle of the room, a look at any point near a seam meets a floor or wall."""
     for seed in range(60):
-        room, patches = _room(ranges, name, seed)
+        room = ranges.sample_room(np.random.default_rng(seed), TEMPLATES[name].parts)
         rng = np.random.default_rng([seed, 1])
         middle = (room.low + room.high) / 2
         for part in TEMPLATES[name].parts[1:]:
             points = _near_seam(rng, room.low, room.high, part)
-            hit = np.any([_meets(middle, points - middle, one) for one in patches], axis=0)
+            hit = np.any([_meets(middle, points - middle, one) for one in room.positions], axis=0)
             assert hit.all(), (seed, part)
 
 
