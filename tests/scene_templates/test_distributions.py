@@ -258,14 +258,6 @@ def test_the_second_training_stage_draws_the_same() -> None:
     assert (finetune.max_triangles, finetune.enough_error) == (4096, 0.0025)
 
 
-def test_published_stages_differ_in_families_and_budget_only() -> None:
-    for suffix in ("", "-original"):
-        first = _settings(f"renderformer-v1-256{suffix}")
-        second = _settings(f"renderformer-v1-512{suffix}")
-        assert dataclasses.replace(second, families=first.families, max_triangles=1572) == first
-        assert (first.max_triangles, second.max_triangles) == (1572, 4192)
-
-
 WRONG: list[tuple[str, Mapping[str, Any], set[str]]] = [
     (
         "renderformer-v1-256",
