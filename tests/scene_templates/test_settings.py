@@ -5,7 +5,6 @@ Draws: named ones, rotations, layouts by index, and exact operations alone.
 
 import ast
 import dataclasses
-import json
 import math
 from collections import Counter
 from pathlib import Path
@@ -108,14 +107,6 @@ def test_the_least_triangle_limit_depends_on_the_layouts_in_use() -> None:
         template_settings(name, {"max_triangles": least})
         with pytest.raises(TrilightError, match=f"at least {least} for {name}"):
             template_settings(name, {"max_triangles": least - 1})
-
-
-def test_settings_are_plain_values_for_a_manifest() -> None:
-    """Through JSON and back, every number is the same, and the settings are as they were."""
-    stored = json.loads(json.dumps(settings_record(DEFAULTS)))
-    assert from_record(SceneSettings, stored) == DEFAULTS
-    stored["lights"]["count"] = [2, 2]
-    assert from_record(SceneSettings, stored) != DEFAULTS
 
 
 def test_an_excursion_that_contradicts_the_settings_is_refused_at_once() -> None:
