@@ -142,10 +142,10 @@ def _bake_texels(
     missed = 0
     for first in range(0, len(points), _BLOCK):
         part = slice(first, first + _BLOCK)
-        shown, is_missed = source.lookup.find(points[part], normals[part], reach)
-        columns[part, : NORMAL.start] = source.columns(shown, 1 / density)
+        locations, is_missed = source.lookup.find(points[part], normals[part], reach)
+        columns[part, : NORMAL.start] = source.columns(locations, 1 / density)
         if source.has_normal_maps:
-            mapped = source.normals(shown, 1 / density, (normals[part], along[part]))
+            mapped = source.normals(locations, 1 / density, (normals[part], along[part]))
             mapped[np.abs(mapped[:, :2]).max(axis=1) < _LEAST_SLOPE] = 0, 0, 1
             columns[part, NORMAL] = (mapped + 1) / 2
         missed += int(is_missed.sum())
@@ -282,9 +282,9 @@ def level_emission(
     normal = level.double_area_vectors
     areas = 0.5 * np.linalg.norm(normal, axis=1)
     normals = np.repeat(normal / (2 * areas[:, None]), len(weights), axis=0)
-    shown, _ = source.lookup.find(points.reshape(-1, 3), normals, reach)
+    locations, _ = source.lookup.find(points.reshape(-1, 3), normals, reach)
     cell = float(np.sqrt(np.median(areas) / len(weights)))
-    seen = source.emission(shown, cell).reshape(len(corners), -1, 3)
+    seen = source.emission(locations, cell).reshape(len(corners), -1, 3)
     mean = seen.mean(axis=1)
     if not mean.max() < _MOST:  # or not a number
         raise Rejected("materials_unreadable", f"a surface emits {mean.max():.3g}; < {_MOST:g}")

@@ -51,17 +51,17 @@ class SurfaceLookup:
             normals: the level's normals there.
             reach: largest distance to a surface, in the unit box.
         """
-        found, is_missed = self._closest(points, normals, reach)
+        locations, is_missed = self._closest(points, normals, reach)
         best = np.full(len(points), np.inf)
         for sign in (1.0, -1.0):
             face, weights, distance = self._cast_rays(points, sign * normals)
             facing = (self._normals[face] * normals).sum(axis=1) > 0
             taken = facing & (distance <= reach) & (distance < best)
             best[taken] = distance[taken]
-            found.faces[taken] = face[taken]
-            found.weights[taken] = weights[taken]
+            locations.faces[taken] = face[taken]
+            locations.weights[taken] = weights[taken]
             is_missed[taken] = False
-        return found, is_missed
+        return locations, is_missed
 
     def _cast_rays(
         self, points: NDArray[np.float64], directions: NDArray[np.float64]

@@ -220,9 +220,9 @@ def _torn_seams(level: TriangleMesh, source: SourceSurface, reach: float, texel:
     points = ((1 - along) * inner[:, 0] + along * inner[:, 1]).reshape(-1, 3)
     side_positions = []
     for side in sides.T:
-        shown, _ = source.lookup.find(points, np.tile(normal[side], (len(_ALONG), 1)), reach)
-        corners = source.mesh.corners[shown.faces]
-        side_positions.append(np.einsum("nc,ncd->nd", shown.weights, corners))
+        locations, _ = source.lookup.find(points, np.tile(normal[side], (len(_ALONG), 1)), reach)
+        corners = source.mesh.corners[locations.faces]
+        side_positions.append(np.einsum("nc,ncd->nd", locations.weights, corners))
     gap = np.linalg.norm(side_positions[0] - side_positions[1], axis=1).reshape(len(_ALONG), -1)
     length = np.linalg.norm(inner[:, 1] - inner[:, 0], axis=1)
     torn = (gap > _TORN_TEXELS * texel).mean(axis=0)
