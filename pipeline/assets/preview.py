@@ -94,7 +94,8 @@ class _CameraHits:
         normals = mesh.double_area_vectors[self.face]
         self.double_areas = np.linalg.norm(normals, axis=1)
         unit = normals / self.double_areas[:, None]
-        ahead, eyes = directions[self._is_hit], origins[self._is_hit]
+        ahead = directions[self._is_hit]
+        eyes = origins[self._is_hit]
         self.facing = np.einsum("ij,ij->i", unit, -ahead)
         steep = np.where(np.abs(self.facing) > 1e-6, self.facing, 1e-6)
         distance = np.einsum("ij,ij->i", unit, eyes - self.corners[:, 0]) / steep
