@@ -8,15 +8,14 @@ meshes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.checks import Range
-from scene_templates.layout import Plane, Pose
-from scene_templates.rooms import SIDES, Room
+from scene_templates.layout import Pose
+from scene_templates.rooms import Room
 from scene_templates.rotations import Orientation, rotate_points, sample_rotation
 from storage.errors import Rejected
 from storage.settings.described import checked
@@ -27,9 +26,6 @@ ARRANGEMENT_TRIES = 100
 
 PLACE_TRIES = 16
 """Draws of one place before the sizes are drawn again."""
-
-TOUCHING = 1e-9
-"""World units below which a resting object still counts as inside: rounding of float64 sums."""
 
 
 @checked("scene settings")
@@ -62,48 +58,10 @@ class PlaceableShape(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ObjectSpace:
-    """The space in which objects are placed."""
-
-    room: Room
-    """The space between the shell parts."""
-    parts: tuple[str, ...]
-    """The shell parts that exist, the floor first."""
-    planes: tuple[Plane, ...]
-
-    @property
-    def floor(self) -> Plane:
-        """The plane that objects rest on."""
-        return self.planes[0]
-
-    def centre_range(
-        self, points: NDArray[np.float64], radius: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the least and greatest centre [3] of an object with `points` [V, 3] around it.
-
-        It keeps clear of walls; through an open side it may stick out by half its radius.
-        """
-        low = np.clip(self.room.low, -0.5, 0.5) + radius / 2
-        high = np.clip(self.room.high, -0.5, 0.5) - radius / 2
-        for name in self.parts:
-            axis = SIDES[name].axis
-            lean = self.room.lean
-            if SIDES[name].sign > 0:
-                high[axis] = self.room.high[axis] - lean - points[:, axis].max()
-            else:
-                low[axis] = self.room.low[axis] + lean - points[:, axis].min()
-        return low, high
-
-    def holds(self, points: NDArray[np.float64]) -> bool:
-        """Return whether all points [V, 3] are on the room's side of every part."""
-        return all(bool((plane.height(points) >= -TOUCHING).all()) for plane in self.planes)
-
-
 def place_objects(
     rng: np.random.Generator,
     settings: PlacementSettings,
-    space: ObjectSpace,
+    room: Room,
     shapes: Sequence[PlaceableShape],
     *,
     object_scale: Range,
@@ -114,7 +72,7 @@ def place_objects(
     Args:
         rng: where the numbers come from.
         settings: how objects are placed.
-        space: where; without shell parts, in the middle of the world.
+        room: where; without shell parts, in the middle of the world.
         shapes: what they look like.
         object_scale: range of the bounding spheres' diameters, before halving.
         overlaps: whether objects may meet.
@@ -128,7 +86,7 @@ def place_objects(
         poses: dict[int, Pose] = {}
         for row in np.argsort(-radii, kind="stable").tolist():
             obstacles = [] if overlaps else [(shapes[other], at) for other, at in poses.items()]
-            pose = _sample_pose(rng, settings, space, shapes[row], float(radii[row]), obstacles)
+            pose = _sample_pose(rng, settings, room, shapes[row], float(radii[row]), obstacles)
             if pose is None:
                 break
             poses[row] = pose
@@ -140,7 +98,7 @@ def place_objects(
 def _sample_pose(
     rng: np.random.Generator,
     settings: PlacementSettings,
-    space: ObjectSpace,
+    room: Room,
     shape: PlaceableShape,
     radius: float,
     obstacles: Sequence[tuple[PlaceableShape, Pose]],
@@ -148,14 +106,14 @@ def _sample_pose(
     """Draw a place for an object clear of others, or None where none was found."""
     rotation = sample_rotation(rng, settings.orientation)
     rests = bool(rng.random() < settings.resting_share)
-    if not space.parts:
+    if not room.parts:
         pose = Pose(centre=np.zeros(3), radius=radius, rotation=rotation)
         return None if any(shape.overlaps(pose, other, at) for other, at in obstacles) else pose
     points = radius * rotate_points(shape.points, rotation)
     low = np.full(3, -0.5)
     high = np.full(3, 0.5)
     if settings.inside:
-        low, high = space.centre_range(points, radius)
+        low, high = room.centre_range(points, radius)
         if rests:
             # it is set down below
             low[2] = 0.0
@@ -166,9 +124,10 @@ def _sample_pose(
         centre = rng.uniform(low, high)
         if rests:
             # until the lowest point touches; it need not be in balance
-            height = space.floor.height(points + centre).min()
-            centre = centre - height / space.floor.normal[2] * np.array([0, 0, 1.0])
-        if settings.inside and not space.holds(points + centre):
+            floor = room.planes[0]
+            height = floor.height(points + centre).min()
+            centre = centre - height / floor.normal[2] * np.array([0, 0, 1.0])
+        if settings.inside and not room.holds(points + centre):
             continue
         pose = Pose(centre=centre, radius=radius, rotation=rotation)
         if not any(shape.overlaps(pose, other, at) for other, at in obstacles):

@@ -13,6 +13,7 @@ X, Y, Z, scale per axis, move, halve.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from types import MappingProxyType
 from typing import Annotated, NamedTuple
 
@@ -27,6 +28,9 @@ from storage.settings.ranges import Share, Within
 
 QUADS = 8
 """Quads per side of a patch: 8 x 8 x 2 = 128 triangles."""
+
+TOUCHING = 1e-9
+"""World units below which a resting object still counts as inside: rounding of float64 sums."""
 
 
 class Side(NamedTuple):
@@ -95,8 +99,10 @@ PATCH_FACES.setflags(write=False)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Room:
-    """The places of the shell parts, and the space between them."""
+    """The shell parts in their places, and the space between them for objects."""
 
+    parts: tuple[str, ...]
+    """Names of the shell parts that exist, the floor first."""
     patches: tuple[PatchPlacement, ...]
     """One placement for each shell part."""
     low: NDArray[np.float64]
@@ -105,6 +111,38 @@ class Room:
     """Upper corner [3] in world units."""
     lean: float
     """How far a tilted wall may stand inside of these bounds at most."""
+
+    @cached_property
+    def positions(self) -> list[NDArray[np.float64]]:
+        """Vertices [81, 3] of each part."""
+        placed = zip(self.parts, self.patches, strict=True)
+        return [patch(SIDES[name], placement) for name, placement in placed]
+
+    @cached_property
+    def planes(self) -> list[Plane]:
+        """The plane of each part; objects rest on the first."""
+        return [plane_of(positions) for positions in self.positions]
+
+    def centre_range(
+        self, points: NDArray[np.float64], radius: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the least and greatest centre [3] of an object with `points` [V, 3] around it.
+
+        It keeps clear of walls; through an open side it may stick out by half its radius.
+        """
+        low = np.clip(self.low, -0.5, 0.5) + radius / 2
+        high = np.clip(self.high, -0.5, 0.5) - radius / 2
+        for name in self.parts:
+            axis = SIDES[name].axis
+            if SIDES[name].sign > 0:
+                high[axis] = self.high[axis] - self.lean - points[:, axis].max()
+            else:
+                low[axis] = self.low[axis] + self.lean - points[:, axis].min()
+        return low, high
+
+    def holds(self, points: NDArray[np.float64]) -> bool:
+        """Return whether all points [V, 3] are on the room's side of every part."""
+        return all(bool((plane.height(points) >= -TOUCHING).all()) for plane in self.planes)
 
 
 @checked("scene settings")
@@ -147,6 +185,7 @@ class SharedRoom:
                 )
             )
         return Room(
+            parts=tuple(names),
             patches=tuple(patches),
             low=(translation - scale) / 2,
             high=(translation + scale) / 2,
@@ -228,4 +267,10 @@ class SeparateSides:
     def sample_room(self, rng: np.random.Generator, names: Sequence[str]) -> Room:
         """Draw the sides `names`; the space between them is the nominal room."""
         patches = [getattr(self, name).sample_placement(rng, SIDES[name].axis) for name in names]
-        return Room(patches=tuple(patches), low=np.full(3, -0.5), high=np.full(3, 0.5), lean=0.0)
+        return Room(
+            parts=tuple(names),
+            patches=tuple(patches),
+            low=np.full(3, -0.5),
+            high=np.full(3, 0.5),
+            lean=0.0,
+        )

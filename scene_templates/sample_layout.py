@@ -13,8 +13,8 @@ import numpy as np
 
 from scene_templates.families import Family
 from scene_templates.layout import Layout, ObjectPlacement, ShellPart
-from scene_templates.placement import ObjectSpace, PlaceableShape, place_objects
-from scene_templates.rooms import PATCH_FACES, SIDES, SeparateSides, patch, plane_of
+from scene_templates.placement import PlaceableShape, place_objects
+from scene_templates.rooms import PATCH_FACES, SeparateSides
 from scene_templates.sample_emitters import sample_emitters
 from scene_templates.sample_material import sample_material
 from scene_templates.settings import SceneSettings
@@ -82,13 +82,10 @@ def sample_layout(
     family = plan.family
     template = TEMPLATES[family.template]
     room = family.shell.sample_room(rng, template.parts)
-    placed = zip(template.parts, room.patches, strict=True)
-    positions = [patch(SIDES[name], placement) for name, placement in placed]
-    space = ObjectSpace(room=room, parts=template.parts, planes=tuple(map(plane_of, positions)))
     poses = place_objects(
         rng,
         settings.placement,
-        space,
+        room,
         shapes,
         object_scale=family.object_scale,
         overlaps=plan.overlaps,
@@ -106,6 +103,6 @@ def sample_layout(
             faces=PATCH_FACES[:, ::-1] if name == "wall2" and wall2_faces_out else PATCH_FACES,
             surface=surface,
         )
-        for name, vertices, surface in zip(template.parts, positions, surfaces, strict=True)
+        for name, vertices, surface in zip(room.parts, room.positions, surfaces, strict=True)
     )
     return Layout(shell=shell, objects=objects, emitters=emitters)

@@ -25,6 +25,8 @@ _LINED_PX = (3.0, 9.0)
 """Triangle sizes in pixels: no edge lines below the first, where they would only blacken the
 picture, and full lines above the second."""
 _SUPERSAMPLE = 2
+_HALF_WIDTH = 0.72
+"""Half of the picture's width, in widths of the unit box."""
 
 
 def preview_source_and_level(
@@ -42,30 +44,15 @@ def preview_source_and_level(
 def preview_level(level: Level, width_px: int) -> NDArray[np.uint8]:
     """Return a picture of a level: gray [W, W], or [W, W, 3] where the level has colors."""
     mesh = level_mesh(level)
-    grey = preview(mesh, width_px)
-    return grey if level.skin is None else _preview_colors(mesh, level.skin, width_px)
+    return preview(mesh, width_px) if level.skin is None else _colors(mesh, level.skin, width_px)
 
 
-def _preview_colors(mesh: TriangleMesh, skin: LevelSkin, width_px: int) -> NDArray[np.uint8]:
+def _colors(mesh: TriangleMesh, skin: LevelSkin, width_px: int) -> NDArray[np.uint8]:
     """Return a picture [W, W, 3] of a mesh with its textures, without edge lines."""
-    wide = width_px * _SUPERSAMPLE
-    origins, directions, _ = _camera_rays(wide)
-    face = first_faces(mesh, origins.astype(np.float32), directions.astype(np.float32))
-    hit = face >= 0
-    color = np.full((len(face), 3), _BACKGROUND)
-    corners = mesh.corners[face[hit]]
-    normals = mesh.double_area_vectors[face[hit]]
-    facing = np.einsum("ij,ij->i", normals, -directions[hit])
-    facing /= np.linalg.norm(normals, axis=1)
-    offset = np.einsum("ij,ij->i", normals, origins[hit] - corners[:, 0])
-    steep = np.einsum("ij,ij->i", normals, -directions[hit])
-    distance = offset / np.where(np.abs(steep) > 1e-12, steep, 1e-12)
-    points = origins[hit] + distance[:, None] * directions[hit]
-    uv = np.einsum("nc,ncd->nd", barycentric(corners, points), skin.uv[face[hit]])
+    hits = _CameraHits(mesh, width_px * _SUPERSAMPLE)
+    uv = np.einsum("nc,ncd->nd", barycentric(hits.corners, hits.points), skin.uv[hits.face])
     diffuse, specular = (texture_values(texture, uv) for texture in skin.textures[:2])
-    color[hit] = (diffuse + specular) * (0.25 + 0.75 * np.abs(facing))[:, None]
-    blocks = color.reshape(width_px, _SUPERSAMPLE, width_px, _SUPERSAMPLE, 3).mean(axis=(1, 3))
-    return srgb8(blocks)
+    return srgb8(hits.picture((diffuse + specular) * (0.25 + 0.75 * np.abs(hits.facing))[:, None]))
 
 
 def preview(mesh: TriangleMesh, width_px: int) -> NDArray[np.uint8]:
@@ -73,50 +60,51 @@ def preview(mesh: TriangleMesh, width_px: int) -> NDArray[np.uint8]:
 
     Parallel projection from the front right and above; back faces are darker.
     """
-    wide = width_px * _SUPERSAMPLE
-    origins, directions, pixel = _camera_rays(wide)
-    face = first_faces(mesh, origins.astype(np.float32), directions.astype(np.float32))
-    shade = np.full(len(face), _BACKGROUND)
-    hit = face >= 0
-    shade[hit] = _shade(mesh, face[hit], origins[hit], directions[hit], pixel)
-    blocks = shade.reshape(width_px, _SUPERSAMPLE, width_px, _SUPERSAMPLE).mean(axis=(1, 3))
-    return np.round(255 * blocks).astype(np.uint8)
-
-
-def _camera_rays(width_px: int) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return origins and directions [W x W, 3] from the top left, and the width of a pixel."""
-    back = _TOWARDS_CAMERA / np.linalg.norm(_TOWARDS_CAMERA)
-    right = np.cross([0.0, 0.0, 1.0], back)
-    right /= np.linalg.norm(right)
-    up = np.cross(back, right)
-    half = 0.72
-    offset = half * ((np.arange(width_px) + 0.5) / width_px * 2 - 1)
-    origins = -offset[:, None, None] * up + offset[None, :, None] * right + 2 * back
-    origins = origins.reshape(-1, 3)
-    return origins, np.broadcast_to(-back, origins.shape), 2 * half / width_px
-
-
-def _shade(
-    mesh: TriangleMesh,
-    face: NDArray[np.int64],
-    origins: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    pixel: float,
-) -> NDArray[np.float64]:
-    """Return the gray value of each hit: brighter towards the camera, dark along the edges."""
-    normal = mesh.double_area_vectors[face]
-    unit = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-    corner = mesh.corners[face]
-    facing = np.einsum("ij,ij->i", unit, -directions)
-    steep = np.where(np.abs(facing) > 1e-6, facing, 1e-6)
-    distance = np.einsum("ij,ij->i", unit, origins - corner[:, 0]) / steep
-    point = origins + distance[:, None] * directions
-    grey = np.where(facing >= 0, 0.25 + 0.65 * facing, 0.10 - 0.25 * facing)
-    nearest = np.full(len(face), np.inf)
+    hits = _CameraHits(mesh, width_px * _SUPERSAMPLE)
+    grey = np.where(hits.facing >= 0, 0.25 + 0.65 * hits.facing, 0.10 - 0.25 * hits.facing)
+    nearest = np.full(len(grey), np.inf)
     for k in range(3):
-        edge = corner[:, (k + 1) % 3] - corner[:, k]
+        edge = hits.corners[:, (k + 1) % 3] - hits.corners[:, k]
         edge /= np.linalg.norm(edge, axis=1, keepdims=True)
-        nearest = np.minimum(nearest, np.linalg.norm(np.cross(point - corner[:, k], edge), axis=1))
-    size_px = np.sqrt(np.linalg.norm(normal, axis=1)) / pixel
+        across = np.linalg.norm(np.cross(hits.points - hits.corners[:, k], edge), axis=1)
+        nearest = np.minimum(nearest, across)
+    size_px = np.sqrt(hits.double_areas) / hits.pixel
     strength = np.interp(size_px, _LINED_PX, (0.0, 0.55))
-    return np.where(nearest < _LINE_PX * pixel, (1 - strength) * grey, grey)
+    lined = np.where(nearest < _LINE_PX * hits.pixel, (1 - strength) * grey, grey)
+    return np.round(255 * hits.picture(lined)).astype(np.uint8)
+
+
+class _CameraHits:
+    """The points of a mesh that the camera's rays hit: faces [N] and what is known there."""
+
+    def __init__(self, mesh: TriangleMesh, width_px: int) -> None:
+        back = _TOWARDS_CAMERA / np.linalg.norm(_TOWARDS_CAMERA)
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right /= np.linalg.norm(right)
+        offset = _HALF_WIDTH * ((np.arange(width_px) + 0.5) / width_px * 2 - 1)
+        rows = -offset[:, None, None] * np.cross(back, right)
+        origins = (rows + offset[None, :, None] * right + 2 * back).reshape(-1, 3)
+        directions = np.broadcast_to(-back, origins.shape)
+        face = first_faces(mesh, origins.astype(np.float32), directions.astype(np.float32))
+        self._width_px = width_px
+        self._is_hit = face >= 0
+        self.pixel = 2 * _HALF_WIDTH / width_px
+        self.face = face[self._is_hit]
+        self.corners = mesh.corners[self.face]
+        normals = mesh.double_area_vectors[self.face]
+        self.double_areas = np.linalg.norm(normals, axis=1)
+        unit = normals / self.double_areas[:, None]
+        ahead = directions[self._is_hit]
+        eyes = origins[self._is_hit]
+        self.facing = np.einsum("ij,ij->i", unit, -ahead)
+        steep = np.where(np.abs(self.facing) > 1e-6, self.facing, 1e-6)
+        distance = np.einsum("ij,ij->i", unit, eyes - self.corners[:, 0]) / steep
+        self.points = eyes + distance[:, None] * ahead
+
+    def picture(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the picture of values [N, ...] at the hits, of half the width."""
+        pixels = np.full((len(self._is_hit), *values.shape[1:]), _BACKGROUND)
+        pixels[self._is_hit] = values
+        side = self._width_px // _SUPERSAMPLE
+        blocks = pixels.reshape(side, _SUPERSAMPLE, side, _SUPERSAMPLE, *values.shape[1:])
+        return np.asarray(blocks.mean(axis=(1, 3)))

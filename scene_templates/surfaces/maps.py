@@ -97,26 +97,6 @@ def finish(base_rgb: ArrayLike, *, specular_share: float, roughness: float, meta
     )
 
 
-def surface_maps(
-    family: str,
-    made_of: Finish,
-    *,
-    size: int,
-    roughness_clip: tuple[float, float],
-    parameters: Mapping[str, tuple[Any, ...]],
-) -> SurfaceMaps:
-    """Return the maps of a finish, rounded once."""
-    full_size = np.zeros((size, size, 1))
-    roughness = np.clip(made_of.roughness[..., None] + full_size, *roughness_clip)
-    return SurfaceMaps(
-        family=family,
-        diffuse_rgb=(made_of.diffuse_rgb + full_size).astype(np.float32),
-        specular_rgb=(made_of.specular_rgb + full_size).astype(np.float32),
-        roughness=roughness.astype(np.float32),
-        parameters=parameters,
-    )
-
-
 RGB = tuple[float, float, float]
 """Linear, Rec.709 primaries."""
 
@@ -160,17 +140,15 @@ class SurfaceDraws(RecordedSampler):
         metal: bool = False,
     ) -> Finish:
         """Return a finish; natural base colours lie between `low` and `high`."""
+        least, most = self._albedo
+        if self._natural:
+            tint = self.colour(f"{name}: tint", (LEAST_TINT,) * 3, (1.0,) * 3)
+            base = tint * self.shade(f"{name}: colour", low, high)
+        else:
+            base = self.colour(f"{name}: any colour", (least,) * 3, (most,) * 3)
         return finish(
-            self._natural_colour(name, low, high) if self._natural else self._any_colour(name),
+            base,
             specular_share=self.uniform(f"{name}: specular share", *specular),
             roughness=self.uniform(f"{name}: roughness", *roughness),
             metal=metal,
         )
-
-    def _natural_colour(self, name: str, low: RGB, high: RGB) -> NDArray[np.float64]:
-        tint = self.colour(f"{name}: tint", (LEAST_TINT,) * 3, (1.0,) * 3)
-        return tint * self.shade(f"{name}: colour", low, high)
-
-    def _any_colour(self, name: str) -> NDArray[np.float64]:
-        least, most = self._albedo
-        return self.colour(f"{name}: any colour", (least,) * 3, (most,) * 3)

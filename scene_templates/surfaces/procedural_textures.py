@@ -23,7 +23,6 @@ from scene_templates.surfaces.maps import (
     GlossRanges,
     SurfaceDraws,
     SurfaceMaps,
-    surface_maps,
 )
 from scene_templates.surfaces.texels import TEXELS_PER_CELL, Texels, stones
 from storage.registry import Registry
@@ -484,10 +483,12 @@ def draw_surface(rng: np.random.Generator, settings: SurfaceMapSettings) -> Surf
     name = settings.families[int(rng.integers(len(settings.families)))]
     draws = SurfaceDraws(rng, natural_share=settings.natural_share, albedo=settings.albedo)
     made_of = SURFACES[name](draws, Texels(settings.size))
-    return surface_maps(
-        name,
-        made_of,
-        size=settings.size,
-        roughness_clip=settings.roughness_clip,
+    full_size = np.zeros((settings.size, settings.size, 1))
+    roughness = np.clip(made_of.roughness[..., None] + full_size, *settings.roughness_clip)
+    return SurfaceMaps(
+        family=name,
+        diffuse_rgb=(made_of.diffuse_rgb + full_size).astype(np.float32),
+        specular_rgb=(made_of.specular_rgb + full_size).astype(np.float32),
+        roughness=roughness.astype(np.float32),
         parameters=draws.parameters(),
     )

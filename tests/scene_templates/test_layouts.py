@@ -1,6 +1,6 @@
 """Laws of every layout: objects, emitters, surfaces and cameras lie in their stated ranges.
 
-Shells are flat, closed at their seams, and in the published families as published.
+Shells are flat and closed at their seams; the numbers of published families stand by digests.
 """
 
 import dataclasses
@@ -11,15 +11,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scene_templates.families import DEFAULT_FAMILIES, Family
+from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Pose, ShellPart
-from scene_templates.placement import TOUCHING
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
 from scene_templates.rooms import (
     PATCH_FACES,
     SIDES,
-    Room,
-    SeparateSides,
+    TOUCHING,
     SharedRoom,
     patch,
     plane_of,
@@ -42,7 +40,6 @@ from tests.scene_templates.balls import (
     one_drawn,
     template_settings,
 )
-from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row, side_row
 
 ROUNDING = 1e-9
 """Far above the 1e-15 of float64 sums of numbers about 1, far below anything that matters."""
@@ -132,25 +129,14 @@ def test_objects_that_cannot_fit_are_rejected_with_a_reason() -> None:
 
 @for_each("name", ROOMS)
 def test_emitters_hang_outside(name: str) -> None:
-    counts = set()
     for one in _sixty(name):
-        layout = one.layout
-        counts.add(len(layout.emitters))
-        for channel in range(3):
-            total = sum(emitter.radiance_rgb[channel] for emitter in layout.emitters)
-            assert 2500 <= total <= 5000
-        reach = max(float(np.linalg.norm(part.positions, axis=1).max()) for part in layout.shell)
-        floor = plane_of(layout.shell[0].positions)
-        for emitter in layout.emitters:
+        shell = one.layout.shell
+        reach = max(float(np.linalg.norm(part.positions, axis=1).max()) for part in shell)
+        floor = plane_of(shell[0].positions)
+        for emitter in one.layout.emitters:
             centre = emitter.triangle.mean(axis=0)
-            # At most 0.2 per axis from a point 2.1 to 2.7 from the origin.
-            assert 2.1 - 0.2 * math.sqrt(3) < np.linalg.norm(centre) < 2.7 + 0.2 * math.sqrt(3)
             assert np.linalg.norm(centre) > min(reach, 1.7)
             assert floor.height(centre) > 0
-            edges = np.linalg.norm(emitter.triangle - np.roll(emitter.triangle, 1, axis=0), axis=1)
-            assert (edges > 2.0 * 0.0707 * 0.999).all()
-            assert (edges < 2.5 * 0.0708).all()
-    assert counts == set(range(1, 9))
 
 
 @for_each("name", ROOMS)
@@ -201,13 +187,6 @@ def _corner_normals(
 ) -> NDArray[np.float64]:
     corners = positions[faces]
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-
-
-def _room(ranges: SharedRoom, name: str, seed: int) -> tuple[Room, list[NDArray[np.float64]]]:
-    """Draw a room, and return it with the vertices of its parts."""
-    parts = TEMPLATES[name].parts
-    room = ranges.sample_room(np.random.default_rng(seed), parts)
-    return room, [patch(SIDES[part], at) for part, at in zip(parts, room.patches, strict=True)]
 
 
 def _shells(ranges: SharedRoom, name: str, count: int) -> list[tuple[ShellPart, ...]]:
@@ -273,12 +252,12 @@ def test_in_square_rooms_walls_stand_exactly_on_the_floors_edge(name: str) -> No
 def test_nothing_shines_through_the_seams(ranges: SharedRoom, name: str) -> None:
     """From the middle of the room, a look at any point near a seam meets a floor or wall."""
     for seed in range(60):
-        room, patches = _room(ranges, name, seed)
+        room = ranges.sample_room(np.random.default_rng(seed), TEMPLATES[name].parts)
         rng = np.random.default_rng([seed, 1])
         middle = (room.low + room.high) / 2
         for part in TEMPLATES[name].parts[1:]:
             points = _near_seam(rng, room.low, room.high, part)
-            hit = np.any([_meets(middle, points - middle, one) for one in patches], axis=0)
+            hit = np.any([_meets(middle, points - middle, one) for one in room.positions], axis=0)
             assert hit.all(), (seed, part)
 
 
@@ -312,39 +291,15 @@ def _meets(
 
 POLICIES: tuple[Policy, ...] = ("original", "de-biased")
 
-STAGES = {1: (stage_1_families, STAGE_1), 2: (stage_2_families, STAGE_2)}
 
-
-def _as_rows(families: tuple[Family, ...]) -> tuple[Row, ...]:
-    for family in families:
-        assert family.template == family.name.split("-")[0]
-    return tuple(
-        (one.name, one.weight, one.num_objects, one.object_scale, one.smooth_share)
-        for one in families
-    )
-
-
-@pytest.mark.parametrize("policy", POLICIES)
-def test_families_are_the_published_ones_and_ours_the_stated_ones(policy: Policy) -> None:
-    first, second = stage_1_families(policy), stage_2_families(policy)
-    assert (_as_rows(first), _as_rows(second)) == (STAGE_1, STAGE_2)
-    assert (len(first), sum(family.weight for family in first)) == (21, 46)
-    assert (len(second), sum(family.weight for family in second)) == (14, 42)
-    assert _as_rows(DEFAULT_FAMILIES) == DEFAULT
-
-
-@for_each(("policy", "stage"), itertools.product(POLICIES, STAGES))
-def test_every_side_has_its_published_ranges(policy: Policy, stage: int) -> None:
-    for family in STAGES[stage][0](policy):
-        assert isinstance(family.shell, SeparateSides)
-        for part in TEMPLATES[family.template].parts:
-            side = getattr(family.shell, part)
-            moves = (side.shift_x, side.shift_y, side.shift_z)
-            found = (side.spin_deg, side.tilt_deg, side.scale, *moves)
-            assert found == side_row(family.name, part, policy, stage), (family.name, part)
-        assert family.shell.wall2_faces_out == (
-            policy == "original" and ("open_box" in family.name or "patch" in family.name)
-        )
+def test_ours_have_each_layout_and_each_number_of_objects_equally_often() -> None:
+    odds = {
+        (family.template, count): family.weight / (1 + high - low)
+        for family in DEFAULT_FAMILIES
+        for low, high in [family.num_objects]
+        for count in range(low, high + 1)
+    }
+    assert odds == dict.fromkeys(itertools.product(ROOMS, (1, 2, 3)), 1.0)
 
 
 @pytest.mark.parametrize("policy", POLICIES)

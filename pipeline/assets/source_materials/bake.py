@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.settings import OwnMaterialSettings
-from pipeline.assets.source_materials.nearest import SurfaceLookup
 from pipeline.assets.source_materials.source_surface import SourceSurface
 from pipeline.assets.source_materials.texture_atlas import (
     FLAT,
@@ -79,24 +78,20 @@ class _Texels:
 
 
 def bake(
-    level: TriangleMesh,
-    source: SourceSurface,
-    nearest: SurfaceLookup,
-    settings: OwnMaterialSettings,
-    reach: float,
+    level: TriangleMesh, source: SourceSurface, settings: OwnMaterialSettings, reach: float
 ) -> BakedTextures:
     """Return the baked textures of a level.
 
     Args:
         level: mesh in the unit box.
-        source: surface that `nearest` looks up.
+        source: surface whose materials it shows.
         settings: texels and greatest size.
         reach: largest distance to the source, in the unit box.
     """
     order = longest_edge_order(level.corners)
     corners = np.take_along_axis(level.corners, order[..., None], axis=1)
     cells, density = _cells(corners, settings)
-    texels = _bake_texels(corners, cells, source, nearest, reach, density)
+    texels = _bake_texels(corners, cells, source, reach, density)
     tile_of, first_of = _tiles(cells, texels)
     plan = pack_atlas(np.where(_is_flat(texels), 0, cells)[first_of])
     uv = np.zeros((len(corners), 3, 2))
@@ -129,7 +124,6 @@ def _bake_texels(
     corners: NDArray[np.float64],
     cells: NDArray[np.int64],
     source: SourceSurface,
-    nearest: SurfaceLookup,
     reach: float,
     density: float,
 ) -> _Texels:
@@ -148,14 +142,13 @@ def _bake_texels(
     missed = 0
     for first in range(0, len(points), _BLOCK):
         part = slice(first, first + _BLOCK)
-        locations = nearest.find(points[part], normals[part], reach)
-        place = locations.faces, locations.weights, 1 / density
-        columns[part, : NORMAL.start] = source.columns(*place)
+        locations, is_missed = source.lookup.find(points[part], normals[part], reach)
+        columns[part, : NORMAL.start] = source.columns(locations, 1 / density)
         if source.has_normal_maps:
-            mapped = source.normals(*place, (normals[part], along[part]))
+            mapped = source.normals(locations, 1 / density, (normals[part], along[part]))
             mapped[np.abs(mapped[:, :2]).max(axis=1) < _LEAST_SLOPE] = 0, 0, 1
             columns[part, NORMAL] = (mapped + 1) / 2
-        missed += int(locations.is_missed.sum())
+        missed += int(is_missed.sum())
     codes = np.concatenate(
         [
             srgb8(columns[:, DIFFUSE]),
@@ -272,7 +265,7 @@ def _limit_diffuse(diffuse: NDArray[np.uint8], specular: NDArray[np.floating]) -
 
 
 def level_emission(
-    level: TriangleMesh, source: SourceSurface, nearest: SurfaceLookup, reach: float
+    level: TriangleMesh, source: SourceSurface, reach: float
 ) -> NDArray[np.float32] | None:
     """Return the radiance [F, 3] of a level's triangles; None where nothing emits.
 
@@ -289,9 +282,9 @@ def level_emission(
     normal = level.double_area_vectors
     areas = 0.5 * np.linalg.norm(normal, axis=1)
     normals = np.repeat(normal / (2 * areas[:, None]), len(weights), axis=0)
-    locations = nearest.find(points.reshape(-1, 3), normals, reach)
+    locations, _ = source.lookup.find(points.reshape(-1, 3), normals, reach)
     cell = float(np.sqrt(np.median(areas) / len(weights)))
-    seen = source.emission(locations.faces, locations.weights, cell).reshape(len(corners), -1, 3)
+    seen = source.emission(locations, cell).reshape(len(corners), -1, 3)
     mean = seen.mean(axis=1)
     if not mean.max() < _MOST:  # or not a number
         raise Rejected("materials_unreadable", f"a surface emits {mean.max():.3g}; < {_MOST:g}")

@@ -4,7 +4,7 @@ Rays along the level's normal, both ways, take the nearer surface that faces the
 thin shell does not show its far side. Where they hit none within reach, the closest point counts.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import igl
 import numpy as np
@@ -20,16 +20,11 @@ _BEHIND = 1e-4
 """
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SurfaceLocations:
-    """Points on a surface, by face and barycentric coordinates."""
+class FacePoints(NamedTuple):
+    """Points on a surface: their faces [N], and their barycentric coordinates there [N, 3]."""
 
     faces: NDArray[np.int64]
-    """[N] face of each point."""
     weights: NDArray[np.float64]
-    """[N, 3] barycentric coordinates in that face."""
-    is_missed: NDArray[np.bool_]
-    """[N] True where no surface nearby faced the same way."""
 
 
 class SurfaceLookup:
@@ -46,25 +41,27 @@ class SurfaceLookup:
 
     def find(
         self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float
-    ) -> SurfaceLocations:
+    ) -> tuple[FacePoints, NDArray[np.bool_]]:
         """Return the source points that points [N, 3] with unit normals [N, 3] show.
+
+        The second result is True [N] where no surface nearby faced the same way.
 
         Args:
             points: points on or near the source.
             normals: the level's normals there.
             reach: largest distance to a surface, in the unit box.
         """
-        result = self._closest(points, normals, reach)
+        locations, is_missed = self._closest(points, normals, reach)
         best = np.full(len(points), np.inf)
         for sign in (1.0, -1.0):
             face, weights, distance = self._cast_rays(points, sign * normals)
             facing = (self._normals[face] * normals).sum(axis=1) > 0
             taken = facing & (distance <= reach) & (distance < best)
             best[taken] = distance[taken]
-            result.faces[taken] = face[taken]
-            result.weights[taken] = weights[taken]
-            result.is_missed[taken] = False
-        return result
+            locations.faces[taken] = face[taken]
+            locations.weights[taken] = weights[taken]
+            is_missed[taken] = False
+        return locations, is_missed
 
     def _cast_rays(
         self, points: NDArray[np.float64], directions: NDArray[np.float64]
@@ -80,17 +77,15 @@ class SurfaceLookup:
 
     def _closest(
         self, points: NDArray[np.float64], normals: NDArray[np.float64], reach: float
-    ) -> SurfaceLocations:
+    ) -> tuple[FacePoints, NDArray[np.bool_]]:
         squared, face, nearest = self._tree.squared_distance(
             self._mesh.positions, self._mesh.faces, points
         )
         face = np.asarray(face, np.int64).ravel()
         facing = (self._normals[face] * normals).sum(axis=1) > 0
-        return SurfaceLocations(
-            faces=face,
-            weights=barycentric(self._mesh.corners[face], np.asarray(nearest)),
-            is_missed=~(facing & (np.sqrt(np.asarray(squared).ravel()) <= reach)),
-        )
+        weights = barycentric(self._mesh.corners[face], np.asarray(nearest))
+        is_near = np.sqrt(np.asarray(squared).ravel()) <= reach
+        return FacePoints(face, weights), ~(facing & is_near)
 
 
 def barycentric(corners: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:

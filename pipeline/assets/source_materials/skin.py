@@ -15,7 +15,7 @@ from pipeline.assets.quality.measure import (
 )
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.assets.source_materials.bake import DIFFUSE, BakedTextures, bake, level_emission
-from pipeline.assets.source_materials.nearest import SurfaceLookup, barycentric
+from pipeline.assets.source_materials.nearest import FacePoints, barycentric
 from pipeline.assets.source_materials.source_surface import SourceSurface, match_source_surface
 from pipeline.foreign.gltf.materials import GltfMaterials
 from pipeline.foreign.gltf.primitives import gltf_textured_mesh
@@ -61,15 +61,15 @@ def add_source_materials(
         settings: `own_materials` keeps materials, and says what happens where they are lost.
 
     Raises:
-        Rejected: as `open_skin_baker`, where `if_lost` is `reject`; transmissive_material, where
-            `transmission` is.
+        Rejected: as `read_source_surface`, where `if_lost` is `reject`; transmissive_material,
+            where `transmission` is.
     """
     reasons = dict(missed)
     if not settings.own_materials.keep:
         return levels, reasons, None
     refuse = settings.own_materials.if_lost == "reject"
     try:
-        baker, materials = open_skin_baker(source, mesh, settings.own_materials)
+        surface, materials = read_source_surface(source, mesh, settings.own_materials)
     except Rejected as lost:
         if refuse:
             raise
@@ -83,7 +83,7 @@ def add_source_materials(
     with_skins = list[Level]()
     for level in levels:
         try:
-            with_skins.append(baker.add_skin(level))
+            with_skins.append(add_skin(level, surface, settings.own_materials))
         except Rejected as lost:
             if refuse:
                 reasons[level.record.budget] = (lost.reason, lost.message)
@@ -93,53 +93,44 @@ def add_source_materials(
     return tuple(with_skins), reasons, materials
 
 
-class SkinBaker:
-    """Bakes the skins of the levels of one source."""
+def add_skin(level: Level, surface: SourceSurface, settings: OwnMaterialSettings) -> Level:
+    """Return a level with its skin, which shows the materials of its source.
 
-    def __init__(self, surface: SourceSurface, settings: OwnMaterialSettings) -> None:
-        """Build the lookup of a source surface."""
-        self._surface = surface
-        self._settings = settings
-        self._nearest = SurfaceLookup(surface.mesh)
+    Raises:
+        Rejected: colours_changed or colours_missed where an error is over its limit, or
+            materials_unreadable where no scene could hold the skin.
+    """
+    mesh = level_mesh(level)
+    reach = max(_LEAST_REACH, 1.5 * level.record.quality.error_max * surface.mesh.diagonal)
+    baked = bake(mesh, surface, settings, reach)
+    quality = skin_quality(mesh, baked, surface, reach)
+    _require_near(quality, level.record.budget, settings)
+    glow = level_emission(mesh, surface, reach)
+    _require_lawful(baked.textures, glow)
+    first, second, third = map(pack_map, baked.textures)
+    skin = LevelSkin(
+        uv=baked.uv,
+        packed=(first, second, third),
+        packed_normal=None if baked.normal is None else pack_map(baked.normal),
+        quality=quality,
+        emission=glow,
+    )
+    return dataclasses.replace(level, skin=skin)
 
-    def add_skin(self, level: Level) -> Level:
-        """Return a level with its skin.
 
-        Raises:
-            Rejected: colours_changed or colours_missed where an error is over its limit, or
-                materials_unreadable where no scene could hold the skin.
-        """
-        mesh = level_mesh(level)
-        off = level.record.quality.error_max * self._surface.mesh.diagonal
-        reach = max(_LEAST_REACH, 1.5 * off)
-        baked = bake(mesh, self._surface, self._nearest, self._settings, reach)
-        quality = skin_quality(mesh, baked, self._surface, self._nearest, reach)
-        self._require_near(quality, level.record.budget)
-        glow = level_emission(mesh, self._surface, self._nearest, reach)
-        _require_lawful(baked.textures, glow)
-        first, second, third = map(pack_map, baked.textures)
-        skin = LevelSkin(
-            uv=baked.uv,
-            packed=(first, second, third),
-            packed_normal=None if baked.normal is None else pack_map(baked.normal),
-            quality=quality,
-            emission=glow,
+def _require_near(quality: SkinQuality, budget: int, settings: OwnMaterialSettings) -> None:
+    if quality.colour_error > settings.max_colour_error:
+        raise Rejected(
+            "colours_changed",
+            f"colors are off by {quality.colour_error:.3f} on average at {budget} faces; "
+            f"expected <= {settings.max_colour_error}",
         )
-        return dataclasses.replace(level, skin=skin)
-
-    def _require_near(self, quality: SkinQuality, budget: int) -> None:
-        if quality.colour_error > self._settings.max_colour_error:
-            raise Rejected(
-                "colours_changed",
-                f"colors are off by {quality.colour_error:.3f} on average at {budget} faces; "
-                f"expected <= {self._settings.max_colour_error}",
-            )
-        if quality.missed_cells > self._settings.max_missed:
-            raise Rejected(
-                "colours_missed",
-                f"{quality.missed_cells:.1%} of the texels have no surface of the source near at "
-                f"{budget} faces; expected <= {self._settings.max_missed:.1%}",
-            )
+    if quality.missed_cells > settings.max_missed:
+        raise Rejected(
+            "colours_missed",
+            f"{quality.missed_cells:.1%} of the texels have no surface of the source near at "
+            f"{budget} faces; expected <= {settings.max_missed:.1%}",
+        )
 
 
 def _require_lawful(textures: Sequence[Texture], emission: NDArray[np.float32] | None) -> None:
@@ -152,10 +143,10 @@ def _require_lawful(textures: Sequence[Texture], emission: NDArray[np.float32] |
         raise Rejected("materials_unreadable", f"it emits {emission.max()}; expected {FINITE}")
 
 
-def open_skin_baker(
+def read_source_surface(
     source: SourceFile, mesh: TriangleMesh, settings: OwnMaterialSettings
-) -> tuple[SkinBaker, OwnMaterials]:
-    """Return the skin baker of a source with its clean, oriented mesh, and the lost materials.
+) -> tuple[SourceSurface, OwnMaterials]:
+    """Return the clean, oriented mesh of a source with its materials, and the lost ones.
 
     Raises:
         Rejected: no_materials, materials_unreadable, texture_missing, texture_outside,
@@ -167,8 +158,7 @@ def open_skin_baker(
     source.notes.extend(decode.notes)
     lost = {word for material in parts.materials for word in material.lost}
     lost -= {"emission"} if settings.emission else set()
-    surface = match_source_surface(mesh, parts)
-    return SkinBaker(surface, settings), OwnMaterials(lost=tuple(sorted(lost)))
+    return match_source_surface(mesh, parts), OwnMaterials(lost=tuple(sorted(lost)))
 
 
 def _parts(
@@ -183,11 +173,7 @@ def _parts(
 
 
 def skin_quality(
-    level: TriangleMesh,
-    baked: BakedTextures,
-    source: SourceSurface,
-    nearest: SurfaceLookup,
-    reach: float,
+    level: TriangleMesh, baked: BakedTextures, source: SourceSurface, reach: float
 ) -> SkinQuality:
     """Return the measures of a baked level; arguments as those of `bake`."""
     error = _color_errors(level, baked, source)
@@ -195,7 +181,7 @@ def skin_quality(
         colour_error=round_digits(error.mean()),
         colour_error_p95=round_digits(np.percentile(error, 95)),
         missed_cells=round_digits(baked.missed),
-        torn_seams=round_digits(_torn_seams(level, nearest, source, reach, 1 / baked.density)),
+        torn_seams=round_digits(_torn_seams(level, source, reach, 1 / baked.density)),
         texels_per_length=round_digits(baked.density),
     )
 
@@ -207,7 +193,8 @@ def _color_errors(
     uniform = rng_for(0, "own-materials").random((_NUM_POINTS, 3))
     points = sample_surface(source.mesh, uniform)
     weights = barycentric(source.mesh.corners[points.faces], points.positions)
-    source_rgb = source.columns(points.faces, weights, 1 / baked.density)[:, DIFFUSE]
+    at = FacePoints(points.faces, weights)
+    source_rgb = source.columns(at, 1 / baked.density)[:, DIFFUSE]
     _, faces, nearest = igl.point_mesh_squared_distance(
         points.positions, level.positions, level.faces
     )
@@ -217,13 +204,7 @@ def _color_errors(
     return np.abs(level_rgb - source_rgb).mean(axis=1)
 
 
-def _torn_seams(
-    level: TriangleMesh,
-    nearest: SurfaceLookup,
-    source: SourceSurface,
-    reach: float,
-    texel: float,
-) -> float:
+def _torn_seams(level: TriangleMesh, source: SourceSurface, reach: float, texel: float) -> float:
     """Return the fraction of inner edge length whose two sides show distant source points."""
     directed = np.stack([level.faces, np.roll(level.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
     ends = np.sort(directed, axis=1)
@@ -239,7 +220,7 @@ def _torn_seams(
     points = ((1 - along) * inner[:, 0] + along * inner[:, 1]).reshape(-1, 3)
     side_positions = []
     for side in sides.T:
-        locations = nearest.find(points, np.tile(normal[side], (len(_ALONG), 1)), reach)
+        locations, _ = source.lookup.find(points, np.tile(normal[side], (len(_ALONG), 1)), reach)
         corners = source.mesh.corners[locations.faces]
         side_positions.append(np.einsum("nc,ncd->nd", locations.weights, corners))
     gap = np.linalg.norm(side_positions[0] - side_positions[1], axis=1).reshape(len(_ALONG), -1)

@@ -3,12 +3,12 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import cell_keys, normalize, start_at_lowest
+from pipeline.assets.source_materials.nearest import FacePoints, SurfaceLookup
 from pipeline.foreign.material import Slot, SourceMaterial, TexturedMesh, source_columns
 from pipeline.foreign.mesh import TriangleMesh
 from storage.errors import Rejected
@@ -20,13 +20,6 @@ _LEAST_FOUND = 0.999
 
 _LEAST_LENGTH = 0.1
 """Least length of a normal of a picture: a shorter one has no direction, and counts as flat."""
-
-
-class _Points(NamedTuple):
-    """Points on faces of the file: their faces [N], and their weights of its corners [N, 3]."""
-
-    faces: NDArray[np.int64]
-    weights: NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,18 +35,18 @@ class SourceSurface:
     source_corner: NDArray[np.int64]
     """[F, 3] corner of that face for each corner."""
 
-    def columns(
-        self, faces: NDArray[np.int64], weights: NDArray[np.float64], cell: float
-    ) -> NDArray[np.float64]:
-        """Return diffuse rgb, specular rgb and roughness [N, 7] at points on faces.
+    @cached_property
+    def lookup(self) -> SurfaceLookup:
+        """Lookup of the points of the clean mesh that points of a level show."""
+        return SurfaceLookup(self.mesh)
 
-        Args:
-            faces: [N] clean faces.
-            weights: [N, 3] barycentric coordinates in them.
-            cell: width in the unit box over which pictures are averaged.
+    def columns(self, at: FacePoints, cell: float) -> NDArray[np.float64]:
+        """Return diffuse rgb, specular rgb and roughness [N, 7] at points of clean faces.
+
+        `cell` is the width in the unit box over which pictures are averaged.
         """
-        result = np.zeros((len(faces), 7))
-        for material, chosen, points in self._by_material(faces, weights):
+        result = np.zeros((len(at.faces), 7))
+        for material, chosen, points in self._by_material(at):
             result[chosen] = self._material_columns(material, points, cell)
         return result
 
@@ -62,12 +55,10 @@ class SourceSurface:
         """True where any material emits light."""
         return any(material.emits for material in self.parts.materials)
 
-    def emission(
-        self, faces: NDArray[np.int64], weights: NDArray[np.float64], cell: float
-    ) -> NDArray[np.float64]:
-        """Return the radiance [N, 3] at points on faces; arguments as in `columns`."""
-        result = np.zeros((len(faces), 3))
-        for material, chosen, points in self._by_material(faces, weights):
+    def emission(self, at: FacePoints, cell: float) -> NDArray[np.float64]:
+        """Return the radiance [N, 3] at points of clean faces; arguments as in `columns`."""
+        result = np.zeros((len(at.faces), 3))
+        for material, chosen, points in self._by_material(at):
             if material.emits:
                 result[chosen] = material.emission_rgb
             if material.emits and material.emission is not None:
@@ -81,8 +72,7 @@ class SourceSurface:
 
     def normals(
         self,
-        faces: NDArray[np.int64],
-        weights: NDArray[np.float64],
+        at: FacePoints,
         cell: float,
         frame: tuple[NDArray[np.float64], NDArray[np.float64]],
     ) -> NDArray[np.float64]:
@@ -92,13 +82,12 @@ class SourceSurface:
         normals a level gets.
 
         Args:
-            faces: [N] clean faces.
-            weights: [N, 3] barycentric coordinates in them.
+            at: points of clean faces.
             cell: width in the unit box over which pictures are averaged.
             frame: unit normal and x axis of the level at each point, [N, 3] each.
         """
-        result = np.tile([0.0, 0.0, 1.0], (len(faces), 1))
-        for material, chosen, points in self._by_material(faces, weights):
+        result = np.tile([0.0, 0.0, 1.0], (len(at.faces), 1))
+        for material, chosen, points in self._by_material(at):
             if material.normal is None:
                 continue
             texels = self._sample_picture(material.normal, points, cell)[:, :3]
@@ -107,7 +96,7 @@ class SourceSurface:
             stated[:, 2] = np.maximum(stated[:, 2], LEAST_Z)
             x, y, z = unit_or_zero(stated).T
             tangent, bitangent, normal = self._frames(material.normal, points)
-            outward = _unit_normals(self.mesh.positions[self.mesh.faces[faces[chosen]]])
+            outward = _unit_normals(self.mesh.positions[self.mesh.faces[at.faces[chosen]]])
             # A face that was turned over shows the other side of the same bumps.
             side = np.where((outward * normal).sum(axis=1) < 0, -1.0, 1.0)
             slope = side[:, None] * (x[:, None] * tangent + y[:, None] * bitangent)
@@ -119,7 +108,7 @@ class SourceSurface:
         return result
 
     def _frames(
-        self, slot: Slot, points: _Points
+        self, slot: Slot, points: FacePoints
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return unit tangent, bitangent and normal [N, 3] at points of the file.
 
@@ -143,20 +132,20 @@ class SourceSurface:
         return tangent, hand[:, None] * np.cross(normal, tangent), normal
 
     def _by_material(
-        self, faces: NDArray[np.int64], weights: NDArray[np.float64]
-    ) -> Iterator[tuple[SourceMaterial, NDArray[np.int64], _Points]]:
+        self, at: FacePoints
+    ) -> Iterator[tuple[SourceMaterial, NDArray[np.int64], FacePoints]]:
         """Yield each material, the rows of its points, and their faces and weights in the file."""
-        source_face = self.source_face[faces]
-        source_weights = np.zeros((len(faces), 3))  # weights of the corners in the file's order
-        np.put_along_axis(source_weights, self.source_corner[faces], weights, axis=1)
+        source_face = self.source_face[at.faces]
+        source_weights = np.zeros_like(at.weights)  # weights of the corners in the file's order
+        np.put_along_axis(source_weights, self.source_corner[at.faces], at.weights, axis=1)
         material = self.parts.material[source_face]
         for row in np.unique(material):
             chosen = np.flatnonzero(material == row)
-            points = _Points(source_face[chosen], source_weights[chosen])
+            points = FacePoints(source_face[chosen], source_weights[chosen])
             yield self.parts.materials[row], chosen, points
 
     def _material_columns(
-        self, material: SourceMaterial, points: _Points, cell: float
+        self, material: SourceMaterial, points: FacePoints, cell: float
     ) -> NDArray[np.float64]:
         known: dict[tuple[object, ...], NDArray[np.float32]] = {}
 
@@ -175,7 +164,7 @@ class SourceSurface:
             seen["base"] = tinted.astype(np.float32)
         return source_columns(material, seen, len(points.faces))
 
-    def _sample_picture(self, slot: Slot, points: _Points, cell: float) -> NDArray[np.float32]:
+    def _sample_picture(self, slot: Slot, points: FacePoints, cell: float) -> NDArray[np.float32]:
         corners = self.parts.uv[points.faces, slot.uv_set] @ slot.uv_matrix.T + slot.uv_offset
         uv = np.einsum("nc,ncd->nd", points.weights, corners)
         return slot.picture.sample(uv, _halvings(slot, corners, self._areas[points.faces], cell))

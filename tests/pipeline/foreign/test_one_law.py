@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
 
+from pipeline.assets.source_materials.nearest import FacePoints
 from pipeline.assets.source_materials.skin import _parts
 from pipeline.assets.source_materials.source_surface import SourceSurface
 from pipeline.exchange.open_scene import load_source, scene_source
@@ -53,7 +54,7 @@ def assert_same(path: Path) -> None:
     )
     for weights in WEIGHTS:
         each = np.tile(weights, (count, 1))
-        expected = surface.columns(np.arange(count), each, 1e-9)
+        expected = surface.columns(FacePoints(np.arange(count), each), 1e-9)
         uv = np.zeros((count, 2))
         if scene.uv is not None:
             uv = np.einsum("c,tcd->td", weights, scene.uv.reshape(-1, 3, 2)[:count])

@@ -19,7 +19,7 @@ from pipeline.objects.maps.listing import find_maps
 from storage.errors import TrilightError
 from storage.records.objects import TEXTURE, ObjectRecord
 from storage.remote import retries
-from tests.for_each import for_each
+from tests.for_each import for_each, with_folders
 from tests.pipeline.objects.find_kit import find, reasons, touch
 from tests.scenes_by_hand import tiny_scene
 from trilight import write_scene
@@ -31,10 +31,6 @@ def listed(folder: Path, **options: Any) -> list[ObjectRecord]:
     found = find(folder, **{"allowed_licences": ALLOWED, **options})
     assert not found.failures
     return list(found.records)
-
-
-def uids_of(folder: Path) -> list[str]:
-    return [record.uid for record in listed(folder)]
 
 
 def test_a_folder_is_listed_at_any_depth_in_order(tmp_path: Path) -> None:
@@ -260,39 +256,23 @@ def test_a_catalogue_rules_its_folder_and_publishes_no_password(tmp_path: Path) 
     assert not Path(gone.path).exists()
 
 
-GOOD = {"uid": "a", "path": "a.obj"}
-
-
-@for_each(
-    "row, message",
-    [
-        ("{not json", "objects.jsonl:2: not JSON"),
-        ("[" * 100_000, "objects.jsonl:2: not JSON"),
-        ([1, 2], "objects.jsonl:2: got a list"),
-        ({"path": "a.obj"}, "objects.jsonl:2: field 'uid' is missing"),
-        ({"uid": "b"}, "objects.jsonl:2: field 'path' is missing"),
-        ({"uid": "b", "path": "a.obj", "licence": None}, "field 'licence' is a NoneType"),
-        ({"uid": " ", "path": "a.obj"}, "not blank"),
-        ({"uid": "b\n", "path": "a.obj"}, "printable"),
-        ({"uid": "a", "path": "b.obj"}, "objects.jsonl:2: uid 'a' is already used in line 1"),
-        ({"uid": "b", "path": ""}, "expected the name of a file"),
-        ({"uid": "b", "path": "a\u0000b"}, "expected the name of a file"),
-        ({"uid": "b", "path": "x/../../secret.obj"}, "leads out"),
-        ({"uid": "b", "path": "/etc/hostname"}, "leads out"),
-        ({"uid": "b", "path": "link.obj"}, "leads out"),
-    ],
-)
-def test_mistakes_in_a_catalogue_are_placed(tmp_path: Path, row: Any, message: str) -> None:
-    folder = tmp_path / "objects"
-    touch(tmp_path, "secret.obj")
-    touch(folder, "a.obj")
-    (folder / "link.obj").symlink_to(tmp_path / "secret.obj")
-    write_catalogue(folder, GOOD, row)
-    with pytest.raises(TrilightError, match="objects.jsonl:2") as caught:
-        listed(folder)
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
-    str(caught.value).encode()
+ROWS: list[tuple[Any, str]] = [
+    ("{not json", "not JSON"),
+    ("[" * 100_000, "not JSON"),
+    ([1, 2], "got a list"),
+    ({"path": "a.obj"}, "field 'uid' is missing"),
+    ({"uid": "b"}, "field 'path' is missing"),
+    ({"uid": "b", "path": "a.obj", "licence": None}, "field 'licence' is a NoneType"),
+    ({"uid": " ", "path": "a.obj"}, "not blank"),
+    ({"uid": "b\n", "path": "a.obj"}, "printable"),
+    ({"uid": "a", "path": "b.obj"}, "uid 'a' is already used in line 1"),
+    ({"uid": "b", "path": ""}, "expected the name of a file"),
+    ({"uid": "b", "path": "a\u0000b"}, "expected the name of a file"),
+    ({"uid": "b", "path": "x/../../secret.obj"}, "leads out"),
+    ({"uid": "b", "path": "/etc/hostname"}, "leads out"),
+    ({"uid": "b", "path": "link.obj"}, "leads out"),
+]
+"""Second rows of a catalogue, after a good one."""
 
 
 def test_catalogues_that_are_empty_no_text_or_two(tmp_path: Path) -> None:
@@ -333,29 +313,40 @@ def test_a_table_says_what_lines_say(tmp_path: Path, encoding: str, ending: str)
     assert (groe.uid, groe.title, groe.licence) == ("grö", "grö", "LicenseRef-unknown")
 
 
-@for_each(
-    "text, message",
-    [
-        ("uid;path\na;b", "objects.csv:1: the columns are 'uid;path'; expected uid and path"),
-        ("uid,path,path\na,b,c", "objects.csv:1: .*each name once"),
-        ("uid,path\na", "objects.csv:2: has 1 cells; expected 2"),
-        ('uid,path\n"a\n\nb",c.obj\nd', "objects.csv:2: uid is"),
-        ('uid,path,title\na,c.obj,"x\n\ny"\nd', "objects.csv:5: has 1 cells"),
-        ('uid,path\na,"b" c', "objects.csv:2: not CSV"),
-        ('uid,path\na,b\nc,"d', "objects.csv:3: not CSV"),
-        ("uid,path\na," + "x" * 200_000, "objects.csv:2: not CSV"),
-        ("uid,path\na,b.obj\na,c.obj", "objects.csv:3: uid 'a' is already used in line 2"),
-        ("uid,path\n,b.obj", "objects.csv:2: field 'uid' is missing"),
-        ("uid,path\na, ", "objects.csv:2: field 'path' is missing"),
-        ("uid,path\na,b\x00c", "objects.csv:2: path is"),
-        ("uid,path\n", "holds no object"),
-    ],
-)
-def test_mistakes_in_a_table_are_placed(tmp_path: Path, text: str, message: str) -> None:
-    write_csv(tmp_path, text)
-    with pytest.raises(TrilightError, match=message) as caught:
-        listed(tmp_path)
-    assert "expected" in str(caught.value) and "\n" not in str(caught.value)
+TABLES = [
+    ("uid;path\na;b", "objects.csv:1: the columns are 'uid;path'; expected uid and path"),
+    ("uid,path,path\na,b,c", "objects.csv:1: .*each name once"),
+    ("uid,path\na", "objects.csv:2: has 1 cells; expected 2"),
+    ('uid,path\n"a\n\nb",c.obj\nd', "objects.csv:2: uid is"),
+    ('uid,path,title\na,c.obj,"x\n\ny"\nd', "objects.csv:5: has 1 cells"),
+    ('uid,path\na,"b" c', "objects.csv:2: not CSV"),
+    ('uid,path\na,b\nc,"d', "objects.csv:3: not CSV"),
+    ("uid,path\na," + "x" * 200_000, "objects.csv:2: not CSV"),
+    ("uid,path\na,b.obj\na,c.obj", "objects.csv:3: uid 'a' is already used in line 2"),
+    ("uid,path\n,b.obj", "objects.csv:2: field 'uid' is missing"),
+    ("uid,path\na, ", "objects.csv:2: field 'path' is missing"),
+    ("uid,path\na,b\x00c", "objects.csv:2: path is"),
+    ("uid,path\n", "holds no object"),
+]
+
+
+def test_mistakes_in_a_catalogue_are_placed(tmp_path: Path) -> None:
+    touch(tmp_path, "secret.obj")
+    mistakes: list[tuple[str, Any, str]] = [
+        ("objects.jsonl", row, f"objects.jsonl:2: .*{message}") for row, message in ROWS
+    ]
+    mistakes += [("objects.csv", *entry) for entry in TABLES]
+    for folder, (name, text, message) in with_folders(tmp_path, mistakes):
+        touch(folder, "a.obj")
+        (folder / "link.obj").symlink_to(tmp_path / "secret.obj")
+        if name == "objects.csv":
+            write_csv(folder, text)
+        else:
+            write_catalogue(folder, {"uid": "a", "path": "a.obj"}, text)
+        with pytest.raises(TrilightError, match=message) as caught:
+            listed(folder)
+        said = str(caught.value)
+        assert "expected" in said and "\n" not in said and said.encode()
 
 
 CANARY = "hunter2-secret-value"

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from scene_templates.surfaces.maps import MOST_ALBEDO, finish, surface_maps
+from scene_templates.surfaces.maps import MOST_ALBEDO, finish
 from scene_templates.surfaces.procedural_textures import (
     HEXAGONS,
     OUR_SURFACES,
@@ -43,16 +43,6 @@ def test_noise_has_the_stated_deviation_and_prefers_no_direction() -> None:
     diagonals = [np.square(found - np.roll(found, (1, step), (1, 2))).mean() for step in (1, -1)]
     assert diagonals[0] == pytest.approx(diagonals[1], rel=0.05)
     assert sum(diagonals) / 2 == pytest.approx(sum(along), rel=0.1)
-
-
-def test_noise_is_smooth_across_the_edge_of_the_map() -> None:
-    found = Texels(256).noise(rng_for(0, "noise"), (4, 4))
-    for axis in (0, 1):
-        steps = np.abs(found - np.roll(found, 1, axis))
-        across = np.take(steps, 0, axis)
-        assert across.max() <= steps.max()
-        # a cell is 64 texels: the steepest slope, of about 2 a cell, is 0.06 a texel
-        assert steps.max() < 0.1
 
 
 def test_octaves_that_texels_cannot_show_are_left_out() -> None:
@@ -113,10 +103,7 @@ def test_finishes_are_grey_but_for_metal_mixed_by_area_and_toned() -> None:
     np.testing.assert_array_equal(toned.diffuse_rgb, dimmed.diffuse_rgb)
     np.testing.assert_array_equal(RED.toned(7.0).diffuse_rgb, RED.diffuse_rgb)
     np.testing.assert_array_equal(RED.toned(-1.0).diffuse_rgb, np.zeros(3))
-    maps = surface_maps("one", RED.rougher(0.7), size=4, roughness_clip=(0.05, 0.9), parameters={})
-    assert maps.diffuse_rgb.shape == (4, 4, 3) and maps.roughness.shape == (4, 4, 1)
-    assert (maps.roughness == np.float32(0.9)).all()
-    assert (maps.specular_rgb == np.float32(0.25)).all()
+    assert RED.rougher(0.7).roughness == pytest.approx(1.3)
 
 
 def _shares(family: str, seed: int, first: str, second: str) -> float:

@@ -14,7 +14,7 @@ from pxr import Gf, Usd
 from pipeline.assets.cleaning.clean import clean, normalize
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
-from pipeline.assets.source_materials.skin import open_skin_baker
+from pipeline.assets.source_materials.skin import add_skin, read_source_surface
 from pipeline.foreign.load_mesh import load_mesh
 from pipeline.foreign.mesh import TriangleMesh
 from pipeline.foreign.source_file import read_source
@@ -234,12 +234,13 @@ def test_a_level_over_its_bound_goes_without_and_one_far_from_its_source_is_told
     path = textured_glb(tmp_path / "b.glb", PICTURE, ball.positions[:, [0, 2]], ball)
     source = read_source(path, KEEP.read_limits)
     mesh, _ = orient_outward(clean(normalize(load_mesh(source))))
-    maker, _ = open_skin_baker(source, mesh, dataclasses.replace(OWN, max_colour_error=1.0))
+    lax = dataclasses.replace(OWN, max_colour_error=1.0)
+    surface, _ = read_source_surface(source, mesh, lax)
     level = prepare(path, KEEP).levels[0]
-    assert maker.add_skin(level).skin is not None
+    assert add_skin(level, surface, lax).skin is not None
     with pytest.raises(Rejected, match="colours_missed"):
         # shrunk behind the back of its own measure
-        maker.add_skin(dataclasses.replace(level, positions=0.8 * level.positions))
+        add_skin(dataclasses.replace(level, positions=0.8 * level.positions), surface, lax)
 
 
 GLOW = AssetSettings(own_materials=dataclasses.replace(OWN, emission=True))

@@ -207,15 +207,6 @@ def test_a_dead_link_costs_one_object(site: Site, place: Path, status: int, mess
     (place / glb("d")[1:]).unlink()
 
 
-def test_what_may_pass_is_tried_again(site: Site, place: Path) -> None:
-    site.faults = {
-        glb("a"): [Fault(status=500), Fault(status=503)],
-        "/object-paths.json.gz": [Fault(status=503)],
-        "/metadata/000-000.json.gz": [Fault(status=500)],
-    }
-    assert found_names(find(UID["a"])) == ["a"]
-
-
 def test_damaged_metadata_is_fetched_again(site: Site, place: Path) -> None:
     whole = find("category/vase,chair")
     damages: list[Callable[[bytes], bytes]] = [
@@ -248,24 +239,3 @@ def test_no_server_at_all(site: Site, place: Path) -> None:
     site.always = {glb("a"): Fault(status=503)}
     with pytest.raises(TrilightError, match=r"none of 1 objects could be downloaded.*503"):
         find(UID["a"])
-
-
-def test_a_full_disk_ends_the_run(site: Site, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    find(UID["a"])
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("storage.remote.fetch._fill_http", full)
-    with pytest.raises(TrilightError, match="disk is full"):
-        find(f"{UID['a']},{UID['d']}")
-
-
-def test_a_dead_server_does_not_hang(
-    site: Site, place: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("storage.remote.url._SILENCE_S", 0.15)
-    site.always = {glb("a"): Fault(silent=True)}
-    found = find(f"{UID['a']},{UID['b']}")
-    assert reasons(found) == {"a": "download_failed"}
-    assert "no answer in time" in found.failures[0].message

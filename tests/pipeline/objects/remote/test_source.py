@@ -255,17 +255,6 @@ def test_a_csv_catalogue_and_two_of_them(site: Site) -> None:
         find(site.url)
 
 
-def test_refused_licences_cost_no_download(site: Site) -> None:
-    site.put("a.obj")
-    found = find(site.url, licence="LicenseRef-mine")
-    assert reasons(found) == {"a": "licence_refused"}
-    assert "/a.obj" not in site.gets()
-    (record,) = find(
-        site.url, licence="LicenseRef-mine", allowed_licences=["licenseref-MINE"]
-    ).records
-    assert record.licence_source == "stated by the user (--licence)"
-
-
 def test_buffers_of_a_gltf_come_with_it(site: Site) -> None:
     site.put("m/a.gltf", gltf("a%20b.bin", "sub/c.bin", "data:,x", "a%20b.bin"))
     site.put("m/b.gltf", gltf("a%20b.bin"))
