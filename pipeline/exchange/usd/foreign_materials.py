@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.part_materials import PartConverter
+from pipeline.exchange.part_materials import Part, PartConverter, drop_empty, unit_normals
 from pipeline.exchange.pictures import decode_values
 from pipeline.exchange.textured_triangles import TexturedTriangles, join_triangles
 from pipeline.exchange.usd.held_materials import (
@@ -22,7 +22,6 @@ from pipeline.exchange.usd.held_materials import (
     restore_exact,
 )
 from pipeline.exchange.usd.prim_names import added_column
-from pipeline.foreign.part import Part, drop_empty, unit_normals
 from pipeline.foreign.usd.materials import MeshMaterials
 from pipeline.foreign.usd.object_source import UsdStage, read_stage_materials
 from pipeline.foreign.usd.placed import PlacedPrim
