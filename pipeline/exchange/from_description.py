@@ -34,15 +34,12 @@ from storage.settings.ranges import Within
 
 Vector = tuple[float, float, float]
 
-_Length = Annotated[float, Within(-1e6, 1e6)]
-Lengths = tuple[_Length, _Length, _Length]
+Lengths = Annotated[Vector, Within(-1e6, 1e6)]
 """Coordinates or factors; beyond 1e6 float32 positions are off by centimeters."""
-_Angle = Annotated[float, Within(-1e6, 1e6, unit="degrees")]
-Angles = tuple[_Angle, _Angle, _Angle]
+Angles = Annotated[Vector, Within(-1e6, 1e6, unit="degrees")]
 Fraction = Annotated[float, Within(0, 1)]
-Albedo = tuple[Fraction, Fraction, Fraction]
-_Radiance = Annotated[float, Within(0, 1e9)]
-Radiance = tuple[_Radiance, _Radiance, _Radiance]
+Albedo = Annotated[Vector, Within(0, 1)]
+Radiance = Annotated[Vector, Within(0, 1e9)]
 
 ColorGroups = Literal["per-triangle", "per-shading-group"]
 

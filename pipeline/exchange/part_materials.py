@@ -1,4 +1,4 @@
-"""Converts parts of any format to textures and material rows, as for objects.
+"""`Part`, triangles with one material, of any format, and their textures and material rows.
 
 Other formats reflect more at grazing angles, by Schlick's curve; a scene's material reflects the
 mean of that curve at all angles (pipeline.foreign.material).
@@ -10,7 +10,7 @@ mesh uses, each equals one picture: the tiles side by side, looked up at coordin
 scaled to [0, 1].
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,13 +25,63 @@ from pipeline.exchange.linear_maps import (
 )
 from pipeline.exchange.textured_triangles import NO_TEXTURES, TexturedTriangles, TextureSet
 from pipeline.foreign.material import Slot, SourceMaterial, source_columns
-from pipeline.foreign.part import Part
 from pipeline.foreign.picture import Picture, Wrap, spread_points
 from storage.conventions import srgb8
 from storage.records.exr import MAX_RESOLUTION
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.records.scene import MAX_UV
 from storage.records.texture import MapSource
+
+_SMALLEST_DOUBLE_AREA = 1e-12
+"""Twice the area of a triangle, in square meters, below which it counts as empty."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Part:
+    """Triangles with one material, each with three separate corners."""
+
+    where: str
+    """Beginning of notes, such as the path of a mesh with a colon; may be empty."""
+    material: SourceMaterial
+    """Material of every triangle, as the file states it."""
+    positions: NDArray[np.float32]
+    """[T, 3, 3] corners in world space; every triangle has an area."""
+    normals: NDArray[np.float32]
+    """[T, 3, 3] unit normals at the corners."""
+    coordinates: Callable[[int], NDArray[np.float64] | None]
+    """Returns a set of texture coordinates [T, 3, 2], v up; None where it is missing."""
+    colors: NDArray[np.float64] | None
+    """[T, 3, 3] linear tints of the corners, multiplied with the base color; None for white."""
+
+
+def drop_empty(
+    corners: NDArray[np.float64],
+) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_]]:
+    """Return triangles [T, 3, 3] that have an area, their unit normals [T, 3], and a mask of them.
+
+    In a mesh smaller than a meter the least area shrinks with its size: triangles of a watch are
+    small.
+    """
+    positions = corners.astype(np.float32)
+    wide = positions.astype(np.float64)
+    cross = np.cross(wide[:, 1] - wide[:, 0], wide[:, 2] - wide[:, 0])
+    size = min(float(np.ptp(wide.reshape(-1, 3), axis=0).max()), 1.0) if wide.size else 1.0
+    length = np.linalg.norm(cross, axis=1, keepdims=True)
+    has_area: NDArray[np.bool_] = length[:, 0] > _SMALLEST_DOUBLE_AREA * size**2
+    return positions[has_area], cross[has_area] / length[has_area], has_area
+
+
+def unit_normals(
+    stated: NDArray[np.float64] | None, flat: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Return unit normals [T, 3, 3] at corners; `flat` [T, 3] where none of a length is stated."""
+    if stated is None:
+        return np.repeat(flat[:, None], 3, axis=1).astype(np.float32)
+    length = np.linalg.norm(stated, axis=2, keepdims=True)
+    usable = np.isfinite(length) & (length > 0)
+    unit = np.where(usable, stated / np.where(usable, length, 1), flat[:, None])
+    return np.asarray(unit, np.float32)
+
 
 _MAX_TILES = 8
 """Maximum number of tiles along a side."""

@@ -12,13 +12,11 @@ compute (smooth across edges of up to 30 degrees).
 """
 
 import dataclasses
-import functools
 import json
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, NoReturn, get_args, get_origin, get_type_hints
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +24,6 @@ from numpy.typing import NDArray
 from pipeline.exchange.from_description import (
     SHELL_FOLDER,
     SMOOTH_ANGLE_DEG,
-    ColorGroups,
     DescribedCamera,
     DescribedObject,
     SceneDescription,
@@ -39,6 +36,8 @@ from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, ROUGHNESS, SPECULAR
 from storage.records.scene import ARRAY_FIELDS, Scene
+from storage.settings.fields import describe_fields
+from storage.typed_json import read_json
 
 MAX_BYTES = 4 << 20
 """Maximum size of a file; an object takes about 1 KiB."""
@@ -121,7 +120,9 @@ class _Reader:
 
     def field(self, tree: dict[str, Any], name: str) -> Any:
         """Return a field of the file, which must exist."""
-        return tree[name] if name in tree else self._refuse_missing(name)
+        if name not in tree:
+            raise TrilightError(f"{self._file}: {name} is missing; add it.")
+        return tree[name]
 
     def cameras(self, tree: dict[str, Any]) -> tuple[DescribedCamera, ...]:
         rows = self.field(tree, "cameras")
@@ -146,39 +147,25 @@ class _Reader:
 
     def _record(self, kind: Any, value: Any, where: str, **more: str) -> Any:
         """Return a JSON object as a record; `more` are fields that the file states elsewhere."""
-        from pydantic import ValidationError  # takes time to import
-
         if not isinstance(value, dict):
             self.refuse(where, value, "a JSON object")
         known = self._take_known(kind, value, where, more)
-        first: Any = {"type": "json_invalid"}
         try:
-            return _adapter(kind).validate_json(json.dumps(known))
+            return read_json(json.dumps(known), kind, f"{self._file}: {_to_text(where)}")
         except RecursionError:
-            pass
-        except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-        if first["type"] == "json_invalid":
-            raise TrilightError(
-                f"{self._file}: {_to_text(where)} is nested too deeply, or holds half a character; "
-                "expected the fields of a scene."
-            )
-        theirs = {ours: name for name, ours in _OUR_NAMES.items()}
-        steps = [step for step in first["loc"] if step != kind.__name__]
-        is_short = first["type"] == "missing" and isinstance(steps[-1], int)
-        for step in steps[:-1] if is_short else steps:
-            where += f"[{step}]" if isinstance(step, int) else f".{theirs.get(step, step)}"
-        if first["type"] == "missing" and not is_short:
-            self._refuse_missing(where)
-        expected = _EXPECTED.get(first["type"]) or _expected_number(kind, steps)
-        self.refuse(where, first["input"], expected)
+            self.refuse(where, "nested too deeply", "the fields of a scene")
+        except TrilightError as error:
+            text = str(error)
+            for name, ours in _OUR_NAMES.items():
+                text = text.replace(ours, name)
+            raise TrilightError(text) from error
 
     def _take_known(self, kind: Any, value: Any, where: str, more: dict[str, str]) -> Any:
         """Return the fields of a record, renamed, and those of records in it; note the others."""
         is_record = dataclasses.is_dataclass(kind) and isinstance(value, dict)
         if not is_record:
             return value
-        hints = {name: hint for name, hint in _field_types(kind).items() if name not in more}
+        hints = {each.name: each.hint for each in describe_fields(kind) if each.name not in more}
         known: dict[str, Any] = dict(more)
         for key, inner in value.items():
             name = _OUR_NAMES.get(key, key)
@@ -188,51 +175,11 @@ class _Reader:
                 known[name] = self._take_known(hints[name], inner, f"{where}.{key}", {})
         return known
 
-    def _refuse_missing(self, where: str) -> NoReturn:
-        raise TrilightError(f"{self._file}: {_to_text(where)} is missing; add it.")
-
     def refuse(self, where: str, value: Any, expected: str) -> NoReturn:
         """Raise TrilightError about a value."""
         raise TrilightError(
             f"{self._file}: {_to_text(where)} is {_to_text(value)}; expected {expected}."
         )
-
-
-@functools.cache
-def _field_types(kind: Any) -> Mapping[str, Any]:
-    return get_type_hints(kind, include_extras=True)
-
-
-@functools.cache
-def _adapter(kind: Any) -> Any:
-    from pydantic import ConfigDict, TypeAdapter
-
-    # pydantic takes rules for a union, and hands them on to the plain dataclasses in it
-    return TypeAdapter(kind | None, config=ConfigDict(strict=True, allow_inf_nan=False))
-
-
-_LIST = "a list of three numbers"
-_EXPECTED = {
-    "bool_type": "true or false",
-    "dataclass_type": "a JSON object",
-    "literal_error": f"one of {', '.join(get_args(ColorGroups))}",
-    "missing": _LIST,
-    "string_type": f"printable text of up to {_MAX_TEXT} letters",
-    "too_long": _LIST,
-    "tuple_type": _LIST,
-}
-"""Expected values by pydantic's types of errors; all others are about numbers."""
-
-
-def _expected_number(hint: Any, steps: Sequence[str | int]) -> str:
-    """Return the number that a record expects at a place, with its range."""
-    for step in steps:
-        hints = _field_types(hint) if isinstance(step, str) else {}
-        hint = hints.get(str(step)) or get_args(hint)[0]
-    if get_origin(hint) is not Annotated:  # a number or None
-        hint = get_args(hint)[0]
-    number, within = get_args(hint)
-    return f"a {'whole ' if number is int else ''}number {within}"
 
 
 def _to_text(value: Any) -> str:

@@ -16,7 +16,6 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from pipeline.foreign.obj import list_libraries
-from pipeline.foreign.ply import list_ply_pictures
 from pipeline.foreign.text import decode_name, join_continued, plain_text, unquote_name
 from storage.errors import Rejected
 
@@ -192,11 +191,6 @@ def obj_files(
     named = [name for text in libraries.data.values() for name in list_pictures(text, keys)]
     extra_folders = {name.replace("\\", "/").rpartition("/")[0] for name in libraries.data} - {""}
     return libraries.join(folder.read_all(named, bytes_left, extra_folders=sorted(extra_folders)))
-
-
-def ply_files(data: bytes, folder: SourceFolder, bytes_left: int) -> MaterialFiles:
-    """Return the pictures that a PLY names."""
-    return folder.read_all(list_ply_pictures(data), bytes_left)
 
 
 def read_mtl(data: bytes) -> dict[str, Fields]:

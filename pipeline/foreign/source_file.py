@@ -16,11 +16,11 @@ import numpy as np
 
 from pipeline.foreign.gltf.document import GltfDocument, open_gltf
 from pipeline.foreign.limits import SUFFIXES, USD_SUFFIXES, ReadLimits
-from pipeline.foreign.material_files import MaterialFiles, SourceFolder, obj_files, ply_files
+from pipeline.foreign.material_files import MaterialFiles, SourceFolder, obj_files
 from pipeline.foreign.mesh import FileMesh
 from pipeline.foreign.obj import read_obj
 from pipeline.foreign.off import read_off
-from pipeline.foreign.ply import check_face_count, read_ply
+from pipeline.foreign.ply import check_face_count, list_ply_pictures, read_ply
 from pipeline.foreign.stl import count_facets, read_stl
 from storage.errors import Rejected
 
@@ -141,7 +141,7 @@ def read_source(path: Path, limits: ReadLimits, root: Path | None = None) -> Sou
             normal_maps = limits.with_normal_maps
             materials = obj_files(data, folder, bytes_left, normal_maps=normal_maps)
         else:
-            materials = ply_files(data, folder, bytes_left)
+            materials = folder.read_all(list_ply_pictures(data), bytes_left)
     digest = hashlib.sha256(data)
     buffers = {} if gltf is None else gltf.buffers
     for files in (buffers, materials.data):

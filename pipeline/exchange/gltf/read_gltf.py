@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.loaded_scene import LoadedScene
-from pipeline.exchange.part_materials import PartConverter
+from pipeline.exchange.part_materials import Part, PartConverter, drop_empty, unit_normals
 from pipeline.exchange.pictures import decode_values
 from pipeline.exchange.textured_triangles import (
     SceneParts,
@@ -32,7 +32,6 @@ from pipeline.foreign.gltf.primitives import PlacedPrimitive, placed_primitives
 from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material import SourceMaterial
 from pipeline.foreign.numbers import read_number, read_numbers
-from pipeline.foreign.part import Part, drop_empty, unit_normals
 from pipeline.foreign.source_file import read_source
 from storage.conventions import latlong_direction, latlong_uv
 from storage.errors import Rejected, TrilightError

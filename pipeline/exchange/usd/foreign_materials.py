@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.part_materials import PartConverter
+from pipeline.exchange.part_materials import Part, PartConverter, drop_empty, unit_normals
 from pipeline.exchange.pictures import decode_values
 from pipeline.exchange.textured_triangles import TexturedTriangles, join_triangles
 from pipeline.exchange.usd.held_materials import (
@@ -22,18 +22,10 @@ from pipeline.exchange.usd.held_materials import (
     restore_exact,
 )
 from pipeline.exchange.usd.prim_names import added_column
-from pipeline.foreign.part import Part, drop_empty, unit_normals
 from pipeline.foreign.usd.materials import MeshMaterials
 from pipeline.foreign.usd.object_source import UsdStage, read_stage_materials
 from pipeline.foreign.usd.placed import PlacedPrim
-from pipeline.foreign.usd.polygons import (
-    CutMesh,
-    MeshPolygons,
-    as_array,
-    cut_mesh,
-    mesh_polygons,
-    place_points,
-)
+from pipeline.foreign.usd.polygons import CutMesh, as_array, cut_mesh
 from pipeline.foreign.usd.shaders import StatedMaterial, read_material
 from pipeline.scenes.shading_normals import smooth_shaded
 from storage.records.material import laid_out
@@ -58,31 +50,28 @@ def read_mesh(placed: PlacedPrim, time: Any, lost: list[str]) -> TriangleSoup:
     Raises:
         TrilightError: the arrays of the mesh contradict each other, or are not finite.
     """
-    polygons = mesh_polygons(placed, time)
-    cut = cut_mesh(polygons)
-    rows = cut.indices[cut.corners]
-    corners = place_points(polygons.points, placed.to_world)[rows]
+    cut = cut_mesh(placed, time)
+    corners = cut.world_points[cut.indices[cut.corners]]
     positions, flat, has_area = drop_empty(corners)
     if not has_area.all():
         lost.append(f"{cut.prim.GetPath()}: {int((~has_area).sum())} triangles without an area")
     cut = cut.select(has_area)
-    normals = _normals(polygons, cut, time, positions, flat, lost)
+    normals = _normals(cut, time, positions, flat, lost)
     return TriangleSoup(positions=positions, normals=normals, cut=cut)
 
 
 def _normals(
-    polygons: MeshPolygons,
     cut: CutMesh,
     time: Any,
     positions: NDArray[np.float32],
     flat: NDArray[np.float64],
     lost: list[str],
 ) -> NDArray[np.float32]:
-    placed = polygons.placed
+    placed = cut.placed
     where = cut.prim.GetPath()
     stated = None if placed.skin is not None else _stated_normals(cut.prim, time)
     if stated is None:
-        if not (polygons.is_smooth or placed.skin is not None) or not len(positions):
+        if not (cut.is_smooth or placed.skin is not None) or not len(positions):
             return unit_normals(None, flat)
         if placed.skin is not None:
             lost.append(f"{where}: posed by bones; its normals are those of its faces")

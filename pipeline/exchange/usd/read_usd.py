@@ -24,7 +24,6 @@ from pipeline.exchange.textured_triangles import MAX_ROWS
 from pipeline.exchange.usd import prim_names as names
 from pipeline.exchange.usd.foreign_scene import build_stage_scene
 from pipeline.exchange.usd.write_materials import (
-    COAT_ROUGHNESS,
     PREVIEW,
     PREVIEW_INPUTS,
     SHADERS,
@@ -317,13 +316,10 @@ def _read_vertices(root: Any, meshes: list[Any]) -> tuple[NDArray[np.float32], N
 
 
 def _read_positions(mesh: Any) -> NDArray[np.float32]:
-    """Return the positions [V, 3] of a mesh's vertices; meshes of old files have no center."""
-    points = _read_vectors(mesh, "points")
+    """Return the positions [V, 3] of a mesh's vertices."""
     name = _OLD_CENTER if _OLD_CENTER in mesh.attributes else CENTER
-    if name not in mesh.attributes:
-        return points
     center = np.array(mesh.attributes[name].default, np.float64)
-    positions = sum_positions(center, points)
+    positions = sum_positions(center, _read_vectors(mesh, "points"))
     positions[_read_integers(mesh, names.EXACT_ROWS)] = _read_vectors(mesh, names.EXACT_POSITIONS)
     return positions
 
@@ -437,27 +433,19 @@ _NOT_AS_WRITTEN = (LookupError, TypeError, ValueError, AttributeError)
 _PLAIN_INFO = {"specifier", "typeName", "apiSchemas", "documentation", "comment", "displayName"}
 """Metadata that does not change how a prim looks."""
 _OLD_CENTER = "xformOp:translate:center"
-"""Name of the transform to the center in older files."""
-_PLACED = {CENTER, "xformOpOrder", names.EXACT_ROWS, names.EXACT_POSITIONS}
-_ADDED = {"inputs:ior", COAT_ROUGHNESS, "outputs:r", *map(names.texture_attribute, TEXTURED)}
-_ADDED |= {names.SKY_SOURCE, names.SKY_VISIBLE, *names.SKY_ROWS, *_PLACED}
-"""Properties that older Trilights did not write; their roughness textures have `outputs:r`."""
+"""Name of the transform to the center in older files, such as `examples/room.usdz`."""
 
 
 def _require_same(stored: Any, expected: Any, roots: tuple[str, str]) -> None:
     """Require that a prim and all below it, at two root paths, are as export writes them."""
+    _require(stored.typeName == expected.typeName and set(stored.ListInfoKeys()) <= _PLAIN_INFO)
     properties = {each.name: each for each in stored.properties}
     if _OLD_CENTER in properties:
         expected.attributes[CENTER].name = _OLD_CENTER
         expected.attributes["xformOpOrder"].default = (_OLD_CENTER,)
-    expected_properties = {each.name: each for each in expected.properties}
-    missing = expected_properties.keys() - properties.keys()
-    _require(properties.keys() <= expected_properties.keys() and missing <= _ADDED)
-    _require(stored.typeName == expected.typeName and set(stored.ListInfoKeys()) <= _PLAIN_INFO)
-    is_old = CENTER in missing  # its points are positions
-    for name, each in properties.items():
-        if not is_old or name not in ("points", "extent"):
-            _require_same_property(each, expected_properties[name], roots)
+    _require(properties.keys() == {each.name for each in expected.properties})
+    for each in expected.properties:
+        _require_same_property(properties[each.name], each, roots)
     prims = {prim.name: prim for prim in stored.nameChildren}
     _require(prims.keys() == {prim.name for prim in expected.nameChildren})
     for prim in expected.nameChildren:

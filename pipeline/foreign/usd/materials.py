@@ -161,7 +161,9 @@ class MeshMaterials:
         distinct, index = np.unique(table, axis=0, return_inverse=True)
         if len(distinct) > _MOST_VARIED:
             names = ", ".join(means)
-            cut.lost.append(f"{cut.prim.GetPath()}: many values of {names}: their mean is taken")
+            cut.placed.lost.append(
+                f"{cut.prim.GetPath()}: many values of {names}: their mean is taken"
+            )
             distinct = table.mean(axis=0, keepdims=True)
             index = np.zeros(len(table), np.int64)
         rows = []

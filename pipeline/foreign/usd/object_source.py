@@ -21,7 +21,7 @@ from pipeline.foreign.limits import ReadLimits
 from pipeline.foreign.material_files import MaterialFiles
 from pipeline.foreign.mesh import TriangleMesh, join_meshes
 from pipeline.foreign.usd.placed import PlacedPrim, placed_prims
-from pipeline.foreign.usd.polygons import CutMesh, cut_mesh, mesh_polygons, place_points
+from pipeline.foreign.usd.polygons import CutMesh, cut_mesh
 from pipeline.foreign.usd.shaders import StatedMaterial, read_bindings, read_material
 from pipeline.foreign.usd.skins import UnposedMesh
 from pipeline.foreign.usd.solids import SOLIDS
@@ -207,16 +207,12 @@ def place_meshes(stage: UsdStage, limits: ReadLimits) -> tuple[PlacedMesh, ...]:
     faces_left = limits.max_faces
     farthest = 0.0
     for number, each in enumerate(stage.meshes):
-        polygons = mesh_polygons(each, stage.time)
-        faces_left -= int(np.maximum(polygons.counts - 2, 0).sum())
-        if faces_left < 0:
-            raise Rejected("too_many_faces", f"expected <= {limits.max_faces} faces")
-        cut = cut_mesh(polygons)
+        cut = cut_mesh(each, stage.time, faces_left)
+        faces_left -= cut.num_faces
         if len(cut.corners):
             scale = np.linalg.norm(each.to_world[:3, :3], 2)
-            farthest = max(farthest, float(scale * np.abs(polygons.points).max()))
-            points = place_points(polygons.points, each.to_world)
-            meshes.append(PlacedMesh(number=number, points=points, cut=cut))
+            farthest = max(farthest, float(scale * np.abs(cut.points).max()))
+            meshes.append(PlacedMesh(number=number, points=cut.world_points, cut=cut))
     if not meshes:
         raise Rejected("no_faces", "the stage shows no mesh with triangles")
     _require_precision(meshes, farthest)

@@ -1,4 +1,4 @@
-"""A mesh or solid of a stage as checked polygons, and as triangles."""
+"""A mesh or solid of a stage as triangles of its checked polygons."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -11,34 +11,39 @@ from pipeline.foreign.polygons import triangulate
 from pipeline.foreign.usd.placed import PlacedPrim
 from pipeline.foreign.usd.solids import SOLIDS, build_solid
 from pipeline.foreign.usd.texture_nodes import convert_to_rec709
-from storage.errors import TrilightError
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MeshPolygons:
-    """The arrays of a mesh, checked to be consistent."""
-
-    placed: PlacedPrim
-    points: NDArray[np.float64]  # [P, 3] in the units of the mesh, finite
-    counts: NDArray[np.int64]  # [F] corners of each polygon
-    indices: NDArray[np.int64]  # [sum of counts] rows of `points`
-    holes: NDArray[np.int64]  # [H] indices of polygons that are holes
-    is_smooth: bool  # the mesh stands for a curved surface: normals are smooth by default
+from storage.errors import Rejected, TrilightError
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CutMesh:
     """The triangles of a mesh, with access to values at their corners."""
 
-    prim: Any
+    placed: PlacedPrim
+    """The mesh or solid; it receives notes on primvars whose number of values does not fit."""
+    points: NDArray[np.float64]
+    """[P, 3] in the units of the mesh, finite."""
+    is_smooth: bool
+    """True where the mesh stands for a curved surface: normals are smooth by default."""
     indices: NDArray[np.int64]
     """[sum of corners] index of the point of each polygon corner."""
     corners: NDArray[np.int64]
     """[T, 3] rows of `indices`, counter-clockwise from outside."""
     polygons: NDArray[np.int64]
     """[T] index of the polygon of each triangle."""
-    lost: list[str]
-    """Receives notes on primvars whose number of values does not fit."""
+    num_faces: int
+    """Number of triangles with those of holes, which limits count."""
+
+    @property
+    def prim(self) -> Any:
+        """Return the prim of the mesh."""
+        return self.placed.prim
+
+    @property
+    def world_points(self) -> NDArray[np.float64]:
+        """Return the points [P, 3] in meters, +Z up."""
+        to_world = self.placed.to_world
+        rotated: NDArray[np.float64] = np.einsum("ij,vj->vi", to_world[:3, :3], self.points)
+        return rotated + to_world[:3, 3]
 
     def select(self, chosen: NDArray[np.bool_]) -> "CutMesh":
         """Return the triangles that a mask [T] selects."""
@@ -82,7 +87,9 @@ class CutMesh:
             return None  # the polygons of solids are generated here, so its values cannot fit
         fitting = self.per_corner(convert_to_rec709(primvar.GetAttr(), values), spread)
         if fitting is None:
-            self.lost.append(f"{self.prim.GetPath()}.{primvar.GetName()}: its number does not fit")
+            self.placed.lost.append(
+                f"{self.prim.GetPath()}.{primvar.GetName()}: its number does not fit"
+            )
         return fitting
 
     def read_coordinates(self, primvar: str, time: Any) -> NDArray[np.float64] | None:
@@ -93,10 +100,14 @@ class CutMesh:
         return np.asarray(values[..., :2], np.float64)
 
 
-def mesh_polygons(placed: PlacedPrim, time: Any) -> MeshPolygons:
-    """Return the polygons of a mesh or solid at a time, posed by its skeleton if it has one.
+def cut_mesh(placed: PlacedPrim, time: Any, max_faces: int | None = None) -> CutMesh:
+    """Return the triangles of a mesh or solid at a time, posed by its skeleton, without its holes.
+
+    A mirroring transform reverses the order of corners. More than `max_faces` triangles are not
+    cut.
 
     Raises:
+        Rejected: too_many_faces.
         TrilightError: its arrays contradict each other, or are not finite.
     """
     from pxr import UsdGeom
@@ -116,45 +127,25 @@ def mesh_polygons(placed: PlacedPrim, time: Any) -> MeshPolygons:
         holes = as_array(mesh.GetHoleIndicesAttr().Get(time), np.int64, (-1,))
         is_smooth = mesh.GetSubdivisionSchemeAttr().Get() != "none"
     _check(prim, points, counts, indices)
-    return MeshPolygons(
-        placed=placed,
-        points=points,
-        counts=counts,
-        indices=indices,
-        holes=holes,
-        is_smooth=is_smooth,
-    )
-
-
-def cut_mesh(mesh: MeshPolygons) -> CutMesh:
-    """Return the triangles of a placed mesh without its holes.
-
-    A mirroring transform reverses the order of corners.
-    """
-    from pxr import UsdGeom
-
-    prim = mesh.placed.prim
-    to_world = mesh.placed.to_world
-    corners, polygons = triangulate(mesh.points, mesh.counts, mesh.indices)
-    is_surface = ~np.isin(polygons, mesh.holes)
+    num_faces = int(np.maximum(counts - 2, 0).sum())
+    if max_faces is not None and num_faces > max_faces:
+        raise Rejected("too_many_faces", f"{num_faces} faces; expected <= {max_faces} of this mesh")
+    corners, polygons = triangulate(points, counts, indices)
+    is_surface = ~np.isin(polygons, holes)
     corners = corners[is_surface]
     polygons = polygons[is_surface]
-    mirrored = np.linalg.det(to_world[:3, :3]) < 0
+    mirrored = np.linalg.det(placed.to_world[:3, :3]) < 0
     if mirrored != (UsdGeom.Gprim(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded):
         corners = corners[:, ::-1]
     return CutMesh(
-        prim=prim,
-        indices=mesh.indices,
+        placed=placed,
+        points=points,
+        is_smooth=is_smooth,
+        indices=indices,
         corners=corners,
         polygons=polygons,
-        lost=mesh.placed.lost,
+        num_faces=num_faces,
     )
-
-
-def place_points(points: NDArray[np.float64], to_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return points [P, 3] transformed by a matrix [4, 4]."""
-    rotated: NDArray[np.float64] = np.einsum("ij,vj->vi", to_world[:3, :3], points)
-    return rotated + to_world[:3, 3]
 
 
 def as_array(values: Any, dtype: type, shape: tuple[int, ...]) -> NDArray:

@@ -141,7 +141,9 @@ class StatedMaterial:
         values = read_colors(cut, self.primvars[name], time)
         if values is None:
             primvar = self.primvars[name]
-            cut.lost.append(f"{cut.prim.GetPath()}: no primvar {primvar!r:.60}; its fallback taken")
+            cut.placed.lost.append(
+                f"{cut.prim.GetPath()}: no primvar {primvar!r:.60}; its fallback taken"
+            )
         return values
 
 

@@ -17,15 +17,12 @@ from storage.records.scene_file import encode_scene
 from storage.records.texture import Texture
 from tests.columns_kit import COAT, WAVES, declared
 from tests.for_each import case, for_each, with_folders
-from tests.pipeline.exchange.usd.test_write_usd import odd_scene
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 from tests.textured_by_hand import number_texture, sky, textured_scene
 
 MATERIAL = f"/Scene/Materials/material_{FLOOR}"
 PREVIEW, OPENPBR = "/Preview.inputs:roughness", "/OpenPBR.inputs:specular_roughness"
-OLD_CENTER = "xformOp:translate:center"
 MOVE = np.array([1.0, 2.0, 3.0])
-EXACT = ("trilight:exactRows", "trilight:exactPositions")
 
 
 def edited(tmp_path: Path, scene: Scene, edit: Callable[[Any], None]) -> LoadedScene:
@@ -58,26 +55,6 @@ def set_values(*edits: tuple[str, Any]) -> Callable[[Any], None]:
             layer.GetAttributeAtPath(f"{MATERIAL}{path}").default = value
 
     return edit
-
-
-def as_written_before(layer: Any) -> None:
-    """Take away what an older Trilight did not write: meshes stood at the origin."""
-    for material in layer.GetPrimAtPath("/Scene/Materials").nameChildren:
-        for prim in [material, *material.nameChildren]:
-            for name in list(prim.properties.keys()):
-                is_new = name in ("inputs:ior", "inputs:clearcoatRoughness")
-                if is_new or name.startswith("trilight:texture:"):
-                    del prim.properties[name]
-    for mesh in layer.GetPrimAtPath("/Scene/Objects").nameChildren:
-        if mesh.typeName == "Mesh":
-            points = np.array(mesh.attributes["points"].default, np.float64)
-            points += np.array(mesh.attributes[CENTER].default)
-            positions = points.astype(np.float32)
-            exact, known = (mesh.attributes[name].default for name in EXACT)
-            positions[list(exact)] = np.array(known, np.float32).reshape(-1, 3)
-            mesh.attributes["points"].default = positions
-            for name in (CENTER, "xformOpOrder", *EXACT):
-                del mesh.properties[name]
 
 
 def do_nothing(layer: Any) -> None:
@@ -138,7 +115,7 @@ def assert_changed(found: LoadedScene, scene: Scene, column: str, value: Any, pl
     assert f"the value of {place} is used" in said
 
 
-@for_each("besides", [do_nothing, move_light, as_blender_writes, as_written_before])
+@for_each("besides", [do_nothing, move_light, as_blender_writes])
 def test_an_edit_changes_its_column_alone(tmp_path: Path, besides: Callable[[Any], None]) -> None:
     """Of each column in each place; Blender keeps what stands in the preview alone."""
     in_blender = besides is as_blender_writes
@@ -284,34 +261,12 @@ def test_a_column_that_blender_drops_is_named(tmp_path: Path) -> None:
     assert notes and all(f"{WAVES.name!r}" in text for text in notes)
 
 
-def with_named_centers(layer: Any) -> None:
-    """Name the transform of each mesh as an older Trilight did."""
-    for mesh in layer.GetPrimAtPath("/Scene/Objects").nameChildren:
-        if mesh.typeName == "Mesh":
-            mesh.attributes[CENTER].name = OLD_CENTER
-            mesh.attributes["xformOpOrder"].default = (OLD_CENTER,)
-
-
-@for_each("as_older", [as_written_before, with_named_centers])
-def test_files_of_an_older_trilight_are_exact(
-    tmp_path: Path, as_older: Callable[[Any], None]
-) -> None:
-    for scene in (odd_scene(), textured_scene()):
-        found = edited(tmp_path, scene, as_older)
-        assert not found.notes and encode_scene(found.scene) == encode_scene(scene)
-
-
-@for_each("is_old", [False, True])
-def test_moved_objects_are_read_as_moved(tmp_path: Path, is_old: bool) -> None:
+def test_moved_objects_are_read_as_moved(tmp_path: Path) -> None:
     def move(layer: Any) -> None:
         stage = Usd.Stage.Open(layer)
         light = UsdGeom.Xformable(stage.GetPrimAtPath("/Scene/Objects/light"))
-        if is_old:
-            with_named_centers(layer)
-            light.AddTranslateOp().Set(tuple(MOVE))
-        else:
-            center = np.array(light.GetPrim().GetAttribute(CENTER).Get())
-            assert UsdGeom.XformCommonAPI(light).SetTranslate((center + MOVE).tolist())
+        center = np.array(light.GetPrim().GetAttribute(CENTER).Get())
+        assert UsdGeom.XformCommonAPI(light).SetTranslate((center + MOVE).tolist())
 
     scene = tiny_scene()
     found = edited(tmp_path, scene, move)
@@ -333,3 +288,14 @@ def test_objects_turn_about_their_centers(tmp_path: Path) -> None:
     assert np.array_equal(rows(found.scene)[2], scene.materials[LIGHT])
     middle = (was.min(axis=0) + was.max(axis=0)) / 2
     assert now == pytest.approx((middle - was) * [1, 1, 0] + middle, abs=1e-6)
+
+
+def test_a_file_with_the_older_name_of_centers_is_exact(tmp_path: Path) -> None:
+    """As the example that comes with the checkout is."""
+    room = Path(__file__).parents[4] / "examples" / "room.usdz"
+    assert "xformOp:translate:center" in Sdf.Layer.FindOrOpen(str(room)).ExportToString()
+    found = read_usd(room, None, None, "CC0-1.0")
+    assert not found.notes
+    write_usd(tmp_path / "again.usdz", found.scene)
+    again = read_usd(tmp_path / "again.usdz", None, None, "CC0-1.0")
+    assert not again.notes and encode_scene(again.scene) == encode_scene(found.scene)
