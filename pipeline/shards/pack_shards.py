@@ -52,7 +52,7 @@ from storage.dataset.planned import planned_scenes_of
 from storage.dataset.progress import count_given_up
 from storage.dataset.scene_logs import log_name, log_scene
 from storage.dataset.settings import MOST_SCENES, SplitSettings
-from storage.dataset.shard import samples_of, write_shard
+from storage.dataset.shard import ShardReader, write_shard
 from storage.dataset.shard_notes import (
     ShardNote,
     encode_note,
@@ -162,7 +162,7 @@ def unpack_shard(folder: DatasetFolder, note: ShardNote, scenes: range, stream: 
         scenes: indices of its scenes; one that the file lacks was given up.
     """
     name = note.shard.name
-    samples = dict(samples_of(stream, name))
+    samples = dict(ShardReader(stream, name))
     for index in scenes:
         key = sample_key(index)
         failures = [failure for failure in note.failures if failure.item == key]

@@ -13,7 +13,7 @@ from typing import BinaryIO, TypeVar
 from storage.conventions import SPLITS
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest, missing_manifest
-from storage.dataset.shard import ShardContents, contents_of, samples_of
+from storage.dataset.shard import ShardReader
 from storage.digests import sha256_of_stream
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.records.objects import Failure, LockedObject, decode_failures, decode_objects_lock
@@ -271,8 +271,8 @@ class Dataset:
         manifest.
         """
         held = HeldMaps()
-        with self.files.open(shard, checked=True) as stream:
-            for key, members in samples_of(stream, shard.name):
+        with self.open_shard(shard, checked=True) as opened:
+            for key, members in opened:
                 yield decode_sample(key, members, held)
 
     def read_scenes(self, shard: ShardEntry) -> Iterator[SceneRecord]:
@@ -297,17 +297,17 @@ class Dataset:
         accepts: Callable[[str], bool] = lambda suffix: True,
     ) -> Iterator[Record]:
         held = HeldMaps()
-        with self._open_unchecked(shard) as (stream, contents):
-            for key in contents.samples if keys is None else keys:
+        with self.open_shard(shard) as opened:
+            for key in opened.samples if keys is None else keys:
                 with reading(self.display_name, shard.name):
-                    record = decode(key, contents.read(stream, key, accepts), held)
+                    record = decode(key, opened.members(key, accepts), held)
                     require_lawful(record)
                 yield record
 
     def keys(self, shard: ShardEntry) -> list[str]:
         """Return the keys of a shard's samples in the order of the file; as `read_scenes`."""
-        with self._open_unchecked(shard) as (_, contents):
-            keys = list(contents.samples)
+        with self.open_shard(shard) as opened:
+            keys = list(opened.samples)
         if len(keys) != shard.num_samples:
             raise TrilightError(
                 f"{shard.name}: {len(keys)} samples; expected {shard.num_samples}, as the manifest "
@@ -317,15 +317,14 @@ class Dataset:
 
     def suffixes(self, shard: ShardEntry) -> set[str]:
         """Return the suffixes of all members of a shard's samples; as `read_scenes`."""
-        with self._open_unchecked(shard) as (_, contents):
-            return {suffix for members in contents.samples.values() for suffix in members}
+        with self.open_shard(shard) as opened:
+            return {suffix for members in opened.samples.values() for suffix in members}
 
-    @contextlib.contextmanager
-    def _open_unchecked(self, shard: ShardEntry) -> Iterator[tuple[BinaryIO, ShardContents]]:
-        with self.files.open(shard, checked=False) as stream:
-            with reading(self.display_name, shard.name):
-                contents = contents_of(stream, shard.name)
-            yield stream, contents
+    def open_shard(self, shard: ShardEntry, *, checked: bool = False) -> ShardReader:
+        """Open a shard; with `checked`, after its digest; as `read_scenes`."""
+        stream = self.files.open(shard, checked=checked)
+        with reading(self.display_name, shard.name):
+            return ShardReader(stream, shard.name)
 
     def lock_bytes(self) -> bytes | None:
         """Return the file of the objects that were used, or None where the dataset has none."""

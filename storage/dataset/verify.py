@@ -22,7 +22,7 @@ from storage.dataset.dataset import (
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest, index_stream
 from storage.dataset.planned import is_whole, num_planned
-from storage.dataset.shard import contents_of, samples_of
+from storage.dataset.shard import ShardReader
 from storage.digests import seal_of, sha256_hex
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.licences import mixed_share_alike
@@ -212,7 +212,7 @@ def _check_shard(
             return findings
         with _open_shard(dataset, shard) as stream:
             if fast:
-                findings.keys += contents_of(stream, shard.name).samples
+                findings.keys += ShardReader(stream, shard.name).samples
                 if len(findings.keys) != shard.num_samples:
                     findings.faults.append(
                         f"{len(findings.keys)} samples; expected {shard.num_samples}"
@@ -254,9 +254,10 @@ def _check_content(
 ) -> None:
     if index_stream(stream, shard.name) != shard:
         findings.faults.append("sha256 or number of samples differs from the manifest")
-    unused = set(contents_of(stream, shard.name).maps)
+    opened = ShardReader(stream, shard.name)
+    unused = set(opened.maps)
     held = HeldMaps()
-    for key, members in samples_of(stream, shard.name):
+    for key, members in opened:
         findings.keys.append(key)
         unused -= members.keys()
         try:
