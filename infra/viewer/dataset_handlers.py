@@ -28,7 +28,7 @@ from infra.viewer.scene_handlers import (
 )
 from infra.viewer.server import NotFound, Request, Response, Routes, json_response
 from pipeline.exchange.formats import LoadedScene
-from storage.dataset.dataset import Dataset, LocalFiles, reading
+from storage.dataset.dataset import Dataset, reading
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.shard import Member, ShardReader
 from storage.errors import TrilightError, expected_one_of
@@ -340,7 +340,7 @@ class DatasetHandlers:
         )
 
     def _command(self, chosen: SceneFilter) -> str:
-        if not isinstance(self._dataset.files, LocalFiles):
+        if not self._dataset.local:
             return ""
         root = Path(self._source)
         return chosen.command(root, root.with_name(f"{root.resolve().name}-selected"))
@@ -370,7 +370,6 @@ class DatasetHandlers:
         (sample,) = self._dataset.read_samples(shard, [key])
         floors = [view.noise_floor_db for view in sample.views]
         loaded = LoadedScene(scene=sample.scene, notes=(), radiance_rgb=sample.radiance_rgb)
-        is_here = isinstance(self._dataset.files, LocalFiles)
-        place = f"{Path(self._source) / shard.name}::{key}" if is_here else ""
+        place = f"{Path(self._source) / shard.name}::{key}" if self._dataset.local else ""
         name = f"scene {key}, {row.split}"
         return handlers_of_scene(name, loaded, place, self._child, self._checkpoint, floors)

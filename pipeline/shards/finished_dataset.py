@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from storage.dataset.dataset import Dataset, DatasetFiles, open_listed
+from storage.dataset.dataset import Dataset, open_listed
 from storage.dataset.manifest import Manifest, ShardEntry
 from storage.dataset.planned import is_whole, num_planned
 from storage.digests import sha256_hex
@@ -16,15 +16,16 @@ from storage.records.quantities import QUANTITIES
 from storage.records.sample import SceneRecord, decode_scene
 from storage.records.scene_facts import scene_values
 from storage.remote.safe_url import safe_url
+from storage.remote.store import Store
 
 
 class FinishedDataset(Dataset):
     """A dataset on this machine whose shards are all finished."""
 
     def __init__(
-        self, files: DatasetFiles, manifest: Manifest, objects: Mapping[str, list[LockedObject]]
+        self, store: Store, manifest: Manifest, objects: Mapping[str, list[LockedObject]]
     ) -> None:
-        super().__init__(files, manifest)
+        super().__init__(store, manifest)
         self.objects = objects
         """Locked objects by uid; a merged dataset may have several under one uid."""
 
@@ -68,7 +69,7 @@ def open_finished(path: str) -> FinishedDataset:
     objects: dict[str, list[LockedObject]] = {}
     for entry in decode_objects_lock(lock, "objects.lock.jsonl"):
         objects.setdefault(entry.uid, []).append(entry)
-    return FinishedDataset(listed.files, manifest, objects)
+    return FinishedDataset(listed.store, manifest, objects)
 
 
 def read_facts(

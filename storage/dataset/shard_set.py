@@ -211,7 +211,7 @@ class ManifestShards(ShardSet):
 
     def __init__(self, dataset: Dataset, entries: Sequence[ShardEntry]) -> None:
         self.names = [entry.name for entry in entries]
-        self._files = dataset.files
+        self._dataset = dataset
         self._entries = entries
         self._held = HeldMaps()
 
@@ -220,7 +220,8 @@ class ManifestShards(ShardSet):
 
     def open(self, number: int) -> OpenShard:
         entry = self._entries[number]
-        shard = OpenShard(entry.name, self._files.open(entry, checked=True), self._held)
+        stream = self._dataset.open_stream(entry, checked=True)
+        shard = OpenShard(entry.name, stream, self._held)
         if len(shard.keys) != entry.num_samples:
             shard.close()
             raise TrilightError(

@@ -121,7 +121,7 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
         by_split[shard.split] += shard.num_samples
     for shard in (read := described_shards(dataset)):
         with dataset.open_shard(shard) as opened, reading(dataset.display_name, shard.name):
-            num_bytes = dataset.files.num_bytes(shard)
+            num_bytes = dataset.store.num_bytes(shard.name)
             if num_bytes not in (None, shard.num_bytes):
                 raise TrilightError(f"{num_bytes} bytes; expected {shard.num_bytes}")
             _count_shard(opened, tally)

@@ -65,7 +65,7 @@ def _copy_shard(
 ) -> None:
     target = out / shard.name
     target.parent.mkdir(parents=True, exist_ok=True)
-    with dataset.files.open(shard, checked=True) as stream:
+    with dataset.open_stream(shard, checked=True) as stream:
         with atomic_writer(target) as copy:
             shutil.copyfileobj(stream, copy)
         samples = list(ShardReader(stream, shard.name).samples.values())
