@@ -362,9 +362,9 @@ def _samples(
     for (source, _), entries in itertools.groupby(
         group, key=lambda entry: (entry.source, entry.facts.shard.name)
     ):
-        first, *others = entries
+        first, *following = entries
         with sources[source].open_shard(first.facts.shard, checked=True) as opened:
-            for entry in (first, *others):
+            for entry in (first, *following):
                 yield entry.key, opened.members(entry.facts.key)
 
 

@@ -191,8 +191,8 @@ class ShardReader:
             raise TrilightError(
                 f"{self.name}: no sample {key}; expected one of its {len(keys)}: {held}."
             )
-        wanted = {name: member for name, member in self.samples[key].items() if accepts(name)}
-        members = {name: self.read(member) for name, member in wanted.items()}
+        selected = {name: member for name, member in self.samples[key].items() if accepts(name)}
+        members = {name: self.read(member) for name, member in selected.items()}
         names: Iterable[str] = ()
         if self.maps and "json" in members:
             with contextlib.suppress(ValueError, RecursionError):  # its decoder says what is wrong

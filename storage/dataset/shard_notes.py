@@ -168,6 +168,6 @@ def _notes(dataset: Dataset) -> list[ShardNote]:
     listed = {shard.name for shard in manifest.shards}
     notes = map(name_of_note, sorted(filter(SHARD_NAME.fullmatch, names - listed)))
     with contextlib.suppress(TrilightError):  # it may be listed and not read
-        there = [name for name in notes if name in names]
-        return fetch_notes(dataset.store.get, there, dataset.display_name)
+        noted_files = [name for name in notes if name in names]
+        return fetch_notes(dataset.store.get, noted_files, dataset.display_name)
     return []
