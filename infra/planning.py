@@ -25,7 +25,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
 from storage.dataset.progress import read_progress
 from storage.dataset.scene_logs import sample_logs
-from storage.dataset.shard import contents_of
+from storage.dataset.shard import open_shard
 from storage.dataset.splits import (
     keeps_scenes,
     lacks_validation,
@@ -35,7 +35,6 @@ from storage.dataset.splits import (
 )
 from storage.dataset.staging import read_staged_scene
 from storage.machine import available_cores
-from storage.records.safe_read import open_plain
 from storage.records.sample import sample_key
 from storage.seeds import rng_for
 
@@ -253,8 +252,8 @@ def _scene_bytes(folder: DatasetFolder, shard: str, scene: int) -> int:
     The last scene of a shard is packed already; the others are still staged.
     """
     if folder.shard(shard).exists():
-        with open_plain(folder.shard(shard)) as stream:
-            members = contents_of(stream, shard).samples.get(sample_key(scene), {})
+        with open_shard(folder.shard(shard)) as opened:
+            members = opened.samples.get(sample_key(scene), {})
         sizes = [member.num_bytes for member in members.values()]
     else:
         staged = read_staged_scene(folder.staged_shard(shard), scene)

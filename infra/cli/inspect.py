@@ -22,7 +22,7 @@ from infra.cli.console import (
 from infra.cli.options import OutputOptions, command
 from infra.run_record import is_run, run_facts, tensorboard_command
 from storage.aliases import PRESET_ALIASES, name_for_people
-from storage.dataset.dataset import Dataset, RemoteDatasetFiles, open_dataset
+from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.statistics import Statistics, dataset_statistics, described_shards
 from storage.errors import TrilightError
@@ -118,11 +118,8 @@ def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | N
     """Return the folder for report and sheet; None where --out is missing and no folder fits."""
     if out is not None:
         return DatasetFolder(out)
-    if isinstance(opened.files, RemoteDatasetFiles) or not os.access(
-        opened.folder.root, os.W_OK | os.X_OK
-    ):
-        return None
-    return opened.folder
+    folder = opened.local
+    return folder if folder and os.access(folder.root, os.W_OK | os.X_OK) else None
 
 
 def _inspect_scene(source: str, turntable: Path | None, *, json: bool) -> None:

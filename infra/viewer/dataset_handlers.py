@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -28,9 +28,9 @@ from infra.viewer.scene_handlers import (
 )
 from infra.viewer.server import NotFound, Request, Response, Routes, json_response
 from pipeline.exchange.formats import LoadedScene
-from storage.dataset.dataset import Dataset, LocalFiles, reading
+from storage.dataset.dataset import Dataset, reading
 from storage.dataset.manifest import ShardEntry
-from storage.dataset.shard import Member, contents_of, read_member, scan_samples
+from storage.dataset.shard import Member, ShardReader
 from storage.errors import TrilightError, expected_one_of
 from storage.records.exr import decode_exr
 from storage.records.profiles import PACKED, PLAIN
@@ -134,22 +134,19 @@ class DatasetIndex:
 
     def _read_shard(self, number: int, shard: ShardEntry) -> None:
         dataset = self._dataset
-        with dataset.files.open(shard, checked=False) as stream:
-            with reading(dataset.display_name, shard.name):
-                samples = contents_of(stream, shard.name).samples
-            for key, members in samples.items():
+        with dataset.open_shard(shard) as opened:
+            for key in opened.samples:
                 if self._closed:
                     return
                 with reading(dataset.display_name, shard.name):
-                    row = _row(stream, key, members, number, shard.split)
+                    row = _row(opened, key, number, shard.split)
                 self._rows.append(row)
                 self._by_key[key] = row
 
 
-def _row(
-    stream: BinaryIO, key: str, members: Mapping[str, Member], shard: int, split: str
-) -> SceneRow:
-    record = json.loads(read_member(stream, members["json"]))
+def _row(opened: ShardReader, key: str, shard: int, split: str) -> SceneRow:
+    members = opened.samples[key]
+    record = json.loads(opened.read(members["json"]))
     views = record["views"]
     return SceneRow(
         key=key,
@@ -157,7 +154,7 @@ def _row(
         split=split,
         template=str(record["provenance"].get("template", "unknown")),
         views=len(views),
-        triangles=_num_triangles(stream, members),
+        triangles=_num_triangles(opened, members),
         lights=sum(entry["kind"] == "emitter" for entry in record["objects"]),
         floor=min(_single(view["noise_floor_db"]) for view in views),
         coverage=min(_single(view["coverage"]) for view in views),
@@ -165,10 +162,10 @@ def _row(
     )
 
 
-def _num_triangles(stream: BinaryIO, members: Mapping[str, Member]) -> int:
+def _num_triangles(opened: ShardReader, members: Mapping[str, Member]) -> int:
     suffix = PLAIN if PLAIN in members else PACKED
-    stream.seek(members[suffix].offset)
-    head = stream.read(min(members[suffix].num_bytes, _MOST_HEADER))
+    num_bytes = min(members[suffix].num_bytes, _MOST_HEADER)
+    head = opened.read(dataclasses.replace(members[suffix], num_bytes=num_bytes))
     if suffix == PACKED:
         head = zlib.decompressobj(31).decompress(head, _MOST_HEADER)
     (length,) = struct.unpack("<Q", head[:8])
@@ -343,7 +340,7 @@ class DatasetHandlers:
         )
 
     def _command(self, chosen: SceneFilter) -> str:
-        if not isinstance(self._dataset.files, LocalFiles):
+        if not self._dataset.local:
             return ""
         root = Path(self._source)
         return chosen.command(root, root.with_name(f"{root.resolve().name}-selected"))
@@ -361,12 +358,10 @@ class DatasetHandlers:
     def _small_png(self, row: SceneRow, view: int, width: int) -> bytes:
         shard = self._dataset.manifest.shards[row.shard]
         with (
-            self._dataset.files.open(shard, checked=False) as stream,
+            self._dataset.open_shard(shard) as opened,
             reading(self._dataset.display_name, shard.name),
         ):
-            samples = scan_samples(stream, shard.name)
-            members = next(members for key, members in samples if key == row.key)
-            radiance_rgb = decode_exr(read_member(stream, members[f"{view}.exr"]))
+            radiance_rgb = decode_exr(opened.read(opened.samples[row.key][f"{view}.exr"]))
         return thumbnail_png(radiance_rgb, width)
 
     def _open_scene(self, key: str) -> SceneHandlers:
@@ -375,7 +370,6 @@ class DatasetHandlers:
         (sample,) = self._dataset.read_samples(shard, [key])
         floors = [view.noise_floor_db for view in sample.views]
         loaded = LoadedScene(scene=sample.scene, notes=(), radiance_rgb=sample.radiance_rgb)
-        is_here = isinstance(self._dataset.files, LocalFiles)
-        place = f"{Path(self._source) / shard.name}::{key}" if is_here else ""
+        place = f"{Path(self._source) / shard.name}::{key}" if self._dataset.local else ""
         name = f"scene {key}, {row.split}"
         return handlers_of_scene(name, loaded, place, self._child, self._checkpoint, floors)

@@ -89,7 +89,7 @@ def _drawn_materials(dataset: Dataset) -> tuple[dict[str, str], str]:
         return {}, ""
     if settings.get("scenes", {}).get("materials", {}).get("source") != "object":
         return {}, "drawn"
-    lost = json.loads(dataset.files.read("logs/drawn_materials.json") or "{}")
+    lost = json.loads(dataset.store.get("logs/drawn_materials.json") or "{}")
     return {uid: f"drawn: {', '.join(whys)}" for uid, whys in lost.items()}, "own"
 
 

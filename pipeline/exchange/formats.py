@@ -32,7 +32,7 @@ from pipeline.exchange.usd.read_usd import read_usd, usd_keys
 from pipeline.exchange.usd.write_usd import write_usd, write_usd_shard
 from pipeline.objects.licences import USER_PROVIDED
 from storage.atomic import write_atomically
-from storage.dataset.shard import iterate_samples, read_members
+from storage.dataset.shard import open_shard
 from storage.errors import TrilightError
 from storage.records import scene_file
 from storage.records.material import columns_in_use
@@ -155,18 +155,23 @@ def _write_scene_file(target: Path, scene: Scene, pictures: Pictures) -> Iterabl
     return ()
 
 
+def _list_samples(source: SceneSource) -> list[str | None]:
+    with open_shard(source.path) as opened:
+        return list(opened.samples)
+
+
 def _read_sample(source: SceneSource, pictures: bool) -> LoadedScene:
-    path = source.path
     key = str(source.key)
-    record = decode_scene(key, read_members(path, key, _MEMBERS))
-    try:
-        record.scene.check()
-    except TrilightError as error:
-        raise TrilightError(f"sample {key}: {error}") from error
-    if not pictures:
-        return LoadedScene(scene=record.scene, notes=())
-    names = (*_MEMBERS, *(f"{view}.exr" for view in range(len(record.views))))
-    sample = decode_sample(key, read_members(path, key, names))
+    with open_shard(source.path) as opened:
+        record = decode_scene(key, opened.members(key, _MEMBERS.__contains__))
+        try:
+            record.scene.check()
+        except TrilightError as error:
+            raise TrilightError(f"sample {key}: {error}") from error
+        if not pictures:
+            return LoadedScene(scene=record.scene, notes=())
+        names = (*_MEMBERS, *(f"{view}.exr" for view in range(len(record.views))))
+        sample = decode_sample(key, opened.members(key, names.__contains__))
     return LoadedScene(scene=sample.scene, notes=(), radiance_rgb=sample.radiance_rgb)
 
 
@@ -216,7 +221,7 @@ FORMATS: Registry[SceneFormat] = Registry(
         ),
         ".tar": SceneFormat(
             read=_read_sample,
-            keys=lambda source: [key for key, _ in iterate_samples(source.path)],
+            keys=_list_samples,
             always_many=True,
         ),
     },

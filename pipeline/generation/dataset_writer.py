@@ -30,7 +30,7 @@ from pipeline.shards.pack_shards import (
     unpack_here,
 )
 from storage.atomic import write_atomically
-from storage.dataset.dataset import Dataset, DatasetFiles, LocalFiles, RemoteDatasetFiles
+from storage.dataset.dataset import Dataset, published_manifest
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder, in_parts, parts_of, place_of_part, shard_names_in
 from storage.dataset.manifest import (
@@ -61,7 +61,7 @@ from storage.records.objects import (
     read_objects_lock,
     write_failures,
 )
-from storage.remote.store import BucketStore, Store
+from storage.remote.store import Store
 from storage.settings.described import from_record
 
 _LISTING = ".staging/listing/"
@@ -117,12 +117,7 @@ class DatasetWriter:
         self.left_to_others = False
         """True if another machine has just listed the shards, and writes the documents."""
         self._splits = splits
-        self._files: DatasetFiles = (
-            RemoteDatasetFiles(store.url)
-            if isinstance(store, BucketStore)
-            else LocalFiles(folder.root)
-        )
-        self._shards = PublishedShards(folder, store, self._files)
+        self._shards = PublishedShards(folder, store)
         self._ends: dict[str, range] = {}
         """Last shards of earlier plans of a bucket, by name, with the scenes that they should hold
         now."""
@@ -137,7 +132,7 @@ class DatasetWriter:
         return shards_for(self.manifest.num_scenes, self._splits)
 
     def dataset(self) -> Dataset:
-        return Dataset(self._files, read_manifest(self.folder.manifest))
+        return Dataset(self.store, read_manifest(self.folder.manifest))
 
     def publish(self, *paths: Path) -> None:
         """Publish files of the folder, in this order, replacing existing ones."""
@@ -354,7 +349,7 @@ class DatasetWriter:
         folder = self.folder
         if not self.store.is_here:  # what the bucket's manifest lists is no news
             merge_failures(folder, self.store)
-            theirs = self._shards.manifest()
+            theirs = published_manifest(self.store)
             if self.left_to_others:
                 fetch_lock(folder, self.store, theirs.objects_lock_sha256)
             else:

@@ -3,9 +3,8 @@
 A revisit takes scenes, objects and splits of a new dataset from the finished one.
 """
 
-import contextlib
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,12 +18,7 @@ from pipeline.generation.render_sample import RenderInput
 from pipeline.presets.settings import DatasetSettings, RevisitSettings
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
 from pipeline.scenes.views import ViewCamera, cameras_of, require_valid, with_first_cameras
-from pipeline.shards.finished_dataset import (
-    FinishedDataset,
-    SampleReader,
-    open_finished,
-    require_whole,
-)
+from pipeline.shards.finished_dataset import FinishedDataset, open_finished
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.settings import ListedShard
 from storage.digests import canonical_json
@@ -42,7 +36,6 @@ class RevisitedScenes:
     root: Path
     """Folder of the finished dataset."""
     digest: str
-    _checked: set[str] = field(default_factory=set, compare=False, repr=False)
 
     def scene(self, index: int, attempt: int, settings: DatasetSettings) -> RenderInput:
         """Return the scene of an index, which counts the scenes of the source shard by shard.
@@ -56,9 +49,12 @@ class RevisitedScenes:
         """
         revisit = settings.revisit
         assert revisit is not None
-        shard, key = self._locate(index, settings)
-        with contextlib.closing(SampleReader(self._source)) as reader:
-            members = reader.members(shard, key)
+        starts = settings.splits.first_scenes
+        row = int(np.searchsorted(starts, index, side="right")) - 1
+        shard = shards_with_scenes(self._source)[row]
+        with self._source.open_shard(shard, checked=True) as opened:
+            key = list(opened.samples)[index - starts[row]]
+            members = opened.members(key)
         sample = decode_sample(key, members)
         origin = self._origin(sample.scene, key, revisit, settings.seed, attempt)
         scene = _redraw(sample.scene.with_provenance(origin), index, attempt, settings)
@@ -95,17 +91,6 @@ class RevisitedScenes:
         dataset = open_finished(str(self.root))
         require_digest(dataset, self.digest)
         return dataset
-
-    def _locate(self, index: int, settings: DatasetSettings) -> tuple[ShardEntry, str]:
-        """Return the shard and key of a scene; a shard is hashed before its first scene is read."""
-        starts = settings.splits.first_scenes
-        row = int(np.searchsorted(starts, index, side="right")) - 1
-        shard = shards_with_scenes(self._source)[row]
-        if shard.name not in self._checked:
-            require_whole(self._source, shard)
-            self._checked.add(shard.name)
-        with contextlib.closing(SampleReader(self._source)) as reader:
-            return shard, reader.keys(shard)[index - starts[row]]
 
     def _origin(
         self, scene: Scene, key: str, revisit: RevisitSettings, seed: int, attempt: int

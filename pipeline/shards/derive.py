@@ -6,18 +6,16 @@ Members are copied byte for byte under their new keys, one sample at a time. The
 the sources, their order and the arguments alone; it is written into a folder of its own.
 """
 
-import contextlib
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import count
 from typing import Any, Literal
 
 import numpy as np
 
 from pipeline.shards.expression import Condition, condition
-from pipeline.shards.finished_dataset import FinishedDataset, SampleReader, SceneFacts, read_facts
+from pipeline.shards.finished_dataset import FinishedDataset, SceneFacts, read_facts
 from storage.conventions import MANIFEST_VERSION, SPLITS
 from storage.dataset.derived import (
     Derivation,
@@ -36,7 +34,6 @@ from storage.records.objects import (
     Failure,
     LockedObject,
     encode_objects_lock,
-    read_failures,
     write_failures,
     write_objects_lock,
 )
@@ -84,6 +81,7 @@ class SelectedScene:
 
 def select_scenes(
     sources: Sequence[FinishedDataset],
+    offsets: Sequence[int],
     selection: Selection,
     *,
     value_names: Sequence[str] = (),
@@ -92,12 +90,12 @@ def select_scenes(
     """Return the selected scenes, in the order of the sources and of their shards.
 
     Args:
+        offsets: what is added to the keys of each source.
         value_names: names of values to read for each scene beside those of the condition.
 
     Raises:
         TrilightError: two sources hold the same scene, or a source is damaged.
     """
-    offsets = key_offsets(sources)
     where = selection.condition()
     names = {*value_names, *(where.names if where else ())}
     selected: list[SelectedScene] = []
@@ -135,9 +133,8 @@ def _last_key(source: FinishedDataset) -> int:
     """Return the largest key of a derived dataset; -1 for a generated one (keys are indices)."""
     if not derivation_of(source.manifest.settings):
         return -1
-    with contextlib.closing(SampleReader(source)) as reader:
-        keys = (key for shard in source.manifest.shards for key in reader.keys(shard))
-        return max((int(key) for key in keys if key.isdecimal()), default=-1)
+    keys = (key for shard in source.manifest.shards for key in source.keys(shard))
+    return max((int(key) for key in keys if key.isdecimal()), default=-1)
 
 
 def offset_key(key: str, offset: int) -> str:
@@ -241,10 +238,11 @@ def list_scenes(
     Raises:
         TrilightError: a shard is damaged.
     """
-    done = count(1)
+    done = itertools.count(1)
     total = len(source.manifest.shards)
     selected = select_scenes(
         [source],
+        [0],
         selection,
         value_names=(*_TEXTS, *_COLUMNS),
         shard_done=lambda: progress(next(done), total),
@@ -312,8 +310,9 @@ def derive_shards(
     _require_alike(sources)
     total = sum(len(source.manifest.shards) for source in sources)
     done = itertools.count(1)
+    offsets = key_offsets(sources)
     selected = select_scenes(
-        sources, derive.selection, shard_done=lambda: progress(next(done), total)
+        sources, offsets, derive.selection, shard_done=lambda: progress(next(done), total)
     )
     if not selected:
         num_scenes = sum(source.manifest.num_samples for source in sources)
@@ -323,16 +322,23 @@ def derive_shards(
     )
     groups, scenes_per_shard = _group_scenes(sources, derive, selected)
     write_objects_lock(out.objects_lock, objects)
-    write_failures(out.failures, _failures(sources, selected))
+    write_failures(out.failures, _failures(sources, offsets, selected))
     shards = []
     for number, group in enumerate(groups):
         name = named_shard(number, group[0].facts.shard.split)
         write_shard(out.shard(name), _samples(sources, group))
         shards.append(index_shard(out.shard(name)))
         progress(next(done), total + len(groups))
-    write_manifest(
-        out.manifest, _manifest(sources, derive, objects, tuple(shards), scenes_per_shard)
+    derivation = Derivation(
+        operation=derive.operation,
+        arguments=derive.arguments,
+        sources=[
+            source_record(source.manifest, key_offset=offset)
+            for source, offset in zip(sources, offsets, strict=True)
+        ],
     )
+    settings = derived_settings(derivation, scenes_per_shard=scenes_per_shard)
+    write_manifest(out.manifest, _manifest(sources, settings, objects, tuple(shards)))
 
 
 def _group_scenes(
@@ -353,36 +359,27 @@ def _group_scenes(
 def _samples(
     sources: Sequence[FinishedDataset], group: Sequence[SelectedScene]
 ) -> Iterator[tuple[str, Mapping[str, bytes]]]:
-    with contextlib.ExitStack() as opened:
-        readers = [
-            opened.enter_context(contextlib.closing(SampleReader(source))) for source in sources
-        ]
-        for entry in group:
-            facts = entry.facts
-            yield entry.key, readers[entry.source].members(facts.shard, facts.key)
+    for (source, _), entries in itertools.groupby(
+        group, key=lambda entry: (entry.source, entry.facts.shard.name)
+    ):
+        first, *following = entries
+        with sources[source].open_shard(first.facts.shard, checked=True) as opened:
+            for entry in (first, *following):
+                yield entry.key, opened.members(entry.facts.key)
 
 
 def _manifest(
     sources: Sequence[FinishedDataset],
-    derive: DeriveOptions,
+    settings: Mapping[str, Any],
     objects: Sequence[LockedObject],
     shards: tuple[ShardEntry, ...],
-    scenes_per_shard: int | None,
 ) -> Manifest:
     manifests = [source.manifest for source in sources]
-    derivation = Derivation(
-        operation=derive.operation,
-        arguments=derive.arguments,
-        sources=[
-            source_record(manifest, key_offset=offset)
-            for manifest, offset in zip(manifests, key_offsets(sources), strict=True)
-        ],
-    )
     builds = {manifest.build for manifest in manifests}
     return dataclasses.replace(
         manifests[0],
         build=builds.pop() if len(builds) == 1 else "merged",
-        settings=derived_settings(derivation, scenes_per_shard=scenes_per_shard),
+        settings=settings,
         environment=_environment(manifests),
         extensions=_extensions(manifests),
         num_scenes=sum(shard.num_samples for shard in shards),
@@ -410,7 +407,7 @@ def _extensions(manifests: Sequence[Manifest]) -> Mapping[str, str]:
 
 
 def _failures(
-    sources: Sequence[FinishedDataset], selected: Sequence[SelectedScene]
+    sources: Sequence[FinishedDataset], offsets: Sequence[int], selected: Sequence[SelectedScene]
 ) -> list[Failure]:
     """Return the rejections of the selected scenes, and of objects.
 
@@ -420,8 +417,8 @@ def _failures(
     keys = {(entry.source, entry.facts.key) for entry in selected}
     held = sum(source.manifest.num_samples for source in sources)
     rows = []
-    for row, (source, offset) in enumerate(zip(sources, key_offsets(sources), strict=True)):
-        for failure in read_failures(source.folder.failures):
+    for row, (source, offset) in enumerate(zip(sources, offsets, strict=True)):
+        for failure in source.failures():
             key, dot, view = failure.item.partition(".")
             if failure.stage not in ("scenes", "renders"):
                 rows.append(failure)

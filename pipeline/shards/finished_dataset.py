@@ -1,35 +1,33 @@
 """Reads finished datasets as sources of others: checks digests, then reads scene by scene."""
 
-import contextlib
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, ShardEntry, index_shard, read_manifest
+from storage.dataset.dataset import Dataset, open_listed
+from storage.dataset.manifest import Manifest, ShardEntry
 from storage.dataset.planned import is_whole, num_planned
-from storage.dataset.shard import ShardContents, contents_of
-from storage.digests import sha256_hex, sha256_of_file
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.objects import LockedObject, locked_uids, read_objects_lock
+from storage.records.objects import LockedObject, decode_objects_lock, locked_uids
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
 from storage.records.quantities import QUANTITIES
-from storage.records.safe_read import open_plain
 from storage.records.sample import SceneRecord, decode_scene
 from storage.records.scene_facts import scene_values
 from storage.remote.safe_url import safe_url
+from storage.remote.store import Store
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FinishedDataset:
-    """A dataset whose shards are all finished."""
+class FinishedDataset(Dataset):
+    """A dataset on this machine whose shards are all finished."""
 
-    folder: DatasetFolder
-    manifest: Manifest
-    objects: Mapping[str, list[LockedObject]]
-    """Locked objects by uid; a merged dataset may have several under one uid."""
+    def __init__(
+        self, store: Store, manifest: Manifest, objects: Mapping[str, list[LockedObject]]
+    ) -> None:
+        super().__init__(store, manifest)
+        self.objects = objects
+        """Locked objects by uid; a merged dataset may have several under one uid."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,24 +52,24 @@ def open_finished(path: str) -> FinishedDataset:
     """
     if "://" in path:
         raise TrilightError(f"{safe_url(path)}: expected the folder of a dataset on this machine.")
-    folder = DatasetFolder(Path(path))
-    manifest = read_manifest(folder.manifest)
+    listed = open_listed(path)
+    manifest = listed.manifest
     if not is_whole(manifest, len(manifest.shards)):
         done = {entry.name for entry in manifest.shards}.difference(manifest.growing)
         raise TrilightError(
             f"{path}: {len(done)} of {num_planned(manifest)} shards are there; expected a "
             "finished dataset. Run the same `trilight generate` again to finish it."
         )
-    lock = folder.objects_lock
-    if not lock.exists() or sha256_of_file(lock) != manifest.objects_lock_sha256:
+    lock = listed.lock_bytes()
+    if lock is None or sha256_hex(lock) != manifest.objects_lock_sha256:
         raise TrilightError(
-            f"{path}: {lock.name} is missing or not the one of the manifest (sha256 differs); run "
-            "`trilight verify`."
+            f"{path}: objects.lock.jsonl is missing or not the one of the manifest (sha256 "
+            "differs); run `trilight verify`."
         )
     objects: dict[str, list[LockedObject]] = {}
-    for entry in read_objects_lock(lock):
+    for entry in decode_objects_lock(lock, "objects.lock.jsonl"):
         objects.setdefault(entry.uid, []).append(entry)
-    return FinishedDataset(folder=folder, manifest=manifest, objects=objects)
+    return FinishedDataset(listed.store, manifest, objects)
 
 
 def read_facts(
@@ -87,58 +85,11 @@ def read_facts(
             of a scene is incomplete.
     """
     for shard in dataset.manifest.shards:
-        require_whole(dataset, shard)
-        with contextlib.closing(SampleReader(dataset)) as reader:
-            for key in reader.keys(shard):
-                yield _facts(shard, key, reader.members(shard, key, ("json", PLAIN, PACKED)), names)
+        with dataset.open_shard(shard, checked=True) as opened:
+            for key in opened.samples:
+                members = opened.members(key, lambda suffix: suffix in ("json", PLAIN, PACKED))
+                yield _facts(shard, key, members, names)
         shard_done()
-
-
-def require_whole(dataset: FinishedDataset, shard: ShardEntry) -> None:
-    """Raise TrilightError if a shard is missing or its digest is not the manifest's."""
-    path = dataset.folder.shard(shard.name)
-    if not path.exists() or index_shard(path) != shard:
-        raise TrilightError(
-            f"{path}: missing, or its bytes are not those of the manifest (sha256 differs); "
-            "run `trilight verify`, then make the shard again."
-        )
-
-
-class SampleReader:
-    """Reads members of samples by key; keeps the last shard open until `close`."""
-
-    def __init__(self, dataset: FinishedDataset) -> None:
-        self._folder = dataset.folder
-        self._shard: ShardEntry | None = None
-        self._contents = ShardContents(samples={}, maps={})
-        self._stream: BinaryIO | None = None
-
-    def keys(self, shard: ShardEntry) -> list[str]:
-        """Return the keys of a checked shard's samples, in the order of the file."""
-        self._open(shard)
-        return list(self._contents.samples)
-
-    def members(
-        self, shard: ShardEntry, key: str, suffixes: tuple[str, ...] | None = None
-    ) -> dict[str, bytes]:
-        """Return members of a sample of a checked shard by suffix; by default all of them.
-
-        With the record come the maps that it names.
-        """
-        stream = self._open(shard)
-        return self._contents.read(stream, key, lambda name: suffixes is None or name in suffixes)
-
-    def _open(self, shard: ShardEntry) -> BinaryIO:
-        if shard is not self._shard or self._stream is None:
-            self.close()
-            self._stream = open_plain(self._folder.shard(shard.name))
-            self._shard = shard
-            self._contents = contents_of(self._stream, shard.name)
-        return self._stream
-
-    def close(self) -> None:
-        if self._stream is not None:
-            self._stream.close()
 
 
 def _facts(

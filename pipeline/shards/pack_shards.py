@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from storage.atomic import write_atomically
-from storage.dataset.dataset import DatasetFiles, RemoteDatasetFiles, read_beside
+from storage.dataset.dataset import published_manifest
 from storage.dataset.layout import (
     DatasetFolder,
     numbered_path,
@@ -41,7 +41,6 @@ from storage.dataset.manifest import (
     Manifest,
     ShardEntry,
     decode_head,
-    decode_manifest,
     index_shard,
     index_stream,
     read_head,
@@ -52,7 +51,7 @@ from storage.dataset.planned import planned_scenes_of
 from storage.dataset.progress import count_given_up
 from storage.dataset.scene_logs import log_name, log_scene
 from storage.dataset.settings import MOST_SCENES, SplitSettings
-from storage.dataset.shard import samples_of, write_shard
+from storage.dataset.shard import ShardReader, write_shard
 from storage.dataset.shard_notes import (
     ShardNote,
     encode_note,
@@ -72,7 +71,7 @@ from storage.records.packed_maps import MAP_NAME
 from storage.records.profiles import Profile
 from storage.records.sample import Sample, sample_key
 from storage.remote.shard_cache import shard_cache
-from storage.remote.store import Store
+from storage.remote.store import RemoteStore, Store
 
 PLANNED = ".staging/planned/"
 """Folder of a bucket with one file for each requested number of scenes; the largest counts."""
@@ -162,7 +161,7 @@ def unpack_shard(folder: DatasetFolder, note: ShardNote, scenes: range, stream: 
         scenes: indices of its scenes; one that the file lacks was given up.
     """
     name = note.shard.name
-    samples = dict(samples_of(stream, name))
+    samples = dict(ShardReader(stream, name))
     for index in scenes:
         key = sample_key(index)
         failures = [failure for failure in note.failures if failure.item == key]
@@ -174,10 +173,9 @@ def unpack_shard(folder: DatasetFolder, note: ShardNote, scenes: range, stream: 
 class PublishedShards:
     """Publishes the shards of a folder, and tells which are published."""
 
-    def __init__(self, folder: DatasetFolder, store: Store, files: DatasetFiles) -> None:
+    def __init__(self, folder: DatasetFolder, store: Store) -> None:
         self._folder = folder
         self._store = store
-        self._files = files
         self._names_listed: set[str] | None = None
         self._unpacked = set[str]()
 
@@ -214,19 +212,18 @@ class PublishedShards:
         """Stage the scenes of a shard of the bucket here, if its digest is the one of the note."""
         with contextlib.suppress(TrilightError):  # else its scenes are made again
             if note.shard.name not in self._unpacked:
-                with self._files.open(note.shard, checked=True) as tar:
+                shard = note.shard
+                with self._store.open_shard(
+                    shard.name, num_bytes=shard.num_bytes, sha256=shard.sha256, checked=True
+                ) as tar:
                     unpack_shard(self._folder, note, scenes, tar)
         self._unpacked.add(note.shard.name)
 
     def _manifest_names(self) -> set[str]:
         """Return the shards that the bucket's manifest lists: of a grown or copied dataset."""
         if self._names_listed is None:
-            self._names_listed = {shard.name for shard in self.manifest().shards}
+            self._names_listed = {shard.name for shard in published_manifest(self._store).shards}
         return self._names_listed
-
-    def manifest(self) -> Manifest:
-        """Return the published manifest, with the shards that it lists."""
-        return read_beside(self._files, decode_manifest)
 
     def notes(self, names: Sequence[str]) -> list[ShardNote]:
         """Return the notes on finished shards: from the folder, or else from the bucket."""
@@ -270,8 +267,8 @@ class PublishedShards:
             if note is None:
                 return None
             self._mark_sent(name)
-            if note.shard == made.shard and isinstance(self._files, RemoteDatasetFiles):
-                shard_cache().keep(path, self._files.url.child(name), made.shard.sha256)
+            if note.shard == made.shard and isinstance(self._store, RemoteStore):
+                shard_cache().keep(path, self._store.url.child(name), made.shard.sha256)
             path.unlink(missing_ok=True)
         return note
 
@@ -310,7 +307,7 @@ class PublishedShards:
 
     def _list_again(self, shard: ShardEntry) -> None:
         """Update the entry of a shard in the bucket's manifest, if it is listed there."""
-        theirs = self.manifest()
+        theirs = published_manifest(self._store)
         if theirs.with_grown(shard) != theirs:
             path = self._folder.staging / "relisted.json"
             write_manifest(path, theirs.with_grown(shard))
@@ -324,13 +321,13 @@ class PublishedShards:
 
     def _note_of_list(self, name: str) -> ShardNote:
         """Return a note made of the manifest's entry of a shard, as in a copied dataset."""
-        theirs = self.manifest()
+        theirs = published_manifest(self._store)
         shard = {entry.name: entry for entry in theirs.shards}[name]
         return ShardNote(shard=shard, failures=(), scenes=planned_scenes_of(theirs, shard))
 
     def _index_remote(self, name: str) -> ShardEntry:
-        assert isinstance(self._files, RemoteDatasetFiles)
-        url = self._files.url.child(name)
+        assert isinstance(self._store, RemoteStore)
+        url = self._store.url.child(name)
         with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
             return index_stream(stream, Path(name).name)
 

@@ -1,24 +1,19 @@
 """A dataset that is read, in a folder of this machine or on a server: manifest, files, samples."""
 
 import contextlib
-import os
 import shlex
 import zlib
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import BinaryIO, TypeVar
 
 from storage.conventions import SPLITS
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest, missing_manifest
-from storage.dataset.shard import ShardContents, contents_of, samples_of
-from storage.digests import sha256_of_stream
+from storage.dataset.shard import ShardReader
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.records.objects import Failure, LockedObject, decode_failures, decode_objects_lock
 from storage.records.packed_maps import HeldMaps
-from storage.records.safe_read import open_if_there, open_plain
 from storage.records.sample import (
     Sample,
     SceneRecord,
@@ -26,144 +21,10 @@ from storage.records.sample import (
     decode_scene,
     require_lawful,
 )
-from storage.remote.fetch import facts_of, fetch_if_there, unreadable
-from storage.remote.retries import TransferFailed, is_missing
-from storage.remote.shard_cache import shard_cache
-from storage.remote.store import MAX_FILE_BYTES, WRITABLE
-from storage.remote.url import RemoteUrl, parse_url
+from storage.remote.store import WRITABLE, LocalStore, RemoteStore, Store
+from storage.remote.url import parse_url
 
 Record = TypeVar("Record", bound=SceneRecord)
-
-
-def _open_error(path: Path, error: OSError) -> TrilightError:
-    if isinstance(error, FileNotFoundError | NotADirectoryError):
-        return ShardMissing(
-            f"{path}: the shard is missing; run `trilight generate` again to make it."
-        )
-    return Unreadable(f"{path}: cannot be read ({error.strerror}); fix its permissions.")
-
-
-class _Files(ABC):
-    """The files next to the shards."""
-
-    @abstractmethod
-    def open_beside(self, name: str) -> BinaryIO | None:
-        """Open a file next to the shards, or return None where there is none."""
-
-    def read(self, name: str) -> bytes | None:
-        """Return a file next to the shards, or None where there is none."""
-        stream = self.open_beside(name)
-        if stream is None:
-            return None
-        with stream:
-            return stream.read()
-
-
-class LocalFiles(_Files):
-    """A folder of this machine."""
-
-    def __init__(self, root: Path) -> None:
-        self.root = root
-        self.shown = str(root)
-        self._checked: dict[str, tuple[int, ...]] = {}
-
-    def open_beside(self, name: str) -> BinaryIO | None:
-        return open_if_there(self.root / name)
-
-    def num_bytes(self, shard: ShardEntry) -> int | None:
-        """Return the size of a shard; raises ShardMissing, or Unreadable."""
-        path = self.root / shard.name
-        try:
-            return path.stat().st_size
-        except OSError as error:
-            raise _open_error(path, error) from error
-
-    def open(self, shard: ShardEntry, *, checked: bool) -> BinaryIO:
-        """Open a shard for reading.
-
-        Args:
-            shard: which one.
-            checked: check its digest first, once as long as the file stays unchanged.
-
-        Raises:
-            TrilightError: it is missing, or its bytes are not those of the manifest.
-        """
-        path = self.root / shard.name
-        try:
-            stream = open_plain(path)
-        except OSError as error:
-            raise _open_error(path, error) from error
-        if checked:
-            self._check_shard_digest(path, stream, shard)
-        return stream
-
-    def _check_shard_digest(self, path: Path, stream: BinaryIO, shard: ShardEntry) -> None:
-        facts = os.fstat(stream.fileno())
-        seen = (facts.st_ino, facts.st_size, facts.st_mtime_ns)
-        if self._checked.get(shard.name) == seen:
-            return
-        if sha256_of_stream(stream) != shard.sha256:
-            stream.close()
-            raise TrilightError(
-                f"{path}: the bytes are not those of the manifest (sha256 differs). Delete the "
-                "file and run `trilight generate` again to make it."
-            )
-        stream.seek(0)
-        self._checked[shard.name] = seen
-
-
-class RemoteDatasetFiles(_Files):
-    """A folder on a server. Its shards come whole to the cache of this machine."""
-
-    def __init__(self, url: RemoteUrl) -> None:
-        self.url = url
-        self.shown = url.display_url
-
-    def open_beside(self, name: str) -> BinaryIO | None:
-        url = self.url.child(name)
-        stream: BinaryIO = TemporaryFile()
-        try:
-            if fetch_if_there(url, stream, max_bytes=MAX_FILE_BYTES):
-                stream.seek(0)
-                return stream
-        except BaseException:
-            stream.close()
-            raise
-        stream.close()
-        return None
-
-    def num_bytes(self, shard: ShardEntry) -> int | None:
-        """Return the size of a shard, or None where the server does not state it.
-
-        Raises:
-            ShardMissing: there is none.
-            Unreadable: the server gives no answer.
-        """
-        url = self.url.child(shard.name)
-        try:
-            return facts_of(url).num_bytes
-        except TransferFailed as error:
-            if error.__cause__ is not None and is_missing(error.__cause__):
-                raise ShardMissing(f"{url.display_url}: the shard is missing.") from error
-            raise unreadable(url, error) from error
-
-    def open(self, shard: ShardEntry, *, checked: bool) -> BinaryIO:
-        """Open a shard for reading; its digest is always checked on arrival.
-
-        Raises:
-            TrilightError: as `storage.remote.shard_cache`.
-        """
-        url = self.url.child(shard.name)
-        return shard_cache().open(url, num_bytes=shard.num_bytes, sha256=shard.sha256)
-
-
-DatasetFiles = LocalFiles | RemoteDatasetFiles
-
-
-def dataset_files(url: str) -> DatasetFiles:
-    """Return where the files of a dataset are; raises TrilightError for a URL that is refused."""
-    place = parse_url(url, what="dataset")
-    return LocalFiles(place) if isinstance(place, Path) else RemoteDatasetFiles(place)
 
 
 _OF_DAMAGED_BYTES = (ValueError, LookupError, TypeError, EOFError, RecursionError, zlib.error)
@@ -202,7 +63,7 @@ class Dataset:
 
     def __init__(
         self,
-        files: DatasetFiles,
+        store: Store,
         manifest: Manifest,
         num_listed: int | None = None,
         noted: Sequence[Failure] = (),
@@ -210,12 +71,12 @@ class Dataset:
         """Name what is read.
 
         Args:
-            files: where it is.
+            store: where it is.
             manifest: what it is, with every shard that may be read.
             num_listed: how many of the shards the manifest on the disk lists; all by default.
             noted: what was rejected on the way to the others.
         """
-        self.files = files
+        self.store = store
         self.manifest = manifest
         self.num_listed = len(manifest.shards) if num_listed is None else num_listed
         self._noted = noted
@@ -223,16 +84,25 @@ class Dataset:
     @property
     def display_name(self) -> str:
         """The place of the dataset for messages, without secrets."""
-        return self.files.shown
+        return self.store.display_name
 
     @property
     def folder(self) -> DatasetFolder:
         """The dataset's folder; raises TrilightError where it is on a server."""
-        if isinstance(self.files, RemoteDatasetFiles):
+        if (folder := self.local) is None:
             raise TrilightError(
                 f"dataset {self.display_name!r} is on a server; expected a local folder."
             )
-        return DatasetFolder(self.files.root)
+        return folder
+
+    @property
+    def local(self) -> DatasetFolder | None:
+        """The dataset's folder; None where it is on a server."""
+        return DatasetFolder(self.store.root) if isinstance(self.store, LocalStore) else None
+
+    def names_in_bucket(self) -> set[str]:
+        """Return the names of all files of a bucket that may be listed; of another place, none."""
+        return self.store.list_all() if isinstance(self.store, RemoteStore) else set()
 
     @property
     def digest(self) -> str:
@@ -271,8 +141,8 @@ class Dataset:
         manifest.
         """
         held = HeldMaps()
-        with self.files.open(shard, checked=True) as stream:
-            for key, members in samples_of(stream, shard.name):
+        with self.open_shard(shard, checked=True) as opened:
+            for key, members in opened:
                 yield decode_sample(key, members, held)
 
     def read_scenes(self, shard: ShardEntry) -> Iterator[SceneRecord]:
@@ -297,17 +167,17 @@ class Dataset:
         accepts: Callable[[str], bool] = lambda suffix: True,
     ) -> Iterator[Record]:
         held = HeldMaps()
-        with self._open_unchecked(shard) as (stream, contents):
-            for key in contents.samples if keys is None else keys:
+        with self.open_shard(shard) as opened:
+            for key in opened.samples if keys is None else keys:
                 with reading(self.display_name, shard.name):
-                    record = decode(key, contents.read(stream, key, accepts), held)
+                    record = decode(key, opened.members(key, accepts), held)
                     require_lawful(record)
                 yield record
 
     def keys(self, shard: ShardEntry) -> list[str]:
         """Return the keys of a shard's samples in the order of the file; as `read_scenes`."""
-        with self._open_unchecked(shard) as (_, contents):
-            keys = list(contents.samples)
+        with self.open_shard(shard) as opened:
+            keys = list(opened.samples)
         if len(keys) != shard.num_samples:
             raise TrilightError(
                 f"{shard.name}: {len(keys)} samples; expected {shard.num_samples}, as the manifest "
@@ -317,19 +187,24 @@ class Dataset:
 
     def suffixes(self, shard: ShardEntry) -> set[str]:
         """Return the suffixes of all members of a shard's samples; as `read_scenes`."""
-        with self._open_unchecked(shard) as (_, contents):
-            return {suffix for members in contents.samples.values() for suffix in members}
+        with self.open_shard(shard) as opened:
+            return {suffix for members in opened.samples.values() for suffix in members}
 
-    @contextlib.contextmanager
-    def _open_unchecked(self, shard: ShardEntry) -> Iterator[tuple[BinaryIO, ShardContents]]:
-        with self.files.open(shard, checked=False) as stream:
-            with reading(self.display_name, shard.name):
-                contents = contents_of(stream, shard.name)
-            yield stream, contents
+    def open_shard(self, shard: ShardEntry, *, checked: bool = False) -> ShardReader:
+        """Open a shard; with `checked`, after its digest; as `read_scenes`."""
+        stream = self.open_stream(shard, checked=checked)
+        with reading(self.display_name, shard.name):
+            return ShardReader(stream, shard.name)
+
+    def open_stream(self, shard: ShardEntry, *, checked: bool) -> BinaryIO:
+        """Open the file of a shard; as `Store.open_shard`."""
+        return self.store.open_shard(
+            shard.name, num_bytes=shard.num_bytes, sha256=shard.sha256, checked=checked
+        )
 
     def lock_bytes(self) -> bytes | None:
         """Return the file of the objects that were used, or None where the dataset has none."""
-        return self.files.read("objects.lock.jsonl")
+        return self.store.get("objects.lock.jsonl")
 
     def objects_lock(self) -> list[LockedObject]:
         """Return the objects that were used; none where the dataset has no lock."""
@@ -338,7 +213,7 @@ class Dataset:
 
     def failures(self) -> list[Failure]:
         """Return what was rejected; none where the dataset does not say."""
-        return [*decode_failures(self.files.read("failures.jsonl") or b""), *self._noted]
+        return [*decode_failures(self.store.get("failures.jsonl") or b""), *self._noted]
 
 
 def open_dataset(url: str) -> Dataset:
@@ -349,7 +224,12 @@ def open_dataset(url: str) -> Dataset:
     refused, or the driver for it is not installed.
     """
     dataset = open_listed(url)
-    if not _may_be_growing(dataset.files):
+    store = dataset.store
+    if isinstance(store, RemoteStore):
+        may_be_growing = store.url.scheme in WRITABLE
+    else:
+        may_be_growing = dataset.folder.staged_entries.exists()
+    if not may_be_growing:
         return dataset
     # slow, and not needed to stream a whole set
     from storage.dataset.shard_notes import with_unlisted
@@ -357,23 +237,17 @@ def open_dataset(url: str) -> Dataset:
     return with_unlisted(dataset)
 
 
-def _may_be_growing(files: DatasetFiles) -> bool:
-    if isinstance(files, LocalFiles):
-        return DatasetFolder(files.root).staged_entries.exists()
-    return files.url.scheme in WRITABLE
-
-
 def open_listed(url: str) -> Dataset:
     """Open what the manifest lists of a dataset: nothing while it is made; as `open_dataset`."""
-    files = dataset_files(url)
-    return Dataset(files, read_beside(files, decode_manifest))
+    place = parse_url(url, what="dataset")
+    store = LocalStore(place) if isinstance(place, Path) else RemoteStore(place)
+    return Dataset(store, published_manifest(store))
 
 
-def read_beside(files: DatasetFiles, decode: Callable[[BinaryIO, str], Manifest]) -> Manifest:
-    """Return what `decode` finds in the manifest; raises as `open_dataset`."""
-    stream = files.open_beside("manifest.json")
-    if stream is None:
-        is_there = not isinstance(files, LocalFiles) or files.root.exists()
-        raise missing_manifest(files.shown, is_there=is_there)
-    with stream:
-        return decode(stream, f"{files.shown}/manifest.json")
+def published_manifest(store: Store) -> Manifest:
+    """Return the manifest of a dataset in a store; raises as `open_dataset`."""
+    data = store.get("manifest.json")
+    if data is None:
+        is_there = not isinstance(store, LocalStore) or store.root.exists()
+        raise missing_manifest(store.display_name, is_there=is_there)
+    return decode_manifest(data, f"{store.display_name}/manifest.json")

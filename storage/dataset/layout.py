@@ -25,7 +25,7 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.file_locks import hold_lock, is_locked, open_lock, take_lock
 from storage.remote.safe_url import printable, safe_url
-from storage.remote.store import WRITABLE, BucketStore, LocalStore, Store
+from storage.remote.store import WRITABLE, LocalStore, RemoteStore, Store
 from storage.remote.url import RemoteUrl, parse_url
 
 _LEFT_S = 3600.0
@@ -161,7 +161,7 @@ class DatasetFolder:
             return LocalStore(self.root)
         url = parse_url(self.bucket, what="out")
         assert isinstance(url, RemoteUrl)
-        return BucketStore(url, self.root)
+        return RemoteStore(url, self.root)
 
     def name_of(self, path: Path) -> str:
         """Return the name of a file of the folder, relative to it."""

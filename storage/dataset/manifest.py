@@ -222,7 +222,7 @@ def read_manifest(path: Path) -> Manifest:
     Raises:
         TrilightError: missing, not JSON, another schema version, or a shard name that is none.
     """
-    return _read(path, decode_manifest)
+    return _read(path, lambda stream, place: decode_manifest(stream.read(MAX_FILE_BYTES), place))
 
 
 def read_head(path: Path) -> Manifest:
@@ -248,20 +248,16 @@ def missing_manifest(place: str, *, is_there: bool) -> TrilightError:
     )
 
 
-def decode_manifest(stream: BinaryIO, place: str) -> Manifest:
-    """Return the manifest of an open file, called `place`; raises as `read_manifest`."""
-    return _manifest(stream.read(MAX_FILE_BYTES), place)
-
-
 def decode_head(stream: BinaryIO, place: str) -> Manifest:
     """Return the manifest of an open file without its shards; otherwise as `decode_manifest`."""
     lines = itertools.takewhile(lambda line: not line.startswith(b' "shards": ['), stream)
     head = b"".join(lines)
     is_cut = head.endswith(b",\n")  # as `write_manifest` has it: shards and totals come last
-    return _manifest(head + b'"shards": []}' if is_cut else head, place)
+    return decode_manifest(head + b'"shards": []}' if is_cut else head, place)
 
 
-def _manifest(data: bytes, place: str) -> Manifest:
+def decode_manifest(data: bytes, place: str) -> Manifest:
+    """Return the manifest of a file, called `place`; raises as `read_manifest`."""
     if len(data) > _HEAD_BYTES + _ROW_BYTES * data.count(b'.tar"'):
         raise TrilightError(f"{place}: {len(data)} bytes are too many for the shards in it.")
     try:

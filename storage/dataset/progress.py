@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from storage.atomic import write_atomically, write_error
-from storage.dataset.dataset import Dataset, LocalFiles, open_listed
+from storage.dataset.dataset import Dataset, open_listed
 from storage.dataset.layout import DatasetFolder, numbered_path, shard_names_in
 from storage.dataset.manifest import Manifest, read_manifest
 from storage.dataset.planned import expected_scenes, is_whole, listed_scenes, planned_shards
@@ -31,7 +31,6 @@ from storage.errors import TrilightError
 from storage.extensions import is_reference
 from storage.records.objects import Failure, count_by_reason
 from storage.records.safe_read import read_plain
-from storage.remote.store import WRITABLE, BucketStore
 from storage.typed_json import T, read_json
 
 _NAME = "logs/asked.json"
@@ -51,7 +50,7 @@ def read_asked(dataset: Dataset) -> list[str] | None:
     and none that would run a file when they are repeated.
     """
     try:
-        words = read_json(dataset.files.read(_NAME) or b"[]", list[str], _NAME)
+        words = read_json(dataset.store.get(_NAME) or b"[]", list[str], _NAME)
     except TrilightError:
         return None
     if words[:1] != ["generate"]:
@@ -216,17 +215,12 @@ def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
     A bucket is asked what it holds, where it may be asked and something is not listed yet: a shard
     is finished there when it and the note on it have come (pipeline.shards.pack_shards).
     """
-    if isinstance(dataset.files, LocalFiles):
-        existing = existing_shards(DatasetFolder(dataset.files.root)) & set(planned)
-        return existing - set(dataset.manifest.growing)
+    if folder := dataset.local:
+        return existing_shards(folder) & set(planned) - set(dataset.manifest.growing)
     listed = {entry.name for entry in dataset.manifest.shards} & set(planned)
     unlisted = set(planned) - listed
-    if not unlisted or dataset.files.url.scheme not in WRITABLE:
-        return listed
-    with contextlib.suppress(TrilightError):  # it may be read and not listed
-        names = BucketStore(dataset.files.url).list_all()
-        listed |= {name for name in unlisted & names if name_of_note(name) in names}
-    return listed
+    names = dataset.names_in_bucket() if unlisted else set()
+    return listed | {name for name in unlisted & names if name_of_note(name) in names}
 
 
 def missing_shards(url: str, num_scenes: int = 0) -> list[int]:
@@ -253,7 +247,7 @@ def missing_shards(url: str, num_scenes: int = 0) -> list[int]:
 def _is_finished(dataset: Dataset) -> bool:
     """Return whether every shard is listed, and the documents are there."""
     listed = is_whole(dataset.manifest, len(dataset.manifest.shards))
-    return listed and dataset.files.read("README.md") is not None
+    return listed and dataset.store.get("README.md") is not None
 
 
 def _count_scenes(
@@ -330,7 +324,7 @@ def read_status(url: str) -> DatasetStatus:
     """Return the status of a dataset; raises as `missing_shards`."""
     dataset = open_listed(url)
     manifest = dataset.manifest
-    local = DatasetFolder(dataset.files.root) if isinstance(dataset.files, LocalFiles) else None
+    local = dataset.local
     planned = expected_scenes(manifest)
     names = _finished_names(dataset, planned)
     done, given_up = _count_scenes(manifest, planned, names, local)
@@ -386,7 +380,7 @@ def _sampled_logs(dataset: Dataset) -> tuple[LogSample, float]:
     rows: list[SceneLog] = []
     scenes = 0
     for entry in shards[:: -(-len(shards) // _LOGS_READ)] if shards else ():
-        data = dataset.files.read(log_name(entry.name))
+        data = dataset.store.get(log_name(entry.name))
         if data is None and not rows:
             break
         if data is not None:

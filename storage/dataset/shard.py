@@ -9,21 +9,21 @@ before the first one that uses it (storage.records.packed_maps). Readers
 return the members of a sample together with those of its maps; writers take the same form.
 """
 
+import contextlib
 import io
 import json
+import os
 import re
 import tarfile
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import BinaryIO
 
 from storage.atomic import atomic_writer
 from storage.errors import ShardMissing, TrilightError
 from storage.records.packed_maps import MAP_NAME, referenced_maps
 from storage.records.safe_read import open_plain
-
-Place = TypeVar("Place")
 
 
 def write_shard(path: Path, samples: Iterable[tuple[str, Mapping[str, bytes]]]) -> None:
@@ -149,114 +149,88 @@ def scan_samples(
         yield current, members
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShardContents:
-    """Positions of all members of a shard, from its headers."""
+class ShardReader:
+    """An open shard, which gives any of its samples, in any order and to several threads."""
 
-    samples: Mapping[str, Mapping[str, Member]]
-    """Members by suffix of each sample by key, in the order of the file."""
-    maps: Mapping[str, Member]
-    """Textures and environment maps by the names of their members."""
+    def __init__(self, stream: BinaryIO, name: str) -> None:
+        """Read the headers; raises TrilightError as `scan_samples`, and closes the file then.
 
-    def read(
-        self, stream: BinaryIO, key: str, accepts: Callable[[str], bool] = lambda suffix: True
+        Args:
+            stream: the shard, a file of this machine.
+            name: of the shard, for messages.
+        """
+        self.name = name
+        self.maps: dict[str, Member] = {}
+        """Textures and environment maps by the names of their members."""
+        self._stream = stream
+        try:
+            samples = dict(scan_samples(stream, name, self.maps))
+        except BaseException:
+            stream.close()
+            raise
+        self.samples: Mapping[str, Mapping[str, Member]] = samples
+        """Members by suffix of each sample by key, in the order of the file."""
+
+    def members(
+        self, key: str, accepts: Callable[[str], bool] = lambda suffix: True
     ) -> dict[str, bytes]:
         """Return members of a sample by suffix, and the maps that its record names.
 
+        A map that does not stand before the sample is left out: its decoder says that.
+
         Args:
-            stream: the shard.
             key: of the sample.
-            accepts: says of a suffix whether it is read.
+            accepts: says of a suffix whether it is read; without the record, no map is.
 
         Raises:
-            TrilightError: the shard has become shorter.
+            TrilightError: there is no such sample, or the shard has become shorter.
         """
-        members = {
-            suffix: read_member(stream, member)
-            for suffix, member in self.samples[key].items()
-            if accepts(suffix)
-        }
-        return with_maps(members, self.maps, lambda member: read_member(stream, member))
+        if key not in self.samples:
+            keys = list(self.samples)
+            held = f"{keys[0]} to {keys[-1]}" if keys else "none"
+            raise TrilightError(
+                f"{self.name}: no sample {key}; expected one of its {len(keys)}: {held}."
+            )
+        selected = {name: member for name, member in self.samples[key].items() if accepts(name)}
+        members = {name: self.read(member) for name, member in selected.items()}
+        names: Iterable[str] = ()
+        if self.maps and "json" in members:
+            with contextlib.suppress(ValueError, RecursionError):  # its decoder says what is wrong
+                names = referenced_maps(json.loads(members["json"]))
+        start = min(member.offset for member in self.samples[key].values())
+        maps = {name: self.maps[name] for name in names if name in self.maps}
+        before = {name: map_ for name, map_ in maps.items() if map_.offset < start}
+        return members | {name: self.read(map_) for name, map_ in before.items()}
+
+    def read(self, member: Member) -> bytes:
+        """Return the bytes of a member; raises TrilightError where the shard became shorter."""
+        data = os.pread(self._stream.fileno(), member.num_bytes, member.offset)
+        if len(data) != member.num_bytes:
+            raise TrilightError(f"{self.name}: became shorter while it was read. Copy it again.")
+        return data
+
+    def __iter__(self) -> Iterator[tuple[str, dict[str, bytes]]]:
+        """Yield the key and the members of each sample."""
+        return ((key, self.members(key)) for key in self.samples)
+
+    def close(self) -> None:
+        """Let go of the file; a cache may then remove it."""
+        self._stream.close()
+
+    def __enter__(self) -> "ShardReader":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
 
-def contents_of(stream: BinaryIO, name: str) -> ShardContents:
-    """Return what an open shard holds, reading headers only; raises as `scan_samples`."""
-    maps: dict[str, Member] = {}
-    samples = dict(scan_samples(stream, name, maps))
-    return ShardContents(samples=samples, maps=maps)
-
-
-def samples_of(stream: BinaryIO, name: str) -> Iterator[tuple[str, dict[str, bytes]]]:
-    """Yield (key, bytes of the members by suffix) of each sample of an open shard.
-
-    Raises:
-        TrilightError: as `scan_samples`.
-    """
-    maps: dict[str, Member] = {}
-    for key, members in scan_samples(stream, name, maps):
-        yield key, ShardContents(samples={key: members}, maps=maps).read(stream, key)
-
-
-def with_maps(
-    members: dict[str, bytes], maps: Mapping[str, Place], read: Callable[[Place], bytes]
-) -> dict[str, bytes]:
-    """Return the members of a sample with those of the maps that its record names.
-
-    Args:
-        members: of the sample, by suffix; without its record, nothing is added.
-        maps: where the maps of the shard are, by the names of their members. One that is missing
-            stays so: what decodes the sample says that.
-        read: returns the bytes at such a place.
-    """
-    if not maps or "json" not in members:
-        return members
+def open_shard(path: Path) -> ShardReader:
+    """Open a shard; raises ShardMissing, or TrilightError where it is no readable shard."""
     try:
-        names = referenced_maps(json.loads(members["json"]))
-    except (ValueError, RecursionError):  # what decodes the sample says what is wrong
-        return members
-    return members | {name: read(maps[name]) for name in names if name in maps}
-
-
-def iterate_samples(path: Path) -> Iterator[tuple[str, dict[str, bytes]]]:
-    """Yield (key, members by suffix) of each sample of a shard.
-
-    Raises:
-        TrilightError: as `scan_samples`, or the file cannot be read.
-    """
-    with _open_shard(path) as stream:
-        yield from samples_of(stream, path.name)
-
-
-def read_members(path: Path, key: str, suffixes: Collection[str]) -> dict[str, bytes]:
-    """Return some members of one sample of a shard by suffix, reading no other.
-
-    Raises:
-        TrilightError: as `scan_samples`, the file cannot be read, or there is no such sample.
-    """
-    with _open_shard(path) as stream:
-        contents = contents_of(stream, path.name)
-        if key in contents.samples:
-            return contents.read(stream, key, lambda suffix: suffix in suffixes)
-    keys = list(contents.samples)
-    held = f"{keys[0]} to {keys[-1]}" if keys else "none"
-    raise TrilightError(f"{path.name}: no sample {key}; expected one of its {len(keys)}: {held}.")
-
-
-def _open_shard(path: Path) -> BinaryIO:
-    try:
-        return open_plain(path)
+        return ShardReader(open_plain(path), path.name)
     except OSError as error:
         kind = ShardMissing if isinstance(error, FileNotFoundError) else TrilightError
         raise kind(f"{path.name}: not a readable shard ({error.strerror}).") from error
-
-
-def read_member(stream: BinaryIO, member: Member) -> bytes:
-    """Return the bytes of a member; raises TrilightError where the shard has become shorter."""
-    stream.seek(member.offset)
-    data = stream.read(member.num_bytes)
-    if len(data) != member.num_bytes:
-        raise TrilightError("became shorter while it was read")
-    return data
 
 
 def _parse_header(name: str, block: bytes, offset: int) -> Member:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from storage.atomic import write_atomically
-from storage.dataset.dataset import Dataset, LocalFiles
+from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder, shard_names_in
 from storage.dataset.manifest import (
     SHARD_NAME,
@@ -27,7 +27,6 @@ from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.objects import Failure, decode_failures, encode_failures, read_failures
 from storage.records.safe_read import read_plain
-from storage.remote.store import WRITABLE, BucketStore
 from storage.typed_json import read_json
 
 _SUFFIX = ".json"
@@ -155,21 +154,20 @@ def with_unlisted(dataset: Dataset) -> Dataset:
     every = tuple(sorted(shards.values(), key=number_of_shard))
     failures = [failure for note in notes.values() for failure in note.failures]
     manifest = dataclasses.replace(dataset.manifest, shards=every)
-    return Dataset(dataset.files, manifest, dataset.num_listed, failures)
+    return Dataset(dataset.store, manifest, dataset.num_listed, failures)
 
 
 def _notes(dataset: Dataset) -> list[ShardNote]:
-    files = dataset.files
     manifest = dataset.manifest
-    if isinstance(files, LocalFiles):
-        folder = DatasetFolder(files.root)
+    if folder := dataset.local:
         noted = filter(SHARD_NAME.fullmatch, noted_names(folder))
         return [noted_shard(folder, name) for name in noted if folder.shard(name).exists()]
-    if files.url.scheme not in WRITABLE or len(manifest.shards) >= num_planned(manifest):
+    if len(manifest.shards) >= num_planned(manifest):
         return []
-    with contextlib.suppress(TrilightError):  # it may be read and not listed
-        names = BucketStore(files.url).list_all()
-        listed = {shard.name for shard in manifest.shards}
-        notes = map(name_of_note, sorted(filter(SHARD_NAME.fullmatch, names - listed)))
-        return fetch_notes(files.read, [name for name in notes if name in names], files.shown)
+    names = dataset.names_in_bucket()
+    listed = {shard.name for shard in manifest.shards}
+    notes = map(name_of_note, sorted(filter(SHARD_NAME.fullmatch, names - listed)))
+    with contextlib.suppress(TrilightError):  # it may be listed and not read
+        noted_files = [name for name in notes if name in names]
+        return fetch_notes(dataset.store.get, noted_files, dataset.display_name)
     return []

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import ShardEntry
-from storage.dataset.shard import Member, scan_samples, with_maps
+from storage.dataset.shard import ShardReader
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.packed_maps import HeldMaps
@@ -138,8 +138,8 @@ def _alternatives(group: str, named: str) -> Sequence[str]:
     return [f"{number:0{width}d}" for number in range(first, last + 1)]
 
 
-class OpenShard:
-    """A shard that is being read."""
+class OpenShard(ShardReader):
+    """A shard that is being read, whose samples have numbers."""
 
     def __init__(self, name: str, stream: BinaryIO, held: HeldMaps) -> None:
         """Look at the headers; raises TrilightError as `storage.dataset.shard`.
@@ -149,40 +149,10 @@ class OpenShard:
             stream: the file.
             held: maps of this shard and others that were unpacked already.
         """
-        self.name = name
-        self._stream = stream
+        super().__init__(stream, name)
         self._held = held
-        self._maps: dict[str, Member] = {}
-        try:
-            self._samples = list(scan_samples(stream, name, self._maps))
-        except BaseException:
-            stream.close()
-            raise
-
-    @property
-    def keys(self) -> Sequence[str]:
+        self.keys = list(self.samples)
         """The keys of its samples, in the order of the file."""
-        return [key for key, _ in self._samples]
-
-    def members(self, row: int) -> dict[str, bytes]:
-        """Return the members of a sample by suffix, in one read, and one for each of its maps."""
-        _, members = self._samples[row]
-        first = min(member.offset for member in members.values())
-        end = max(member.offset + member.num_bytes for member in members.values())
-        data = self._read(first, end - first)
-        contents = {
-            suffix: data[member.offset - first : member.offset - first + member.num_bytes]
-            for suffix, member in members.items()
-        }
-        return with_maps(
-            contents, self._maps, lambda member: self._read(member.offset, member.num_bytes)
-        )
-
-    def _read(self, offset: int, num_bytes: int) -> bytes:
-        data = os.pread(self._stream.fileno(), num_bytes, offset)
-        if len(data) != num_bytes:
-            raise TrilightError(f"{self.name}: became shorter while it was read. Copy it again.")
-        return data
 
     def sample(self, row: int) -> Sample:
         """Return a sample that passes `Sample.check`.
@@ -191,7 +161,7 @@ class OpenShard:
             TrilightError: it is not whole, not readable or breaks a law; names shard and sample.
         """
         with self._name_errors():
-            sample = decode_sample(self._samples[row][0], self.members(row), self._held)
+            sample = decode_sample(self.keys[row], self.members(self.keys[row]), self._held)
             sample.check()
             return sample
 
@@ -202,7 +172,7 @@ class OpenShard:
             TrilightError: its scene is not readable or breaks a law; names shard and sample.
         """
         with self._name_errors():
-            return stored_sample(self._samples[row][0], self.members(row), self._held)
+            return stored_sample(self.keys[row], self.members(self.keys[row]), self._held)
 
     @contextlib.contextmanager
     def _name_errors(self) -> Iterator[None]:
@@ -210,10 +180,6 @@ class OpenShard:
             yield
         except TrilightError as error:
             raise TrilightError(f"{self.name}: {error}") from error
-
-    def close(self) -> None:
-        """Let go of the file; a cache may then remove it."""
-        self._stream.close()
 
 
 class ShardSet(ABC):
@@ -245,7 +211,7 @@ class ManifestShards(ShardSet):
 
     def __init__(self, dataset: Dataset, entries: Sequence[ShardEntry]) -> None:
         self.names = [entry.name for entry in entries]
-        self._files = dataset.files
+        self._dataset = dataset
         self._entries = entries
         self._held = HeldMaps()
 
@@ -254,7 +220,8 @@ class ManifestShards(ShardSet):
 
     def open(self, number: int) -> OpenShard:
         entry = self._entries[number]
-        shard = OpenShard(entry.name, self._files.open(entry, checked=True), self._held)
+        stream = self._dataset.open_stream(entry, checked=True)
+        shard = OpenShard(entry.name, stream, self._held)
         if len(shard.keys) != entry.num_samples:
             shard.close()
             raise TrilightError(

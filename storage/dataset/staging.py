@@ -10,7 +10,7 @@ from pathlib import Path
 
 from storage.atomic import write_atomically
 from storage.dataset.layout import numbered_path
-from storage.dataset.shard import iterate_samples, write_tar
+from storage.dataset.shard import open_shard, write_tar
 from storage.records.objects import Failure, decode_failures, encode_failures
 from storage.records.profiles import Profile
 from storage.records.sample import Sample, encode_sample, sample_key
@@ -56,7 +56,8 @@ def is_staged(folder: Path, scene_index: int) -> bool:
 
 def read_staged_scene(folder: Path, scene_index: int) -> StagedScene:
     """Return what became of a finished scene; raises ShardMissing where it is not staged."""
-    ((_, members),) = iterate_samples(_path(folder, scene_index))
+    with open_shard(_path(folder, scene_index)) as opened:
+        ((_, members),) = opened
     failures = decode_failures(members.pop(_FAILURES))
     return StagedScene(members=members, failures=failures)
 

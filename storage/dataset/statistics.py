@@ -5,7 +5,7 @@ from array import array
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset, reading
 from storage.dataset.manifest import ShardEntry
-from storage.dataset.shard import read_member, scan_members
+from storage.dataset.shard import ShardReader
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
@@ -120,14 +120,11 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
     for shard in dataset.manifest.shards:
         by_split[shard.split] += shard.num_samples
     for shard in (read := described_shards(dataset)):
-        with (
-            dataset.files.open(shard, checked=False) as stream,
-            reading(dataset.display_name, shard.name),
-        ):
-            num_bytes = dataset.files.num_bytes(shard)
+        with dataset.open_shard(shard) as opened, reading(dataset.display_name, shard.name):
+            num_bytes = dataset.store.num_bytes(shard.name)
             if num_bytes not in (None, shard.num_bytes):
                 raise TrilightError(f"{num_bytes} bytes; expected {shard.num_bytes}")
-            _count_shard(stream, shard, tally)
+            _count_shard(opened, tally)
     is_complete = len(read) == len(dataset.manifest.shards)
     views = len(tally.views["spp"])
     has_parts = all(len(column) == views for column in tally.parts.values())
@@ -180,16 +177,11 @@ class _Tally:
                 self.parts.setdefault(name, array("d")).append(part["noise_floor_db"])
 
 
-def _count_shard(stream: BinaryIO, shard: ShardEntry, tally: _Tally) -> None:
-    for member in scan_members(stream, shard.name):
-        if member.suffix not in ("json", PLAIN, PACKED):
-            continue
-        data = read_member(stream, member)
-        if member.suffix != "json":
-            scene = f"{member.key}.{PLAIN}"
-            tally.scene_members[scene] = sha256_hex(unpack_arrays({member.suffix: data}))
-            continue
-        record = json.loads(data)
+def _count_shard(opened: ShardReader, tally: _Tally) -> None:
+    for key, members in opened.samples.items():
+        arrays = {name: opened.read(members[name]) for name in (PLAIN, PACKED) if name in members}
+        tally.scene_members[f"{key}.{PLAIN}"] = sha256_hex(unpack_arrays(arrays))
+        record = json.loads(opened.read(members["json"]))
         provenance = scene_provenance(record["provenance"])
         tally.templates[provenance.get("template", "unknown")] += 1
         if excursion := provenance.get("excursion"):

@@ -1,6 +1,5 @@
 """Checks a dataset against its manifest: each checksum, each member, the laws of every sample."""
 
-import io
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -12,17 +11,10 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.dataset.dataset import (
-    Dataset,
-    LocalFiles,
-    RemoteDatasetFiles,
-    open_dataset,
-    read_beside,
-)
-from storage.dataset.layout import DatasetFolder
+from storage.dataset.dataset import Dataset, open_dataset, published_manifest
 from storage.dataset.manifest import Manifest, ShardEntry, Totals, decode_manifest, index_stream
 from storage.dataset.planned import is_whole, num_planned
-from storage.dataset.shard import contents_of, samples_of
+from storage.dataset.shard import ShardReader
 from storage.digests import seal_of, sha256_hex
 from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.licences import mixed_share_alike
@@ -35,6 +27,7 @@ from storage.records.sample import Sample, decode_sample
 from storage.records.scene import Scene
 from storage.remote.fetch import download
 from storage.remote.retries import TransferFailed
+from storage.remote.store import RemoteStore
 
 REMOTE_THREADS = 8
 """Shards of a server that are fetched, or asked for, at the same time."""
@@ -99,7 +92,7 @@ def verify_dataset(
     problems += [f"{name}: not in the manifest" for name in _list_unlisted(dataset)]
     where: dict[str, str] = {}
     bad: list[str] = []
-    threads = available_cores() if isinstance(dataset.files, LocalFiles) else REMOTE_THREADS
+    threads = available_cores() if dataset.local else REMOTE_THREADS
     with ThreadPoolExecutor(threads) as pool:
         checks = _ahead(
             pool, lambda shard: _check_shard(dataset, shard, locked, fast=fast), manifest.shards
@@ -120,7 +113,7 @@ def verify_dataset(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    if bad and read_beside(dataset.files, decode_manifest).stored != manifest.stored:
+    if bad and published_manifest(dataset.store).stored != manifest.stored:
         raise TrilightError(
             f"{dataset.display_name}: its manifest was written while the shards were checked, as "
             "when a dataset grows; expected one that rests. Verify it again."
@@ -152,11 +145,9 @@ def _ahead(
 
 def _list_unlisted(dataset: Dataset) -> list[str]:
     """Return shard files that the manifest does not list; of a remote dataset, none."""
-    if isinstance(dataset.files, RemoteDatasetFiles):
-        return []
     listed = {shard.name for shard in dataset.manifest.shards}
-    root = dataset.files.root
-    names = [path.relative_to(root).as_posix() for path in DatasetFolder(root).shard_files()]
+    folder = dataset.local
+    names = map(folder.name_of, folder.shard_files()) if folder else ()
     return [name for name in names if name not in listed]
 
 
@@ -174,8 +165,8 @@ def _check_lock(lock: bytes | None, dataset: Dataset) -> Iterator[str]:
 def _check_manifest(dataset: Dataset) -> Iterator[str]:
     """Yield the faults of the manifest in itself, and of the documents that it vouches for."""
     name = "manifest.json"
-    data = dataset.files.read(name) or b""
-    listed = decode_manifest(io.BytesIO(data), name)  # makers may have written it since
+    data = dataset.store.get(name) or b""
+    listed = decode_manifest(data, name)  # makers may have written it since
     stored = listed.stored
     assert stored is not None  # it was read
     seal = stored.manifest_sha256
@@ -193,7 +184,7 @@ def _check_manifest(dataset: Dataset) -> Iterator[str]:
         if count > 1:
             yield f"{name}: {shard} is listed {count} times"
     for document, sha256 in listed.documents.items():
-        if (content := dataset.files.read(document)) is None:
+        if (content := dataset.store.get(document)) is None:
             yield f"{document}: missing"
         elif sha256_hex(content) != sha256:
             yield f"{document}: edited since it was written (sha256 differs from the manifest)"
@@ -204,15 +195,15 @@ def _check_shard(
 ) -> _ShardFindings:
     findings = _ShardFindings()
     try:
-        num_bytes = dataset.files.num_bytes(shard)
+        num_bytes = dataset.store.num_bytes(shard.name)
         if num_bytes not in (None, shard.num_bytes):
             findings.faults.append(f"{num_bytes} bytes; expected {shard.num_bytes}")
-        if findings.faults or (fast and isinstance(dataset.files, RemoteDatasetFiles)):
+        if findings.faults or (fast and not dataset.local):
             findings.unread += ["its server states no size"] * (num_bytes is None)
             return findings
         with _open_shard(dataset, shard) as stream:
             if fast:
-                findings.keys += contents_of(stream, shard.name).samples
+                findings.keys += ShardReader(stream, shard.name).samples
                 if len(findings.keys) != shard.num_samples:
                     findings.faults.append(
                         f"{len(findings.keys)} samples; expected {shard.num_samples}"
@@ -233,11 +224,11 @@ def _check_shard(
 
 
 def _open_shard(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
-    if isinstance(dataset.files, LocalFiles):
-        return dataset.files.open(shard, checked=False)
+    if not isinstance(dataset.store, RemoteStore):
+        return dataset.open_stream(shard, checked=False)
     stream: BinaryIO = TemporaryFile()
     try:
-        url = dataset.files.url.child(shard.name)
+        url = dataset.store.url.child(shard.name)
         download(url, stream, num_bytes=shard.num_bytes, max_bytes=shard.num_bytes)
     except BaseException:
         stream.close()
@@ -254,9 +245,10 @@ def _check_content(
 ) -> None:
     if index_stream(stream, shard.name) != shard:
         findings.faults.append("sha256 or number of samples differs from the manifest")
-    unused = set(contents_of(stream, shard.name).maps)
+    opened = ShardReader(stream, shard.name)
+    unused = set(opened.maps)
     held = HeldMaps()
-    for key, members in samples_of(stream, shard.name):
+    for key, members in opened:
         findings.keys.append(key)
         unused -= members.keys()
         try:

@@ -1,4 +1,4 @@
-"""`Store`: where a dataset is published, a folder or a bucket (s3://, gs://) by fsspec.
+"""`Store`: where a dataset is: a folder, a bucket (s3://, gs://) or a server, by fsspec.
 
 Files have names relative to it. A file appears whole or not at all, and once if asked. A bucket
 shows one when all of it has come, however large it is, so a kill leaves nothing half written; parts
@@ -21,13 +21,15 @@ import uuid
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from storage.atomic import atomic_writer, write_atomically
-from storage.errors import EnvironmentFailure, TrilightError
+from storage.digests import sha256_of_stream
+from storage.errors import EnvironmentFailure, ShardMissing, TrilightError, Unreadable
 from storage.file_locks import hold_lock
-from storage.remote.fetch import fetch_if_there
+from storage.remote.fetch import facts_of, fetch_if_there, unreadable
 from storage.remote.retries import TransferFailed, is_missing, is_taken, may_pass, with_tries
+from storage.remote.shard_cache import shard_cache
 from storage.remote.url import RemoteUrl, shared_driver
 
 WRITABLE = ("s3", "gs")
@@ -50,6 +52,8 @@ class Store(ABC):
 
     is_here: bool
     """True for a folder: what is written there is published."""
+    display_name: str
+    """The folder or URL without secrets, for messages."""
 
     @abstractmethod
     def get(self, name: str, num_bytes: int | None = None) -> bytes | None:
@@ -87,6 +91,30 @@ class Store(ABC):
     def require_create(self) -> None:
         """Raise TrilightError if the store writes a file again that it was to create once."""
 
+    @abstractmethod
+    def num_bytes(self, name: str) -> int | None:
+        """Return the size of a shard, or None where the server does not state it.
+
+        Raises:
+            ShardMissing: there is none.
+            Unreadable: it cannot be looked at, or the server gives no answer.
+        """
+
+    @abstractmethod
+    def open_shard(self, name: str, *, num_bytes: int, sha256: str, checked: bool) -> BinaryIO:
+        """Open a shard for reading.
+
+        Args:
+            name: its name.
+            num_bytes: its size.
+            sha256: its digest.
+            checked: check the digest first, once as long as the file stays unchanged; what comes
+                from a server always is.
+
+        Raises:
+            TrilightError: it is missing, cannot be read, or its bytes are not those of the digest.
+        """
+
 
 class LocalStore(Store):
     """A folder of this machine, or of one that all machines see at the same place."""
@@ -95,6 +123,8 @@ class LocalStore(Store):
 
     def __init__(self, root: Path) -> None:
         self.root = root
+        self.display_name = str(root)
+        self._checked: dict[str, tuple[int, ...]] = {}
 
     def get(self, name: str, num_bytes: int | None = None) -> bytes | None:
         from storage.records.safe_read import open_if_there  # slow, and most names need no file
@@ -137,9 +167,51 @@ class LocalStore(Store):
     def require_create(self) -> None:
         """Pass: storage.atomic sees to it."""
 
+    def num_bytes(self, name: str) -> int | None:
+        path = self.root / name
+        with _name_missing(path):
+            return path.stat().st_size
 
-class BucketStore(Store):
-    """A folder in a bucket, by fsspec."""
+    def open_shard(self, name: str, *, num_bytes: int, sha256: str, checked: bool) -> BinaryIO:
+        from storage.records.safe_read import open_plain
+
+        path = self.root / name
+        with _name_missing(path):
+            stream = open_plain(path)
+        facts = os.fstat(stream.fileno())
+        seen = (facts.st_ino, facts.st_size, facts.st_mtime_ns)
+        if checked and self._checked.get(name) != seen:
+            if sha256_of_stream(stream) != sha256:
+                stream.close()
+                raise TrilightError(
+                    f"{path}: the bytes are not those of the manifest (sha256 differs). Delete the "
+                    "file and run `trilight generate` again to make it."
+                )
+            stream.seek(0)
+            self._checked[name] = seen
+        return stream
+
+
+@contextlib.contextmanager
+def _name_missing(path: Path) -> Iterator[None]:
+    """Raise ShardMissing or Unreadable for what the system says of a shard within the block."""
+    try:
+        yield
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise ShardMissing(
+            f"{path}: the shard is missing; run `trilight generate` again to make it."
+        ) from error
+    except OSError as error:
+        raise Unreadable(
+            f"{path}: cannot be read ({error.strerror}); fix its permissions."
+        ) from error
+
+
+class RemoteStore(Store):
+    """A folder in a bucket, by fsspec; one on a plain server can only be read.
+
+    Its shards come whole to the cache of this machine.
+    """
 
     is_here = False
 
@@ -152,6 +224,7 @@ class BucketStore(Store):
                 written at its first claim: a machine that is killed has its claims again at once.
         """
         self.url = url
+        self.display_name = url.display_url
         self._work = work
         self._first_seen: dict[str, float] = {}
 
@@ -199,11 +272,13 @@ class BucketStore(Store):
     def list_all(self) -> set[str]:
         """Return the names of all files, however deep; a thousand names are a request.
 
-        Raises:
-            TrilightError: the bucket does not exist or may not be listed, or the server gives no
-                answer (an EnvironmentFailure where that may pass).
+        There are none where they cannot be listed: on a plain server, or without the permission.
         """
-        return self._list_paths("", lambda driver, place: driver.find(place))
+        if self.url.scheme not in WRITABLE:
+            return set()
+        with contextlib.suppress(TrilightError):
+            return self._list_paths("", lambda driver, place: driver.find(place))
+        return set()
 
     def _list_paths(self, folder: str, find: Callable[[Any, str], Iterable[str]]) -> set[str]:
         root = self.url.root
@@ -260,6 +335,18 @@ class BucketStore(Store):
                 "other's files; expected one that refuses to create a file twice. Use another "
                 "server, or a folder."
             )
+
+    def num_bytes(self, name: str) -> int | None:
+        url = self.url.child(name)
+        try:
+            return facts_of(url).num_bytes
+        except TransferFailed as error:
+            if error.__cause__ is not None and is_missing(error.__cause__):
+                raise ShardMissing(f"{url.display_url}: the shard is missing.") from error
+            raise unreadable(url, error) from error
+
+    def open_shard(self, name: str, *, num_bytes: int, sha256: str, checked: bool) -> BinaryIO:
+        return shard_cache().open(self.url.child(name), num_bytes=num_bytes, sha256=sha256)
 
     def _upload(self, name: str, content: Path | bytes, *, mode: str) -> None:
         driver = shared_driver(self.url)

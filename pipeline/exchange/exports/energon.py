@@ -19,7 +19,7 @@ from pipeline.exchange.exports.pictures import write_json
 from storage.atomic import atomic_writer, write_atomically
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import ShardEntry
-from storage.dataset.shard import scan_samples
+from storage.dataset.shard import ShardReader
 from storage.errors import TrilightError
 
 _SPLITS = {"train": "train", "validation": "val", "test": "test"}
@@ -65,11 +65,10 @@ def _copy_shard(
 ) -> None:
     target = out / shard.name
     target.parent.mkdir(parents=True, exist_ok=True)
-    with dataset.files.open(shard, checked=True) as stream:
-        samples = [members for _, members in scan_samples(stream, shard.name)]
-        stream.seek(0)
+    with dataset.open_stream(shard, checked=True) as stream:
         with atomic_writer(target) as copy:
             shutil.copyfileobj(stream, copy)
+        samples = list(ShardReader(stream, shard.name).samples.values())
     block = tarfile.BLOCKSIZE
     starts = [min(each.offset for each in members.values()) - block for members in samples]
     last = samples[-1].values() if samples else ()

@@ -83,6 +83,6 @@ def export_dataset(
     else:
         lost = FORMS[form](samples(), out)
     for name in _RIGHTS:
-        if (data := dataset.files.read(name)) is not None:
+        if (data := dataset.store.get(name)) is not None:
             write_atomically(out / name, data)
     return lost or ()

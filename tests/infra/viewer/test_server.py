@@ -354,7 +354,7 @@ def test_what_is_shown_is_what_the_printed_command_selects(
                 template=options.get("--template"),
                 where=options.get("--where"),
             )
-            whole = FinishedDataset(folder=dataset.folder, manifest=dataset.manifest, objects={})
+            whole = FinishedDataset(dataset.store, dataset.manifest, {})
             chosen = list_scenes(whole, selection)
             assert [row["key"] for row in found["rows"]] == [row["key"] for row in chosen]
             for mine, theirs in zip(found["rows"], chosen, strict=True):

@@ -62,7 +62,7 @@ class Writes:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.left = 0
-        put = store.BucketStore._upload
+        put = store.RemoteStore._upload
 
         def put_or_die(bucket: Any, *arguments: Any, **options: Any) -> None:
             self.left -= 1
@@ -70,7 +70,7 @@ class Writes:
                 raise Killed
             put(bucket, *arguments, **options)
 
-        monkeypatch.setattr(store.BucketStore, "_upload", put_or_die)
+        monkeypatch.setattr(store.RemoteStore, "_upload", put_or_die)
 
 
 class Machines:

@@ -25,7 +25,7 @@ from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, index_shard, write_manifest
-from storage.dataset.shard import contents_of, write_shard
+from storage.dataset.shard import open_shard, write_shard
 from storage.dataset.staging import read_staged_scene, stage_scene
 from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_hex
@@ -341,8 +341,8 @@ def maps_in(dataset: Dataset) -> list[list[str]]:
     """Return the names of the maps in each shard."""
     names = []
     for shard in dataset.manifest.shards:
-        with dataset.files.open(shard, checked=True) as stream:
-            names.append(list(contents_of(stream, shard.name).maps))
+        with dataset.open_shard(shard, checked=True) as opened:
+            names.append(list(opened.maps))
     return names
 
 
@@ -381,8 +381,7 @@ def test_staged_scenes_bring_their_maps_into_the_shard(tmp_path: Path) -> None:
         stage_scene(staged, index, each, [], "compact")
         assert read_staged_scene(staged, index).members == encode_sample(each, "compact")
     packed = pack_shard(folder, "train-000000.tar", range(3))
-    with folder.shard(packed.name).open("rb") as stream:
-        assert len(contents_of(stream, packed.name).maps) == 4
+    assert len(open_shard(folder.shard(packed.name)).maps) == 4
     other = tmp_path / "train-000009.tar"
     write_shard(other, [(sample.key, encode_sample(sample, "compact")) for sample in samples])
     assert index_shard(other).sha256 == packed.sha256

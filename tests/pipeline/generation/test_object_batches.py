@@ -287,10 +287,10 @@ def test_a_kill_before_any_write_leaves_the_same_lock(
     assert open_dataset(OUT).lock_bytes() == lock_of_one
 
 
-def _machine(tmp_path: Path, name: str) -> store.BucketStore:
+def _machine(tmp_path: Path, name: str) -> store.RemoteStore:
     url = parse_url(OUT, what="bucket")
     assert isinstance(url, RemoteUrl)
-    return store.BucketStore(url, tmp_path / name)
+    return store.RemoteStore(url, tmp_path / name)
 
 
 def test_a_claim_keeps_other_machines_off_until_it_ends(
@@ -306,7 +306,7 @@ def test_a_claim_keeps_other_machines_off_until_it_ends(
         ):
             assert (ours, theirs, free) == (True, False, True)
     with monkeypatch.context() as patch:
-        patch.setattr(store.BucketStore, "put", lambda *given: None)  # it dies
+        patch.setattr(store.RemoteStore, "put", lambda *given: None)  # it dies
         with a.hold_lock("z") as ours:
             assert ours
     with b.hold_lock("z") as theirs, _machine(tmp_path, "a").hold_lock("z") as again:

@@ -23,7 +23,7 @@ from pipeline.generation.revisit_options import RevisitOptions, to_generate_opti
 from pipeline.isolation import IsolatedChild
 from pipeline.renders.renderer import SceneRenderer
 from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.shard import iterate_samples
+from storage.dataset.shard import open_shard
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.sample import Sample
@@ -70,7 +70,7 @@ def members(dataset: Dataset) -> dict[str, bytes]:
     return {
         f"{shard.name}/{key}.{suffix}": data
         for shard in dataset.manifest.shards
-        for key, of_key in iterate_samples(dataset.folder.shard(shard.name))
+        for key, of_key in open_shard(dataset.folder.shard(shard.name))
         for suffix, data in of_key.items()
     }
 
@@ -243,7 +243,7 @@ def test_a_damaged_source_is_named(source: Dataset, tmp_path: Path) -> None:
     data = bytearray(shard.read_bytes())
     data[len(data) // 2] ^= 1
     shard.write_bytes(bytes(data))
-    with pytest.raises(TrilightError, match=r"sha256 differs\); run `trilight verify`"):
+    with pytest.raises(TrilightError, match=r"not those of the manifest \(sha256 differs\)"):
         make_dataset(order_of(copy, tmp_path / "set", cameras="2"), Undocumented())
     assert not (tmp_path / "set" / shard.name).exists()
 

@@ -57,6 +57,7 @@ from storage.dataset.splits import (
     split_of_shard,
 )
 from storage.errors import TrilightError
+from storage.remote.store import RemoteStore
 from storage.seeds import rng_for, seed_for
 from tests.conftest import ROOT
 from tests.for_each import for_each
@@ -377,7 +378,7 @@ def test_only_a_bucket_is_asked_what_it_holds(
     """What a plain server has beyond its manifest nobody can know; asking it would take a while."""
     pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
     asked: list[object] = []
-    monkeypatch.setattr(progress, "BucketStore", asked.append)
+    monkeypatch.setattr(RemoteStore, "_list_paths", asked.append)
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     begin_tiny(tmp_path, 8)
     with serve(tmp_path) as site:

@@ -25,13 +25,7 @@ from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import index_shard
 from storage.dataset.settings import SplitSettings
-from storage.dataset.shard import (
-    contents_of,
-    iterate_samples,
-    read_members,
-    scan_members,
-    write_shard,
-)
+from storage.dataset.shard import open_shard, scan_members, write_shard
 from storage.dataset.shard_set import expand_pattern, listed_shards
 from storage.dataset.splits import shard_name
 from storage.dataset.training_data import open_mixture, open_training_data
@@ -88,14 +82,14 @@ def test_a_shard_cut_at_any_block_is_refused(tmp_path: Path, kept_blocks: int) -
     content = whole.read_bytes().rstrip(b"\0")
     cut.write_bytes(content[: min(kept_blocks * 512, len(content))])
     with pytest.raises(TrilightError, match=r"cut\.tar"):
-        list(iterate_samples(cut))
+        list(open_shard(cut))
 
 
 def test_names_without_a_suffix_and_samples_in_two_places_are_refused(tmp_path: Path) -> None:
     """Kinds of members, their paths and sizes are those of tests/hostile/file_cases.py."""
     for names in (("README",), ("0.json", "0.json"), ("0.json", "1.json", "0.exr")):
         with case(names), pytest.raises(TrilightError, match="refused|twice"):
-            list(iterate_samples(_tar(tmp_path / "hostile.tar", [(name, b"") for name in names])))
+            list(open_shard(_tar(tmp_path / "hostile.tar", [(name, b"") for name in names])))
 
 
 def test_a_failed_write_leaves_what_was_there_and_leftovers_go(tmp_path: Path) -> None:
@@ -184,9 +178,8 @@ def test_headers_find_every_member_and_each_map_once_before_its_first_sample(
     entry = index_shard(shard)
     assert (entry.split, entry.num_samples, entry.num_bytes) == ("train", 4, len(data))
     with shard.open("rb") as stream:
-        contents = contents_of(stream, TRAIN)
-        stream.seek(0)
         members = {each.name: each for each in scan_members(stream, TRAIN)}
+    contents = open_shard(shard)
     assert list(contents.samples) == [sample_key(key) for key in range(4)]
     assert members.keys() == expected.keys() and set(contents.maps) == set(MAPS.values())
     for name, held in [*members.items(), *contents.maps.items()]:
@@ -204,7 +197,7 @@ def test_equal_samples_give_equal_files_in_any_order_of_members(tmp_path: Path) 
     for name in ("a.tar", "b.tar"):
         write_shard(tmp_path / name, [(key, dict(reversed(m.items()))) for key, m in samples])
     assert (tmp_path / "a.tar").read_bytes() == (tmp_path / "b.tar").read_bytes()
-    assert list(iterate_samples(tmp_path / "a.tar")) == samples
+    assert list(open_shard(tmp_path / "a.tar")) == samples
 
 
 def test_stock_webdataset_sees_samples_as_before(dataset: Dataset) -> None:
@@ -257,9 +250,11 @@ def test_every_reader_finds_the_maps(dataset: Dataset) -> None:
     assert [encode_sample(each) for each in by_key] == [encode_sample(samples[k]) for k in (3, 2)]
     path = dataset.folder.shard(TRAIN)
     key = sample_key(3)
-    record = decode_scene(key, read_members(path, key, ("json", "scene.safetensors")))
+    with open_shard(path) as shard_of_path:
+        record = decode_scene(key, shard_of_path.members(key, lambda name: "exr" not in name))
+        alone = shard_of_path.members(sample_key(1), "0.exr".__eq__)
     assert record.scene.textures[0].sha256 == expected[3][0]
-    assert set(read_members(path, sample_key(1), ["0.exr"])) == {"0.exr"}, "and no map"
+    assert set(alone) == {"0.exr"}, "and no map"
     for data in ([str(dataset.folder.root)], [str(path)]):
         opened = open_training_data(data).split("train").open(0)
         found = [looks(opened.sample(row)) for row in (3, 2, 0)]
@@ -272,14 +267,14 @@ def test_a_map_twice_or_behind_its_sample_is_refused(tmp_path: Path) -> None:
     name, path = MAPS["sky"], tmp_path / "a.tar"
     late = {suffix: data for suffix, data in members.items() if suffix != name}
     with pytest.raises(TrilightError, match=f"member {name} occurs twice"):
-        list(iterate_samples(_tar(path, [(name, b"a"), (name, b"a")])))
+        list(open_shard(_tar(path, [(name, b"a"), (name, b"a")])))
     own = [(f"{sample_key(0)}.{s}", d) for s, d in late.items() if not MAP_NAME.fullmatch(s)]
     others = [(s, d) for s, d in late.items() if MAP_NAME.fullmatch(s)]
-    ((key, read),) = iterate_samples(_tar(path, [*others, *own, (name, members[name])]))
+    ((key, read),) = open_shard(_tar(path, [*others, *own, (name, members[name])]))
     with pytest.raises(TrilightError, match="is missing; expected a member __map-"):
         decode_scene(key, read)
     with pytest.raises(TrilightError, match=f"sample {sample_key(0)} occurs twice"):
-        list(iterate_samples(_tar(path, [*others, *own[:2], (name, b"a"), *own[2:]])))
+        list(open_shard(_tar(path, [*others, *own[:2], (name, b"a"), *own[2:]])))
 
 
 @for_each(

@@ -21,7 +21,7 @@ from storage.errors import EnvironmentFailure, TrilightError
 from storage.remote import fetch, store
 from storage.remote import url as remote_url
 from storage.remote.retries import with_tries
-from storage.remote.store import BucketStore, LocalStore, Store
+from storage.remote.store import LocalStore, RemoteStore, Store
 from storage.remote.url import RemoteUrl
 from tests.for_each import for_each
 from tests.pipeline.generation.bucket_kit import empty_bucket
@@ -176,13 +176,13 @@ def create_once(made: Store, folder: Path) -> None:
 def test_a_file_is_created_once(moto: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(store, "_PART_BYTES", 5 << 20)  # no server takes smaller parts
     with empty_bucket(moto, monkeypatch):
-        made = BucketStore(place("s3://shards/set"), tmp_path / "work")
+        made = RemoteStore(place("s3://shards/set"), tmp_path / "work")
         create_once(made, tmp_path)
         assert {"small", "part-0001/large"} < made.list_all()
 
 
 def test_a_file_is_created_once_at_google(gs: Any, conditional: None, tmp_path: Path) -> None:
-    create_once(BucketStore(place("gs://shards/made"), tmp_path / "work"), tmp_path)
+    create_once(RemoteStore(place("gs://shards/made"), tmp_path / "work"), tmp_path)
 
 
 def test_a_file_is_created_once_in_a_folder(tmp_path: Path) -> None:
@@ -202,7 +202,7 @@ def test_a_server_that_ignores_the_condition_is_refused_before_anything_is_begun
         hold_dataset_lock(folder),
     ):
         begin_or_resume_dataset(folder, _build(), ENVIRONMENT, 8, accept_environment=False)
-    assert BucketStore(place("gs://shards/made")).list_all() == {".staging/once"}
+    assert RemoteStore(place("gs://shards/made")).list_all() == {".staging/once"}
     assert not folder.manifest.exists()
 
 
