@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from infra.bench.experiment import BenchScale, Figures
-from infra.bench.workloads.named_scenes import given_scenes, read_given, sampled_scene
+from infra.bench.workloads.named_scenes import given_scenes, preset_scene, read_given
 from infra.bench.workloads.reading import Members, render_scenes, write_copies
 from infra.bench_options import BenchOptions
 from infra.render.held_out_scenes import composing_child
@@ -92,7 +92,7 @@ class BenchContext:
             path = given_scenes(self.options.scenes).get(trial)
             if path is not None:
                 return self.child.call(read_given, path)
-            return sampled_scene(self.child, int(trial.split()[-1]))
+            return preset_scene(self.child, smoke(), int(trial.split()[-1]))
 
         return self.get_or_make(("scene", trial), make)
 

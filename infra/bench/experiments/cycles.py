@@ -10,7 +10,7 @@ from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, percent
 from infra.bench.experiments.frontier import adaptive
 from infra.bench.workloads.cycles import render_with_cycles
-from infra.bench.workloads.named_scenes import SKIES, given_scenes, mapped_scene, object_alone
+from infra.bench.workloads.named_scenes import SKIES, given_scenes, mapped_scene, preset_scene
 from infra.bench.workloads.traced_pictures import (
     difference_db,
     render_shot,
@@ -96,8 +96,9 @@ def _measure_object(context: BenchContext, trial: str) -> Figures:
     px = context.scale.picture_px
     spp = context.scale.max_spp
     views = range(OBJECT_VIEWS)
-    scene = object_alone(context.child, int(trial.split()[-1]), OBJECT_VIEWS)
-    settings = dataclasses.replace(object_views().renders, resolution=px)
+    preset = object_views()
+    scene = preset_scene(context.child, preset, int(trial.split()[-1]), OBJECT_VIEWS)
+    settings = dataclasses.replace(preset.renders, resolution=px)
     ours, our_core_s = context.child.call(render_shots, scene, settings, OBJECT_VIEWS)
     filtered, core_s = render_with_cycles(scene, px, SCRIPT_SPP, views=views, denoise=True)
     raws, _ = render_with_cycles(scene, px, spp, seeds=(0, 1), views=views)

@@ -1,5 +1,6 @@
 """Experiment `gpu`: throughput, correct pictures, and steps of every training preset on a GPU."""
 
+import itertools
 import os
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -43,15 +44,14 @@ def _points(scale: BenchScale, options: BenchOptions) -> list[Point]:
     copies = ("within", "to_pageable", "to_pinned") if on_gpu else ("within",)
     precisions = ("float32", "bfloat16") if on_gpu else ("float32",)
     threads = [count for count in _THREADS if count <= (os.cpu_count() or 1)]
+    works = [
+        *itertools.product(["product"], kinds),
+        *itertools.product(["copy"], copies),
+        *itertools.product(["picture"], NETWORKS, precisions),
+        *itertools.product(["step"], _runs(scale, options)),
+    ]
     named: dict[str, Measured] = {
-        **{f"product, {kind}": partial(_product, kind) for kind in kinds},
-        **{f"copy, {kind}": partial(_copy, kind) for kind in copies},
-        **{
-            f"picture, {network}, {precision}": partial(_picture, network, precision)
-            for network in NETWORKS
-            for precision in precisions
-        },
-        **{f"step, {run}": partial(_step, run) for run in _runs(scale, options)},
+        **{", ".join(work): partial(_work, work[0], work[1:]) for work in works},
         "rendering a view": lambda context, device: context.rendered[0],
         **{f"reading a sample, {count} threads": partial(_reading, count) for count in threads},
     }
@@ -88,32 +88,22 @@ def _measure(name: str, part: Measured, context: BenchContext, trial: str) -> Fi
         return {}
 
 
-def _product(kind: str, context: BenchContext, device: "torch.device") -> Figures:
-    from infra.bench.gpu.steps import product_figures
-
-    return product_figures(device, kind, _PRODUCT_WIDTH[device.type])
-
-
-def _copy(kind: str, context: BenchContext, device: "torch.device") -> Figures:
-    from infra.bench.gpu.steps import copy_figures
-
-    return copy_figures(device, kind, _COPIED_BYTES[device.type])
-
-
-def _picture(
-    network: str, precision: str, context: BenchContext, device: "torch.device"
+def _work(
+    kind: str, words: Sequence[str], context: BenchContext, device: "torch.device"
 ) -> Figures:
-    from infra.bench.gpu.steps import twin_figures
+    """Measure a product, a copy, a picture or a step."""
+    from infra.bench.gpu import steps  # imports torch
 
-    return twin_figures(network, precision, device)
-
-
-def _step(run: str, context: BenchContext, device: "torch.device") -> Figures:
-    from infra.bench.gpu.steps import step_figures
-
-    figures = step_figures(run, _STEPS[context.scale.name], device)
+    match kind, *words:
+        case "product", number_type:
+            return steps.product_figures(device, number_type, _PRODUCT_WIDTH[device.type])
+        case "copy", way:
+            return steps.copy_figures(device, way, _COPIED_BYTES[device.type])
+        case "picture", network, precision:
+            return steps.twin_figures(network, precision, device)
+    figures = steps.step_figures(words[0], _STEPS[context.scale.name], device)
     if not figures:
-        context.note(f"{run}: too little memory, even for one scene a pass")
+        context.note(f"{words[0]}: too little memory, even for one scene a pass")
     return figures
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from infra.bench.context import BenchContext
 from infra.bench.experiment import BenchScale, Column, Experiment, Figures, Point, percent
-from infra.bench.workloads.named_scenes import lights_apart
+from infra.bench.workloads.named_scenes import preset_scene
 from infra.bench.workloads.traced_pictures import render_shot
 from infra.bench_options import BenchOptions
 from infra.render.raw_references import (
@@ -51,7 +51,7 @@ def _measure(target_db: float, context: BenchContext, trial: str) -> Figures:
     index = int(trial.split()[-1])
     px = context.scale.resolution
     spp = 4 * context.scale.reference_spp
-    scene = context.get_or_make(trial, lambda: lights_apart(context.child, index))
+    scene = context.get_or_make(trial, lambda: preset_scene(context.child, olat(), index))
     references = context.get_or_make(
         (trial, "lights"),
         lambda: context.child.call(light_references, scene, first_camera(scene, px), spp),

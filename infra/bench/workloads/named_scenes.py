@@ -21,7 +21,8 @@ from pipeline.exchange.gltf.read_gltf import SUFFIXES as GLTF_SUFFIXES
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.isolation import IsolatedChild
 from pipeline.objects.builtin.superquadric import superquadric
-from pipeline.presets.training import object_views, olat, smoke, textured_256
+from pipeline.presets.settings import DatasetSettings
+from pipeline.presets.training import textured_256
 from pipeline.scenes.pieces import (
     ScenePiece,
     concatenate_pieces,
@@ -79,13 +80,15 @@ def read_given(path: Path) -> Scene:
     return load_source(scene_source(str(path))).scene
 
 
-def sampled_scene(child: IsolatedChild, scene_index: int) -> Scene:
-    """Return a scene of the preset `smoke` with one camera, composed in a render child.
+def preset_scene(
+    child: IsolatedChild, preset: DatasetSettings, scene_index: int, num_views: int = 1
+) -> Scene:
+    """Return a scene of a preset, composed in a render child.
 
     Raises:
         Rejected: every attempt at it was rejected.
     """
-    settings = dataclasses.replace(smoke().scenes, num_views=1)
+    settings = dataclasses.replace(preset.scenes, num_views=num_views)
     return first_composed(child, settings, scene_index)
 
 
@@ -111,21 +114,6 @@ def mapped_scene(child: IsolatedChild, name: str) -> Scene:
         }
         settings = apply_overrides(settings, sky)
     return first_composed(child, settings, number, seed=_MAPPED_SEED)
-
-
-def object_alone(child: IsolatedChild, scene_index: int, num_views: int) -> Scene:
-    """Return a scene of the preset `object-views`, composed in a render child.
-
-    Raises:
-        Rejected: every attempt at it was rejected.
-    """
-    settings = dataclasses.replace(object_views().scenes, num_views=num_views)
-    return first_composed(child, settings, scene_index)
-
-
-def lights_apart(child: IsolatedChild, scene_index: int) -> Scene:
-    """Return a scene of the preset `olat` with one camera; as `object_alone`."""
-    return first_composed(child, dataclasses.replace(olat().scenes, num_views=1), scene_index)
 
 
 def _holds_a_scene(path: Path) -> bool:
