@@ -118,9 +118,14 @@ def file_child(confined_to: Reach = NO_FILES) -> IsolatedChild:
     return IsolatedChild(limits=_LIMITS, confined_to=confined_to)
 
 
-def unconfined_child() -> IsolatedChild:
-    """Return an unconfined child with limits, for scenes that are already read; close it."""
-    return IsolatedChild(limits=_LIMITS)
+def unconfined_child(address_space: Callable[[int], int]) -> IsolatedChild:
+    """Return an unconfined child with limits, for scenes that are already read; close it.
+
+    Args:
+        address_space: returns the memory limit for what the child renders with, of the usual one.
+    """
+    memory_bytes = address_space(_LIMITS.memory_bytes)
+    return IsolatedChild(limits=dataclasses.replace(_LIMITS, memory_bytes=memory_bytes))
 
 
 def reach_of(source: SceneSource, *, writes: Iterable[Path] = ()) -> Reach:

@@ -1,5 +1,6 @@
 """Reports the contents of one scene and renders a turntable of it, in children with limits."""
 
+import contextlib
 import dataclasses
 import math
 from collections import Counter
@@ -43,7 +44,7 @@ class InspectedScene:
     facts: Mapping[str, Any]
     """Facts for the user as JSON values, by name, such as triangles and extent_m."""
     notes: tuple[str, ...]
-    """Parts of the file that the reader could not convert."""
+    """Parts of the file that the reader could not convert, and why no GPU rendered."""
 
 
 def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene:
@@ -55,22 +56,25 @@ def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene
     if turntable is not None and turntable.suffix.lower() != ".png":
         raise TrilightError(f"--turntable is {turntable}; expected the name of a file X.png.")
     child = file_child(reach_of(source))
-    renderer = unconfined_child()
     try:
         inspected = call_with_retries(child, _facts, source)
         if turntable is not None:
             from pipeline.documents.png import encode_png
 
             scene = call_with_retries(child, load_source, source).scene
-            sheet = call_with_retries(renderer, _turntable, scene, choose_variant(device="cpu"))
+            variant = choose_variant("auto")
+            with contextlib.closing(unconfined_child(variant.address_space)) as renderer:
+                sheet = call_with_retries(renderer, _turntable, scene, variant)
             write_atomically(turntable, encode_png(sheet))
+            if variant.note:
+                note = f"{variant.note}; see trilight doctor"
+                inspected = dataclasses.replace(inspected, notes=(*inspected.notes, note))
     except ChildFailed as failure:
         raise TrilightError(f"{source.name}: cannot be inspected ({failure}).") from failure
     except Rejected as rejection:
         raise TrilightError(f"{source.name}: cannot be rendered ({rejection}).") from rejection
     finally:
         child.close()
-        renderer.close()
     return inspected
 
 

@@ -44,6 +44,8 @@ def test_a_summary_and_a_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     use_children_here(monkeypatch)
     monkeypatch.setattr(inspecting, "_RESOLUTION", 32)
     monkeypatch.setattr(inspecting, "_SPP", 16)
+    variant = dataclasses.replace(choose_variant(), note="the GPU renders no right picture")
+    monkeypatch.setattr(inspecting, "choose_variant", {"auto": variant}.__getitem__)
     write_usd(tmp_path / "a.usdz", tiny_scene())
     words = ["inspect", str(tmp_path / "a.usdz"), "--turntable", str(tmp_path / "t.png"), "--json"]
     result = trilight(words)
@@ -51,7 +53,7 @@ def test_a_summary_and_a_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     found = json.loads(result.output)
     assert found["triangles"] == 3 and found["lights"] == 1
     assert found["objects"] == "1 emitter, 1 shell"
-    assert found["notes"] == []
+    assert found["notes"] == ["the GPU renders no right picture; see trilight doctor"]
     sheet = np.asarray(Image.open(tmp_path / "t.png"))
     assert sheet.shape[0] * VIEWS == sheet.shape[1] * ROWS**2
     tiles = np.split(sheet, ROWS)
