@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from model.hits.view_inputs import Channel
-from storage.denoiser import Features, denoise, gpu_is_supported
+from storage.denoiser import gpu_is_supported, open_filter
 
 if TYPE_CHECKING:  # it loads pydantic
     from model.config import HitStage
@@ -103,7 +103,7 @@ def denoise_traced(traced: Traced, stage: "HitStage") -> Traced:
 
 
 def _denoise_view(view_RRC: Tensor, unit_113: Tensor) -> None:
-    """Filter the light of a view in place, on its GPU where the denoiser runs there."""
+    """Filter the light of a view in place, in a GPU's memory where the denoiser runs there."""
     light = torch.zeros_like(view_RRC[..., Channel.SHOWN_DIFFUSE])
     for part in _SUMMED:
         light += view_RRC[..., part]
@@ -111,13 +111,18 @@ def _denoise_view(view_RRC: Tensor, unit_113: Tensor) -> None:
     coverage = view_RRC[..., Channel.COVERAGE]
     albedo = coverage * (view_RRC[..., Channel.DIFFUSE] + view_RRC[..., Channel.SPECULAR])
     normal = coverage * view_RRC[..., Channel.NORMAL]
-    color, *guides = (each.float().cpu().numpy() for each in (light / unit_113, albedo, normal))
     on_gpu = view_RRC.is_cuda and gpu_is_supported()
-    filtered = denoise(
-        color,
-        Features(albedo=guides[0], normal=guides[1]),
-        "fast",
-        threads=1,
-        device="CUDA" if on_gpu else None,
+    place = torch.device("cuda", 0) if on_gpu else torch.device("cpu")
+    color, albedo, normal = (
+        each.to(place, torch.float32).contiguous() for each in (light / unit_113, albedo, normal)
     )
-    view_RRC[..., Channel.SHOWN_DIFFUSE] = unit_113 * torch.from_numpy(filtered).to(view_RRC)
+    filtered = torch.zeros_like(color)
+    images = {"color": color, "albedo": albedo, "normal": normal, "output": filtered}
+    if on_gpu:  # the denoiser has a stream of its own
+        torch.cuda.current_stream(place).synchronize()
+    opened = open_filter(len(view_RRC), "fast", threads=1, device="CUDA" if on_gpu else "CPU")
+    opened.run_in_place({name: image.data_ptr() for name, image in images.items()})
+    # as `storage.denoiser.denoise`: black without light, and where nothing is met
+    is_covered = (normal != 0).any(-1, keepdim=True) | (color != 0).any(-1, keepdim=True)
+    filtered = torch.where(is_covered & color.any(), filtered.clamp(min=0), 0)
+    view_RRC[..., Channel.SHOWN_DIFFUSE] = unit_113 * filtered.to(view_RRC)

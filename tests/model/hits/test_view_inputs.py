@@ -17,6 +17,7 @@ from model.inference import NeuralRenderer
 from model.renderformer import radiance
 from model.scene_tensors import batch_scenes, scene_tensors
 from storage.conventions import pixel_places
+from storage.denoiser import Features, denoise
 from storage.metrics import pepper
 from storage.raycast.first_hits import first_hits
 from storage.records.material import EMISSION
@@ -242,6 +243,14 @@ def test_noise_goes_and_light_and_surfaces_stay() -> None:
     for channel in DENOISED:
         kept[channel] = False
     assert torch.equal(clean[..., kept], noisy[..., kept])
+    coverage = noisy[0, ..., Channel.COVERAGE]
+    guides = [noisy[0, ..., channel] for channel in (Channel.DIFFUSE, Channel.SPECULAR)]
+    features = Features(
+        albedo=(coverage * (guides[0] + guides[1])).numpy(),
+        normal=(coverage * noisy[0, ..., Channel.NORMAL]).numpy(),
+    )
+    filtered = denoise((_light(noisy) / UNIT).numpy(), features, "fast", threads=1)
+    np.testing.assert_array_equal(_light(clean), UNIT.numpy() * filtered)
     nothing = noisy[0, ..., 0] == 0
     assert nothing.any() and not _light(clean)[nothing].any(), "nothing is met: black"
 
